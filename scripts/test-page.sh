@@ -4,5 +4,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 cargo build --workspace --bins --locked
+PATH=$(sh scripts/get-node.sh):$PATH
+export PATH
 export SLAG_PROGRAMS="${CARGO_TARGET_DIR:-$PWD/target}/debug"
 timeout 1200 node --test --test-concurrency=1 --test-timeout=400000 tests/page/*.test.mjs

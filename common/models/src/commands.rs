@@ -151,10 +151,12 @@ pub fn open(
     })
 }
 
-/// Returns the folders in which setup installs ONNX Runtime: that of the program `exe`, or the build folder above it.
+/// Returns the folders that may hold ONNX Runtime, for the program `exe`: its own, `lib/slag` of its prefix, and the build
+/// folder above it.
 pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
-    let arch = Path::new("onnxruntime").join(std::env::consts::ARCH);
-    exe.ancestors().skip(1).take(3).flat_map(|folder| [folder.to_owned(), folder.join(&arch)]).collect()
+    let built = Path::new("onnxruntime").join(std::env::consts::ARCH);
+    let above = exe.ancestors().skip(1).take(3);
+    above.flat_map(|folder| [folder.to_owned(), folder.join("lib/slag"), folder.join(&built)]).collect()
 }
 
 /// Asks a question on the terminal; returns false without a terminal.

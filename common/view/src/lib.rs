@@ -42,8 +42,8 @@ static FILES: &[File] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
 const POLICY: &str = include_str!("csp.txt");
 
 /// Answer of a program that was built without the page.
-const NOT_BUILT: &str = "this program was built without its page; run scripts/build-page.sh, which needs Node.js, and build the \
-                         program again";
+const NOT_BUILT: &str =
+    "this program was built without its page; run scripts/build-page.sh and build the program again";
 
 /// Whether the page was built into this program.
 pub fn is_built() -> bool {

@@ -115,7 +115,7 @@ pub(super) fn check_page() -> Result<()> {
     match slag_view::is_built() {
         true => Ok(()),
         false => Err(anyhow!(
-            "this program was built without its page; run scripts/build-page.sh, which needs Node.js, and build it again"
+            "this program was built without its page; run scripts/build-page.sh and build it again"
         )),
     }
 }
