@@ -1,32 +1,266 @@
-//! The documents of formats and numerics promise nothing that no test holds: every test that they name exists.
+//! The documents are short, and what they name exists: files, headings, flags and tests.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use clap::CommandFactory;
 use slag_tests::root;
+use syn::visit::{self, Visit};
 
-/// Folders with tests.
-const FOLDERS: [&str; 4] = ["common", "encoder", "edge", "tests"];
+/// Most words of all documents together.
+const MAX_WORDS: usize = 22_000;
+/// Most characters of a line, of a row of a table, and most columns.
+const MAX_LINE: usize = 120;
+const MAX_ROW: usize = 200;
+const MAX_COLUMNS: usize = 8;
+/// Flags of other projects' programs and of scripts, which documents name beside ours.
+const OTHER_FLAGS: [&str; 5] =
+    ["--alignment_type", "--container", "--help", "--no-normalize-world-space", "--ref_is_gps"];
 
-/// Collects the functions of all Rust files below a folder: `function` and `file::function`.
-fn collect(dir: &Path, found: &mut BTreeSet<String>) {
-    for entry in fs_err::read_dir(dir).expect("a folder") {
+/// Returns the documents, relative to the project's root, with their texts.
+fn documents() -> Vec<(PathBuf, String)> {
+    let mut paths: Vec<PathBuf> = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "jetson/README.md"]
+        .into_iter()
+        .chain(["clients/python/README.md", "common/models/embedded/CARD.md"])
+        .map(PathBuf::from)
+        .collect();
+    let pages = files(&root().join("docs"), "md");
+    paths.extend(pages.iter().map(|page| page.strip_prefix(root()).expect("in the project").to_owned()));
+    assert!(paths.len() > 15, "only {paths:?}");
+    paths
+        .into_iter()
+        .map(|path| (path.clone(), fs_err::read_to_string(root().join(path)).expect("a document")))
+        .collect()
+}
+
+/// Returns the files below a folder with an extension, without build folders.
+fn files(folder: &Path, extension: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in fs_err::read_dir(folder).expect("a folder") {
         let path = entry.expect("an entry").path();
-        if path.is_dir() && !path.ends_with("target") {
-            collect(&path, found);
-        } else if path.extension().is_some_and(|extension| extension == "rs") {
-            let text = fs_err::read_to_string(&path).expect("a source file");
-            let module = path.file_stem().and_then(|stem| stem.to_str()).expect("a name");
-            for line in text.lines() {
-                let line = line.trim_start().trim_start_matches("pub ").trim_start_matches("async ");
-                let Some(rest) = line.strip_prefix("fn ") else { continue };
-                let is_name = |c: char| c.is_ascii_alphanumeric() || c == '_';
-                let name: String = rest.chars().take_while(|c| is_name(*c)).collect();
-                found.insert(format!("{module}::{name}"));
-                found.insert(name);
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        match path.is_dir() {
+            true if ["target", "node_modules", "dist"].contains(&name) || name.starts_with('.') => {}
+            true => found.extend(files(&path, extension)),
+            false if path.extension().is_some_and(|found| found == extension) => found.push(path),
+            false => {}
+        }
+    }
+    found.sort();
+    found
+}
+
+/// Fails with the faults that `faults` finds in each document.
+fn check(faults: impl Fn(&Path, &str) -> Vec<String>) {
+    let found: Vec<String> = documents()
+        .iter()
+        .flat_map(|(path, text)| {
+            let of_page = faults(path, text).into_iter();
+            of_page.map(|fault| format!("{}: {fault}", path.display())).collect::<Vec<_>>()
+        })
+        .collect();
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn the_documents_are_short() {
+    let n_words: usize = documents().iter().map(|(_, text)| text.split_whitespace().count()).sum();
+    assert!(n_words <= MAX_WORDS, "the documents have {n_words} words, at most {MAX_WORDS} are wanted");
+}
+
+#[test]
+fn lines_and_tables_fit_a_screen() {
+    check(|_, text| {
+        let mut is_layers = false;
+        let mut faults = Vec::new();
+        for (line, number) in text.lines().zip(1..) {
+            if line.starts_with("```") {
+                is_layers = line == "```layers";
+            }
+            let n_chars = line.chars().count();
+            let is_row = line.trim_start().starts_with('|');
+            let n_columns = line.replace("\\|", "").matches('|').count().saturating_sub(1);
+            // Pictures and the table that a test reads cannot be wrapped.
+            if n_chars > if is_row { MAX_ROW } else { MAX_LINE } && !line.starts_with("![") && !is_layers {
+                faults.push(format!("line {number} has {n_chars} characters"));
+            }
+            if is_row && n_columns > MAX_COLUMNS {
+                faults.push(format!("line {number} has {n_columns} columns"));
+            }
+        }
+        faults
+    });
+}
+
+/// Returns the anchor of a heading, as GitHub makes it.
+fn anchor(heading: &str) -> String {
+    let heading = heading.trim_start_matches('#').trim().to_lowercase();
+    let kept = heading.chars().filter(|c| c.is_alphanumeric() || [' ', '-', '_'].contains(c));
+    kept.map(|c| if c == ' ' { '-' } else { c }).collect()
+}
+
+#[test]
+fn links_lead_somewhere() {
+    check(|path, text| {
+        let links = text.split("](").skip(1).filter_map(|rest| rest.split(')').next());
+        let ours = links.filter(|link| !link.starts_with("http"));
+        ours.filter(|link| {
+            let (file, heading) = link.split_once('#').unwrap_or((link, ""));
+            let target = match file {
+                "" => root().join(path),
+                file => root().join(path).with_file_name("").join(file),
+            };
+            let has_heading = || {
+                let page = fs_err::read_to_string(&target).unwrap_or_default();
+                page.lines().any(|line| line.starts_with('#') && anchor(line) == heading)
+            };
+            !target.exists() || (!heading.is_empty() && !has_heading())
+        })
+        .map(|link| format!("the link {link} leads nowhere"))
+        .collect()
+    });
+}
+
+/// Collects the flags that clap reads into the fields of structs and variants.
+#[derive(Default)]
+struct Flags(BTreeSet<String>);
+
+impl<'ast> Visit<'ast> for Flags {
+    fn visit_field(&mut self, field: &'ast syn::Field) {
+        for attribute in field.attrs.iter().filter(|attribute| attribute.path().is_ident("arg")) {
+            let Ok(list) = attribute.meta.require_list() else { continue };
+            let tokens = list.tokens.to_string();
+            let named = tokens.split("long = \"").nth(1).and_then(|rest| rest.split('"').next());
+            let is_long = tokens.split([',', ' ']).any(|word| word == "long");
+            let of_field =
+                field.ident.as_ref().filter(|_| is_long).map(|name| name.to_string().replace('_', "-"));
+            self.0.extend(named.map(str::to_owned).or(of_field).map(|name| format!("--{name}")));
+        }
+        visit::visit_field(self, field);
+    }
+}
+
+/// Returns the commands of our programs in the code blocks of a document, each as its words.
+fn commands(text: &str) -> Vec<Vec<String>> {
+    let mut lines = vec![String::new()];
+    let mut is_fenced = false;
+    for line in text.lines() {
+        is_fenced ^= line.trim_start().starts_with("```");
+        if is_fenced || line.starts_with("    ") {
+            let line = line.split(" #").next().unwrap_or_default().trim();
+            let last = lines.last_mut().expect("never empty");
+            *last += line.strip_suffix('\\').unwrap_or(line);
+            if !line.ends_with('\\') {
+                lines.push(String::new());
             }
         }
     }
+    let parts = lines.iter().flat_map(|line| line.split([';', '|', '&', '>']));
+    let words = parts.map(|part| {
+        // Words in quotes are one word.
+        let quoted = part.split('"').enumerate().flat_map(|(i, piece)| match i % 2 {
+            1 => vec![piece.to_owned()],
+            _ => piece.split_whitespace().map(str::to_owned).collect(),
+        });
+        quoted.collect::<Vec<_>>()
+    });
+    words
+        .map(|words| {
+            words.into_iter().skip_while(|word| word == "sudo" || word == "-u" || word == "slag").collect()
+        })
+        .filter(|words: &Vec<String>| words.first().is_some_and(|program| program.starts_with("slag-")))
+        .collect()
+}
+
+/// Returns the flags in a document's sentences, without those of other programs and scripts.
+fn flags_in_sentences(text: &str) -> Vec<&str> {
+    const OURS: [&str; 12] = [
+        "encode", "check", "query", "serve", "fetch", "worker", "goal", "store", "keys", "trust", "push",
+        "bench",
+    ];
+    let mut is_fenced = false;
+    let sentences = text.lines().filter(|line| {
+        is_fenced ^= line.trim_start().starts_with("```");
+        !is_fenced && !line.starts_with("    ")
+    });
+    let code = sentences.flat_map(|line| line.split('`').skip(1).step_by(2)).filter(|code| {
+        let mut words = code.split(' ').filter(|word| !word.contains('='));
+        words
+            .next()
+            .is_some_and(|word| word.starts_with("--") || word.starts_with("slag-") || OURS.contains(&word))
+    });
+    flags(code.flat_map(|code| code.split([' ', '\\', '|', '"'])))
+}
+
+fn flags<'a>(words: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+    words
+        .map(|word| word.split('=').next().unwrap_or_default())
+        .filter(|word| word.starts_with("--") && word.len() > 2)
+        .collect()
+}
+
+#[test]
+fn flags_that_the_documents_name_exist() {
+    let mut known = Flags::default();
+    for file in files(&root(), "rs") {
+        let text = fs_err::read_to_string(&file).expect("a source file");
+        if text.contains("#[arg(") {
+            let parsed = syn::parse_file(&text);
+            known.visit_file(&parsed.unwrap_or_else(|error| panic!("{}: {error}", file.display())));
+        }
+    }
+    assert!(known.0.len() > 100 && known.0.contains("--radius"), "{:?}", known.0);
+    check(|_, text| {
+        let commands = commands(text);
+        let of_commands = flags(commands.iter().flatten().map(String::as_str));
+        let named = flags_in_sentences(text).into_iter().chain(of_commands);
+        let missing = named.filter(|flag| !known.0.contains(*flag) && !OTHER_FLAGS.contains(flag));
+        missing.map(|flag| format!("no program has {flag}")).collect()
+    });
+}
+
+/// The command lines of the documents are those that the programs parse, with values in place of their placeholders.
+#[test]
+fn documented_commands_are_understood() {
+    let programs: [(&str, fn() -> clap::Command); 3] = [
+        ("slag-encoder", slag_encoder::cli::Cli::command),
+        ("slag-edge", slag_edge::cli::Cli::command),
+        ("slag-lab", slag_lab::cli::Cli::command),
+    ];
+    let n: usize = documents().iter().map(|(_, text)| commands(text).len()).sum();
+    assert!(n > 50, "{n} commands are documented");
+    check(|_, text| {
+        let mut faults = Vec::new();
+        for words in commands(text) {
+            let Some((_, program)) = programs.iter().find(|(name, _)| *name == words[0]) else { continue };
+            let given = words.iter().map(|word| match &**word {
+                "HEX" | "HEX_A" | "HEX_B" => "0".repeat(64),
+                word => word.replace("LAT,LON", "46.8,-92").replace("VERSION", "0.1.0"),
+            });
+            if let Err(error) = program().try_get_matches_from(given) {
+                let message = error.to_string();
+                faults.push(format!("`{}`: {}", words.join(" "), message.lines().next().unwrap_or_default()));
+            }
+        }
+        faults
+    });
+}
+
+/// Collects the functions of all Rust files: `function` and `file::function`.
+fn functions() -> BTreeSet<String> {
+    let mut found = BTreeSet::new();
+    for path in files(&root(), "rs") {
+        let text = fs_err::read_to_string(&path).expect("a source file");
+        let module = path.file_stem().and_then(|stem| stem.to_str()).expect("a name");
+        for line in text.lines() {
+            let line = line.trim_start().trim_start_matches("pub ").trim_start_matches("async ");
+            let Some(rest) = line.strip_prefix("fn ") else { continue };
+            let name: String = rest.chars().take_while(|c| c.is_ascii_alphanumeric() || *c == '_').collect();
+            found.insert(format!("{module}::{name}"));
+            found.insert(name);
+        }
+    }
+    found
 }
 
 /// Returns the names of tests in a text: words in backquotes with a `::`, or of at least four parts (`a_b_c_d`). Names of
@@ -34,23 +268,18 @@ fn collect(dir: &Path, found: &mut BTreeSet<String>) {
 fn tests_named(text: &str) -> Vec<&str> {
     let is_name = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == ':';
     let words = text.split('`').skip(1).step_by(2);
-    let is_test =
-        |word: &&str| word.chars().all(is_name) && (word.contains("::") || word.split('_').count() > 3);
-    words.filter(is_test).collect()
+    words
+        .filter(|word| word.chars().all(is_name) && (word.contains("::") || word.split('_').count() > 3))
+        .collect()
 }
 
 #[test]
 fn every_test_that_the_documents_name_exists() {
-    let mut known = BTreeSet::new();
-    FOLDERS.iter().for_each(|folder| collect(&root().join(folder), &mut known));
-    for (document, n_least) in
-        [("formats.md", 20), ("numerics.md", 40), ("accuracy.md", 5), ("security.md", 20)]
-    {
-        let text = fs_err::read_to_string(root().join("docs").join(document)).expect("the document");
-        let named = tests_named(&text);
-        assert!(named.len() >= n_least, "{document} names {} tests", named.len());
-        let missing: Vec<&&str> = named.iter().filter(|name| !known.contains(**name)).collect();
-        assert!(missing.is_empty(), "docs/{document} names tests that do not exist: {missing:?}");
-        assert!(!text.contains("_...`"), "docs/{document} abbreviates a test's name");
-    }
+    let known = functions();
+    let n_named: usize = documents().iter().map(|(_, text)| tests_named(text).len()).sum();
+    assert!(n_named > 50, "{n_named} tests are named");
+    check(|_, text| {
+        let missing = tests_named(text).into_iter().filter(|name| !known.contains(*name));
+        missing.map(|name| format!("no test is called {name}")).collect()
+    });
 }
