@@ -1,12 +1,13 @@
 #!/bin/sh
-# Boots a Debian 12 with the package installed, and checks the unit as shipped under its systemd: it starts by itself and is ready,
-# answers from a scene, scores 2.5 or better, and is started again when it falls silent.
-# As it is, on an emulated machine with Debian's own kernel: some 15 minutes for arm64 on 2 cores. With --container in namespaces of
-# this machine's kernel (container.sh), as CI does: a minute. Another machine's programs are emulated there one by one, and
-# qemu neither makes a user namespace nor takes filters of system calls: the container test of arm64 leaves out PrivateUsers
-# by a drop-in, systemd itself all directives that are such filters. Memory limits need control groups of version 2.
-# Needs root, debootstrap, the programs in target/debug, for another machine's packages qemu-user-static with binfmt, and without
-# --container e2fsprogs and qemu-system-arm or qemu-system-x86.
+# Boots a Debian 12 with the package installed, and checks the unit as shipped under its systemd: it starts by
+# itself and is ready, answers from a scene, scores 2.5 or better, and is started again when it falls silent. As
+# it is, on an emulated machine with Debian's own kernel: some 15 minutes for arm64 on 2 cores. With --container
+# in namespaces of this machine's kernel (container.sh), as CI does: a minute. Another machine's programs are
+# emulated there one by one, and qemu neither makes a user namespace nor takes filters of system calls: the
+# container test of arm64 leaves out PrivateUsers by a drop-in, systemd itself all directives that are such
+# filters. Memory limits need control groups of version 2. Needs root, debootstrap, the programs in
+# target/debug, for another machine's packages qemu-user-static with binfmt, and without --container e2fsprogs
+# and qemu-system-arm or qemu-system-x86.
 # usage: boot-deb.sh [--container] amd64|arm64 DEB [ROOT]       ROOT: a root file system to install into, instead of a new one; needs
 #                                                               PACKAGES
 set -eu
@@ -48,7 +49,8 @@ trap '[ -z "$server" ] || kill "$server" 2>/dev/null || true; umount "$root/proc
 root=${3:-$work/root}
 if [ $# -lt 3 ]; then
     if [ -z "$container" ]; then
-        # Only what the emulated disk needs: with all modules, making the initial file system takes half an hour under emulation.
+        # Only what the emulated disk needs: with all modules, making the initial file system takes half an hour
+        # under emulation.
         mkdir -p "$root/etc/initramfs-tools/conf.d" "$root/usr/share/initramfs-tools/modules.d"
         echo MODULES=list >"$root/etc/initramfs-tools/conf.d/slag"
         printf '%s\n' virtio_pci virtio_blk ext4 >"$root/usr/share/initramfs-tools/modules.d/slag"

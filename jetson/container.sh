@@ -1,14 +1,14 @@
 #!/bin/sh
-# Boots a root file system in namespaces of its own, with its systemd as process 1, until it powers itself off. It has no network but
-# its own loopback, and neither clock, modules nor kernel variables of this machine. Of another machine's programs, binfmt runs each.
-# Needs root.
+# Boots a root file system in namespaces of its own, with its systemd as process 1, until it powers itself off.
+# It has no network but its own loopback, and neither clock, modules nor kernel variables of this machine. Of
+# another machine's programs, binfmt runs each. Needs root.
 # usage: container.sh ROOT SECONDS       after SECONDS it is killed
 set -eu
 [ $# -eq 2 ] || { echo "usage: jetson/container.sh ROOT SECONDS" >&2; exit 2; }
 root=$1 secs=$2
 work=$(mktemp -d)
-# systemd needs a control group of version 2 that it may divide; where the controllers are in version 1, it has none, and limits
-# of memory are not enforced.
+# systemd needs a control group of version 2 that it may divide; where the controllers are in version 1, it has
+# none, and limits of memory are not enforced.
 mount -t cgroup2 none "$work"
 group=$work/slag-boot-$$
 trap 'find "$group" -depth -type d -exec rmdir {} + 2>/dev/null || true; umount "$work"; rmdir "$work"' EXIT

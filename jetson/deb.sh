@@ -1,5 +1,6 @@
 #!/bin/sh
-# Makes a Debian package of slag-edge: program, unit, ONNX Runtime, configuration, manual pages, completions. The same files make the same bytes.
+# Makes a Debian package of slag-edge: program, unit, ONNX Runtime, configuration, manual pages, completions.
+# The same files make the same bytes.
 # usage: deb.sh amd64|arm64 BINARY OUT      OUT/slag-edge_VERSION_ARCH.deb is written, and its path printed
 set -eu
 cd "$(dirname "$0")/.."
@@ -87,7 +88,8 @@ if [ "$1" = remove ] && command -v systemctl >/dev/null; then
     systemctl disable slag-edge.service
 fi
 SCRIPT
-# What was fetched and whom the robot trusts stay until the package is purged; the user stays for good, as Debian advises.
+# What was fetched and whom the robot trusts stay until the package is purged; the user stays for good, as
+# Debian advises.
 cat >"$root/DEBIAN/postrm" <<'SCRIPT'
 #!/bin/sh
 set -e

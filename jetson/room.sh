@@ -1,5 +1,6 @@
-# Sourced by the scripts that test packages and programs against a real server: serve_room WORK [ENCODE_FLAG...] makes a generated
-# room in WORK, serves it from this machine, and sets `url` and `server` (the process). Programs: target/debug.
+# Sourced by the scripts that test packages and programs against a real server: serve_room WORK [ENCODE_FLAG...]
+# makes a generated room in WORK, serves it from this machine, and sets `url` and `server` (the process).
+# Programs: target/debug.
 serve_room() {
     room_work=$1
     shift

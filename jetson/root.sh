@@ -1,6 +1,6 @@
 #!/bin/sh
-# Makes a Debian 12 root file system, from the mirror that this machine installs from. Needs root and debootstrap; for another
-# machine's also qemu-user-static with binfmt.
+# Makes a Debian 12 root file system, from the mirror that this machine installs from. Needs root and
+# debootstrap; for another machine's also qemu-user-static with binfmt.
 # usage: root.sh amd64|arm64 ROOT [PACKAGE,PACKAGE...]
 set -eu
 [ $# -ge 2 ] || { echo "usage: jetson/root.sh amd64|arm64 ROOT [PACKAGE,...]" >&2; exit 2; }

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Installs, runs, upgrades, removes and purges the package in a new Debian 12 root file system. Needs root and debootstrap; for
-# another machine's packages also qemu-user-static with binfmt.
+# Installs, runs, upgrades, removes and purges the package in a new Debian 12 root file system. Needs root and
+# debootstrap; for another machine's packages also qemu-user-static with binfmt.
 # usage: test-deb.sh amd64|arm64 DEB NEWER_DEB [ROOT]       ROOT: a root file system to use, instead of a new one
 set -eu
 cd "$(dirname "$0")/.."
@@ -35,7 +35,8 @@ for file in $(sed -n 's/^Documentation=man:\(.*\)(\(.\))$/.\/usr\/share\/man\/ma
     ./usr/share/man/man1/slag-edge-fetch.1.gz ./usr/share/bash-completion/completions/slag-edge; do
     dpkg-deb --fsys-tarfile "$deb" | tar -tf - "$file" >/dev/null || fail "the package lacks $file"
 done
-# The unit's own command, as its user; the configuration names the folder, and the model opens ONNX Runtime from the package.
+# The unit's own command, as its user; the configuration names the folder, and the model opens ONNX Runtime from
+# the package.
 as_slag slag-edge serve --listen 127.0.0.1:0 >"$work/out" 2>"$work/err" &
 service=$!
 for _ in $(seq 120); do

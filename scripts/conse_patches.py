@@ -1,6 +1,6 @@
-"""Makes a model with vectors of patches of the ConSE encoder: the words of its classes at each place, as class activation maps
-show them (Zhou et al. 2016), before the average over the photo. Patches were measured against crops
-with it (docs/accuracy.md).
+"""Makes a model with vectors of patches of the ConSE encoder: the words of its classes at each place, as class
+activation maps show them (Zhou et al. 2016), before the average over the photo. Patches were measured against
+crops with it (docs/decisions.md).
 
     conse_patches.py MODELS CONSE OUT SIZE_PX
 
@@ -46,7 +46,8 @@ for k in range((size_px // CROP_PX).bit_length() - 1):
     entry = f"half_{k}"
 for node in graph.node:
     copied(node, "crop_", entry)
-# Patches: all places of the last feature map in place of their mean; then [n, places, classes], and the classes' axis is the last.
+# Patches: all places of the last feature map in place of their mean; then [n, places, classes], and the
+# classes' axis is the last.
 is_head = False
 for node in graph.node:
     if node.op_type == "GlobalAveragePool":

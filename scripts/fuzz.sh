@@ -1,10 +1,10 @@
 #!/bin/sh
 # Fuzzes every decoder guided by coverage: fuzz.sh [SECONDS [TARGET...]]
 #
-# Needs the stable compiler and a C++ compiler, no more. Each target runs SECONDS (600) on a core, as many targets at once as
-# there are cores, from its seeds and from fuzz/corpus/TARGET. That folder then has the smallest set of inputs with the same coverage,
-# but for the seeds, and for inputs beyond MAX_BYTES and MAX_FILES. Prints a line a target; crashing inputs lie in
-# target/fuzz/crashes, and end with a failure.
+# Needs the stable compiler and a C++ compiler, no more. Each target runs SECONDS (600) on a core, as many
+# targets at once as there are cores, from its seeds and from fuzz/corpus/TARGET. That folder then has the
+# smallest set of inputs with the same coverage, but for the seeds, and for inputs beyond MAX_BYTES and
+# MAX_FILES. Prints a line a target; crashing inputs lie in target/fuzz/crashes, and end with a failure.
 set -eu
 cd "$(dirname "$0")/.."
 MAX_INPUT_BYTES=100000
@@ -50,7 +50,8 @@ fi
 seconds=${1:-600}
 [ $# -eq 0 ] || shift
 cp Cargo.lock fuzz/Cargo.lock # the versions of the workspace
-# The flags of cargo-fuzz, without a sanitizer: programs here have checks of their own. --target keeps them from build scripts.
+# The flags of cargo-fuzz, without a sanitizer: programs here have checks of their own. --target keeps them from
+# build scripts.
 RUSTFLAGS="-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 -Cllvm-args=-sanitizer-coverage-inline-8bit-counters \
 -Cllvm-args=-sanitizer-coverage-pc-table -Cllvm-args=-sanitizer-coverage-trace-compares" \
     cargo build --release --manifest-path fuzz/Cargo.toml --target "$host" --target-dir "$out/build"

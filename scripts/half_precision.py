@@ -1,6 +1,7 @@
 #!/usr/bin/env python3
-"""Converts a model of 32-bit floats to 16 bits for GPUs, with ONNX Runtime's own tools: constants are folded, attention and
-normalisations become single operators where onnxruntime.transformers.optimizer knows the model, weights become float16.
+"""Converts a model of 32-bit floats to 16 bits for GPUs, with ONNX Runtime's own tools: constants are folded,
+attention and normalisations become single operators where onnxruntime.transformers.optimizer knows the model,
+weights become float16.
 
 Tensors between programs keep 32 bits with --keep-io: Segment Anything needs that; image encoders of crops are quicker
 without it. Write the new files' hashes into model.toml; vectors differ from those of the 32-bit files, and so does the

@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Many robots that start at once, then follow: bytes, seconds and p99 for `serve` on two cores and for a static server; prints JSON.
+"""Many robots that start at once, then follow: bytes, seconds and p99 for `serve` on two cores and for a static
+server; prints JSON.
 
 usage: scripts/many_robots.py FOLDER_OF_PROGRAMS [ROBOTS [RADIUS_M]]
 

@@ -1,9 +1,11 @@
-// Measures the page in Chromium: time to the first picture, time of a question and its parts, frames a second while the camera turns.
+// Measures the page in Chromium: time to the first picture, time of a question and its parts, frames a second
+// while the camera turns.
 // usage: node scripts/measure-page.mjs OUT.png CAMERA QUESTION,QUESTION PROGRAM FLAGS...
 //   OUT.png             picture of the first question's answer, or `none`
 //   CAMERA              X,Y,Z,X,Y,Z: position and target, or `whole`
 //   PROGRAM FLAGS...    slag-encoder view .. or slag-edge serve .., with a free port, built with the page; from SLAG_PROGRAMS [default: target/debug]
-// N_ASKED and TURN_MS: questions, and milliseconds of turning. Prints one JSON object; its `renderer` names the GPU, in software SwiftShader unless CHROMIUM_GPU has Chromium's flags for another.
+// N_ASKED and TURN_MS: questions, and milliseconds of turning. Prints one JSON object; its `renderer` names the
+// GPU, in software SwiftShader unless CHROMIUM_GPU has Chromium's flags for another.
 
 import { execFileSync } from "node:child_process";
 import { mkdirSync } from "node:fs";

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Makes a release: programs, both packages of the robot, the encoder's image, bills of materials, notes from CHANGELOG.md, and
-# checksums signed by a key of yours (ssh-keygen -t ed25519 makes one). Nothing is uploaded.
+# Makes a release: programs, both packages of the robot, the encoder's image, bills of materials, notes from
+# CHANGELOG.md, and checksums signed by a key of yours (ssh-keygen -t ed25519 makes one). Nothing is uploaded.
 # usage: release.sh KEY OUT [--built DIR] [--without PART]...
 #   KEY            private key, in the form of ssh-keygen; one in an agent works by its public file
 #   --built DIR    takes the programs for this machine, slag-lab among them, from DIR, built before, instead of building them; a trial: CHANGELOG may have

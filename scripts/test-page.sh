@@ -1,5 +1,6 @@
 #!/bin/sh
-# Tests the page in Chromium, without a GPU: over a small known scene with faults, and in the real programs over a generated room.
+# Tests the page in Chromium, without a GPU: over a small known scene with faults, and in the real programs over
+# a generated room.
 # usage: test-page.sh      after `scripts/setup.sh page` and `scripts/build-page.sh`; builds the programs that embed the page
 set -eu
 cd "$(dirname "$0")/.."

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Lays out an OCI image of slag-encoder without a container service: a Debian 12 base by mmdebstrap, the program with ONNX Runtime
-# above it. The same files and the same state of the mirror make the same digests. Needs mmdebstrap and root, or user namespaces.
+# Lays out an OCI image of slag-encoder without a container service: a Debian 12 base by mmdebstrap, the program
+# with ONNX Runtime above it. The same files and the same state of the mirror make the same digests. Needs
+# mmdebstrap and root, or user namespaces.
 # usage: image.sh amd64|arm64 BINARY OUT      OUT/slag-encoder_VERSION_ARCH.oci.tar is written, and its path printed
 #   IMAGE_PACKAGES: more Debian packages, such as "libvulkan1 mesa-vulkan-drivers" for a GPU that mesa drives
 # Load it: skopeo copy oci-archive:FILE docker://registry.example/slag-encoder:VERSION, or podman load --input FILE

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Judges an image by skopeo and umoci, unpacks it, and runs the encoder in it: a generated room becomes a store. Needs root.
+# Judges an image by skopeo and umoci, unpacks it, and runs the encoder in it: a generated room becomes a store.
+# Needs root.
 # usage: test-image.sh IMAGE LAB      LAB: the program slag-lab, to generate the room
 set -eu
 [ $# = 2 ] || { echo "usage: encoder/deploy/test-image.sh IMAGE LAB" >&2; exit 2; }
@@ -21,7 +22,8 @@ assert config["config"]["Labels"]["org.opencontainers.image.version"] == sys.arg
 PYTHON
 mkdir "$work/layout"
 tar -xf "$image" -C "$work/layout"
-# By the name that podman load gives it. umoci compares every blob with its digest, and the layers with the configuration.
+# By the name that podman load gives it. umoci compares every blob with its digest, and the layers with the
+# configuration.
 umoci unpack --image "$work/layout:slag-encoder:$version" "$work/bundle" >/dev/null 2>"$work/log" || { cat "$work/log" >&2; fail "umoci does not unpack it"; }
 root=$work/bundle/rootfs
 mount -t proc proc "$root/proc"

@@ -1,4 +1,5 @@
-"""Writes a program's bill of materials (CycloneDX 1.6) from `cargo metadata`, and checks it against CycloneDX's own schema.
+"""Writes a program's bill of materials (CycloneDX 1.6) from `cargo metadata`, and checks it against CycloneDX's
+own schema.
 
 usage: sbom.py METADATA.json PACKAGE OUT.json
 The crates are those of the normal and build dependencies on the platforms that the metadata was filtered for. Checksums are those

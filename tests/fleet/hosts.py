@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Hosts as network namespaces, and the network between them: IP packets are delayed, lost and cut off, and TCP makes up for it.
+"""Hosts as network namespaces, and the network between them: IP packets are delayed, lost and cut off, and TCP
+makes up for it.
 
 Each host has a namespace of its own with one device, a TUN, whose other end is this program. Kernels without netem can do
 it, too. Needs Linux, root, /dev/net/tun and iproute2's ip.

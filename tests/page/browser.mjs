@@ -9,11 +9,17 @@ const { chromium } = fromPage("playwright-core");
 export const axe = readFileSync(fromPage.resolve("axe-core/axe.min.js"), "utf8");
 
 const PICTURES = process.env.SLAG_PAGE_PICTURES;
-/** With SLAG_PAGE_DIST=1 the page's files are those last built, not those in the programs: no build of them while the page is worked on. */
+/**
+ * With SLAG_PAGE_DIST=1 the page's files are those last built, not those in the programs: no build of them
+ * while the page is worked on.
+ */
 const DIST = process.env.SLAG_PAGE_DIST ? new URL("../../common/view/dist/", import.meta.url) : null;
 const SIZE = { width: 1100, height: 640 };
 
-/** Starts Chromium. CHROMIUM: its program; CHROMIUM_GPU: the flags that choose a GPU, instead of those of one in software. */
+/**
+ * Starts Chromium. CHROMIUM: its program; CHROMIUM_GPU: the flags that choose a GPU, instead of those of one in
+ * software.
+ */
 export const launch = () => chromium.launch({
   executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
   args: ["--no-sandbox", ...(process.env.CHROMIUM_GPU ?? "--use-angle=swiftshader --enable-unsafe-swiftshader").split(" ")],
@@ -26,7 +32,10 @@ export async function openBrowser() {
 
 export const closeBrowser = () => browser?.close();
 
-/** Opens the page of a service, or "about:blank" of one with this origin; fails at errors in the console and requests to others, but for those expected. */
+/**
+ * Opens the page of a service, or "about:blank" of one with this origin; fails at errors in the console and
+ * requests to others, but for those expected.
+ */
 export async function opened(url, run, { fragment = "", options = {}, expected = null, origin = url } = {}) {
   const context = await browser.newContext({ viewport: SIZE, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
   const page = await context.newPage();
@@ -86,7 +95,10 @@ export async function litPixels(page, leftPx, name) {
   return pixels(page, leftPx, (r, g, b) => r > 90 && r - Math.min(g, b) > 45, name);
 }
 
-/** Pixels beside the panel for which a function of red, green and blue is true, in a picture that stands still, or at once. */
+/**
+ * Pixels beside the panel for which a function of red, green and blue is true, in a picture that stands still,
+ * or at once.
+ */
 export async function pixels(page, leftPx, test, name, isStill = true) {
   const png = (isStill ? await picture(page, name) : await page.screenshot()).toString("base64");
   const scratch = await browser.newPage();

@@ -1,4 +1,5 @@
-// The page of the real programs in Chromium: what a question lights is compared with the mask of a photo that the encoder never saw.
+// The page of the real programs in Chromium: what a question lights is compared with the mask of a photo that
+// the encoder never saw.
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -50,7 +51,10 @@ function truth() {
   return { camera: [...position, ...position.map((v, i) => v + forward[i])].map((v) => v.toFixed(4)).join(","), isThing };
 }
 
-/** Share of lit pixels that show the thing, give or take a few pixels, and share of the thing's pixels that are lit. */
+/**
+ * Share of lit pixels that show the thing, give or take a few pixels, and share of the thing's pixels that are
+ * lit.
+ */
 function judge(lit, isThing) {
   const isNear = (x, y) => [0, -6, 6].some((dx) => [0, -6, 6].some((dy) => isThing(x + dx, y + dy)));
   const known = lit.filter(([x, y]) => isThing(x, y) !== null);

@@ -1,4 +1,5 @@
-// A service that speaks the page's protocol over a small known scene, so that tests can refuse, vanish and publish at will.
+// A service that speaks the page's protocol over a small known scene, so that tests can refuse, vanish and
+// publish at will.
 
 import { createReadStream, readFileSync, statSync } from "node:fs";
 import { createServer } from "node:http";

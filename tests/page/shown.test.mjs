@@ -66,7 +66,8 @@ test("without a generation before, the service's words say so", () => opened(asy
   await page.locator("#changes").getByText("one generation alone").waitFor();
 }, { behaviour: { program: "slag-encoder", generation: 2 }, expected: /409/ }));
 
-// Where the test's camera is, it would be under the panel: this one looks at the scene's middle from the other side.
+// Where the test's camera is, it would be under the panel: this one looks at the scene's middle from the other
+// side.
 const PHOTO = { name: "roof/12.jpg", position_m: [1.5, 1.5, 1.2], rotation_xyzw: [0.7071068, 0, 0, 0.7071068], width_px: 640, height_px: 480, focal_px: 500, has_picture: false };
 
 test("a camera without its picture can be clicked and stood in", () => opened(async (page) => {

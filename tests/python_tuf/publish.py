@@ -1,4 +1,5 @@
-"""Publishes the manifest of a served store anew with python-tuf: publish.py STORE_URL MANIFEST FOLDER --listen IP:PORT.
+"""Publishes the manifest of a served store anew with python-tuf: publish.py STORE_URL MANIFEST FOLDER --listen
+IP:PORT.
 
 Keys, roots and signatures are python-tuf's own. FOLDER gets `1.root.json`; the file `state` in it names what is served, a
 key of `states`. Objects come from STORE_URL.

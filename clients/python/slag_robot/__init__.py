@@ -104,7 +104,8 @@ class Reply:
 
 @dataclass(frozen=True)
 class Goal:
-    """A pose to stand in: the ground below the robot's middle, x forward, y left, z up (REP-103). Lengths in metres."""
+    """A pose to stand in: the ground below the robot's middle, x forward, y left, z up (REP-103). Lengths in
+    metres."""
 
     position_in_world: Sequence[float]
     yaw_rad: float
@@ -132,7 +133,8 @@ class Goals:
 
 @dataclass(frozen=True)
 class Changed:
-    """A thing as it is, or as it was. `like`: the text that it is most like, with the cosine, if texts were given."""
+    """A thing as it is, or as it was. `like`: the text that it is most like, with the cosine, if texts were
+    given."""
 
     id: str
     position_in_world: Sequence[float]
@@ -254,7 +256,8 @@ class Robot:
             offset = reply.results[0].next_offset
 
     def objects(self, **parameters: Any) -> Iterator[dict[str, Any]]:
-        """Yields the things on board, page by page: near, radius, min_size, limit as `GET /v1/objects` takes them."""
+        """Yields the things on board, page by page: near, radius, min_size, limit as `GET /v1/objects` takes
+        them."""
         while True:
             page = self._send("/v1/objects?" + urllib.parse.urlencode(parameters))
             yield from page["objects"]
@@ -273,7 +276,8 @@ class Robot:
         return place
 
     def goal(self, text: Optional[str] = None, near: Optional[Sequence[float]] = None, **parameters: Any) -> Goals:
-        """Returns places to stand near a thing: by text, or by id="o...", with radius_m, reach_m, sensor_height_m ..."""
+        """Returns places to stand near a thing: by text, or by id="o...", with radius_m, reach_m,
+        sensor_height_m ..."""
         if text is not None:
             parameters["text"] = text
         if near is not None:
@@ -289,8 +293,8 @@ class Robot:
         return ground
 
     def changes(self, texts: Sequence[str] = (), near: Optional[Sequence[float]] = None, **parameters: Any) -> Changes:
-        """Returns what changed between two generations: from_, to, radius as `GET /v1/changes` takes them. `texts`: kinds of
-        things; each changed thing names the one that it is most like."""
+        """Returns what changed between two generations: from_, to, radius as `GET /v1/changes` takes them.
+        `texts`: kinds of things; each changed thing names the one that it is most like."""
         pairs = [("text", text) for text in texts]
         if near is not None:
             pairs.append(("near", ",".join(str(of_axis) for of_axis in near)))
@@ -303,7 +307,8 @@ class Robot:
         return Changes(earlier, reply["to"]["generation"], reply["frame"], **things, moved=moved, none=none, more=reply)
 
     def events(self, timeout_secs: float = 60.0) -> Iterator[Event]:
-        """Yields events as they happen. The robot is heard at least every 15 s; silence longer than that is an error."""
+        """Yields events as they happen. The robot is heard at least every 15 s; silence longer than that is an
+        error."""
         name, data = "message", []
         with self._open("/v1/events", None, timeout_secs) as stream:
             for line in stream:

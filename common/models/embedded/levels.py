@@ -1,4 +1,5 @@
-"""Makes levels_f16.onnx and levels_f32.onnx: levels of an image's channels to pixel values, on the device of the model.
+"""Makes levels_f16.onnx and levels_f32.onnx: levels of an image's channels to pixel values, on the device of
+the model.
 
 values[n][c][y][x] = levels[n][c][y][x] * scale[c] + offset[c]. Levels come plane by plane: a GPU takes longer to split pixels
 into planes than to do everything else.

@@ -247,8 +247,8 @@ def augment(images):
 
 
 def recolour(images, chosen):
-    """Recolours the chosen crops (rotated hues, or shades of one colour), so that nouns are learnt from shape. Their
-    colour and material are unknown afterwards."""
+    """Recolours the chosen crops (rotated hues, or shades of one colour), so that nouns are learnt from shape.
+    Their colour and material are unknown afterwards."""
     n, device = len(images), images.device
     x = images.float() / 255
     white = (images.amin(1, keepdim=True) == 255)

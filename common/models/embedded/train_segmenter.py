@@ -37,8 +37,8 @@ class Block(nn.Sequential):
 
 
 class Boundaries(nn.Module):
-    """[n, channels, h, w], h and w multiples of 32 -> [n, 4, h, w]: logits of a boundary between each pixel and its
-    neighbours. Channels: red, green, blue, (level / 255 - 0.5) / 0.5; then those of `depth_channels`."""
+    """[n, channels, h, w], h and w multiples of 32 -> [n, 4, h, w]: logits of a boundary between each pixel and
+    its neighbours. Channels: red, green, blue, (level / 255 - 0.5) / 0.5; then those of `depth_channels`."""
 
     def __init__(self, channels, widths=(32, 64, 96, 128, 192)):
         super().__init__()
@@ -72,8 +72,8 @@ def boundaries(things):
 
 
 def depth_channels(depth_m):
-    """[n, 1, h, w], 0 where unknown -> [n, 4, h, w]: logarithm of depth over the median depth, its slopes to the right and
-    down over 4 px, and whether depth is known. All are 0 where it is not."""
+    """[n, 1, h, w], 0 where unknown -> [n, 4, h, w]: logarithm of depth over the median depth, its slopes to
+    the right and down over 4 px, and whether depth is known. All are 0 where it is not."""
     known = depth_m > 0
     logs = torch.where(known, depth_m.clamp(min=1e-6).log(), torch.full_like(depth_m, float("nan")))
     median = torch.nanmedian(logs.flatten(1), 1).values.nan_to_num()[:, None, None, None]
@@ -85,8 +85,8 @@ def depth_channels(depth_m):
 
 
 def paint(x, things, depth_m, corner):
-    """Gives things patterns and colours. x: [n, 3, h, w], 0 to 1; things: [n, h, w]; depth_m: [n, 1, h, w]; corner: [n, 2],
-    column and row of the patch in the photo."""
+    """Gives things patterns and colours. x: [n, 3, h, w], 0 to 1; things: [n, h, w]; depth_m: [n, 1, h, w];
+    corner: [n, 2], column and row of the patch in the photo."""
     n, _, h, w = x.shape
     device = x.device
     rand = lambda *shape: torch.rand(*shape, device=device)

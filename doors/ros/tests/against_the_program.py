@@ -229,7 +229,8 @@ def check_places(ros, robot):
 
 
 def check_action(ros, word, distribution):
-    """Stands in for Nav2's server: takes a goal, tells how far it is, and ends it; then one that it gives up; then rejects."""
+    """Stands in for Nav2's server: takes a goal, tells how far it is, and ends it; then one that it gives up;
+    then rejects."""
     action = "navigate_to_pose/_action"
     goals = ros.reader("rt/slag/goal", PoseStamped)
     states = ros.reader("rt/slag/navigation", String)

@@ -1,4 +1,5 @@
-"""Types a line and a tab into an interactive bash that has read a completion script; prints the line as bash completed it.
+"""Types a line and a tab into an interactive bash that has read a completion script; prints the line as bash
+completed it.
 
 usage: complete.py SCRIPT LINE
 """
@@ -34,7 +35,8 @@ def send(text):
 # The terminal echoes what is typed, where the marks are in quotes.
 send(f"source '{script}'; printf 'REA''DY'\n")
 read_to("READY")
-# Control-A and a colon make the line harmless. It is read back from the history, for the echo holds bells and line breaks.
+# Control-A and a colon make the line harmless. It is read back from the history, for the echo holds bells and
+# line breaks.
 send(f"{line}\t\x01: \x05\n")
 send("printf 'LI''NE'; fc -ln -1 -1; printf 'EN''D'\n")
 read_to("LINE")

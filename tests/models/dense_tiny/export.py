@@ -1,5 +1,6 @@
-"""Writes an image model with vectors of patches: the architecture of DINOv2 with registers, which TIPSv2's image tower has,
-with small random weights, and what PyTorch computes with it. Its vectors mean nothing; the code path is the real one.
+"""Writes an image model with vectors of patches: the architecture of DINOv2 with registers, which TIPSv2's
+image tower has, with small random weights, and what PyTorch computes with it. Its vectors mean nothing; the
+code path is the real one.
 
     export.py OUT        # vision.onnx, vectors.safetensors, phrases.txt, golden.npz
 

@@ -1,5 +1,6 @@
-"""Writes what the segmenter's training makes of depths, by `depth_channels` of common/models/embedded/train_segmenter.py itself:
-maps of several sizes, with ramps, steps, unknown depths, and depths far from the median.
+"""Writes what the segmenter's training makes of depths, by `depth_channels` of
+common/models/embedded/train_segmenter.py itself: maps of several sizes, with ramps, steps, unknown depths, and
+depths far from the median.
 
     export.py OUT        # golden.json
 
@@ -23,7 +24,8 @@ exec(compile(ast.Module(of_training, []), "train_segmenter.py", "exec"), scope)
 rng = np.random.default_rng(4)
 maps = []
 for width, height, scale in [(9, 7, 1.0), (6, 8, 40.0), (3, 5, 0.02), (1, 1, 2.0)]:
-    # Slopes from far below to far above the scale at which they saturate, and an outlier on each side of the clamp.
+    # Slopes from far below to far above the scale at which they saturate, and an outlier on each side of the
+    # clamp.
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     logs = 0.02 * x - 0.005 * y * y + 0.004 * rng.standard_normal((height, width)) + 1.2 * (x > 6) + 0.3 * (y > 4)
     logs[height // 2, width // 2] += 9.0

@@ -87,7 +87,8 @@ class MaskDecoder(torch.nn.Module):
 
 
 def shorten(graph, short):
-    """Replaces the names of nodes and inner tensors, which make up half of a small file, and drops unused weights."""
+    """Replaces the names of nodes and inner tensors, which make up half of a small file, and drops unused
+    weights."""
     def rename(name):
         return short.setdefault(name, f"t{len(short)}") if name else name
 

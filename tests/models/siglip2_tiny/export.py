@@ -1,6 +1,6 @@
-"""Writes SigLIP 2's architecture (of the models with squares of one size, which is SigLIP's) with small random weights, as its
-public ONNX exports lay it out, a small tokenizer of Gemma's kind, and what transformers and PyTorch compute with them. Its
-vectors mean nothing; the code path is the real one.
+"""Writes SigLIP 2's architecture (of the models with squares of one size, which is SigLIP's) with small random
+weights, as its public ONNX exports lay it out, a small tokenizer of Gemma's kind, and what transformers and
+PyTorch compute with them. Its vectors mean nothing; the code path is the real one.
 
     export.py OUT        # vision_model.onnx, text_model.onnx, tokenizer.json, golden.npz, golden_tokens.json
 
@@ -41,14 +41,16 @@ def make_tokenizer():
     bytes_ = [f"<0x{byte:02X}>" for byte in range(256)]
     trainer = trainers.BpeTrainer(vocab_size=5 + 256 + 120, special_tokens=SPECIAL + bytes_, show_progress=False)
     tokenizer.train_from_iterator(LEARNT * 3, trainer)
-    # Bytes are no special tokens in Gemma's file, and the split is one that no text needs: normalised texts have no spaces.
+    # Bytes are no special tokens in Gemma's file, and the split is one that no text needs: normalised texts
+    # have no spaces.
     made = json.loads(tokenizer.to_str())
     made["added_tokens"] = made["added_tokens"][:len(SPECIAL)]
     tokenizer = Tokenizer.from_str(json.dumps(made))
     tokenizer.pre_tokenizer = pre_tokenizers.Split(" ", "merged_with_previous")
     tokenizer.decoder = decoders.Sequence([decoders.Replace("\u2581", " "), decoders.ByteFallback(), decoders.Fuse()])
     tokenizer.save(path)
-    # Ends texts with <eos>, as Google's configuration of the class does, and keeps its padding and truncation in the file.
+    # Ends texts with <eos>, as Google's configuration of the class does, and keeps its padding and truncation
+    # in the file.
     fast = GemmaTokenizerFast(tokenizer_file=path, add_bos_token=False, add_eos_token=True, padding_side="right")
     fast("", padding="max_length", max_length=N_TOKENS, truncation=True)
     fast.backend_tokenizer.save(path, pretty=False)

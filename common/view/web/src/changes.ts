@@ -1,4 +1,5 @@
-// What changed between the scene's generation and the one before it: listed in the panel, and drawn as boxes by kind of change.
+// What changed between the scene's generation and the one before it: listed in the panel, and drawn as boxes by
+// kind of change.
 
 import type { Drawing } from "./drawing/drawing";
 import type { Change } from "./drawing/marks";

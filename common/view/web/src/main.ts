@@ -14,7 +14,10 @@ import { WorkPanel } from "./work";
 
 const PAUSE_IN_TYPING_MS = 150;
 const LOOK_EVERY_MS = 4000;
-/** Gaussians of a thing that was found are lit from this share of the range of scores, if not from a lower score. */
+/**
+ * Gaussians of a thing that was found are lit from this share of the range of scores, if not from a lower
+ * score.
+ */
 const SHARE_OF_RANGE = 0.75;
 
 const state = readState();
@@ -107,7 +110,10 @@ async function fetchBoth(line: string, signal: AbortSignal): Promise<[Scores, An
   return [reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal), reply];
 }
 
-/** Things are found by the average of their masks, which their Gaussians at edges and in shade stay below: with answers, three quarters of the range is enough. */
+/**
+ * Things are found by the average of their masks, which their Gaussians at edges and in shade stay below: with
+ * answers, three quarters of the range is enough.
+ */
 function levelFrom(found: Scores, { threshold, answers }: Pick<Answers, "threshold" | "answers">): number {
   const high = found.min + SHARE_OF_RANGE * (found.max - found.min);
   return levelOf(answers.length > 0 ? Math.min(threshold ?? high, high) : (threshold ?? high), found);

@@ -165,7 +165,10 @@ export function showPlaces(goals: Goal[], none: string | null, chosen: number | 
 
 const SVG = "http://www.w3.org/2000/svg";
 
-/** Shows a photo in the details: the picture, where there is one, with a box in it, and a button that goes there. */
+/**
+ * Shows a photo in the details: the picture, where there is one, with a box in it, and a button that goes
+ * there.
+ */
 export function showPhoto(photo: Photo, picture: string | null, boxPx: number[] | null, onGo: () => void, onBlend: (share: number) => void): void {
   const figure = document.createElement("figure");
   if (picture) {

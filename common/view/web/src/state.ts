@@ -1,4 +1,5 @@
-// What a link to the page holds: questions, threshold and camera, in the address's fragment; and the history of questions.
+// What a link to the page holds: questions, threshold and camera, in the address's fragment; and the history of
+// questions.
 
 import type { Vector } from "./network";
 

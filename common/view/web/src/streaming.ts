@@ -1,5 +1,5 @@
-// Fetches cells: first every few Gaussians of all of them, nearest cells first, so that there is a picture of the whole at once; then
-// near cells in full and far ones as the budget of Gaussians allows.
+// Fetches cells: first every few Gaussians of all of them, nearest cells first, so that there is a picture of
+// the whole at once; then near cells in full and far ones as the budget of Gaussians allows.
 
 import type { Drawing } from "./drawing/drawing";
 import { type Cell, type Description, fetchCell } from "./network";
@@ -19,7 +19,10 @@ function stepFor(n: number, most: number): number {
   return 2 ** Math.ceil(Math.log2(Math.max(n / Math.max(most, 1), 1)));
 }
 
-/** Chooses a step for each cell, in the order of their distance: 1 while they fit into the share of near cells, one for all others. */
+/**
+ * Chooses a step for each cell, in the order of their distance: 1 while they fit into the share of near cells,
+ * one for all others.
+ */
 export function chooseSteps(counts: number[], budget: number): number[] {
   const total = counts.reduce((sum, n) => sum + n, 0);
   if (total <= budget) return counts.map(() => 1);

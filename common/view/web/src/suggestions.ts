@@ -1,5 +1,6 @@
-// Suggestions under a search box: questions asked before, things on board, the model's words. The combobox pattern of the ARIA
-// Authoring Practices Guide: the focus stays in the box, and `aria-activedescendant` names the suggestion that keys have reached.
+// Suggestions under a search box: questions asked before, things on board, the model's words. The combobox
+// pattern of the ARIA Authoring Practices Guide: the focus stays in the box, and `aria-activedescendant` names
+// the suggestion that keys have reached.
 
 import type { Word } from "./network";
 
@@ -14,7 +15,10 @@ export interface Suggestion {
   note: string;
 }
 
-/** Suggests whole lines: of the history, those that contain the line; of the words, those that its last word begins, or else stands in. */
+/**
+ * Suggests whole lines: of the history, those that contain the line; of the words, those that its last word
+ * begins, or else stands in.
+ */
 export function suggest(line: string, history: string[], words: Word[]): Suggestion[] {
   const typed = line.trimStart().toLowerCase();
   const found: Suggestion[] = [];
@@ -24,7 +28,8 @@ export function suggest(line: string, history: string[], words: Word[]): Suggest
   };
   const before = history.filter((entry) => entry.toLowerCase().includes(typed.trimEnd()));
   for (const entry of typed ? before : before.slice(0, MAX_HISTORY_AT_FIRST)) add({ line: entry, note: "asked before" });
-  // `chair -wa` goes on with the negative "wall"; words of the model may hold spaces, so two typed words may begin one.
+  // `chair -wa` goes on with the negative "wall"; words of the model may hold spaces, so two typed words may
+  // begin one.
   const [, start, last] = line.match(/^(.*\s-?|-?)(\S*)$/s) ?? ["", "", line];
   const starts = [{ start: line.startsWith("-") ? "-" : "", part: typed.replace(/^-/, "") }, { start, part: last.toLowerCase() }];
   for (const [matches, isAllowed] of [

@@ -51,7 +51,10 @@ export class Camera {
     this.controls.update();
   }
 
-  /** Takes a photo's pose and field of view, until the camera is moved. `rotation`: world from camera as three.js has it. */
+  /**
+   * Takes a photo's pose and field of view, until the camera is moved. `rotation`: world from camera as
+   * three.js has it.
+   */
   standAt(position: THREE.Vector3, rotation: THREE.Quaternion, fieldOfViewDeg: number, distance: number): void {
     this.glide = null;
     this.place(position, new THREE.Vector3(0, 0, -distance).applyQuaternion(rotation).add(position));

@@ -22,7 +22,10 @@ export class Drawing {
   stepM = 1;
   private readonly renderer: THREE.WebGLRenderer;
   private readonly scene = new THREE.Scene();
-  /** Holds everything in world metres, moved so that the scene's middle is at the origin: the GPU has 32-bit floats. */
+  /**
+   * Holds everything in world metres, moved so that the scene's middle is at the origin: the GPU has 32-bit
+   * floats.
+   */
   private readonly world = new THREE.Group();
   private readonly box = new THREE.Box3();
   private readonly up: THREE.Vector3;

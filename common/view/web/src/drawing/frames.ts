@@ -12,7 +12,10 @@ export class Frames {
   private startMs: number | null = null;
   private n = 0;
 
-  /** `onSlow` is told by which factor fewer Gaussians would take `LONGEST_MS`, if frames take as long as they have Gaussians. */
+  /**
+   * `onSlow` is told by which factor fewer Gaussians would take `LONGEST_MS`, if frames take as long as they
+   * have Gaussians.
+   */
   constructor(private readonly onSlow: (share: number) => void) {}
 
   /** Counts a frame; `isMoving`: it is drawn because the camera moves. */

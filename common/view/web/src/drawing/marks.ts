@@ -39,7 +39,10 @@ export class Marks {
     parent.add(this.boxes, this.ground, this.cells, this.photos, this.robot, this.changes);
   }
 
-  /** Each box has a solid twin that is never drawn, for clicks. Only transparent things are drawn after the splats. */
+  /**
+   * Each box has a solid twin that is never drawn, for clicks. Only transparent things are drawn after the
+   * splats.
+   */
   showAnswers(answers: Answer[], chosen: number | null): void {
     disposeAll(this.boxes);
     answers.forEach((answer, index) => {
@@ -69,7 +72,8 @@ export class Marks {
     const lowest = [box.min, box.max].map((corner) => corner.clone().sub(centre).dot(up)).reduce((a, b) => Math.min(a, b));
     this.ground.add(grid);
     if (isGeographic) this.ground.add(new THREE.ArrowHelper(new THREE.Vector3(0, 0, -1), new THREE.Vector3(), (n * stepM) / 2, 0xe05a4e));
-    // Three's grid lies in x and z; its -z becomes the world's y, which is north where the scene is geo-referenced.
+    // Three's grid lies in x and z; its -z becomes the world's y, which is north where the scene is
+    // geo-referenced.
     this.ground.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), up);
     this.ground.position.copy(centre).addScaledVector(up, lowest);
     return stepM;

@@ -1,4 +1,5 @@
-// Places to stand: a robot's outline on the ground with a nose, and a thin line from its sensor to what it looks at.
+// Places to stand: a robot's outline on the ground with a nose, and a thin line from its sensor to what it
+// looks at.
 
 import * as THREE from "three";
 import type { Goal, Vector } from "../network";

@@ -1,5 +1,5 @@
-// Colours of scores: dark red to pale yellow, and blues for a second question. Lit Gaussians keep some of their own colour,
-// others turn grey.
+// Colours of scores: dark red to pale yellow, and blues for a second question. Lit Gaussians keep some of their
+// own colour, others turn grey.
 
 const WARM = [[120, 28, 109], [187, 55, 84], [237, 105, 37], [252, 165, 10], [252, 255, 164]];
 const COLD = [[22, 60, 140], [36, 104, 190], [63, 143, 214], [120, 190, 240], [200, 235, 255]];
@@ -30,7 +30,10 @@ function sharesOf(lit: Lit | null): Int16Array {
   return Int16Array.from({ length: 256 }, (_, level) => (level >= threshold ? Math.round((255 * (level - threshold)) / Math.max(255 - threshold, 1)) : -1));
 }
 
-/** Writes RGBA of Gaussians from their packed words. Where both questions light one, the one that is farther above its threshold counts. */
+/**
+ * Writes RGBA of Gaussians from their packed words. Where both questions light one, the one that is farther
+ * above its threshold counts.
+ */
 export function colourByScore(rgba: Uint8Array, { packed, n, step }: { packed: Uint32Array; n: number; step: number }, first: Lit | null, second: Lit | null): void {
   const [ofFirst, ofSecond] = [sharesOf(first), sharesOf(second)];
   const none = new Uint8Array(0);
