@@ -28,7 +28,7 @@ async def check(client, robot, word):
         assert tool.description and tool.annotations.read_only_hint, tool
         assert tool.output_schema["type"] == "object", tool.output_schema
 
-    # What the robot itself says is the truth. The client holds answers against the tool's schema.
+    # The robot's own answers are the oracle. The client checks them against the tool's schema.
     truth = get(f"{robot}/v1/query?text={word}&near=1,2,0&limit=2")
     found = await client.call_tool("find", {"what": word, "near": [1, 2, 0], "limit": 2})
     assert not found.is_error, found
@@ -66,7 +66,7 @@ async def check(client, robot, word):
     if truth["none"] is not None:
         assert stand["none"]["kind"] == truth["none"]["kind"], (stand, truth)
 
-    # The robot has had two generations; ids, places and words are those that it tells itself.
+    # The robot has had two generations; its own ids, places and words are the oracle.
     truth = get(f"{robot}/v1/changes?text={word}&text=blue")
     changed = await client.call_tool("what_changed", {"words": [word, "blue"]})
     assert not changed.is_error, changed
@@ -92,7 +92,7 @@ async def check(client, robot, word):
     there = there.structured_content
     assert there["n_things"] == 0 and not there["is_complete"] and there["kinds"] == [], there
 
-    # What is wrong is told to the model, which can correct it.
+    # Errors go to the model, which can correct its request.
     for name, asked, expected in [
         ("find", {"what": word, "limit": 0}, "expected 1 to 50"),
         ("find", {"what": word, "radius": 1.0}, "radius needs near"),

@@ -320,7 +320,7 @@ def check_fix(ros, robot):
         return get(f"{robot}/status")["following"]["position"].get("geographic", {}).get("latitude_deg") == latitude
 
     until("position from a fix", lambda: told(0, 47.25))
-    # Without a fix the receiver's numbers are no place.
+    # Without a fix the numbers of the receiver are ignored.
     assert not any(told(-1, 47.5) for _ in range(5))
 
 

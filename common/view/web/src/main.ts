@@ -14,10 +14,7 @@ import { WorkPanel } from "./work";
 
 const PAUSE_IN_TYPING_MS = 150;
 const LOOK_EVERY_MS = 4000;
-/**
- * Gaussians of a thing that was found are lit from this share of the range of scores, if not from a lower
- * score.
- */
+/** Where things were found, Gaussians are lit from this share of the range of scores, or a lower threshold. */
 const SHARE_OF_RANGE = 0.75;
 
 const state = readState();
@@ -110,10 +107,7 @@ async function fetchBoth(line: string, signal: AbortSignal): Promise<[Scores, An
   return [reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal), reply];
 }
 
-/**
- * Things are found by the average of their masks, which their Gaussians at edges and in shade stay below: with
- * answers, three quarters of the range is enough.
- */
+/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. */
 function levelFrom(found: Scores, { threshold, answers }: Pick<Answers, "threshold" | "answers">): number {
   const high = found.min + SHARE_OF_RANGE * (found.max - found.min);
   return levelOf(answers.length > 0 ? Math.min(threshold ?? high, high) : (threshold ?? high), found);
@@ -128,7 +122,7 @@ async function ask(): Promise<void> {
   try {
     const [first, beside] = await Promise.all([fetchBoth(state.question, signal), fetchBoth(state.second, signal)]);
     if (signal.aborted) return;
-    // Scores of another generation than the cells would light the wrong Gaussians; the next look finds it, too.
+    // Scores of another generation would light the wrong Gaussians; the next poll brings both.
     if ([first, beside].some((found) => found && found[0].generation !== description.generation % 2 ** 32)) return void lookSoon();
     scores = first?.[0] ?? null;
     thing = first?.[1].thing ?? "";
@@ -172,7 +166,7 @@ function open(): void {
 async function learnWords(): Promise<void> {
   const learnt = description.can_ask ? await fetchWords().catch(() => null) : null;
   words = learnt?.words ?? [];
-  // A model that takes any text counts some words at a time.
+  // Models that take any text count a few words a request.
   hasAllWords = learnt?.complete ?? true;
   for (const combobox of comboboxes) combobox.refresh();
 }
@@ -192,7 +186,7 @@ function stream(): void {
 
 const cellsOf = (seen: Description) => JSON.stringify(seen.cells.map(({ cell, state, generation, n_gaussians }) => [cell, state, generation, n_gaussians]));
 
-/** Looks what has changed: generation, cells, the robot's place, or that the service is gone. */
+/** Polls the service for its generation, cells and the robot's place, and notices when it is gone. */
 async function look(): Promise<void> {
   try {
     const seen = await describe();
@@ -224,13 +218,13 @@ async function look(): Promise<void> {
   lookSoon(LOOK_EVERY_MS);
 }
 
-/** Looks after a while, once. */
+/** Schedules one poll. */
 function lookSoon(afterMs = 0): void {
   clearTimeout(looking);
   looking = window.setTimeout(() => void look(), afterMs);
 }
 
-/** A robot tells where it is and what it has at once; without its events, the next look finds out. */
+/** Listens to a robot's events; without them the next poll finds changes. */
 async function hearEvents(): Promise<void> {
   try {
     await follow((name, data) => {
@@ -238,7 +232,7 @@ async function hearEvents(): Promise<void> {
       if (name === "following") lookSoon();
     });
   } catch {
-    // The page looks every few seconds anyway.
+    // The page polls every few seconds anyway.
   }
   setTimeout(() => void hearEvents(), 5 * LOOK_EVERY_MS);
 }

@@ -4,7 +4,7 @@ const WIDTH = 2048; // textures of splats are this wide, and arrays are padded t
 
 export interface CellGaussians {
   n: number;
-  /** They are every so many-th of the cell. */
+  /** Every `step`-th Gaussian of the cell was sent. */
   step: number;
   originM: [number, number, number];
   hasAppearance: boolean;

@@ -16,7 +16,7 @@ export class PlacesToStand {
 
   constructor(private readonly drawing: Drawing) {}
 
-  /** Looks for places near an answer; nothing for none. */
+  /** Asks for places near an answer; without an answer, clears them. */
   async ask(answer: Answer | null, description: Description): Promise<void> {
     this.asking.abort();
     this.asking = new AbortController();

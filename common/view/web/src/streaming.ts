@@ -9,7 +9,7 @@ const AT_A_TIME = 4;
 const FIRST_PICTURE = 200_000;
 /** Gaussians that are drawn at most: the renderer's own default for computers. */
 const MAX_GAUSSIANS = 2_500_000;
-/** A browser whose frames take long draws fewer, but not fewer than this. */
+/** Lower bound of that budget, for slow browsers. */
 const MIN_GAUSSIANS = 400_000;
 /** Share of the budget for near cells in full. */
 const NEAR_SHARE = 0.6;

@@ -15,10 +15,7 @@ export interface Suggestion {
   note: string;
 }
 
-/**
- * Suggests whole lines: of the history, those that contain the line; of the words, those that its last word
- * begins, or else stands in.
- */
+/** Suggests lines of the history that contain the text, and words that complete its last word. */
 export function suggest(line: string, history: string[], words: Word[]): Suggestion[] {
   const typed = line.trimStart().toLowerCase();
   const found: Suggestion[] = [];

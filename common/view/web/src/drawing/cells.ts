@@ -64,7 +64,7 @@ export class Cells {
     for (const [cell, drawn] of this.drawn) this.colourOne(cell, drawn);
   }
 
-  /** Without colours, a scene in one grey could not be read: what is high is light. */
+  /** Without colours, heights give shades: high is light. */
   private shadeByHeight({ packed, n, originM }: CellGaussians): void {
     const heights = [this.box.min, this.box.max].map((corner) => corner.dot(this.up));
     const [low, high] = [Math.min(...heights), Math.max(...heights)];

@@ -10,7 +10,7 @@ import { Frames } from "./frames";
 import { Places } from "./places";
 
 const MAX_LABELS = 8;
-/** A click this near to a mark means it. */
+/** Largest distance between a click and the mark it means. */
 const NEAR_PX = 14;
 
 export class Drawing {
@@ -121,7 +121,7 @@ export class Drawing {
     return hit ? (hit.object.userData.index as number) : null;
   }
 
-  /** Looks as a photo does; the picture laid over the whole canvas, contained in it, then fits. */
+  /** Takes a photo's camera, so that the picture laid over the canvas fits. */
   standAt(photo: Photo): void {
     const flipped = new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(1, 0, 0), Math.PI);
     const rotation = new THREE.Quaternion(...photo.rotation_xyzw).multiply(flipped);

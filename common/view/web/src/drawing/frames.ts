@@ -5,17 +5,14 @@ const LONGEST_MS = 40;
 /** Frames and time that are averaged. */
 const MIN_FRAMES = 4;
 const MIN_MS = 1000;
-/** The least share that is told at a time: a first slow second says little. */
+/** Smallest share that is reported at once: the first slow second says little. */
 const LEAST_SHARE = 0.4;
 
 export class Frames {
   private startMs: number | null = null;
   private n = 0;
 
-  /**
-   * `onSlow` is told by which factor fewer Gaussians would take `LONGEST_MS`, if frames take as long as they
-   * have Gaussians.
-   */
+  /** `onSlow` gets the share of the Gaussians that would take `LONGEST_MS` a frame. */
   constructor(private readonly onSlow: (share: number) => void) {}
 
   /** Counts a frame; `isMoving`: it is drawn because the camera moves. */
