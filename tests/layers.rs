@@ -353,7 +353,7 @@ fn files_form_no_circle() {
 
 /// No source file is too long to read at once; generated tables do not count.
 #[test]
-fn no_file_is_over_500_lines() {
+fn no_file_is_over_700_lines() {
     let mut open: Vec<PathBuf> = ["common", "encoder", "edge", "doors", "packaging", "tests", "fuzz"]
         .map(|folder| root().join(folder))
         .into();
@@ -366,7 +366,7 @@ fn no_file_is_over_500_lines() {
                 open.push(path);
             } else if path.extension().is_some_and(|e| e == "rs" || e == "wgsl") {
                 let n_lines = fs_err::read_to_string(&path).expect("text").lines().count();
-                if n_lines > 500 {
+                if n_lines > 700 {
                     long.push(format!(
                         "{}: {n_lines} lines",
                         path.strip_prefix(root()).unwrap_or(&path).display()
