@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 mod targets;
 
 use slag_math::random::Random;
-use slag_test_support::{CountingAllocator, memory_of, shared_folder};
+use slag_test_support::{memory_of, shared_folder};
 
 /// Memory a decoder may take in addition to [`MAX_EXPANSION`] times its input: buffers and small images.
 const FREE_BYTES: usize = 64 << 20;
@@ -22,9 +22,6 @@ const N_MUTATIONS: u64 = 3000;
 /// Values at the boundaries of integer types.
 const INTERESTING: [u64; 12] =
     [0, 1, 2, 0x7f, 0x80, 0xff, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, u64::MAX >> 1, u64::MAX];
-
-#[global_allocator]
-static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// Mutates a seed as fuzzers do: bits, numbers, digits, truncation, copies, pieces of another seed.
 fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {

@@ -2,10 +2,7 @@
 
 use slag_common::poses::{self, PoseError};
 use slag_math::random::Random;
-use slag_test_support::{CountingAllocator, damaged, memory_of};
-
-#[global_allocator]
-static ALLOCATOR: CountingAllocator = CountingAllocator;
+use slag_test_support::{damaged, memory_of};
 
 fn text_model() -> [(&'static str, Vec<u8>); 2] {
     let cameras =

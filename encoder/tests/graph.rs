@@ -1,10 +1,7 @@
 //! The built-in segmenter: synthetic images with known answers, and photos with known instances.
 
-mod common;
-
 use std::path::Path;
 
-use common::{needs_shared, shared};
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
 use slag_common::{Distortion, Intrinsics, View, poses};
@@ -14,6 +11,7 @@ use slag_encoder::segment::{GivenMasks, GraphSegmenter, GraphSettings, SegmentIn
 use slag_math::random::Random;
 use slag_models::SessionOptions;
 use slag_models::session::find_runtime;
+use slag_test_support::{needs_shared, shared};
 
 fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> Vec<Mask> {
     let (width_px, height_px) = image.dimensions();

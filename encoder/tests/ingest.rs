@@ -1,16 +1,14 @@
 //! Photos: sizes, undistortion, geo-reference.
 
-mod common;
-
 use std::path::Path;
 
-use common::{needs_shared, shared};
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::{
     GeoError, IngestError, Undistorter, load_image, missing_images, read_geo_reference,
 };
+use slag_test_support::{needs_shared, shared};
 
 fn camera(distortion: Distortion) -> Intrinsics {
     Intrinsics {

@@ -1,8 +1,6 @@
 //! Embeddings at the extremes: rows of the table in docs/numerics.md, each against the paper's equation in
 //! float64 or a closed form.
 
-mod common;
-
 use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;

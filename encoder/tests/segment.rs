@@ -1,10 +1,7 @@
 //! Masks: run lengths, users' files, the partition into regions.
 
-mod common;
-
 use std::path::Path;
 
-use common::{needs_shared, shared};
 use glam::DAffine3;
 use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
@@ -15,6 +12,7 @@ use slag_encoder::masks::rle::{Rle, RleError};
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, RegionMap};
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput, Segmenter};
 use slag_math::random::Random;
+use slag_test_support::{needs_shared, shared};
 
 /// Makes a mask of a membership function; `None` if no pixel is inside.
 fn mask(width: u32, height: u32, inside: impl Fn(u32, u32) -> bool) -> Option<Mask> {

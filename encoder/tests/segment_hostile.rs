@@ -1,8 +1,6 @@
 //! Damaged mask files: an error or a valid result, never a panic, and no allocation that the size
 //! of file and image does not justify.
 
-mod common;
-
 use glam::DAffine3;
 use image::RgbImage;
 use slag_common::{Distortion, Intrinsics, View};
@@ -10,10 +8,7 @@ use slag_encoder::masks::Mask;
 use slag_encoder::masks::rle::Rle;
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput};
 use slag_math::random::Random;
-use slag_test_support::{CountingAllocator, damaged, memory_of};
-
-#[global_allocator]
-static ALLOCATOR: CountingAllocator = CountingAllocator;
+use slag_test_support::{damaged, memory_of};
 
 const WIDTH_PX: u32 = 64;
 const HEIGHT_PX: u32 = 48;

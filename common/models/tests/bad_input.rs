@@ -1,10 +1,8 @@
 //! Wrong descriptions and files: one clear message each, no panic.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::{model_dir, needs_shared, options, shared};
+use crate::common::{model_dir, needs_shared, options, shared};
 use slag_models::{EncoderId, ModelDir, SessionOptions};
 use tempfile::TempDir;
 

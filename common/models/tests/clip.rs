@@ -1,8 +1,6 @@
 //! CLIP's two sides against vectors recorded with transformers, Pillow and openai/CLIP.
 
-mod common;
-
-use common::{array, image, max_difference, model_dir, needs_shared, options, shared, unit};
+use crate::common::{array, image, max_difference, model_dir, needs_shared, options, shared, unit};
 use slag_models::{
     Crop, ModelDir,
     clean::clean,

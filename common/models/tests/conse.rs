@@ -1,9 +1,7 @@
 //! The real small pair: ConSE image vectors and CLIP phrase vectors.
 
-mod common;
-
+use crate::common::{array, max_difference, model_dir, needs_shared, options, shared, unit};
 use ::image::{RgbImage, imageops};
-use common::{array, max_difference, model_dir, needs_shared, options, shared, unit};
 use half::f16;
 use safetensors::SafeTensors;
 use slag_models::{Crop, InferenceError, ModelDir, SessionOptions};

@@ -1,9 +1,7 @@
 //! Vectors of patches against tensors recorded with PyTorch (`tests/models/dense_tiny/export.py`), and texts without an end
 //! token.
 
-mod common;
-
-use common::{array, image, made, max_difference, model_dir, options, unit};
+use crate::common::{array, image, made, max_difference, model_dir, options, unit};
 use slag_models::{Crop, ModelDir};
 
 #[test]
@@ -70,7 +68,7 @@ fn texts_need_no_end_token_and_may_be_lowered() {
 
     let write = |description: &str| {
         let text = made::text_graph(made::TextKind::default());
-        let image = made::image_graph(common::onnx::Element::F32, -1, false);
+        let image = made::image_graph(crate::common::onnx::Element::F32, -1, false);
         made::write(folder.path(), description, &text, &image);
         let kept = made::tokenizer(&made::VOCABULARY).replace(r#"{"type":"Lowercase"},"#, "");
         fs_err::write(&path, kept).expect("it is writable");

@@ -1,13 +1,11 @@
 //! Encoders with the variations of CLIP and SigLIP exports: element types, masks, padding, unnamed outputs, batches.
 //! The models are generated here; the expected vectors are computed from their tables in f64.
 
-mod common;
-
-use common::made::{
+use crate::common::made::{
     DESCRIPTION, DIM, SIZE_PX, TextKind, VOCABULARY, WEIGHTS, image_graph, row, text_graph, tokenizer, write,
 };
-use common::onnx::{Element, model, value};
-use common::{max_difference, options, unit};
+use crate::common::onnx::{Element, model, value};
+use crate::common::{max_difference, options, unit};
 use image::{Rgb, RgbImage};
 use slag_models::{Crop, ModelDir, Provider, SessionOptions};
 use tempfile::TempDir;
@@ -128,7 +126,7 @@ fn outputs_are_named_or_the_only_ones_that_fit() {
     let options = options();
     // "rows" has three dimensions, so "text_embeds" is the only one; with a twin it is not.
     let mut twins = text_graph(TextKind::default());
-    twins.nodes.push(common::onnx::node("Identity", &["text_embeds"], "pooled", &[]));
+    twins.nodes.push(crate::common::onnx::node("Identity", &["text_embeds"], "pooled", &[]));
     twins.outputs.push(value("pooled", Element::F32, &[1, DIM as i64]));
     let folder = tempfile::tempdir().expect("a folder");
     let image = image_graph(Element::F32, -1, false);
@@ -230,7 +228,7 @@ fn models_that_do_not_fit_say_so_when_opened() {
 
     // Versions that no runtime supports.
     for (ir_version, opset) in [(7, 999), (99, 12)] {
-        let bytes = common::onnx::versioned(&text_graph(text), ir_version, opset);
+        let bytes = crate::common::onnx::versioned(&text_graph(text), ir_version, opset);
         fs_err::write(folder.path().join("text.onnx"), bytes).expect("it is writable");
         let message = opened(&folder);
         for part in ["text.onnx", "give a newer libonnxruntime, or export the model for an older opset"] {
@@ -239,7 +237,7 @@ fn models_that_do_not_fit_say_so_when_opened() {
     }
     // An operator that no runtime has, and a file that is something else.
     let mut unknown = text_graph(text);
-    unknown.nodes.push(common::onnx::node("Telepathy", &["text_embeds"], "thought", &[]));
+    unknown.nodes.push(crate::common::onnx::node("Telepathy", &["text_embeds"], "thought", &[]));
     for bytes in [model(&unknown), b"<!DOCTYPE html><html>404</html>".to_vec()] {
         fs_err::write(folder.path().join("text.onnx"), bytes).expect("it is writable");
         let message = opened(&folder);
@@ -249,8 +247,8 @@ fn models_that_do_not_fit_say_so_when_opened() {
 
 /// Returns the indented lines of docs/models.md that follow a line with `start`.
 fn documented(start: &str) -> Vec<String> {
-    let text =
-        fs_err::read_to_string(common::workspace_root().join("docs/models.md")).expect("it is readable");
+    let text = fs_err::read_to_string(slag_test_support::workspace_root().join("docs/models.md"))
+        .expect("it is readable");
     let after = text.lines().skip_while(|line| !line.contains(start));
     let indented = after.skip_while(|line| !line.starts_with("    "));
     indented.map_while(|line| Some(line.strip_prefix("    ")?.to_owned())).collect()

@@ -3,11 +3,9 @@
 //! Needs its ONNX files, of any weights, in 32 and in 8 bits (text_model, text_model_int8, vision_model,
 //! vision_model_int8), in the folder that SLAG_CLIP_B32 names.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::{model_dir, options, shared};
+use crate::common::{model_dir, options, shared};
 use slag_models::{ModelDir, SessionOptions};
 use tempfile::TempDir;
 

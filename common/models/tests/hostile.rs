@@ -1,10 +1,8 @@
 //! Descriptions, vector files and phrase lists with 1,000 damages each: accepted or refused, never a panic.
 
-mod common;
-
 use std::collections::BTreeMap;
 
-use common::model_dir;
+use crate::common::model_dir;
 use safetensors::tensor::{Dtype, TensorView};
 use slag_math::random::Random;
 use slag_models::phrases::PhraseEncoder;

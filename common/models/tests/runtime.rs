@@ -1,12 +1,10 @@
 //! Finding and loading ONNX Runtime; a program of its own, because a process loads it once.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use common::{model_dir, needs_shared, options};
 use slag_models::{ModelDir, SessionOptions, find_runtime};
+use slag_test_support::{needs_shared, onnx_runtime, workspace_root};
 
 #[needs_shared]
 #[test]
@@ -33,7 +31,7 @@ fn a_wrong_library_is_refused_and_the_right_one_still_loads() {
     let folder = tempfile::tempdir().expect("a folder");
     let library = folder.path().join("libonnxruntime.so");
     fs_err::write(&library, "not a library").expect("it is writable");
-    let model = ModelDir::open(&model_dir("conse")).expect("it opens");
+    let model = ModelDir::open(&workspace_root().join("tests/models/conse")).expect("it opens");
     let refusal = |runtime: &Path| {
         let error = model.image_encoder(&SessionOptions::new(runtime.to_owned())).err();
         error.expect("it is refused").to_string()
@@ -57,7 +55,7 @@ fn a_wrong_library_is_refused_and_the_right_one_still_loads() {
         assert!(refusal(&old).contains(part), "{}", refusal(&old));
     }
 
-    let options = options();
+    let options = SessionOptions::new(onnx_runtime());
     model.image_encoder(&options).expect("the right library still loads");
     fs_err::copy(&options.runtime, &library).expect("it is writable");
     assert!(refusal(&library).contains("use one per process"), "{}", refusal(&library));

@@ -1,10 +1,8 @@
 //! SAM's two files against tensors recorded with transformers and PyTorch; wrong files, one clear message each.
 
-mod common;
-
 use std::path::Path;
 
-use common::{array, image, model_dir, needs_shared, options, shared};
+use crate::common::{array, image, model_dir, needs_shared, options, shared};
 use slag_models::sam::{Embedding, Letterbox, Sam};
 
 /// The largest difference between `found`, `[planes][rows][columns]` from which every `step`th row and column is

@@ -1,11 +1,9 @@
 //! SAM 2.1's two files, with their weights beside them, against tensors recorded with transformers and PyTorch
 //! (`tests/models/sam2_tiny/export.py`).
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::{array, image, model_dir, options};
+use crate::common::{array, image, model_dir, options};
 use slag_models::sam::{Letterbox, Sam};
 
 fn golden() -> PathBuf {

@@ -1,11 +1,9 @@
 //! SigLIP 2's two sides as `models pull` describes them, against transformers and PyTorch (`tests/models/siglip2_tiny/export.py`):
 //! preprocessing, tokens with their end and padding, vectors.
 
-mod common;
-
 use std::path::Path;
 
-use common::{array, image, max_difference, model_dir, options, unit};
+use crate::common::{array, image, max_difference, model_dir, options, unit};
 use slag_models::{
     Crop, ModelDir,
     preprocess::{Filter, Preprocess, Resize},

@@ -6,13 +6,10 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use slag_math::random::Random;
-use slag_test_support::{CountingAllocator, memory_of};
+use slag_test_support::memory_of;
 
-use crate::generated::{gzip, write_sog_v1};
-use crate::{assert_columns_agree, needs_shared, read_all, shared};
-
-#[global_allocator]
-static ALLOCATOR: CountingAllocator = CountingAllocator;
+use super::generated::{gzip, write_sog_v1};
+use super::{assert_columns_agree, needs_shared, read_all, shared};
 
 /// Damages a file: truncates it, flips bits, overwrites a word with an extreme value, or changes a digit. Half of the
 /// places lie near the front, among the headers.

@@ -4,7 +4,7 @@
 use serde_json::Value;
 use slag_common::splat::{ReadOptions, SplatError, read};
 
-use crate::{assert_columns_agree, assert_near, needs_shared, read_all, shared};
+use super::{assert_columns_agree, assert_near, needs_shared, read_all, shared};
 
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().into_iter().flatten().map(|v| v.as_f64().expect("a number")).collect()
@@ -147,7 +147,7 @@ fn trained_scenes_row_by_row() {
 fn a_dot_splat_with_an_incomplete_row_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     for (len, row) in [(0, 0), (63, 32), (65, 64)] {
-        let error = crate::read_bytes(folder.path(), "cut.splat", &vec![1; len]).expect_err("is refused");
+        let error = super::read_bytes(folder.path(), "cut.splat", &vec![1; len]).expect_err("is refused");
         let expected =
             format!("cut.splat: byte {row}: expected rows of 32 bytes, found a file of {len} bytes");
         assert!(error.to_string().contains(&expected), "{error}");

@@ -10,7 +10,7 @@ use image::codecs::webp::WebPEncoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use slag_test_support::memory_of;
 
-use crate::{assert_near, read_all, read_bytes};
+use super::{assert_near, read_all, read_bytes};
 
 pub fn gzip(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());

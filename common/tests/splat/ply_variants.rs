@@ -3,7 +3,7 @@
 use slag_common::Gaussians;
 use slag_common::splat::ply;
 
-use crate::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
+use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
 
 /// Returns the properties and rows of a plain PLY of floats, with a parser of the test's own.
 fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {

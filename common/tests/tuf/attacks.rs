@@ -6,7 +6,7 @@ use slag_common::tuf::{
     FileMeta, Kept, Key, MAX_ROOT_BYTES, Snapshot, Targets, TufError, find_target, refresh, sign,
 };
 
-use crate::repo::*;
+use super::repo::*;
 
 #[test]
 fn an_honest_repository_is_followed() {

@@ -6,7 +6,7 @@ use slag_common::tuf::{
     DelegatedRole, Delegations, FileMeta, Key, RoleKeys, TargetFile, Targets, TufError, find_target, sign,
 };
 
-use crate::repo::*;
+use super::repo::*;
 
 fn role(name: &str, signer: u8, pattern: &str, terminating: bool) -> DelegatedRole {
     let keys = RoleKeys { keyids: vec![Key::of(&key(signer)).id()], threshold: 1 };

@@ -2,7 +2,7 @@
 
 use slag_common::tuf::{FileMeta, Kept, TufError};
 
-use crate::repo::*;
+use super::repo::*;
 
 fn others() -> Owner {
     Owner { root: vec![key(11), key(12), key(13)], ..Owner::new() }

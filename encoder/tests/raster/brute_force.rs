@@ -7,10 +7,10 @@ use slag_common::{Distortion, Gaussians};
 use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::{Drawing, RasterError, RasterView, ViewWeights, WeightKind};
 
-use crate::backends::{Backend, backends};
-use crate::oracle;
-use crate::scenes::{random_regions, random_scene, random_view};
-use crate::table::{Case, KINDS, Row};
+use super::backends::{Backend, backends};
+use super::oracle;
+use super::scenes::{random_regions, random_scene, random_view};
+use super::table::{Case, KINDS, Row};
 use slag_math::random::Random;
 
 const SIZES_PX: [(u32, u32); 7] = [(1, 1), (16, 16), (17, 15), (5, 40), (33, 31), (64, 48), (70, 3)];

@@ -8,7 +8,7 @@ use slag_common::{Distortion, Gaussians, Intrinsics};
 use slag_encoder::check::{CheckError, CheckOptions, CheckReport, CheckView, Mistake, check};
 use slag_encoder::raster::{CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer};
 
-use crate::fixtures::{needs_shared, shared};
+use super::fixtures::{needs_shared, shared};
 
 /// PSNR over all photos that the trainer (gsplat) reports at 1000 x 562.
 const TRAINER_PSNR_DB: f64 = 25.02;

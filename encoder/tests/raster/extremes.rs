@@ -7,9 +7,9 @@ use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::constants::{MAX_IMAGE_PX, SUM_FRACTION_BITS};
 use slag_encoder::raster::{RasterView, RegionWeight, WeightKind};
 
-use crate::backends::{Backend, backends};
-use crate::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
-use crate::table::{Case, Row};
+use super::backends::{Backend, backends};
+use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
+use super::table::{Case, Row};
 use slag_math::random::Random;
 
 /// Many views of few Gaussians each: none hides the others.

@@ -9,7 +9,7 @@ use slag_encoder::check::{
 use slag_encoder::ingest::load_image;
 use slag_encoder::raster::{CpuRasterizer, RasterView};
 
-use crate::fixtures::{needs_shared, shared};
+use super::fixtures::{needs_shared, shared};
 
 struct House {
     splat: Gaussians,

@@ -7,8 +7,8 @@ use slag_encoder::raster::{
     CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, WeightKind,
 };
 
-use crate::backends::gpu_is_expected;
-use crate::scenes::{random_regions, random_scene, random_view};
+use super::backends::gpu_is_expected;
+use super::scenes::{random_regions, random_scene, random_view};
 use slag_math::random::Random;
 
 /// Opens the first adapter in its best precision.

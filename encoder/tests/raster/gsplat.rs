@@ -6,8 +6,8 @@ use slag_common::Gaussians;
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::{RasterView, Rasterizer, ViewWeights, WeightKind};
 
-use crate::backends::{Backend, backends};
-use crate::fixtures::{Npz, needs_shared, points, view, widened};
+use super::backends::{Backend, backends};
+use super::fixtures::{Npz, needs_shared, points, view, widened};
 
 type Sums = BTreeMap<(u32, u32), f64>;
 
@@ -111,7 +111,7 @@ fn extremes_are_those_of_the_float64_reference_also_500_km_from_the_origin() {
     let local = (points(&npz.array("means")), widened(&npz.array("viewmat")));
     let offset_means: Vec<f64> = npz.array("means_offset64");
     let offset = (
-        crate::fixtures::rows(&offset_means).map(glam::DVec3::from_array).collect(),
+        super::fixtures::rows(&offset_means).map(glam::DVec3::from_array).collect(),
         npz.array("viewmat_offset64"),
     );
     for (frame, (means, pose)) in [("local", local), ("offset", offset)] {

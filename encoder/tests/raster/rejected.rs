@@ -5,10 +5,10 @@ use slag_common::Gaussians;
 use slag_common::splat::{self, ReadOptions};
 use slag_encoder::raster::{RasterView, WeightKind};
 
-use crate::backends::{Backend, backends};
-use crate::extremes::read_ply;
-use crate::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
-use crate::table::{Case, KINDS, Row};
+use super::backends::{Backend, backends};
+use super::extremes::read_ply;
+use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
+use super::table::{Case, KINDS, Row};
 use slag_math::random::Random;
 
 /// Changes the Gaussian of an index.

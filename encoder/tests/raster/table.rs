@@ -6,8 +6,8 @@ use slag_common::Gaussians;
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::{RasterView, ViewWeights, WeightKind};
 
-use crate::backends::{Backend, backends};
-use crate::oracle;
+use super::backends::{Backend, backends};
+use super::oracle;
 
 /// The kind of weight.
 pub const KINDS: [WeightKind; 2] = [WeightKind::Blend, WeightKind::Falloff];

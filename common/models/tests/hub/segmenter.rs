@@ -5,8 +5,8 @@ use std::path::Path;
 use slag_models::hub::{Here, Hub, HubError, Side, Source};
 use slag_models::sam::Sam;
 
+use super::server::{Server, hub_of, sha256};
 use crate::common::{model_dir, options};
-use crate::server::{Server, hub_of, sha256};
 
 const TABLE: &str = r#"
 hub = "http://127.0.0.1:1"

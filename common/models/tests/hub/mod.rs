@@ -1,13 +1,11 @@
 //! Pulling models from a hub on this machine that behaves like the real one, or worse.
 
-#[path = "../common/mod.rs"]
-mod common;
 mod segmenter;
 mod server;
 
 use std::path::{Path, PathBuf};
 
-use common::options;
+use crate::common::options;
 use slag_models::hub::{Here, Hub, HubError, Side, Source};
 use slag_models::{ModelDir, SessionOptions};
 

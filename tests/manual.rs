@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use slag_tests::{judge, program, run, text};
+use slag_tests::*;
 
 /// The programs, and the least number of pages that each has.
 const PROGRAMS: [(&str, usize); 5] =
@@ -11,7 +11,7 @@ const PROGRAMS: [(&str, usize); 5] =
 
 fn manual() -> tempfile::TempDir {
     let out = tempfile::tempdir().expect("a folder");
-    run(Command::new(env!("CARGO_BIN_EXE_slag-manual")).arg(out.path()));
+    run(Command::new(program("slag-manual")).arg(out.path()));
     out
 }
 

@@ -1,0 +1,15 @@
+//! Models of all kinds, but for the loading of ONNX Runtime.
+
+mod bad_input;
+mod clip;
+mod colours;
+mod common;
+mod conse;
+mod dense;
+mod encoders;
+mod full_size;
+mod hostile;
+mod hub;
+mod sam;
+mod sam2;
+mod siglip2;

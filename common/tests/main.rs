@@ -1,0 +1,13 @@
+//! Formats and geometry.
+
+mod appearance;
+mod fine;
+mod format_doc;
+mod poses;
+mod poses_hostile;
+mod scannet;
+mod splat;
+mod tuf;
+
+#[global_allocator]
+static ALLOCATOR: slag_test_support::CountingAllocator = slag_test_support::CountingAllocator;
