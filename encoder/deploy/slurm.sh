@@ -1,5 +1,5 @@
 #!/bin/sh
-# Workers of a fleet as a Slurm array, without a queue: task I of N does every N-th view and cell, then what others left.
+# Workers of a fleet as a Slurm array, without a queue: task I of N does every N-th view, then what others left.
 # usage: sbatch --array=0-15 encoder/deploy/slurm.sh BUCKET [flags of `slag-encoder worker`]
 #   BUCKET: a folder that all nodes see, or s3://BUCKET/PREFIX with credentials in the environment.
 # Start `slag-encoder encode ... --blobs BUCKET` where the photos are, before or after, and `scancel --name slag-worker` once it has

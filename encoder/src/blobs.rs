@@ -4,13 +4,12 @@
 //! from those of the bucket's own runtime.
 
 use std::error::Error;
-use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
-use futures_util::{StreamExt, TryStreamExt};
+use futures_util::TryStreamExt;
 use object_store::client::{HttpError, HttpErrorKind};
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
@@ -166,27 +165,6 @@ impl Bucket {
         self.get(key)?.ok_or_else(missing)
     }
 
-    /// Returns ranges of objects, in the order given, `n_at_once` requests at a time.
-    ///
-    /// # Errors
-    /// [`BlobError`]: of the first that fails.
-    pub fn get_ranges(
-        &self,
-        wanted: &[(String, Range<u64>)],
-        n_at_once: usize,
-    ) -> Result<Vec<Bytes>, BlobError> {
-        let read = |(key, range): &(String, Range<u64>)| {
-            let (at, key, range) = (self.key(key), key.clone(), range.clone());
-            async move {
-                let read = answered(|| self.store.get_range(&at, range.clone())).await;
-                read.map_err(|source| self.failed(&key, source))
-            }
-        };
-        let reads = wanted.iter().map(read).collect::<Vec<_>>();
-        let reads = futures_util::stream::iter(reads).buffered(n_at_once.max(1));
-        self.runtime.block_on(reads.try_collect())
-    }
-
     /// Returns the length of an object; `None` if it is not there.
     ///
     /// # Errors
@@ -294,7 +272,7 @@ mod tests {
 
     /// A conditional put is one for all who have the folder open; names come without their folder, in order.
     #[test]
-    fn the_first_put_wins_and_ranges_are_of_the_object() {
+    fn the_first_put_wins() {
         let dir = tempfile::tempdir().expect("a folder");
         let open = || Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens");
         let (one, other) = (open(), open());
@@ -304,8 +282,6 @@ mod tests {
         assert_eq!(other.get("jobs/2/plan.json").expect("reads").as_deref(), Some(&b"first"[..]));
         assert_eq!(other.list("jobs").expect("lists"), ["1/end.json", "2/plan.json"]);
         assert!(other.list("none").expect("lists").is_empty() && other.get("none").expect("reads").is_none());
-        let ranges = [("jobs/1/end.json".to_owned(), 8..10), ("jobs/2/plan.json".to_owned(), 0..2)];
-        assert_eq!(other.get_ranges(&ranges, 2).expect("reads"), ["89", "fi"]);
         assert_eq!(other.len_of("jobs/1/end.json").expect("asks"), Some(10));
         let refused = Bucket::open("ftp://somewhere/else", []).expect_err("no bucket").to_string();
         assert!(refused.contains("ftp://somewhere/else"), "{refused}");

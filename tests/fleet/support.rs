@@ -11,8 +11,8 @@ use slag_tests::*;
 /// Flags that coordinator and workers share.
 const MODELS: [&str; 4] = ["--models", "colours", "--device", "cpu"];
 
-/// Flags of the encode: one profile, so that codebooks take less time than views; and places, which cells carry.
-const ENCODE: [&str; 6] = ["--name", "room", "--profiles", "compact", "--occupancy", "0.1"];
+/// Flags of the encode: one profile, so that codebooks take less time than views.
+const ENCODE: [&str; 5] = ["--name", "room", "--profiles", "compact", "--photo-poses"];
 
 /// Photos of the room.
 pub const N_VIEWS: usize = 6;

@@ -1,6 +1,6 @@
 //! `encode`: a scene into a store.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, Result, anyhow};
 use clap::{Args, FromArgMatches};
@@ -8,7 +8,7 @@ use slag_common::shard::Profile;
 use slag_models::gpus::GpuChoice;
 
 use super::common::{
-    InputArgs, ModelArgs, OutputArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
+    InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
     open_models, parse_error, print, profile_parser,
 };
 use super::exit::Exit;
@@ -155,7 +155,6 @@ pub struct EncodeArgs {
     /// Shards say where their photos were taken, so that the page at /view shows cameras on a robot, too: 44 bytes and the
     /// name a photo in every profile. Pictures are not published.
     #[arg(long)]
-    #[cfg_attr(feature = "fleet", arg(conflicts_with = "blobs"))]
     pub photo_poses: bool,
     /// The store carries the text side of --models, signed as all else: robots fetch it with the scene and need no --models.
     /// Refused unless the licence in model.toml permits passing the weights on.
@@ -164,7 +163,7 @@ pub struct EncodeArgs {
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
-    /// Views and cells by other machines.
+    /// Views by other machines.
     #[command(flatten)]
     pub fleet: super::fleet::CoordinatorArgs,
     /// A page that watches, and one that reports.
@@ -298,25 +297,6 @@ fn this_command() -> Option<CommandRecord> {
     Some(CommandRecord { folder: std::env::current_dir().ok()?, words })
 }
 
-/// Makes the objects of a store's generation again, by the command that made it, from the views that are kept.
-pub(super) fn remake(command: &CommandRecord, store: &Path, progress: &dyn Progress) -> Result<()> {
-    let words = command.words.iter().skip_while(|word| *word != "encode").skip(1);
-    let parser = OutputArgs::augment_args(EncodeArgs::augment_args(clap::Command::new("encode")));
-    let mut args = parser
-        .no_binary_name(true)
-        .try_get_matches_from(words)
-        .and_then(|matches| EncodeArgs::from_arg_matches(&matches))
-        .with_context(|| format!("the command that made it is not understood: {:?}", command.words))?;
-    args.store = std::path::absolute(store)?;
-    let folder = &command.folder;
-    std::env::set_current_dir(folder).with_context(|| format!("the encode ran in {}", folder.display()))?;
-    let (settings, _) = settings_and_target(&args)?;
-    let (models, session) = open_models(&args.models)?;
-    let devices = Devices::open(&args.device, GpuOptions::default())?;
-    let engines = Engines::new(&models, &session, &devices);
-    Ok(encode::remake(&settings, &engines, progress, cancel_flag()?.as_ref())?)
-}
-
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let (mut settings, expected) = settings_and_target(args)?;
     settings.output.command = this_command();
@@ -409,16 +389,6 @@ mod tests {
         assert!(message.contains("--raster-width twice"), "{message}");
         let others = parse("--preset best").expect_err("refused").to_string();
         assert!(others.contains("[possible values: paper, plain, fast, balanced]"), "{others}");
-    }
-
-    /// Workers of a fleet do not know the poses of other views.
-    #[cfg(feature = "fleet")]
-    #[test]
-    fn a_fleet_is_not_asked_for_poses_of_photos() {
-        assert!(parse("--photo-poses").expect("parses").photo_poses);
-        assert!(parse("--blobs file:///b").is_ok());
-        let message = parse("--photo-poses --blobs file:///b").expect_err("refused").to_string();
-        assert!(message.contains("--photo-poses") && message.contains("--blobs"), "{message}");
     }
 
     #[test]

@@ -36,10 +36,10 @@ pub struct QueueArgs {
     /// Certificates of the authority that signed the NATS server's.
     #[arg(long, value_name = "FILE", requires = "fleet")]
     nats_ca: Option<PathBuf>,
-    /// Seconds without a sign of life after which a worker's view or cell goes to another.
+    /// Seconds without a sign of life after which a worker's view goes to another.
     #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_secs)]
     ack_wait: Duration,
-    /// Times that a view or cell is handed out; then the view is left out.
+    /// Times that a view is handed out; then it is left out.
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     max_deliver: u32,
 }
@@ -61,7 +61,7 @@ impl QueueArgs {
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Fleet")]
 pub struct CoordinatorArgs {
-    /// Bucket over which workers do the views and cells: file:///FOLDER that all machines see, or s3://BUCKET/PREFIX,
+    /// Bucket over which workers do the views: file:///FOLDER that all machines see, or s3://BUCKET/PREFIX,
     /// with credentials in the usual variables. Start `slag-encoder worker` with the same bucket.
     #[arg(long, value_name = "URL", conflicts_with = "time_budget")]
     blobs: Option<String>,
@@ -171,8 +171,7 @@ pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
     let cancel = cancel_flag()?;
     // The coordinator shows the progress of the fleet.
     let report = work(&bucket, &settings, &engines, &Silent, cancel.as_ref())?;
-    let lines =
-        format!("{} runs: {} views and {} cells done here\n", report.n_runs, report.n_views, report.n_cells);
+    let lines = format!("{} runs: {} views done here\n", report.n_runs, report.n_views);
     print(json, &report, lines)?;
     Ok(if cancel.load(Ordering::Relaxed) { Exit::Interrupted } else { Exit::Done })
 }

@@ -1,7 +1,5 @@
-//! A cell on its way from contributions to shards. Its bytes do not depend on who makes them: this process or another
-//! machine.
+//! A cell on its way from contributions to shards.
 
-use serde::{Deserialize, Serialize};
 use slag_common::manifest::{CellRecord, ShardRecord};
 use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::Profile;
@@ -9,7 +7,6 @@ use slag_common::{Gaussians, Hash32};
 
 use super::context::RunContext;
 use super::error::EncodeError;
-use super::sink::ObjectSink;
 use crate::cells::CellSplit;
 use crate::codebook::ScoreMetricContext;
 use crate::lift::published::extra_field;
@@ -18,6 +15,7 @@ use crate::lift::{CellField, PartContributions, RegionTable};
 use crate::objects::SceneObjects;
 use crate::occupancy::SceneOccupancy;
 use crate::shard::{self, BuiltShard, CellEmbeddings, CellExtras, ShardSettings};
+use crate::store::Store;
 
 /// What all views together say about every cell.
 #[derive(Clone, Copy)]
@@ -38,7 +36,7 @@ pub(crate) struct CellMaker<'a> {
     pub(crate) settings: &'a ShardSettings,
     pub(crate) encoder_id: Hash32,
     pub(crate) merged: Merged<'a>,
-    pub(crate) sink: &'a dyn ObjectSink,
+    pub(crate) store: &'a Store,
     pub(crate) context: &'a RunContext<'a>,
 }
 
@@ -66,7 +64,7 @@ impl CellInWork {
 }
 
 /// A cell whose shards are kept.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug)]
 pub(crate) struct FinishedCell {
     pub(crate) record: CellRecord,
     /// As of the cell in work.
@@ -101,7 +99,7 @@ impl CellMaker<'_> {
             CellField::new(gaussians[part.locals.clone()].to_vec(), contributions, self.merged.table, vectors)
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
-        let (hash, _) = self.context.time("write", || self.sink.put(&mut |out| field.write(out)))?;
+        let (hash, _) = self.context.time("write", || self.store.put_object(|out| field.write(out)))?;
         fields.push((extra_field(part.cell_id, part.number), hash));
         Ok(())
     }
@@ -127,7 +125,7 @@ impl CellMaker<'_> {
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
             let (hash, len_bytes) =
-                self.context.time("write", || self.sink.put(&mut |out| out.write_all(&shard.bytes)))?;
+                self.context.time("write", || self.store.put_bytes(&shard.bytes))?;
             let record = ShardRecord {
                 hash,
                 len_bytes,

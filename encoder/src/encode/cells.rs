@@ -11,7 +11,8 @@ use slag_common::{Hash32, View};
 use super::cell::{FinishedCell, Merged};
 use super::context::{Phase, RunContext};
 use super::error::EncodeError;
-use super::executor::{CellsToBuild, Executor};
+use super::executor::CellsToBuild;
+use super::here;
 use super::plan::Plan;
 use super::report::ViewsReport;
 use super::sink::ViewRecord;
@@ -81,7 +82,6 @@ pub(super) fn build_cells(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
     occupancy: Option<SceneOccupancy>,
-    executor: &dyn Executor,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
     let mut builder = context.install(|| {
@@ -89,7 +89,7 @@ pub(super) fn build_cells(
         CellBuilder::open(plan, views, bank, occupancy, context)
     })?;
     context.progress().begin("cells", "cell", plan.inputs.split.cells.len() as u64, 0);
-    let built = builder.build(views, executor)?;
+    let built = builder.build(views)?;
     context.progress().end();
     built.ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })
 }
@@ -241,11 +241,7 @@ impl<'a> CellBuilder<'a> {
     ///
     /// # Errors
     /// [`EncodeError`].
-    fn build(
-        &mut self,
-        views: &DoneViews<'_>,
-        executor: &dyn Executor,
-    ) -> Result<Option<BuiltCells>, EncodeError> {
+    fn build(&mut self, views: &DoneViews<'_>) -> Result<Option<BuiltCells>, EncodeError> {
         let Plan { inputs, store, settings, .. } = *self.plan;
         let mut n_entries = vec![0; inputs.split.cells.len()];
         self.index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
@@ -299,7 +295,6 @@ impl<'a> CellBuilder<'a> {
         let photo_poses = has_poses.then(|| shard::photo_poses(&inputs.split, &views.used));
         let cells = CellsToBuild {
             plan: self.plan,
-            views: &views.used,
             index: &self.index,
             merged: Merged {
                 table: &self.table,
@@ -313,7 +308,7 @@ impl<'a> CellBuilder<'a> {
             group_bytes: self.cells_bytes,
             n_at_once: self.n_at_once,
         };
-        let Some(finished) = executor.build_cells(&cells, self.context)? else { return Ok(None) };
+        let Some(finished) = here::build_cells(&cells, self.context)? else { return Ok(None) };
         finished.into_iter().for_each(|cell| built.add(cell));
         built.objects = objects.map(|objects| objects.report);
         Ok(Some(built))

@@ -109,12 +109,6 @@ pub enum EncodeError {
         /// Views that it finished.
         n_done: usize,
     },
-    /// No views are kept from which a generation could be made again.
-    #[error("{}: no views of this scene and these settings are kept; encode again, with --keep-views if a later repair should need no photos", path.display())]
-    NotKept {
-        /// The store.
-        path: PathBuf,
-    },
     /// Photos are missing, and `strict` is set.
     #[error("{n_missing} of {n_views} photos are missing, the first is {}; give their folder with --images", first.display())]
     MissingImages {

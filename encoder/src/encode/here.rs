@@ -1,4 +1,4 @@
-//! Does the views and cells of an encode on this machine.
+//! Does the views of an encode on this machine, and the cells.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -64,14 +64,6 @@ impl Executor for Here {
         let skipped = skipped.into_inner().unwrap_or_else(PoisonError::into_inner);
         Ok(ViewsRun { stages: reports, skipped, images_on: stages.images_on() })
     }
-
-    fn build_cells(
-        &self,
-        cells: &CellsToBuild<'_>,
-        context: &RunContext<'_>,
-    ) -> Result<Option<Vec<FinishedCell>>, EncodeError> {
-        build_cells(cells, context)
-    }
 }
 
 /// Takes views through their stages: each with whether it has a thread of its own. `on_bad_view` is told of an error
@@ -124,7 +116,7 @@ impl Budget {
 ///
 /// # Errors
 /// [`EncodeError`]: of the first cell that failed.
-fn build_cells(
+pub(super) fn build_cells(
     cells: &CellsToBuild<'_>,
     context: &RunContext<'_>,
 ) -> Result<Option<Vec<FinishedCell>>, EncodeError> {
@@ -136,7 +128,7 @@ fn build_cells(
         settings: &plan.settings.cells.shards,
         encoder_id: cells.encoder_id,
         merged,
-        sink: plan.store,
+        store: plan.store,
         context,
     };
     let dim = merged.table.dim();

@@ -8,7 +8,7 @@
 //! | build cells | objects, fields and shards in the store | `cells.rs`, `cell.rs` |
 //! | publish | the manifest and its metadata, the summary | `publish.rs` |
 //!
-//! Views and cells are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet.
+//! Views are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet.
 //!
 //! Views are independent: a killed encode resumes after the last finished view, if it is the same encode
 //! (`identity.rs`). The later steps read the contributions in the order of the views' names, so the store's bytes do
@@ -65,14 +65,13 @@ pub use settings::{
 /// The parts of which a fleet makes its own encode.
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet_parts {
-    pub(crate) use super::cell::{CellInWork, CellMaker, FinishedCell, Merged};
     pub(crate) use super::context::RunContext;
-    pub(crate) use super::executor::{CellsToBuild, Executor, ViewsRun};
+    pub(crate) use super::executor::{Executor, ViewsRun};
     pub(crate) use super::here::work_off;
     pub(crate) use super::identity::of_scene;
     pub(crate) use super::inputs::reserve_photos;
     pub(crate) use super::plan::{Plan, segmenter_of};
-    pub(crate) use super::sink::{ObjectSink, PhotoSource, ViewRecord, ViewSink, WriteObject};
+    pub(crate) use super::sink::{PhotoSource, ViewRecord, ViewSink};
     pub(crate) use super::view::{ViewStages, ViewTools};
 }
 
@@ -89,7 +88,7 @@ pub fn encode(
     encode_by(&here::Here, settings, engines, progress, cancel)
 }
 
-/// Encodes a scene as [`encode`] does. `executor` does the views and cells.
+/// Encodes a scene as [`encode`] does. `executor` does the views.
 ///
 /// # Errors
 /// As of [`encode`].
@@ -113,33 +112,8 @@ pub(crate) fn encode_by(
     let occupancy = views::look_around(&plan, &views, &context)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
-    let built = cells::build_cells(&plan, &views, occupancy, executor, &context)?;
+    let built = cells::build_cells(&plan, &views, occupancy, &context)?;
     context.begin_phase(Phase::Publish);
     plan.job.begin("publish")?;
     publish::publish(plan, views, built, executor, &context)
-}
-
-/// Makes the objects of a generation again from the views that an encode kept, and puts those that are missing or damaged
-/// back into the store. Publishes nothing: what is made again has the hashes that the manifest lists.
-///
-/// # Errors
-/// [`EncodeError`]; [`EncodeError::NotKept`] where no views of this scene and these settings are kept.
-pub fn remake(
-    settings: &EncodeSettings,
-    engines: &Engines<'_>,
-    progress: &dyn Progress,
-    cancel: &AtomicBool,
-) -> Result<(), EncodeError> {
-    settings.validate()?;
-    let context = RunContext::new(settings.run.threads, progress, cancel)?;
-    let store = Store::create_or_open(&settings.output.store)?;
-    let inputs = inputs::Inputs::read(settings, &context)?;
-    let plan = plan::plan_of_kept(settings, engines, &store, &inputs, &context)?;
-    let views = views::kept_views(&plan)?;
-    let occupancy = views::look_around(&plan, &views, &context)?;
-    cells::build_cells(&plan, &views, occupancy, &here::Here, &context)?;
-    if settings.output.text_model {
-        text_model::carry(&store, engines.models)?;
-    }
-    Ok(())
 }

@@ -78,31 +78,6 @@ pub(super) fn plan<'a>(
     inputs: &'a Inputs,
     context: &RunContext<'_>,
 ) -> Result<Plan<'a>, EncodeError> {
-    make_plan(settings, engines, store, inputs, context, false)
-}
-
-/// As [`plan`], for views that are kept: refuses where there are none, and drops nothing.
-///
-/// # Errors
-/// [`EncodeError`].
-pub(super) fn plan_of_kept<'a>(
-    settings: &'a EncodeSettings,
-    engines: &'a Engines<'a>,
-    store: &'a Store,
-    inputs: &'a Inputs,
-    context: &RunContext<'_>,
-) -> Result<Plan<'a>, EncodeError> {
-    make_plan(settings, engines, store, inputs, context, true)
-}
-
-fn make_plan<'a>(
-    settings: &'a EncodeSettings,
-    engines: &'a Engines<'a>,
-    store: &'a Store,
-    inputs: &'a Inputs,
-    context: &RunContext<'_>,
-    only_kept: bool,
-) -> Result<Plan<'a>, EncodeError> {
     let mut memory = memory_plan(settings, inputs, engines.models.dim());
     if let (false, Some(preprocess)) = (engines.session.is_on_cpu(), engines.models.preprocess()) {
         // A byte a channel, and one for the mask.
@@ -119,9 +94,6 @@ fn make_plan<'a>(
         context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))
     })?;
     let id_of_view = inputs.views.iter().map(|view| view.name.clone()).zip(ids.of_view).collect();
-    if only_kept && !Job::is_kept(store, ids.of_scene)? {
-        return Err(EncodeError::NotKept { path: store.dir().to_owned() });
-    }
     let lost_views = lost_views(store, ids.of_scene, &ids.inputs, inputs, context)?;
     let job = Job::open(store, ids.of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
@@ -129,16 +101,12 @@ fn make_plan<'a>(
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
-    // Only an encode plans and reports its peak; what kept views give again needs no view drawn for it.
-    let mut planned_peak = None;
-    if !only_kept {
-        let views: Vec<&View> = order.iter().map(|i| &inputs.views[*i]).collect();
-        let of_models = (engines.models.image_bytes(), engines.models.dim());
-        let of_scene = (scene.as_ref(), &views[..]);
-        context.install(|| expected::reserve(&mut memory, settings, inputs, of_scene, of_models));
-        memory::give_back();
-        planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
-    }
+    let views: Vec<&View> = order.iter().map(|i| &inputs.views[*i]).collect();
+    let of_models = (engines.models.image_bytes(), engines.models.dim());
+    let of_scene = (scene.as_ref(), &views[..]);
+    context.install(|| expected::reserve(&mut memory, settings, inputs, of_scene, of_models));
+    memory::give_back();
+    let planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
     if let Some(PlannedPeak { len_bytes, phase }) = planned_peak {
         tracing::info!("at most about {} MB of memory, in {phase:?}", len_bytes / 1_000_000);
     }

@@ -1,14 +1,11 @@
-//! What comes in and goes out where an encode is spread over machines: photos, contributions, objects.
-
-use std::io::{self, Write};
+//! What comes in and goes out where an encode is spread over machines: photos and contributions.
 
 use serde::{Deserialize, Serialize};
-use slag_common::{Hash32, View};
+use slag_common::View;
 
 use super::error::EncodeError;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
-use crate::store::Store;
 
 /// The record of a finished view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -24,11 +21,11 @@ pub(crate) trait PhotoSource: Sync {
     /// Returns the number of views that it brings at once.
     fn n_at_once(&self) -> usize;
 
-    /// Brings the files of a view to where the view says.
+    /// Brings the files of a view to where the view says; returns whether the view is still to be done.
     ///
     /// # Errors
     /// [`EncodeError`].
-    fn fetch(&self, view: &View) -> Result<(), EncodeError>;
+    fn fetch(&self, view: &View) -> Result<bool, EncodeError>;
 }
 
 /// Keeps what a view leaves.
@@ -47,22 +44,4 @@ pub(crate) trait ViewSink: Sync {
         outlines: &[MaskOutline],
         record: ViewRecord,
     ) -> Result<(), EncodeError>;
-}
-
-/// Writes the bytes of an object.
-pub(crate) type WriteObject<'a> = &'a mut (dyn FnMut(&mut dyn Write) -> io::Result<()> + Send);
-
-/// Keeps objects by the hash of their content.
-pub(crate) trait ObjectSink: Sync {
-    /// Keeps an object and returns its hash and length; on return it survives a power cut.
-    ///
-    /// # Errors
-    /// [`EncodeError`].
-    fn put(&self, write: WriteObject<'_>) -> Result<(Hash32, u64), EncodeError>;
-}
-
-impl ObjectSink for Store {
-    fn put(&self, write: WriteObject<'_>) -> Result<(Hash32, u64), EncodeError> {
-        Ok(self.put_object(write)?)
-    }
 }

@@ -189,8 +189,10 @@ impl<'a> ViewStages<'a> {
         let raster_failed = |source: RasterError| EncodeError::Raster { view: view.name.clone(), source };
         let next = match work.next {
             Next::Fetch => {
-                if let Some(photos) = self.tools.photos {
-                    photos.fetch(view)?;
+                if let Some(photos) = self.tools.photos
+                    && !photos.fetch(view)?
+                {
+                    return Ok(None);
                 }
                 Next::Decode
             }

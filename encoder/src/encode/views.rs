@@ -71,32 +71,6 @@ pub(super) fn run_views<'a>(
     Ok(DoneViews { used, records, skipped, n_failed, n_resumed, coverage, stages, secs, images_on })
 }
 
-/// Returns the views whose contributions are kept, without taking any further.
-///
-/// # Errors
-/// [`EncodeError`].
-pub(super) fn kept_views<'a>(plan: &Plan<'a>) -> Result<DoneViews<'a>, EncodeError> {
-    let views = &plan.inputs.views;
-    let records = plan.job.done_views()?;
-    let mut used: Vec<usize> = plan.order.clone();
-    used.retain(|view| records.contains_key(&views[*view].name));
-    used.sort_unstable();
-    if used.is_empty() {
-        return Err(EncodeError::NotKept { path: plan.settings.output.store.clone() });
-    }
-    Ok(DoneViews {
-        n_resumed: used.len(),
-        used: used.into_iter().map(|view| &views[view]).collect(),
-        records,
-        skipped: Vec::new(),
-        n_failed: 0,
-        coverage: None,
-        stages: Vec::new(),
-        secs: 0.0,
-        images_on: None,
-    })
-}
-
 /// Finds the free and occupied places that the used views show; `None` if the settings do not ask for them.
 ///
 /// # Errors

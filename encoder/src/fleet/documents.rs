@@ -9,10 +9,9 @@ use super::error::FleetError;
 use crate::blobs::Bucket;
 use crate::cells::CellLimits;
 use crate::encode::ViewSettings;
-use crate::shard::ShardSettings;
 
 /// Version of the documents and objects.
-const FORMAT: u32 = 3;
+const FORMAT: u32 = 4;
 
 /// Returns the version of this program, as documents state it.
 pub(super) fn own_version() -> String {
@@ -64,29 +63,6 @@ pub(super) struct RunPlan {
     pub(super) views: Vec<PlannedView>,
 }
 
-/// A view's object, as cells read it.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub(super) struct MergedView {
-    pub(super) id: Hash32,
-    pub(super) name: String,
-    /// Where the contributions begin in the object.
-    pub(super) contributions_at_bytes: u64,
-}
-
-/// `jobs/N/cells.json`.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub(super) struct CellsPlan {
-    /// Hash of everything on which the cells depend.
-    pub(super) id: Hash32,
-    pub(super) merged: Hash32,
-    pub(super) encoder_id: Hash32,
-    pub(super) settings: ShardSettings,
-    /// The views, in the order of the index of contributions.
-    pub(super) views: Vec<MergedView>,
-    /// All cells, costly ones first.
-    pub(super) order: Vec<u32>,
-}
-
 /// `jobs/N/failed/VIEW.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct FailedView {
@@ -109,22 +85,6 @@ pub(super) fn input_key(hash: Hash32) -> String {
 
 pub(super) fn view_key(id: Hash32) -> String {
     format!("views/{id}")
-}
-
-pub(super) fn object_key(hash: Hash32) -> String {
-    format!("objects/{hash}")
-}
-
-pub(super) fn merged_key(hash: Hash32) -> String {
-    format!("merged/{hash}")
-}
-
-pub(super) fn cells_folder(id: Hash32) -> String {
-    format!("cells/{id}")
-}
-
-pub(super) fn cell_key(id: Hash32, cell: u32) -> String {
-    format!("{}/{cell:06}.json", cells_folder(id))
 }
 
 /// Reads a document.

@@ -27,7 +27,7 @@ pub enum FleetError {
     /// The queue.
     #[error(transparent)]
     Queue(#[from] QueueError),
-    /// A view or cell cannot be done on this machine.
+    /// A view cannot be done on this machine.
     #[error(transparent)]
     Encode(#[from] EncodeError),
     /// A file of this machine.
@@ -59,12 +59,12 @@ pub enum FleetError {
     },
     /// The coordinator has died, or cannot reach the bucket.
     #[error(
-        "run {run}: its coordinator has shown no sign of life for {secs} s. What is done lies in {url}: start the same encode again, then its workers"
+        "run {run}: its coordinator has shown no heartbeat for {secs} s. What is done lies in {url}: start the same encode again, then its workers"
     )]
     Abandoned {
         /// Number of the run.
         run: u64,
-        /// Time without a sign.
+        /// Time without a heartbeat.
         secs: u64,
         /// The bucket.
         url: String,
@@ -92,14 +92,6 @@ pub enum FleetError {
     /// The memory of the worker.
     #[error(transparent)]
     Memory(#[from] crate::memory::MemoryError),
-    /// A cell ended several workers.
-    #[error("cell {cell}: {reason}")]
-    Cell {
-        /// The cell.
-        cell: u32,
-        /// Why.
-        reason: String,
-    },
     /// A view failed, and `strict` is set.
     #[error("view {view}: {reason}")]
     View {

@@ -10,15 +10,12 @@ use slag_common::{Hash32, View};
 
 use super::documents::{self, InputFile, PlannedView, RunPlan};
 use super::error::FleetError;
-use super::scene_object;
+use super::objects;
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{PhotoSource, Plan, RunContext};
-use crate::encode::{EncodeError, Masks};
+use crate::encode::fleet_parts::{Plan, RunContext};
+use crate::encode::Masks;
 use crate::ingest;
 use crate::segment;
-
-/// Views whose photos a worker brings at once: one while another is decoded.
-const N_AT_ONCE: usize = 2;
 
 /// Uploads the scene and the files of the views to do, and returns the plan of a run. `open`: their numbers.
 ///
@@ -40,7 +37,7 @@ pub(super) fn upload(
         }
         Ok((file, len))
     };
-    let scene = scene_object::pack(&plan.inputs.scene)?;
+    let scene = objects::pack_scene(&plan.inputs.scene)?;
     let scene_hash = Hash32::of(&scene);
     if !there.contains(&scene_hash.to_string()) {
         bucket.put_new(&documents::input_key(scene_hash), scene)?;
@@ -150,14 +147,12 @@ impl ViewFiles {
             let _ = std::fs::remove_file(path);
         }
     }
-}
 
-impl PhotoSource for ViewFiles {
-    fn n_at_once(&self) -> usize {
-        N_AT_ONCE
-    }
-
-    fn fetch(&self, view: &View) -> Result<(), EncodeError> {
+    /// Brings the photo and masks of a view to where the view says.
+    ///
+    /// # Errors
+    /// [`FleetError`].
+    pub(super) fn fetch(&self, view: &View) -> Result<(), FleetError> {
         let Some(planned) = self.planned(view) else { return Ok(()) };
         let mut files = vec![(&planned.photo, self.photo_path(planned))];
         files.extend(planned.masks.as_ref().zip(self.mask_path(planned)));

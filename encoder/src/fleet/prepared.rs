@@ -10,15 +10,14 @@ use super::documents::{self, RunPlan};
 use super::error::FleetError;
 use super::inputs::{ViewFiles, engines_text, fetch_file, fetch_input};
 use super::run::Run;
-use super::scene_object;
+use super::objects;
 use crate::blobs::Bucket;
 use crate::cells::{self, CellSplit};
-use crate::encode::fleet_parts::{RunContext, of_scene};
+use crate::encode::fleet_parts::{RunContext, of_scene, reserve_photos};
 use crate::encode::{EncodeError, Engines, Masks, ViewSettings};
-use crate::memory::MemoryPlan;
+use crate::memory::{MemoryPlan, Phase};
 use crate::raster::project::Prepared as PreparedScene;
 use crate::segment::Segmenter;
-use crate::{encode::fleet_parts::reserve_photos, shard};
 
 /// A run on a worker.
 pub(super) struct Prepared {
@@ -47,7 +46,7 @@ impl Prepared {
     ) -> Result<Self, FleetError> {
         let bytes = fetch_input(bucket, plan.scene)?;
         let key = documents::input_key(plan.scene);
-        let scene = scene_object::unpack(&bytes).map_err(|e| FleetError::damaged(bucket, &key, e))?;
+        let scene = objects::unpack_scene(&bytes).map_err(|e| FleetError::damaged(bucket, &key, e))?;
         drop(bytes);
         let split = context.install(|| cells::split(&scene, plan.limits));
         let files = ViewFiles::new(Arc::clone(bucket), folder, plan.views.clone());
@@ -97,33 +96,22 @@ impl Prepared {
         }
     }
 
-    /// Returns the number of Gaussians of each cell.
-    pub(super) fn n_gaussians_of_cell(&self) -> Vec<usize> {
-        self.split.cells.iter().map(|cell| cell.gaussians.len()).collect()
-    }
-
-    /// Reserves what the worker holds for scene, views and a cell, and checks that it fits.
+    /// Checks that what the worker holds for scene and views fits into its memory.
     ///
     /// # Errors
     /// [`FleetError::Memory`].
-    pub(super) fn memory(
-        &self,
-        memory_bytes: u64,
-        n_threads: usize,
-        dim: usize,
-    ) -> Result<MemoryPlan, FleetError> {
+    pub(super) fn check_memory(&self, memory_bytes: u64, n_threads: usize) -> Result<(), FleetError> {
         let mut memory = MemoryPlan::new(memory_bytes);
-        memory.reserve(crate::memory::Phase::Always, "the scene", self.scene.len_bytes());
+        memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());
         CellSplit::reserve(&mut memory, self.scene.len());
         PreparedScene::reserve(&mut memory, self.scene.len());
         reserve_photos(&mut memory, &self.views, n_threads);
-        shard::reserve(&mut memory, &self.split, dim);
         memory.rest(0)?;
-        Ok(memory)
+        Ok(())
     }
 }
 
-/// Returns the error of a view or cell as the fleet's.
+/// Returns the error of a view as the fleet's.
 pub(super) fn of_encode(error: EncodeError) -> FleetError {
     match error {
         EncodeError::Fleet(inner) => match inner.downcast::<FleetError>() {

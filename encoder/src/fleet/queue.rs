@@ -18,7 +18,7 @@ use futures_util::StreamExt;
 use slag_common::Hash32;
 use tokio::runtime::Runtime;
 
-use super::dispatch::{Dispatcher, Item, Kind, OpenItems};
+use super::dispatch::{Dispatcher, OpenViews};
 use super::error::{FleetError, QueueError};
 use super::run::Run;
 
@@ -44,7 +44,7 @@ pub struct QueueSettings {
     pub ca: Option<PathBuf>,
     /// Time after which work of which nothing is heard goes to another worker.
     pub ack_wait: Duration,
-    /// How often an item is handed out before it is given up.
+    /// How often a view is handed out before it is given up.
     pub max_deliver: u32,
 }
 
@@ -83,9 +83,8 @@ pub(super) struct Enqueuer {
     settings: QueueSettings,
     stream: String,
     last_look: Option<Instant>,
-    /// The kind of items that it was filled with.
-    filled: Option<Kind>,
-    /// Whether the last look found an empty queue although items were open.
+    is_filled: bool,
+    /// Whether the last look found an empty queue although views were open.
     was_empty: bool,
 }
 
@@ -107,18 +106,17 @@ impl Enqueuer {
             settings: settings.clone(),
             stream: stream_name(run, of_scene),
             last_look: None,
-            filled: None,
+            is_filled: false,
             was_empty: false,
         })
     }
 
-    /// Fills the queue with the items that are not done where the stream is gone, was never filled, or has lost them.
+    /// Fills the queue with the views that are not done where the stream is gone, was never filled, or has lost them.
     ///
     /// A server that refuses or does not answer is asked again later.
-    pub(super) fn keep_filled(&mut self, open: &[Item]) {
+    pub(super) fn keep_filled(&mut self, open: &[usize]) {
         let is_due = self.last_look.is_none_or(|last| last.elapsed() >= LOOK_INTERVAL);
-        let is_new = open.first().is_some_and(|item| Some(item.kind()) != self.filled);
-        if !(is_due || is_new) || open.is_empty() {
+        if !is_due || open.is_empty() {
             return;
         }
         let runtime = Arc::clone(&self.runtime);
@@ -128,11 +126,10 @@ impl Enqueuer {
         self.last_look = Some(Instant::now());
     }
 
-    async fn look(&mut self, open: &[Item]) -> Result<(), String> {
-        let kind = open.first().map(|item| item.kind());
-        if self.filled == kind {
+    async fn look(&mut self, open: &[usize]) -> Result<(), String> {
+        if self.is_filled {
             match self.n_left().await {
-                Some(0) if self.was_empty => tracing::warn!("the queue has lost {} items", open.len()),
+                Some(0) if self.was_empty => tracing::warn!("the queue has lost {} views", open.len()),
                 // A worker may have taken the last one to the bucket since the bucket was listed.
                 Some(0) => {
                     self.was_empty = true;
@@ -146,11 +143,11 @@ impl Enqueuer {
             }
         }
         self.fill(open).await?;
-        (self.was_empty, self.filled) = (false, kind);
+        (self.was_empty, self.is_filled) = (false, true);
         Ok(())
     }
 
-    /// Returns the number of items that are waiting or at work; `None` if there is no queue.
+    /// Returns the number of views that are waiting or at work; `None` if there is no queue.
     async fn n_left(&self) -> Option<u64> {
         let stream = self.context.get_stream(&self.stream).await.ok()?;
         let mut consumer: PullConsumer = stream.get_consumer(CONSUMER).await.ok()?;
@@ -158,7 +155,7 @@ impl Enqueuer {
         Some(info.num_pending + info.num_ack_pending as u64)
     }
 
-    async fn fill(&self, open: &[Item]) -> Result<(), String> {
+    async fn fill(&self, open: &[usize]) -> Result<(), String> {
         let config = stream::Config {
             name: self.stream.clone(),
             subjects: vec![format!("slag.{}.>", self.stream)],
@@ -166,7 +163,7 @@ impl Enqueuer {
             ..stream::Config::default()
         };
         let stream = self.context.get_or_create_stream(config).await.map_err(|e| e.to_string())?;
-        // Workers give an item up, so that its end is recorded in the bucket.
+        // Workers give a view up, so that its end is recorded in the bucket.
         let consumer = pull::Config {
             durable_name: Some(CONSUMER.into()),
             ack_policy: AckPolicy::Explicit,
@@ -177,8 +174,8 @@ impl Enqueuer {
         };
         stream.get_or_create_consumer(CONSUMER, consumer).await.map_err(|e| e.to_string())?;
         let mut stored = Vec::with_capacity(open.len());
-        for item in open {
-            let body = serde_json::to_vec(item).map_err(|e| e.to_string())?;
+        for view in open {
+            let body = serde_json::to_vec(view).map_err(|e| e.to_string())?;
             let subject = format!("slag.{}.work", self.stream);
             stored.push(self.context.publish(subject, body.into()).await.map_err(|e| e.to_string())?);
         }
@@ -188,10 +185,9 @@ impl Enqueuer {
         Ok(())
     }
 
-    /// Removes the queue of a run that is published; one that stays does no harm.
-    pub(super) fn close(&mut self) {
-        let runtime = Arc::clone(&self.runtime);
-        if let Err(error) = runtime.block_on(self.context.delete_stream(&self.stream)) {
+    /// Removes the queue of a run whose views are done; one that stays does no harm.
+    pub(super) fn close(&self) {
+        if let Err(error) = self.runtime.block_on(self.context.delete_stream(&self.stream)) {
             tracing::warn!("{}: {error}", self.stream);
         }
     }
@@ -203,48 +199,48 @@ pub(super) struct Queue {
     max_deliver: i64,
 }
 
-/// The messages that a worker holds.
+/// What a worker holds of the queue.
 struct Held {
     runtime: tokio::runtime::Handle,
     n_most: usize,
-    state: Mutex<State>,
+    messages: Mutex<Messages>,
     changed: Condvar,
 }
 
 #[derive(Default)]
-struct State {
-    /// Not begun.
-    waiting: VecDeque<Item>,
-    dead: Vec<Item>,
-    messages: HashMap<Item, Arc<Message>>,
+struct Messages {
+    /// Views that are not begun.
+    waiting: VecDeque<usize>,
+    dead: Vec<usize>,
+    of_view: HashMap<usize, Arc<Message>>,
 }
 
 impl Held {
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    fn messages(&self) -> MutexGuard<'_, Messages> {
+        self.messages.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn add(&self, message: Message, max_deliver: i64) {
-        let Ok(item) = serde_json::from_slice::<Item>(&message.payload) else {
+        let Ok(view) = serde_json::from_slice::<usize>(&message.payload) else {
             tracing::warn!("the queue has a message that is no work: it is left to others");
             return;
         };
         let is_dead = message.info().is_ok_and(|info| info.delivered > max_deliver);
-        let mut state = self.state();
-        let is_new = state.messages.insert(item, Arc::new(message)).is_none();
+        let mut messages = self.messages();
+        let is_new = messages.of_view.insert(view, Arc::new(message)).is_none();
         match is_dead {
-            true => state.dead.push(item),
-            // An item that comes again while it is at work here is the same work.
-            false if is_new => state.waiting.push_back(item),
+            true => messages.dead.push(view),
+            // A view that comes again while it is at work here is the same work.
+            false if is_new => messages.waiting.push_back(view),
             false => {}
         }
-        drop(state);
+        drop(messages);
         self.changed.notify_all();
     }
 }
 
 impl Queue {
-    /// Connects, and asks for at most `n_most` items at a time from then on, until it is dropped.
+    /// Connects, and asks for at most `n_most` views at a time from then on, until it is dropped.
     ///
     /// # Errors
     /// [`QueueError::Connect`].
@@ -259,7 +255,7 @@ impl Queue {
         let held = Arc::new(Held {
             runtime: runtime.handle().clone(),
             n_most,
-            state: Mutex::default(),
+            messages: Mutex::default(),
             changed: Condvar::new(),
         });
         let max_deliver = i64::from(settings.max_deliver);
@@ -270,12 +266,12 @@ impl Queue {
     }
 }
 
-/// Asks for work for as long as the worker holds fewer items than it may.
+/// Asks for work for as long as the worker holds fewer views than it may.
 async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliver: i64) {
     let mut consumer: Option<PullConsumer> = None;
     loop {
         let Some(n_free) = held.upgrade().map(|held| {
-            let n_held = held.state().messages.len();
+            let n_held = held.messages().of_view.len();
             held.n_most.saturating_sub(n_held)
         }) else {
             return;
@@ -316,7 +312,7 @@ async fn send_heartbeats(held: Weak<Held>, interval: Duration) {
     loop {
         tokio::time::sleep(interval).await;
         let Some(held) = held.upgrade() else { return };
-        let messages: Vec<Arc<Message>> = held.state().messages.values().cloned().collect();
+        let messages: Vec<Arc<Message>> = held.messages().of_view.values().cloned().collect();
         for message in messages {
             // One that is lost is redelivered, and its work done twice.
             let _ = message.ack_with(AckKind::Progress).await;
@@ -325,36 +321,33 @@ async fn send_heartbeats(held: Weak<Held>, interval: Duration) {
 }
 
 impl Dispatcher for Queue {
-    fn offer(&self, _open: OpenItems<'_>) -> Result<(), FleetError> {
+    fn offer(&self, _open: OpenViews<'_>) -> Result<(), FleetError> {
         Ok(())
     }
 
-    fn take(&self, kind: Kind) -> Option<Item> {
-        self.held.state().waiting.pop_front_if(|item| item.kind() == kind)
+    fn take(&self) -> Option<usize> {
+        self.held.messages().waiting.pop_front()
     }
 
-    fn done(&self, item: Item) {
-        let Some(message) = self.held.state().messages.remove(&item) else { return };
+    fn done(&self, view: usize) {
+        let Some(message) = self.held.messages().of_view.remove(&view) else { return };
         self.held.runtime.spawn(async move {
-            // Where it is lost, the item comes again and is found done.
+            // Where it is lost, the view comes again and is found done.
             let _ = message.double_ack().await;
         });
     }
 
-    fn wait(&self, kind: Kind, pause: Duration) -> bool {
-        let has_some = |state: &State| {
-            state.waiting.front().is_some_and(|item| item.kind() == kind) || !state.dead.is_empty()
-        };
-        let state = self.held.state();
-        let waited = self.held.changed.wait_timeout_while(state, pause, |state| !has_some(state));
-        let (state, _) = waited.unwrap_or_else(PoisonError::into_inner);
-        has_some(&state)
+    fn wait(&self, pause: Duration) -> bool {
+        let is_idle = |messages: &mut Messages| messages.waiting.is_empty() && messages.dead.is_empty();
+        let waited = self.held.changed.wait_timeout_while(self.held.messages(), pause, is_idle);
+        let (mut messages, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        !is_idle(&mut messages)
     }
 
-    fn take_dead(&self) -> Vec<Item> {
-        let dead = std::mem::take(&mut self.held.state().dead);
-        for item in &dead {
-            tracing::warn!("{item:?} was handed out more than {} times; it is given up", self.max_deliver);
+    fn take_dead(&self) -> Vec<usize> {
+        let dead = std::mem::take(&mut self.held.messages().dead);
+        for view in &dead {
+            tracing::warn!("view {view} was handed out more than {} times; it is given up", self.max_deliver);
         }
         dead
     }

@@ -2,24 +2,17 @@
 //! word that it publishes, or by that of the next run's coordinator. Both put the same object on condition that it is
 //! not there, so one put decides whether a run is published.
 
-use super::documents::{self, CellsPlan, End, PlannedBy, RunPlan};
+use super::documents::{self, End, PlannedBy, RunPlan};
 use super::error::FleetError;
 use crate::blobs::Bucket;
+
+/// Objects of a run: how it ended; all its views are done.
+const END: &str = "end.json";
+const DONE: &str = "done";
 
 /// A run of an encode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Run(pub(super) u64);
-
-/// What became of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum State {
-    /// Views are to be done.
-    Views,
-    /// Cells are to be done.
-    Cells,
-    /// Published or superseded.
-    Ended,
-}
 
 impl Run {
     fn folder(self) -> String {
@@ -39,18 +32,20 @@ impl Run {
         format!("{}/{view:06}.json", self.failed_folder())
     }
 
-    /// Returns the key of the coordinator's sign of life.
-    pub(super) fn pulse_key(self) -> String {
-        self.key("pulse")
+    pub(super) fn heartbeat_key(self) -> String {
+        self.key("heartbeat")
     }
 
-    /// Returns the newest run, and whether it has ended.
-    fn newest(bucket: &Bucket) -> Result<Option<(Self, bool)>, FleetError> {
+    /// Returns the newest run, and the names of all objects of runs.
+    fn newest(bucket: &Bucket) -> Result<Option<(Self, Vec<String>)>, FleetError> {
         let names = bucket.list("jobs")?;
         let number = |name: &String| name.strip_suffix("/plan.json")?.parse().ok();
         let newest = names.iter().filter_map(number).max().map(Self);
-        let ended = |run: Self| names.iter().any(|name| *name == format!("{:08}/end.json", run.0));
-        Ok(newest.map(|run| (run, ended(run))))
+        Ok(newest.map(|run| (run, names)))
+    }
+
+    fn has(self, names: &[String], name: &str) -> bool {
+        names.contains(&format!("{:08}/{name}", self.0))
     }
 
     /// Begins the next run; one that has not ended is superseded.
@@ -59,25 +54,30 @@ impl Run {
     /// [`FleetError::Superseded`] if another coordinator begins one at the same moment.
     pub(super) fn begin(bucket: &Bucket, plan: &RunPlan) -> Result<Self, FleetError> {
         let newest = Self::newest(bucket)?;
-        if let Some((run, false)) = newest {
+        if let Some((run, names)) = &newest
+            && !run.has(names, END)
+        {
             let end = documents::to_bytes(&End::Superseded)?;
-            if bucket.put_new(&run.key("end.json"), end)? {
+            if bucket.put_new(&run.key(END), end)? {
                 tracing::info!("run {} had not ended; this one takes its place", run.0);
             }
         }
         let next = Self(newest.map_or(1, |(run, _)| run.0 + 1));
         match bucket.claim(&next.key("plan.json"), documents::to_bytes(plan)?)? {
             true => Ok(next),
-            false => Err(FleetError::Superseded { run: next.0, url: bucket.url().to_owned() }),
+            false => Err(next.superseded(bucket)),
         }
     }
 
-    /// Returns the newest run and its plan, unless it has ended.
+    /// Returns the newest run and its plan, unless its views are done or it has ended.
     ///
     /// # Errors
     /// [`FleetError::Version`] if another version of the program planned it.
     pub(super) fn open(bucket: &Bucket) -> Result<Option<(Self, RunPlan)>, FleetError> {
-        let Some((run, false)) = Self::newest(bucket)? else { return Ok(None) };
+        let Some((run, names)) = Self::newest(bucket)? else { return Ok(None) };
+        if [DONE, END].iter().any(|name| run.has(&names, name)) {
+            return Ok(None);
+        }
         let key = run.key("plan.json");
         let bytes = bucket.require(&key)?;
         let PlannedBy { program: planned } = documents::parse(bucket, &key, &bytes)?;
@@ -88,18 +88,24 @@ impl Run {
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }
 
-    /// Returns what is to be done.
+    /// Returns whether workers have views to do.
     ///
     /// # Errors
     /// [`FleetError::Blob`].
-    pub(super) fn state(self, bucket: &Bucket) -> Result<State, FleetError> {
-        if bucket.len_of(&self.key("end.json"))?.is_some() {
-            return Ok(State::Ended);
-        }
-        Ok(match bucket.len_of(&self.key("cells.json"))? {
-            Some(_) => State::Cells,
-            None => State::Views,
-        })
+    pub(super) fn is_open(self, bucket: &Bucket) -> Result<bool, FleetError> {
+        Ok(!self.has_ended(bucket)? && bucket.len_of(&self.key(DONE))?.is_none())
+    }
+
+    fn has_ended(self, bucket: &Bucket) -> Result<bool, FleetError> {
+        Ok(bucket.len_of(&self.key(END))?.is_some())
+    }
+
+    /// Lets workers go: all views are in the bucket, or have failed.
+    ///
+    /// # Errors
+    /// [`FleetError::Blob`].
+    pub(super) fn views_are_done(self, bucket: &Bucket) -> Result<(), FleetError> {
+        Ok(bucket.put(&self.key(DONE), "")?)
     }
 
     /// Returns whether another coordinator has taken the run's place: its own run follows at once.
@@ -107,7 +113,7 @@ impl Run {
     /// # Errors
     /// [`FleetError::Blob`]; a document that is none.
     pub(super) fn is_superseded(self, bucket: &Bucket) -> Result<bool, FleetError> {
-        let key = self.key("end.json");
+        let key = self.key(END);
         let Some(bytes) = bucket.get(&key)? else { return Ok(false) };
         Ok(documents::parse::<End>(bucket, &key, &bytes)? == End::Superseded)
     }
@@ -117,9 +123,9 @@ impl Run {
     /// # Errors
     /// [`FleetError::Superseded`].
     pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
-        match self.state(bucket)? {
-            State::Ended => Err(FleetError::Superseded { run: self.0, url: bucket.url().to_owned() }),
-            State::Views | State::Cells => Ok(()),
+        match self.has_ended(bucket)? {
+            true => Err(self.superseded(bucket)),
+            false => Ok(()),
         }
     }
 
@@ -129,27 +135,14 @@ impl Run {
     /// [`FleetError::Superseded`] if another coordinator was first.
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
         // Only the run's own coordinator puts this.
-        match bucket.claim(&self.key("end.json"), documents::to_bytes(&End::Published)?)? {
+        match bucket.claim(&self.key(END), documents::to_bytes(&End::Published)?)? {
             true => Ok(()),
-            false => Err(FleetError::Superseded { run: self.0, url: bucket.url().to_owned() }),
+            false => Err(self.superseded(bucket)),
         }
     }
 
-    /// Lets workers begin with the cells.
-    ///
-    /// # Errors
-    /// [`FleetError::Blob`].
-    pub(super) fn begin_cells(self, bucket: &Bucket, plan: &CellsPlan) -> Result<(), FleetError> {
-        Ok(bucket.put(&self.key("cells.json"), documents::to_bytes(plan)?)?)
-    }
-
-    /// Returns the plan of the cells, which must have begun.
-    ///
-    /// # Errors
-    /// [`FleetError`].
-    pub(super) fn cells(self, bucket: &Bucket) -> Result<CellsPlan, FleetError> {
-        let key = self.key("cells.json");
-        documents::parse(bucket, &key, &bucket.require(&key)?)
+    fn superseded(self, bucket: &Bucket) -> FleetError {
+        FleetError::Superseded { run: self.0, url: bucket.url().to_owned() }
     }
 }
 
@@ -185,10 +178,14 @@ mod tests {
         assert!(Run::open(&bucket).expect("reads").is_none());
         let first = Run::begin(&bucket, &plan()).expect("begins");
         assert_eq!(Run::open(&bucket).expect("reads").map(|(run, _)| run), Some(first));
-        assert_eq!(first.state(&bucket).expect("reads"), State::Views);
+        assert!(first.is_open(&bucket).expect("reads"));
         let second = Run::begin(&bucket, &plan()).expect("begins");
         first.check(&bucket).expect_err("superseded");
         assert!(matches!(first.publish(&bucket), Err(FleetError::Superseded { run: 1, .. })));
+        assert!(second.is_open(&bucket).expect("reads") && !first.is_open(&bucket).expect("reads"));
+        second.views_are_done(&bucket).expect("puts");
+        assert!(Run::open(&bucket).expect("reads").is_none(), "workers have nothing to do");
+        second.check(&bucket).expect("it is still the newest");
         second.publish(&bucket).expect("publishes");
         assert!(Run::open(&bucket).expect("reads").is_none());
         assert_eq!(Run::begin(&bucket, &plan()).expect("begins"), Run(3));

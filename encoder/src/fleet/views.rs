@@ -1,29 +1,30 @@
 //! Views on a worker: through the pipeline, with the bucket at both ends.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use slag_common::View;
 
-use super::dispatch::{Dispatcher, Item, Kind};
+use super::dispatch::Dispatcher;
 use super::documents::{self, FailedView};
 use super::error::FleetError;
+use super::objects;
 use super::prepared::{Prepared, of_encode};
-use super::view_object;
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{RunContext, ViewRecord, ViewSink, ViewStages, ViewTools, work_off};
+use crate::encode::fleet_parts::{
+    PhotoSource, RunContext, ViewRecord, ViewSink, ViewStages, ViewTools, work_off,
+};
 use crate::encode::{EncodeError, Engines};
 use crate::lift::ViewContributions;
 use crate::lift::photos::{MaskOutline, outlines_to_bytes};
 use crate::raster::LoadedScene;
 use crate::segment::Segmenter;
 
-/// Views whose objects are put at once.
-const N_PUTS: usize = 2;
+/// Views whose photos are fetched at once, and views whose objects are put: one while another is decoded or packed.
+const N_AT_ONCE: usize = 2;
 
 /// What views are done with.
 pub(super) struct ViewWork<'a> {
-    pub(super) bucket: &'a Arc<Bucket>,
+    pub(super) bucket: &'a Bucket,
     pub(super) prepared: &'a Prepared,
     pub(super) engines: &'a Engines<'a>,
     pub(super) segmenter: &'a dyn Segmenter,
@@ -50,22 +51,17 @@ impl ViewWork<'_> {
             segmenter: self.segmenter,
             scene: self.scene,
             split: &prepared.split,
-            photos: Some(&prepared.files),
+            photos: Some(self),
             sink: self,
         };
         let stages = ViewStages::new(tools, context);
+        // Never waits for the bucket: the pipeline asks for views with its lock held.
         let source = std::iter::from_fn(|| {
             while !context.is_cancelled() {
-                match self.dispatcher.take(Kind::View)? {
-                    Item::View(number) if number < prepared.views.len() => {
-                        // Another worker may have done it meanwhile.
-                        let key = documents::view_key(prepared.plan.views[number].id);
-                        match self.bucket.len_of(&key) {
-                            Ok(Some(_)) => self.dispatcher.done(Item::View(number)),
-                            Ok(None) | Err(_) => return Some((true, &prepared.views[number])),
-                        }
-                    }
-                    foreign => self.dispatcher.done(foreign),
+                let number = self.dispatcher.take()?;
+                match prepared.views.get(number) {
+                    Some(view) => return Some((true, view)),
+                    None => self.dispatcher.done(number),
                 }
             }
             None
@@ -88,13 +84,31 @@ impl ViewWork<'_> {
 
     fn finish(&self, view: &View) {
         self.prepared.files.remove(view);
-        self.dispatcher.done(Item::View(self.prepared.number_of[&view.name]));
+        self.dispatcher.done(self.prepared.number_of[&view.name]);
+    }
+}
+
+impl PhotoSource for ViewWork<'_> {
+    fn n_at_once(&self) -> usize {
+        N_AT_ONCE
+    }
+
+    fn fetch(&self, view: &View) -> Result<bool, EncodeError> {
+        let number = self.prepared.number_of[&view.name];
+        // Another worker may have done it meanwhile.
+        let key = documents::view_key(self.prepared.plan.views[number].id);
+        if let Ok(Some(_)) = self.bucket.len_of(&key) {
+            self.dispatcher.done(number);
+            return Ok(false);
+        }
+        self.prepared.files.fetch(view)?;
+        Ok(true)
     }
 }
 
 impl ViewSink for ViewWork<'_> {
     fn n_at_once(&self) -> usize {
-        N_PUTS
+        N_AT_ONCE
     }
 
     fn keep(
@@ -105,7 +119,7 @@ impl ViewSink for ViewWork<'_> {
         record: ViewRecord,
     ) -> Result<(), EncodeError> {
         let contributions = contributions.to_bytes(&view.image_path)?;
-        let bytes = view_object::pack(record, &outlines_to_bytes(outlines)?, &contributions)?;
+        let bytes = objects::pack_view(record, &outlines_to_bytes(outlines)?, &contributions)?;
         let id = self.prepared.plan.views[self.prepared.number_of[&view.name]].id;
         // Where another worker was first, its object has the same content.
         if self.bucket.put_new(&documents::view_key(id), bytes)? {

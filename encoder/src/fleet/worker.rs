@@ -1,4 +1,4 @@
-//! A worker: waits for a run, does views until none is left, then cells, until the run ends.
+//! A worker: waits for a run and does its views until all are done.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -8,26 +8,24 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::cells::CellWork;
-use super::dispatch::{Dispatcher, Item, Kind};
+use super::dispatch::{Dispatcher, Share};
 use super::documents::{self, FailedView, RunPlan};
 use super::error::FleetError;
+use super::heartbeat::HeartbeatWatch;
 use super::prepared::Prepared;
-use super::pulse::Pulse;
 use super::queue::{Queue, QueueSettings};
-use super::run::{Run, State};
+use super::run::Run;
 use super::run_folder::RunFolder;
-use super::share::Share;
 use super::views::ViewWork;
 use crate::blobs::Bucket;
-use crate::encode::Engines;
+use crate::encode::{EncodeError, Engines};
 use crate::encode::fleet_parts::{RunContext, segmenter_of};
 use crate::progress::Progress;
 
 /// Pause between two looks at the state of a run: in a folder, and over a network.
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(1)];
 
-/// Which views and cells a worker takes.
+/// Which views a worker takes.
 #[derive(Clone, Debug)]
 pub enum Dispatch {
     /// Every `of`-th, from `index` on; after `help_after` without work, what others left.
@@ -46,7 +44,6 @@ pub enum Dispatch {
 /// How a worker works.
 #[derive(Clone, Debug)]
 pub struct WorkerSettings {
-    /// Which views and cells it takes.
     pub dispatch: Dispatch,
     /// Threads, and views worked on at a time.
     pub n_threads: usize,
@@ -58,7 +55,7 @@ pub struct WorkerSettings {
     pub folder: PathBuf,
     /// The mask model, where the coordinator uses one.
     pub segmenter: Option<PathBuf>,
-    /// Time to wait for a run to begin, and for a sign of life of its coordinator.
+    /// Time to wait for a run to begin, and for a heartbeat of its coordinator.
     pub patience: Duration,
     /// Whether it goes on to the next run when one is published; to the run that takes a run's place it always does.
     pub stays: bool,
@@ -71,8 +68,6 @@ pub struct WorkReport {
     pub n_runs: usize,
     /// Views that it was the first to finish.
     pub n_views: usize,
-    /// Cells that it was the first to finish.
-    pub n_cells: usize,
 }
 
 pub(super) fn pause(bucket: &Bucket) -> Duration {
@@ -124,7 +119,7 @@ fn work_for(
     let prepared = Prepared::fetch(bucket, (run, plan), folder.path(), settings.segmenter.as_ref(), context)?;
     let segmenter = segmenter_of(&prepared.settings, &settings.gpus, engines)?;
     prepared.check(engines, segmenter.as_ref(), context)?;
-    let memory = prepared.memory(settings.memory_bytes, settings.n_threads, engines.models.dim())?;
+    prepared.check_memory(settings.memory_bytes, settings.n_threads)?;
     let dispatcher: Box<dyn Dispatcher> = match &settings.dispatch {
         Dispatch::Share { index, of, help_after } => Box::new(Share::new(*index, *of, *help_after)),
         Dispatch::Queue(queue) => {
@@ -132,46 +127,49 @@ fn work_for(
             Box::new(Queue::open(bucket.runtime(), queue, run, of_scene, n_held)?)
         }
     };
-    let dispatcher = dispatcher.as_ref();
-    let mut watch = Watch { bucket, run, pulse: Pulse::new(run, settings.patience) };
-    if run.state(bucket)? == State::Views {
-        let scene = context
-            .install(|| engines.rasterizer.load(&prepared.scene))
-            .map_err(crate::encode::EncodeError::from)?;
-        let work = ViewWork {
-            bucket,
-            prepared: &prepared,
-            engines,
-            segmenter: segmenter.as_ref(),
-            scene: scene.as_ref(),
-            dispatcher,
-            n_threads: settings.n_threads,
-            gpus: &settings.gpus,
-            n_done: AtomicUsize::new(0),
-        };
-        let mut open = || open_views(bucket, &prepared);
-        let result =
-            while_open(&mut watch, dispatcher, Kind::View, &mut open, context, &mut |_| work.run(context));
-        report.n_views += work.n_done.load(Ordering::Relaxed);
-        result?;
+    let scene =
+        context.install(|| engines.rasterizer.load(&prepared.scene)).map_err(EncodeError::from)?;
+    let work = ViewWork {
+        bucket,
+        prepared: &prepared,
+        engines,
+        segmenter: segmenter.as_ref(),
+        scene: scene.as_ref(),
+        dispatcher: dispatcher.as_ref(),
+        n_threads: settings.n_threads,
+        gpus: &settings.gpus,
+        n_done: AtomicUsize::new(0),
+    };
+    let result = while_open(&work, HeartbeatWatch::new(run, settings.patience), context);
+    report.n_views += work.n_done.load(Ordering::Relaxed);
+    result
+}
+
+/// Does views for as long as the run has any to do.
+fn while_open(
+    work: &ViewWork<'_>,
+    mut coordinator: HeartbeatWatch,
+    context: &RunContext<'_>,
+) -> Result<(), FleetError> {
+    let ViewWork { bucket, dispatcher, prepared, .. } = *work;
+    loop {
+        dispatcher.offer(&mut || open_views(bucket, prepared))?;
+        work.run(context)?;
+        loop {
+            record_failures(bucket, prepared.run, dispatcher)?;
+            if context.is_cancelled() || !prepared.run.is_open(bucket)? {
+                return Ok(());
+            }
+            coordinator.check(bucket)?;
+            if dispatcher.wait(pause(bucket)) {
+                break;
+            }
+        }
     }
-    if !context.is_cancelled() && run.state(bucket)? == State::Cells {
-        let work = CellWork::fetch(bucket, &prepared, dispatcher, memory, context)?;
-        let mut open = || {
-            let done = work.done()?;
-            Ok(work.all().filter(|item| !done.contains(item)).collect())
-        };
-        let result = while_open(&mut watch, dispatcher, Kind::Cell, &mut open, context, &mut |n_open| {
-            work.run(n_open, context)
-        });
-        report.n_cells += work.n_done.load(Ordering::Relaxed);
-        result?;
-    }
-    Ok(())
 }
 
 /// Returns the views of a run that are neither done nor given up, costly ones first.
-fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<Item>, FleetError> {
+fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<usize>, FleetError> {
     let done: BTreeSet<String> = bucket.list("views")?.into_iter().collect();
     let failed = bucket.list(&prepared.run.failed_folder())?;
     let failed: BTreeSet<usize> =
@@ -179,61 +177,16 @@ fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<Item>, FleetEr
     let views = prepared.plan.views.iter().enumerate();
     let open =
         views.filter(|(number, view)| !done.contains(&view.id.to_string()) && !failed.contains(number));
-    Ok(open.map(|(number, _)| Item::View(number)).collect())
+    Ok(open.map(|(number, _)| number).collect())
 }
 
-/// A run as a worker without work looks at it.
-struct Watch<'a> {
-    bucket: &'a Bucket,
-    run: Run,
-    pulse: Pulse,
-}
-
-/// Does the items of a kind for as long as the run asks for them.
-fn while_open(
-    watch: &mut Watch<'_>,
-    dispatcher: &dyn Dispatcher,
-    kind: Kind,
-    open: &mut dyn FnMut() -> Result<Vec<Item>, FleetError>,
-    context: &RunContext<'_>,
-    work: &mut dyn FnMut(usize) -> Result<(), FleetError>,
-) -> Result<(), FleetError> {
-    let asked = match kind {
-        Kind::View => State::Views,
-        Kind::Cell => State::Cells,
-    };
-    let (bucket, run) = (watch.bucket, watch.run);
-    loop {
-        let mut n_open = usize::MAX;
-        dispatcher.offer(&mut || {
-            let items = open()?;
-            n_open = items.len();
-            Ok(items)
-        })?;
-        work(n_open)?;
-        loop {
-            bury(bucket, run, dispatcher)?;
-            if context.is_cancelled() || run.state(bucket)? != asked {
-                return Ok(());
-            }
-            watch.pulse.check(bucket)?;
-            if dispatcher.wait(kind, pause(bucket)) {
-                break;
-            }
-        }
-    }
-}
-
-/// Records the items that ended several workers, so that the run goes on without them.
-fn bury(bucket: &Bucket, run: Run, dispatcher: &dyn Dispatcher) -> Result<(), FleetError> {
-    for item in dispatcher.take_dead() {
+/// Records the views that ended several workers, so that the run goes on without them.
+fn record_failures(bucket: &Bucket, run: Run, dispatcher: &dyn Dispatcher) -> Result<(), FleetError> {
+    for view in dispatcher.take_dead() {
         let reason = "it was given to workers several times, and none left a result; their logs say why";
-        let key = match item {
-            Item::View(number) => run.failed_key(number),
-            Item::Cell(cell) => format!("{}/cell-{cell:06}.json", run.failed_folder()),
-        };
-        bucket.put_new(&key, documents::to_bytes(&FailedView { reason: reason.into() })?)?;
-        dispatcher.done(item);
+        let document = documents::to_bytes(&FailedView { reason: reason.into() })?;
+        bucket.put_new(&run.failed_key(view), document)?;
+        dispatcher.done(view);
     }
     Ok(())
 }

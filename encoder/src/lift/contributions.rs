@@ -229,13 +229,13 @@ impl ViewContributions {
 /// A contribution file, checked except for the contributions: these are checked on reading.
 #[derive(Clone, Debug)]
 pub struct ContributionFile {
-    pub(super) path: PathBuf,
-    pub(super) n_regions: usize,
-    pub(super) n_entries: u64,
+    path: PathBuf,
+    n_regions: usize,
+    n_entries: u64,
     /// Offset of the first entry.
-    pub(super) entries_at_bytes: u64,
+    entries_at_bytes: u64,
     /// By (cell, slice), ascending.
-    pub(super) runs: Vec<Run>,
+    runs: Vec<Run>,
 }
 
 /// The regions of a view, and their masks.
@@ -338,30 +338,8 @@ impl ContributionFile {
         Ok(entries)
     }
 
-    /// Checks the entries of some runs, whose bytes were read elsewhere, and returns them.
-    ///
-    /// # Errors
-    /// [`ContributionError::Damaged`].
-    pub(super) fn parse_runs(
-        &self,
-        runs: Range<usize>,
-        bytes: &[u8],
-    ) -> Result<Vec<PackedEntry>, ContributionError> {
-        let expected = self.bytes_of_runs(runs.clone());
-        if bytes.len() as u64 != expected.end - expected.start {
-            let source = ContainerError::Length {
-                expected_bytes: expected.end,
-                found_bytes: expected.start + bytes.len() as u64,
-            };
-            return Err(ContributionError::Damaged { path: self.path.clone(), source });
-        }
-        let entries = bytemuck::pod_collect_to_vec(bytes);
-        self.check_runs(runs, &entries)?;
-        Ok(entries)
-    }
-
     /// Returns the place of some runs' entries in the file.
-    pub(super) fn bytes_of_runs(&self, runs: Range<usize>) -> Range<u64> {
+    fn bytes_of_runs(&self, runs: Range<usize>) -> Range<u64> {
         if runs.is_empty() {
             return 0..0;
         }

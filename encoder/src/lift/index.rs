@@ -4,7 +4,7 @@
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, OnceLock};
+use std::sync::OnceLock;
 
 use rayon::prelude::*;
 use slag_common::container::ContainerError;
@@ -44,19 +44,8 @@ pub struct ContributionIndex {
     /// The Gaussians of each slice, by their index within its cell.
     pub(super) locals_of_slice: Vec<Range<usize>>,
     n_views_without_masks: usize,
-    /// Reads the views' files, where they are not on this machine.
-    pub(super) elsewhere: Option<Arc<dyn RangeReader>>,
     /// The transposed parts, once a pass has read them and the budget holds them.
     pub(super) kept: OnceLock<Vec<PartContributions>>,
-}
-
-/// Reads the views' files where they are not on this machine: in a bucket.
-pub trait RangeReader: Send + Sync {
-    /// Returns bytes of the views' files, in the order given: the number of a view, and the range.
-    ///
-    /// # Errors
-    /// If a range cannot be read.
-    fn read(&self, wanted: &[(usize, Range<u64>)]) -> std::io::Result<Vec<Vec<u8>>>;
 }
 
 /// The entries of a group of parts, in the order of the files.
@@ -139,7 +128,7 @@ impl ContributionIndex {
             })
             .collect();
         let kept = OnceLock::new();
-        Ok(Self { views, parts, locals_of_slice, n_views_without_masks, elsewhere: None, kept })
+        Ok(Self { views, parts, locals_of_slice, n_views_without_masks, kept })
     }
 
     /// Returns the parts, ascending by cell and within it.
@@ -244,22 +233,11 @@ impl ContributionIndex {
             let at = |slice: usize| view.slices.partition_point(|s| (*s as usize) < slice);
             at(slices.start)..at(slices.end)
         };
-        let Some(elsewhere) = &self.elsewhere else {
-            let read = |view: &IndexedView| {
-                let runs = runs_of(view);
-                Ok((runs.clone(), view.file.read(runs)?))
-            };
-            let views = self.views.par_iter().map(read).collect::<Result<_, ContributionError>>()?;
-            return Ok(RawGroup { parts, views });
+        let read = |view: &IndexedView| {
+            let runs = runs_of(view);
+            Ok((runs.clone(), view.file.read(runs)?))
         };
-        let wanted = |(i, view): (usize, &IndexedView)| (i, view.file.bytes_of_runs(runs_of(view)));
-        let mut wanted: Vec<(usize, Range<u64>)> = self.views.iter().enumerate().map(wanted).collect();
-        wanted.retain(|(_, bytes)| !bytes.is_empty());
-        let mut views: Vec<_> = self.views.iter().map(|view| (runs_of(view), Vec::new())).collect();
-        for ((i, _), bytes) in wanted.iter().zip(elsewhere.read(&wanted)?) {
-            let (runs, entries) = &mut views[*i];
-            *entries = self.views[*i].file.parse_runs(runs.clone(), &bytes)?;
-        }
+        let views = self.views.par_iter().map(read).collect::<Result<_, ContributionError>>()?;
         Ok(RawGroup { parts, views })
     }
 

@@ -18,7 +18,6 @@
 //! | [`photos`] | how a view's masks lie in its photo |
 //! | `table` | the regions of all views: which masks cover each |
 //! | `index` | the files of all views, and the parts that their entries form |
-//! | `shipped` | the index in one file, for machines that read the views' files by byte ranges |
 //! | `transpose` | a group of parts, transposed from the views' order to the Gaussians' |
 //! | `passes` | a pass over all parts within the memory budget, from files or from memory |
 //! | [`refine`] | optional refinements: weights of masks, evidence shared within superpoints |
@@ -36,7 +35,6 @@ mod passes;
 pub mod photos;
 pub mod published;
 pub mod refine;
-mod shipped;
 mod starts;
 pub mod superpoint;
 mod table;
@@ -49,7 +47,7 @@ pub use contributions::{
     ViewRegions,
 };
 pub use field::CellField;
-pub use index::{ContributionIndex, RangeReader, RawGroup};
+pub use index::{ContributionIndex, RawGroup};
 pub use part::{Part, PartContributions};
 pub use passes::TransposedGroups;
 pub use refine::Aggregation;

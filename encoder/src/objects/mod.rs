@@ -15,13 +15,11 @@
 //! | [`vectors`] | the few vectors that represent an object's masks |
 //! | [`shards`] | the objects of a cell, as its shards store them |
 //! | `object` | the result |
-//! | `file` | its file form, for machines that build cells |
 //!
 //! The contributions are needed once, part by part; the result takes four bytes a Gaussian.
 
 pub mod affinity;
 pub mod choice;
-mod file;
 mod find;
 pub mod members;
 pub mod near;

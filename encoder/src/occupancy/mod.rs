@@ -5,11 +5,8 @@
 //! | density | voxels with a surface, from all Gaussians | `density.rs` |
 //! | seen | voxels that views have looked through, from depth pictures | `seen.rs` |
 //! | owners | the cell that stores each block | `owners.rs` |
-//!
-//! `file.rs` is the result's file form, for machines that build cells.
 
 mod density;
-mod file;
 mod lattice;
 mod owners;
 mod seen;

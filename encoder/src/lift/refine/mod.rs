@@ -20,7 +20,6 @@
 
 mod agreement;
 mod equalise;
-mod file;
 mod median;
 mod mixture;
 mod points;
@@ -49,7 +48,7 @@ use points::{AXES, Point};
 pub use settings::Aggregation;
 use views::FirstRegions;
 
-/// The refinements of a scene, ready to be applied part by part. `file` has its file form.
+/// The refinements of a scene, ready to be applied part by part.
 #[derive(Debug, PartialEq)]
 pub struct Refinement {
     settings: Aggregation,

@@ -1,4 +1,4 @@
-//! The coordinator's sign of life: without it, workers would wait for ever for one that died for good.
+//! The coordinator's heartbeat: without it, workers would wait for ever for one that died for good.
 //!
 //! Workers compare what they read with what they read before, by their own clocks: those of the machines may differ.
 
@@ -10,16 +10,15 @@ use super::error::FleetError;
 use super::run::Run;
 use crate::blobs::Bucket;
 
-/// Time between two signs, and between two looks at them.
+/// Time between two beats, and between two looks at them.
 const BEAT: Duration = Duration::from_secs(10);
 
-/// Gives signs until it is dropped.
-pub(super) struct Heart {
+/// Beats until it is dropped.
+pub(super) struct Heartbeat {
     _stop: Sender<()>,
 }
 
-impl Heart {
-    /// Begins to give signs for a run.
+impl Heartbeat {
     pub(super) fn start(bucket: &Arc<Bucket>, run: Run) -> Self {
         let (stop, stopped) = mpsc::channel();
         let bucket = Arc::clone(bucket);
@@ -29,8 +28,8 @@ impl Heart {
                 == Err(RecvTimeoutError::Timeout)
             {
                 n_beats += 1;
-                if let Err(error) = bucket.put(&run.pulse_key(), n_beats.to_string()) {
-                    tracing::warn!("no sign of life: {error}");
+                if let Err(error) = bucket.put(&run.heartbeat_key(), n_beats.to_string()) {
+                    tracing::warn!("no heartbeat: {error}");
                 }
             }
         });
@@ -38,23 +37,23 @@ impl Heart {
     }
 }
 
-/// What a worker has seen of a coordinator's signs.
-pub(super) struct Pulse {
+/// A worker's view of a coordinator's heartbeat.
+pub(super) struct HeartbeatWatch {
     run: Run,
+    /// Time without a new beat after which the coordinator counts as gone.
     patience: Duration,
-    /// The last sign, since when it is known, and the last look.
+    /// The last beat, since when it is known, and the last look.
     last: Option<Vec<u8>>,
     since: Instant,
     looked: Option<Instant>,
 }
 
-impl Pulse {
-    /// Begins to look. `patience`: time without a new sign after which the coordinator counts as gone.
+impl HeartbeatWatch {
     pub(super) fn new(run: Run, patience: Duration) -> Self {
         Self { run, patience, last: None, since: Instant::now(), looked: None }
     }
 
-    /// Looks for a new sign, if it is time to.
+    /// Looks for a new beat, if it is time to.
     ///
     /// # Errors
     /// [`FleetError::Abandoned`]; [`FleetError::Blob`].
@@ -62,11 +61,11 @@ impl Pulse {
         if self.looked.is_some_and(|looked| looked.elapsed() < BEAT.min(self.patience)) {
             return Ok(());
         }
-        let sign = bucket.get(&self.run.pulse_key())?.map(|bytes| bytes.to_vec());
+        let beat = bucket.get(&self.run.heartbeat_key())?.map(|bytes| bytes.to_vec());
         let now = Instant::now();
         // What happened while this worker was busy, or stood still, is no silence.
-        if sign != self.last || self.looked.is_none() {
-            (self.last, self.since) = (sign, now);
+        if beat != self.last || self.looked.is_none() {
+            (self.last, self.since) = (beat, now);
         }
         self.looked = Some(now);
         let silence = now.duration_since(self.since);
@@ -82,25 +81,25 @@ impl Pulse {
 mod tests {
     use super::*;
 
-    /// A worker that has waited is content with a sign that is new, and gives up at the same one.
+    /// A worker that has waited accepts a new beat, and gives up at the same one.
     #[test]
     fn silence_is_noticed() {
         let dir = tempfile::tempdir().expect("a folder");
         let bucket = Arc::new(Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens"));
         let run = Run(3);
         let patience = Duration::from_millis(30);
-        let mut pulse = Pulse::new(run, patience);
-        let heart = Heart::start(&bucket, run);
-        while bucket.get(&run.pulse_key()).expect("reads").is_none() {
+        let mut watch = HeartbeatWatch::new(run, patience);
+        let heartbeat = Heartbeat::start(&bucket, run);
+        while bucket.get(&run.heartbeat_key()).expect("reads").is_none() {
             std::thread::sleep(Duration::from_millis(1));
         }
-        drop(heart);
-        pulse.check(&bucket).expect("first look");
+        drop(heartbeat);
+        watch.check(&bucket).expect("first look");
         std::thread::sleep(2 * patience);
-        bucket.put(&run.pulse_key(), "another").expect("puts");
-        pulse.check(&bucket).expect("a new sign");
+        bucket.put(&run.heartbeat_key(), "another").expect("puts");
+        watch.check(&bucket).expect("a new beat");
         std::thread::sleep(2 * patience);
-        let error = pulse.check(&bucket).expect_err("the same sign").to_string();
+        let error = watch.check(&bucket).expect_err("the same beat").to_string();
         assert!(error.contains("run 3") && error.contains("start the same encode again"), "{error}");
     }
 }
