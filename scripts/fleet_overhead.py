@@ -5,7 +5,7 @@ usage: scripts/fleet_overhead.py FOLDER_OF_PROGRAMS [VIEWS [REPEATS]]
 
 The fleet has a folder as bucket. Each worker has two threads on two cores of its own; an encode alone, and the coordinator beside
 the first worker, have that worker's two. Fleets that need more cores than the machine has are left out. Every store must have the
-manifest of the first. Views and cells are the scene's; what the workers did is what they report.
+manifest of the first. Views are the scene's; what the workers did is what they report.
 """
 
 import json
@@ -46,7 +46,7 @@ def encode(n_workers, folder):
     if not summary or not all(reports):
         sys.exit(f"{n_workers} workers: a program failed")
     with open(f"{folder}/store/manifest", "rb") as file:
-        return secs, file.read(), [[report["n_views"], report["n_cells"]] for report in reports], summary
+        return secs, file.read(), [report["n_views"] for report in reports], summary
 
 
 with tempfile.TemporaryDirectory() as top:
@@ -69,6 +69,6 @@ with tempfile.TemporaryDirectory() as top:
     for n, secs in times.items():
         median = statistics.median(secs)
         row = {"workers": n, "median_s": median, "min_s": min(secs), "max_s": max(secs), "of_alone": median / alone}
-        rows.append({**row, "views_and_cells_by_worker": last[n]})
+        rows.append({**row, "views_by_worker": last[n]})
     machine = {"cpu": platform.processor() or platform.machine(), "cores": len(cores)}
-    print(json.dumps({"machine": machine, "views": int(n_views), "cells": summary["n_cells"], "repeats": n_repeats, "rows": rows}, indent=1))
+    print(json.dumps({"machine": machine, "views": int(n_views), "repeats": n_repeats, "rows": rows}, indent=1))

@@ -54,4 +54,3 @@ pub mod segment;
 pub mod shard;
 pub mod store;
 pub mod view;
-pub mod watch;

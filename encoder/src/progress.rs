@@ -13,14 +13,13 @@ pub trait Progress: Sync {
     fn advance(&self, n: u64);
     /// Ends the stage.
     fn end(&self);
-    /// Tells what an encode is going to do: its views, each with whether an earlier run has done it, and its cells.
-    fn plan(&self, _views: &[(&View, bool)], _cells: &[Aabb]) {}
-    /// Tells which part of the run begins.
-    fn begin_phase(&self, _name: &'static str) {}
-    /// Counts time that a view spent in a stage.
-    fn spend(&self, _stage: &'static str, _secs: f64) {}
-    /// Tells what becomes of a view.
-    fn view(&self, _name: &str, _event: ViewEvent<'_>) {}
+    /// Tells what an encode is going to do: its views, and its cells.
+    fn plan(&self, _views: &[&View], _cells: &[Aabb]) {}
+    /// Tells that a photo has masks. `draw` draws them over the photo, reduced; it takes milliseconds, so only receivers that
+    /// show the picture call it.
+    fn segmented(&self, _view: &str, _n_masks: usize, _draw: &dyn Fn() -> RgbImage) {}
+    /// Tells that a view is left out.
+    fn left_out(&self, _view: &str, _reason: &str) {}
     /// Tells the things that were found.
     fn objects(&self, _objects: &mut dyn Iterator<Item = FoundObject>) {}
 }
@@ -40,25 +39,6 @@ pub struct FoundObject {
     pub n_masks: u32,
     /// Name of the view that shows it best.
     pub photo: String,
-}
-
-/// What becomes of a view.
-pub enum ViewEvent<'a> {
-    /// Its photo has masks. `draw` draws them over the photo, reduced; it takes milliseconds, so it is called by receivers that
-    /// show the picture alone.
-    Segmented {
-        /// Masks.
-        n_masks: usize,
-        /// Draws them.
-        draw: &'a dyn Fn() -> RgbImage,
-    },
-    /// Its contributions are kept.
-    Done,
-    /// It is left out.
-    LeftOut {
-        /// Why.
-        reason: String,
-    },
 }
 
 /// Discards progress events.

@@ -86,7 +86,7 @@ function scoresMessage(things, text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], work: null, photos: [], ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], photos: [], ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -112,7 +112,6 @@ export async function startService(behaviour = {}) {
     if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(behaviour.things, url.searchParams.get("text"), behaviour.generation));
     if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: behaviour.words, complete: behaviour.hasAllWords });
     if (url.pathname === "/v1/changes") return behaviour.changes ? json(response, 200, behaviour.changes) : json(response, 409, { detail: "the store has one generation alone" });
-    if (url.pathname === "/v1/work") return json(response, 200, behaviour.work);
     if (url.pathname === "/v1/goal") {
       if (behaviour.goal === "no-occupancy") return json(response, 409, { detail: "the scene does not say which places are free; encode it with --occupancy" });
       const isReached = behaviour.goal === "reached";

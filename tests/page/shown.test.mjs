@@ -1,4 +1,4 @@
-// What the page shows besides answers, over the small known scene: changes, cameras of photos, an encode at work.
+// What the page shows besides answers, over the small known scene: changes, cameras of photos.
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
@@ -92,28 +92,6 @@ test("a camera without its picture can be clicked and stood in", () => opened(as
   assert.deepEqual(camera.slice(0, 3), PHOTO.position_m);
   assert.ok(Math.abs(camera[3] - 1.5) < 0.01 && camera[4] < 1.5 - 0.4 && Math.abs(camera[5] - 1.2) < 0.01, String(camera));
 }, { behaviour: { photos: [PHOTO] }, fragment: `camera=${CAMERA}` }));
-
-test("an encode is watched before there is a scene, and the scene is opened once it is published", () => opened(async (page, service) => {
-  await page.locator("#work").getByText("At work: views").waitFor();
-  await page.locator("#work").getByText("2 of 3 views").waitFor();
-  await page.locator("#work").getByText("b.jpg is left out: too dark").waitFor();
-  assert.deepEqual(await page.locator("#work circle").evaluateAll((all) => all.map((circle) => circle.getAttribute("class"))), ["done", "left-out", "waiting"]);
-  assert.equal(await page.locator("#work svg").getAttribute("aria-label"), "Map: 1 of 3 views done, 1 left out");
-  service.behaviour.work = { ...service.behaviour.work, ended: "Generation 1 is published." };
-  service.behaviour.hasScene = true;
-  await page.locator("#work").getByText("Generation 1 is published.").waitFor();
-  await drawn(page);
-}, {
-  behaviour: {
-    hasScene: false,
-    work: {
-      ended: null, secs: 2.5, counted: { stage: "views", unit: "view", total: 3, done: 2 }, phases: [{ phase: "read", secs: 0.5 }, { phase: "views", secs: 2 }],
-      busy_secs: { segment: 1.25 }, cells: [{ min: [0, 0, 0], max: [4, 2, 1] }], pictures: [],
-      views: [["a.jpg", "done"], ["b.jpg", "left-out", "too dark"], ["c.jpg", "waiting"]].map(([name, state, reason], i) => ({ name, state, reason, position_m: [i, 1, 0], n_masks: null })),
-    },
-  },
-  expected: /404/,
-}));
 
 test("missing and earlier cells are told and outlined, and the robot is where it says", () => opened(async (page, service) => {
   await page.getByText("1 of 3 cells missing · 1 of an earlier generation").waitFor({ timeout: 30000 });

@@ -32,9 +32,6 @@ pub struct Description {
     pub cells: Vec<Cell>,
     /// The photos whose poses are known.
     pub views: Vec<Photo>,
-    /// Whether the program is making the scene: `GET /v1/work` tells how far it is.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub at_work: bool,
     /// What the robot fetched.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fetched: Option<Fetched>,

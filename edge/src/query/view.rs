@@ -73,7 +73,6 @@ impl Engine {
             can_ask: self.check_encoder(&snapshot).is_ok(),
             cells,
             views: photos.collect(),
-            at_work: false,
             fetched: Some(Fetched { centre_m: map.centre_in_world, radius_m: map.radius }),
             position_m: robot_in_world(&snapshot),
         })

@@ -18,7 +18,6 @@ use super::sam::SamArgs;
 use super::summary::lines;
 use super::target::{REFINEMENTS, TUNED, TargetArgs};
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
-use super::watched::{WatchArgs, Watched};
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
@@ -33,6 +32,7 @@ use crate::progress::Progress;
 use crate::raster::WeightKind;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
+use crate::report::{self, Recorder};
 use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
 use crate::store::CommandRecord;
@@ -166,9 +166,10 @@ pub struct EncodeArgs {
     /// Views by other machines.
     #[command(flatten)]
     pub fleet: super::fleet::CoordinatorArgs,
-    /// A page that watches, and one that reports.
-    #[command(flatten)]
-    pub watch: WatchArgs,
+    /// Writes a report of the encode, one HTML file: views, masks, objects, cells, errors by profile, what was left out and
+    /// why.
+    #[arg(long, value_name = "FILE")]
+    pub report: Option<PathBuf>,
     /// Drops an unfinished encode of another splat or with other settings in the store.
     #[arg(long)]
     pub restart: bool,
@@ -306,12 +307,14 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let devices = Devices::open(&args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
     let cancel = cancel_flag()?;
-    let watched = Watched::begin(&args.watch, &settings, &args.models, &cancel)?;
-    let encode = |progress: &dyn Progress| args.fleet.encode(&settings, &engines, progress, cancel.as_ref());
-    let summary = watched.encode(progress, encode)?;
+    let recorder = args.report.as_ref().map(|_| Recorder::new(progress));
+    let progress = recorder.as_ref().map_or(progress, |recorder| recorder as &dyn Progress);
+    let summary = args.fleet.encode(&settings, &engines, progress, cancel.as_ref())?;
     let lines = lines(&settings, &summary, expected.as_ref());
     print(json, &summary, lines)?;
-    watched.end(&settings, &summary)?;
+    if let (Some(path), Some(recorder)) = (&args.report, &recorder) {
+        fs_err::write(path, report::of_encode(&settings.output.scene_name, &summary, recorder)?)?;
+    }
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
 }
 

@@ -24,7 +24,6 @@ mod summary;
 mod target;
 mod view;
 mod views;
-mod watched;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};

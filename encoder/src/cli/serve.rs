@@ -58,7 +58,6 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
             views: Vec::new(),
             up: None,
             open_text,
-            work: None,
         };
         let page = view::router(Viewer::new(shown));
         let router = serve::router_with(&args.store, limits, access, page)?;

@@ -111,7 +111,7 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
 }
 
 /// Refuses where the page is missing.
-pub(super) fn check_page() -> Result<()> {
+fn check_page() -> Result<()> {
     match slag_view::is_built() {
         true => Ok(()),
         false => Err(anyhow!(
@@ -140,7 +140,7 @@ fn shown(args: &ViewArgs) -> Result<Shown> {
     let views: Vec<View> = set.map(|set| set.views).unwrap_or_default();
     let up = args.up.map(UpAxis::vector).or_else(|| up_of(&views));
     let open_text = open_text(args.models.clone());
-    Ok(Shown { store: args.store.clone(), splat, views, up, open_text, work: None })
+    Ok(Shown { store: args.store.clone(), splat, views, up, open_text })
 }
 
 /// Returns the link that opens the page with a question.
@@ -154,7 +154,7 @@ fn link(url: &str, question: Option<&str>) -> String {
 }
 
 /// Opens a link; where that fails, the link stands on the terminal already.
-pub(super) fn open_browser(link: &str) {
+fn open_browser(link: &str) {
     let (program, arguments): (&str, &[&str]) = match std::env::consts::OS {
         "macos" => ("open", &[]),
         "windows" => ("rundll32", &["url.dll,FileProtocolHandler"]),

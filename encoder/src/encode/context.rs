@@ -95,7 +95,6 @@ impl<'a> RunContext<'a> {
     pub(super) fn begin_phase(&self, phase: Phase) {
         // Before anything of the phase is there, so that phases do not come on top of each other.
         memory::give_back();
-        self.progress.begin_phase(phase.name());
         let began = Began { phase, at: Instant::now(), peak_before: memory::peak_bytes() };
         self.phases.lock().unwrap_or_else(PoisonError::into_inner).push(began);
     }

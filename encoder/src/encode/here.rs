@@ -16,7 +16,6 @@ use super::plan::Plan;
 use super::report::{SkippedView, StageReport};
 use super::sink::ViewRecord;
 use super::view::{ViewStages, Work};
-use crate::progress::ViewEvent;
 
 /// This machine.
 pub(super) struct Here;
@@ -49,7 +48,7 @@ impl Executor for Here {
             }
             tracing::warn!("view {} is left out: {error}", view.name);
             let reason = error.to_string();
-            context.progress().view(&view.name, ViewEvent::LeftOut { reason: reason.clone() });
+            context.progress().left_out(&view.name, &reason);
             locked(&skipped).push(SkippedView { view: view.name.clone(), reason });
             Ok(())
         })?;
@@ -83,12 +82,10 @@ pub(crate) fn work_off<'v>(
     pipeline::run(&list, n_threads, source, |at, (is_alone, work)| {
         let view = work.view();
         // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
-        let start = Instant::now();
         let result = match list[at].on_cpu {
             true => context.workers().run(is_alone, || stages.step(work)),
             false => stages.step(work),
         };
-        context.progress().spend(list[at].name, start.elapsed().as_secs_f64());
         match result {
             // One bad photo or mask file of a thousand must not end an encode. A model that fails on one view fails
             // on the others too.

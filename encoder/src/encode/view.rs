@@ -24,7 +24,6 @@ use crate::masks::patches::patch_masks;
 use crate::masks::regions::{absorb_slivers, partition};
 use crate::masks::windows::Windows;
 use crate::masks::{self, Mask, RegionMap};
-use crate::progress::ViewEvent;
 use crate::raster::{GpuSlots, LoadedScene, RasterError, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
 
@@ -222,8 +221,7 @@ impl<'a> ViewStages<'a> {
                 }
                 masks.retain(|mask| mask.area_px >= self.tools.settings.min_mask_px);
                 let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
-                let event = ViewEvent::Segmented { n_masks: masks.len(), draw: &draw };
-                self.context.progress().view(&view.name, event);
+                self.context.progress().segmented(&view.name, masks.len(), &draw);
                 Next::Crop(loaded, masks)
             }
             Next::Crop(loaded, mut masks) => {
@@ -271,7 +269,6 @@ impl<'a> ViewStages<'a> {
             Next::Write(contributions, outlines, raster_width_px) => {
                 let record = ViewRecord { raster_width_px, secs: work.secs };
                 self.tools.sink.keep(view, &contributions, &outlines, record)?;
-                self.context.progress().view(&view.name, ViewEvent::Done);
                 self.context.progress().advance(1);
                 return Ok(None);
             }

@@ -46,8 +46,7 @@ pub(super) fn run_views<'a>(
     let views = &plan.inputs.views;
     let done = plan.job.done_views()?;
     let n_resumed = plan.order.iter().filter(|view| done.contains_key(&views[**view].name)).count();
-    let planned = plan.order.iter().map(|view| &views[*view]);
-    let planned: Vec<_> = planned.map(|view| (view, done.contains_key(&view.name))).collect();
+    let planned: Vec<&View> = plan.order.iter().map(|view| &views[*view]).collect();
     let cells: Vec<_> = plan.inputs.split.cells.iter().map(|cell| cell.mean_bounds).collect();
     context.progress().plan(&planned, &cells);
     let start = Instant::now();

@@ -1,6 +1,7 @@
 //! The report of an encode: one page with its views, masks, objects, cells, errors by profile, and what was left out and why.
 
 mod map;
+mod recorder;
 
 use glam::DVec3;
 use serde_json::Value;
@@ -8,14 +9,15 @@ use serde_json::Value;
 use crate::encode::EncodeSummary;
 use crate::html::Page;
 use crate::progress::FoundObject;
-use crate::watch::Watch;
+pub use recorder::Recorder;
+use recorder::RecordedView;
 
-/// Makes the page. `watch` watched the encode.
+/// Makes the page of an encode that was recorded.
 ///
 /// # Errors
 /// None: the summary is a record of numbers and texts.
-pub fn of_encode(scene: &str, summary: &EncodeSummary, watch: &Watch) -> serde_json::Result<String> {
-    let work = watch.look();
+pub fn of_encode(scene: &str, summary: &EncodeSummary, recorder: &Recorder<'_>) -> serde_json::Result<String> {
+    let recorded = recorder.recorded();
     let mut rest = serde_json::to_value(summary)?;
     let mut take = |name: &str| rest.as_object_mut().and_then(|members| members.remove(name));
     let lists = ["skipped_views", "views", "cells", "phases", "view_stages"].map(&mut take);
@@ -49,13 +51,15 @@ pub fn of_encode(scene: &str, summary: &EncodeSummary, watch: &Watch) -> serde_j
         page.paragraph(&lost.reason);
     }
     page.heading("Map");
-    page.drawing(&map::svg(&work), "Seen from above: cells, and the cameras by their number of masks");
-    let pictures = watch.pictures_of_report();
-    if !pictures.is_empty() {
+    page.drawing(&map::svg(&recorded), "Seen from above: cells, and the cameras by their number of masks");
+    let mut drawn: Vec<_> = recorded.views.iter().filter(|view| view.picture.is_some()).collect();
+    drawn.sort_by(|a, b| a.name.cmp(&b.name));
+    if !drawn.is_empty() {
         page.heading("Masks");
-        for picture in &pictures {
-            page.picture(&picture.jpeg, &format!("{}: {} masks", picture.view, picture.n_masks));
-        }
+    }
+    for RecordedView { name, picture, n_masks, .. } in drawn {
+        let n_masks = n_masks.unwrap_or_default();
+        page.picture(picture.as_deref().unwrap_or_default(), &format!("{name}: {n_masks} masks"));
     }
     page.heading("Objects");
     match summary.objects.as_ref().map(|found| found.n_objects) {
@@ -63,7 +67,7 @@ pub fn of_encode(scene: &str, summary: &EncodeSummary, watch: &Watch) -> serde_j
         Some(0) => page.paragraph("No object was found: no mask is shared by several views."),
         Some(_) => {
             let columns = ["id", "x, y, z", "size", "Gaussians", "masks", "best photo"];
-            page.table(&columns, &watch.found_objects().iter().map(row_of).collect::<Vec<_>>());
+            page.table(&columns, &recorded.objects.iter().map(row_of).collect::<Vec<_>>());
         }
     }
     if !objects.is_null() {

@@ -78,7 +78,6 @@ impl Generation {
             can_ask: true,
             cells: cells.collect(),
             views: self.photos.clone(),
-            at_work: false,
             fetched: None,
             position_m: None,
         }

@@ -14,7 +14,6 @@ use slag_view::{Description, Step, Words};
 use super::error::ViewError;
 use super::viewer::Viewer;
 use crate::diff::Diff;
-use crate::watch::{Watch, Work};
 
 /// Answers in a page of `/v1/query` unless the request says otherwise.
 const DEFAULT_LIMIT: usize = 10;
@@ -32,8 +31,6 @@ type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
 /// Returns the page and its routes.
 pub fn router(viewer: Viewer) -> Router {
     Router::new()
-        .route("/v1/work", axum::routing::get(work))
-        .route("/v1/work/pictures/{number}", axum::routing::get(work_picture))
         .route("/v1/changes", axum::routing::get(changes))
         .route("/v1/view", axum::routing::get(describe))
         .route("/v1/view/scores", axum::routing::get(scores))
@@ -92,22 +89,6 @@ async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Pro
         })
     };
     blocking(viewer, work).await.map(Json)
-}
-
-/// Tells what the encode does that this page watches; null where it watches none.
-async fn work(State(viewer): AppState) -> Json<Option<Work>> {
-    Json(viewer.work().map(Watch::look))
-}
-
-/// Sends a picture of masks, by its number in the state of the encode.
-async fn work_picture(State(viewer): AppState, Path(number): Path<String>) -> Result<Response, Problem> {
-    let number = self::number("number", &number)?;
-    let picture = viewer.work().and_then(|watch| watch.picture(number)).map(|jpeg| jpeg.to_vec());
-    let picture = picture.ok_or_else(|| {
-        let detail = format!("picture {number} is not kept any more; GET /v1/work lists the last ones");
-        Problem::new(StatusCode::NOT_FOUND, "no-such-picture", "No such picture", detail)
-    })?;
-    Ok(([(header::CONTENT_TYPE, "image/jpeg")], picture).into_response())
 }
 
 /// Compares the published generation with the one before it.

@@ -56,7 +56,6 @@ impl Splat {
             can_ask: false,
             cells: cells.collect(),
             views: Vec::new(),
-            at_work: false,
             fetched: None,
             position_m: None,
         }

@@ -15,7 +15,6 @@ use super::photos;
 use super::splat::Splat;
 use crate::diff::{self, Diff};
 use crate::store::StoreReader;
-use crate::watch::Watch;
 
 /// Opens the text encoder of a store; the error says what to do.
 pub type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
@@ -32,8 +31,6 @@ pub struct Shown {
     pub up: Option<Vec3>,
     /// Opens the store's text encoder, at the first question.
     pub open_text: OpenText,
-    /// The encode into the store that is watched.
-    pub work: Option<Arc<Watch>>,
 }
 
 /// A text encoder.
@@ -105,13 +102,7 @@ impl Viewer {
         if !self.shown.views.is_empty() {
             description.views = photos::describe(&self.shown.views);
         }
-        description.at_work = self.shown.work.is_some();
         Ok(description)
-    }
-
-    /// Returns the encode that is watched.
-    pub(super) fn work(&self) -> Option<&Watch> {
-        self.shown.work.as_deref()
     }
 
     /// Compares the store's current generation with the one before it.

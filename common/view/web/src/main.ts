@@ -4,13 +4,12 @@ import "./style.css";
 import { ChangesPanel } from "./changes";
 import { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Answers, type Description, describe, fetchAnswers, fetchPhoto, fetchScores, fetchWords, fetchWork, follow, NotFound, parseQuestion, setToken, Unauthorized, type Word } from "./network";
+import { type Answer, type Answers, type Description, describe, fetchAnswers, fetchPhoto, fetchScores, fetchWords, follow, NotFound, parseQuestion, setToken, Unauthorized, type Word } from "./network";
 import { askToken, panel, say, showAnswers, showDetails, showFacts, showLegend, showPhoto, showSecond } from "./panel";
 import { PlacesToStand } from "./places";
 import { readHistory, readState, remember, writeState } from "./state";
 import { Streaming } from "./streaming";
 import { Combobox, suggest } from "./suggestions";
-import { WorkPanel } from "./work";
 
 const PAUSE_IN_TYPING_MS = 150;
 const LOOK_EVERY_MS = 4000;
@@ -23,8 +22,6 @@ let drawing: Drawing;
 let streaming: Streaming;
 let places: PlacesToStand;
 let changes: ChangesPanel;
-/** Of the encode that the page watches. */
-let work: WorkPanel | null = null;
 let scores: Scores | null = null;
 /** Of the second question, and its level of threshold. */
 let second: { scores: Scores; threshold: number } | null = null;
@@ -293,18 +290,6 @@ function listen(): void {
   });
 }
 
-/** Shows the encode that the program is at, if it is at one. */
-async function watchWork(): Promise<boolean> {
-  if (work) return true;
-  if (!(await fetchWork().catch(() => null))) return false;
-  work = new WorkPanel(panel.work, () => {
-    // The first generation is found by the next try to open, another one by the next look.
-    if (description) lookSoon();
-  });
-  void work.follow();
-  return true;
-}
-
 async function start(): Promise<void> {
   if (!document.createElement("canvas").getContext("webgl2")) {
     return say("This browser has no WebGL 2, which drawing the scene needs. Switch on hardware acceleration or take another browser.", true);
@@ -313,14 +298,11 @@ async function start(): Promise<void> {
   try {
     description = await withToken(describe);
   } catch (error) {
-    const isAtWork = await watchWork();
-    if (isAtWork) say("Nothing is published yet.");
-    else say(error instanceof NotFound ? "This service has no scene to show (it does not answer /v1/view)." : String((error as Error).message), true);
+    say(error instanceof NotFound ? "This service has no scene to show (it does not answer /v1/view)." : String((error as Error).message), true);
     setTimeout(() => void start(), LOOK_EVERY_MS);
     return;
   }
   say("");
-  if (description.at_work) void watchWork();
   open();
   listen();
   lookSoon(LOOK_EVERY_MS);

@@ -34,8 +34,6 @@ export interface Description {
   metric: boolean;
   geographic: boolean;
   can_ask: boolean;
-  /** Whether the program is making the scene. */
-  at_work?: boolean;
   cells: Cell[];
   views: Photo[];
   /** What a robot fetched. */
@@ -75,20 +73,6 @@ export interface Changes {
   appeared: Thing[];
   went: Thing[];
   moved: { from: Thing; to: Thing }[];
-}
-
-/** Reply of `/v1/work`: an encode, as far as it is. */
-export interface Work {
-  /** How it ended. */
-  ended: string | null;
-  secs: number;
-  counted: { stage: string; unit: string; total: number; done: number };
-  phases: { phase: string; secs: number }[];
-  busy_secs: Record<string, number>;
-  views: { name: string; position_m: Vector; state: string; n_masks: number | null; reason?: string }[];
-  cells: { min: Vector; max: Vector }[];
-  /** Number, view and masks of the last pictures. */
-  pictures: [number, string, number][];
 }
 
 /** A word to ask for, and how many things are found by it. */
@@ -165,16 +149,6 @@ async function get(path: string, signal?: AbortSignal): Promise<Response> {
 
 export async function describe(): Promise<Description> {
   return (await get("/v1/view")).json();
-}
-
-/** The encode that the program is at; null where it is at none. */
-export async function fetchWork(): Promise<Work | null> {
-  return (await get("/v1/work")).json();
-}
-
-/** A picture of masks, by its number. */
-export async function fetchWorkPicture(number: number): Promise<Blob> {
-  return (await get(`/v1/work/pictures/${number}`)).blob();
 }
 
 /** What changed since the generation before, from a store's page or a robot's. */

@@ -24,7 +24,6 @@ export const panel = {
   showCells: element<HTMLInputElement>("show-cells"),
   showPhotos: element<HTMLInputElement>("show-photos"),
   showChanges: element<HTMLInputElement>("show-changes"),
-  work: element("work"),
   changes: element("changes"),
   copyLink: element<HTMLButtonElement>("copy-link"),
   whole: element<HTMLButtonElement>("whole"),
