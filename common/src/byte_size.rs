@@ -1,6 +1,4 @@
-//! Numbers of bytes: binary units in flags, decimal ones in reports.
-//!
-//! The crate `bytesize` reads more than the flags promise: fractions, `2G` as decimal, any case; and it saturates.
+//! Numbers of bytes, as flags take them and reports show them.
 
 use std::fmt;
 use std::num::IntErrorKind;
@@ -14,7 +12,7 @@ pub struct ByteSize(pub u64);
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ByteSizeError {
     /// The unit is unknown.
-    #[error("unit {0:?}: expected none, KiB, MiB or GiB")]
+    #[error("unit {0:?}: expected none, KiB, MiB or GiB, or kB, MB or GB")]
     Unit(String),
     /// It does not begin with a whole number.
     #[error("{0:?} is no number of bytes; expected for example 512MiB")]
@@ -24,7 +22,7 @@ pub enum ByteSizeError {
     TooLarge(String),
 }
 
-/// Reads a whole number with an optional unit: `512MiB`.
+/// Reads a whole number with an optional unit: `512MiB` and `512M` are binary, `512MB` is decimal.
 impl FromStr for ByteSize {
     type Err = ByteSizeError;
 
@@ -32,9 +30,12 @@ impl FromStr for ByteSize {
         let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
         let factor: u64 = match &text[digits.len()..] {
             "" | "B" => 1,
-            "KiB" => 1 << 10,
-            "MiB" => 1 << 20,
-            "GiB" => 1 << 30,
+            "KiB" | "K" | "k" => 1 << 10,
+            "MiB" | "M" => 1 << 20,
+            "GiB" | "G" => 1 << 30,
+            "kB" | "KB" => 1_000,
+            "MB" => 1_000_000,
+            "GB" => 1_000_000_000,
             unit => return Err(ByteSizeError::Unit(unit.to_owned())),
         };
         let number: u64 = digits.parse().map_err(|e: std::num::ParseIntError| match e.kind() {
@@ -78,6 +79,10 @@ mod tests {
             ("3KiB", 3072),
             ("512MiB", 536_870_912),
             ("2GiB", 2_147_483_648),
+            ("2G", 2_147_483_648),
+            ("2GB", 2_000_000_000),
+            ("512M", 536_870_912),
+            ("5kB", 5000),
             ("18446744073709551615", u64::MAX),
         ];
         for (text, bytes) in good {
@@ -90,8 +95,8 @@ mod tests {
         for text in ["99999999999GiB", "17179869184GiB", "18446744073709551616"] {
             assert_eq!(read(text), Err(format!("{text:?} is too large")));
         }
-        for unit in ["G", "GB", "gib", "TiB"] {
-            let message = format!("unit {unit:?}: expected none, KiB, MiB or GiB");
+        for unit in ["T", "gb", "gib", "TiB"] {
+            let message = format!("unit {unit:?}: expected none, KiB, MiB or GiB, or kB, MB or GB");
             assert_eq!(read(&format!("2{unit}")), Err(message));
         }
     }

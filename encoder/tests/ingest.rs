@@ -6,7 +6,7 @@ use glam::DAffine3;
 use image::{Rgb, RgbImage};
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::{
-    GeoError, IngestError, Undistorter, load_image, missing_images, read_geo_reference,
+    GeoError, IngestError, RotatedPhotos, Undistorter, load_image, missing_images, read_geo_reference,
 };
 use slag_test_support::{needs_shared, shared};
 
@@ -202,7 +202,14 @@ fn exif_orientation_is_ignored() {
     // APP1: big-endian TIFF with one entry, tag 0x0112 (orientation), a 16-bit 6 (rotated by 90 degrees).
     let exif = b"\xFF\xE1\x00\x22Exif\0\0MM\0\x2A\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
     fs_err::write(&path, [&jpeg[..2], exif, &jpeg[2..]].concat()).unwrap();
-    assert_eq!(load_image(&view(&path, camera(Distortion::None))).unwrap().image, plain);
+    let rotated = load_image(&view(&path, camera(Distortion::None))).unwrap();
+    assert!(rotated.image == plain && rotated.is_rotated);
+    // Two thousand of them make one line.
+    let photos = RotatedPhotos::default();
+    assert_eq!(photos.line(), None);
+    (0..2000).for_each(|_| photos.add(&rotated));
+    let line = photos.line().unwrap();
+    assert!(line.starts_with("2000 photos have an EXIF orientation") && line.len() < 250, "{line}");
 }
 
 #[test]

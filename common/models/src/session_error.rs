@@ -9,14 +9,15 @@ use crate::provider::{Provider, names};
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
     /// The requested library does not exist.
-    #[error("{}: no such ONNX Runtime library; give the path of libonnxruntime.so (1.17 or newer)", path.display())]
+    #[error("{}: no such ONNX Runtime library; `scripts/get-onnxruntime.sh` downloads one and prints its path, which --runtime takes", path.display())]
     NoRuntime {
         /// Its path.
         path: PathBuf,
     },
     /// The library cannot be loaded.
     #[error(
-        "ONNX Runtime: {cause}; install version 1.17 or newer, put libonnxruntime.so beside the program, or give its path"
+        "ONNX Runtime: {cause}; version 1.17 or newer is needed: `scripts/get-onnxruntime.sh` downloads it and prints its \
+         path, which --runtime takes; beside the program it is found by itself"
     )]
     Runtime {
         /// The loader's error, with the path.

@@ -49,7 +49,7 @@ pub enum TufError {
     },
     /// Expired.
     #[error(
-        "{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder store refresh` there"
+        "{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder {}` there", if role == "root" { "keys renew" } else { "store refresh" }
     )]
     Expired {
         /// The role.

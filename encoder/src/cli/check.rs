@@ -10,7 +10,7 @@ use slag_common::{View, durable, poses, splat};
 use super::common::{InputArgs, print};
 use super::exit::Exit;
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
-use crate::ingest::{self, FoundFrame};
+use crate::ingest::{self, FoundFrame, RotatedPhotos};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -75,8 +75,10 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     let n = (args.samples as usize).min(there.len());
     let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
     // One at a time: a photo is loaded when the check reaches it.
+    let rotated = RotatedPhotos::default();
     let views = (0..n).map(|i| {
         let loaded = ingest::load_image(&there[i * there.len() / n])?;
+        rotated.add(&loaded);
         let camera_from_world = loaded.view.camera_from_world;
         let view = RasterView {
             camera_from_world: stated.map_or(camera_from_world, |s| s.camera_from_target(camera_from_world)),
@@ -92,6 +94,7 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     };
     let devices = Devices::open(&args.device, GpuOptions::default())?;
     let mut report = check::check(&scene, views, &devices, &options)?;
+    rotated.warn();
     // Cameras were in the stated frame already; what is reported and written begins at the poses.
     if let (Some(stated), Some(diagnosis)) = (stated, &mut report.diagnosis) {
         diagnosis.splat_from_poses = diagnosis.splat_from_poses.map(|found| found.after(&stated));

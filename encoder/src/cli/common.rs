@@ -20,7 +20,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::ingest::FrameChoice;
 use crate::store::StoreReader;
-use crate::store::metadata::clock_unix_secs;
+use crate::store::metadata::{MetadataReader, clock_unix_secs};
 
 /// Flags that every command has.
 #[derive(Clone, Copy, Debug, Args)]
@@ -132,6 +132,14 @@ pub fn now_unix_secs() -> u64 {
     // The convention of reproducible-builds.org.
     let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
     given.unwrap_or_else(clock_unix_secs)
+}
+
+/// Warns of metadata of a store that expires soon: robots then refuse the store.
+pub(super) fn warn_of_expiry(store: &Path) {
+    match MetadataReader::new(store).expiry_warnings(clock_unix_secs()) {
+        Ok(warnings) => warnings.iter().for_each(|warning| tracing::warn!("{warning}")),
+        Err(error) => tracing::warn!("{error}"),
+    }
 }
 
 /// Opens the models that the flags name, and returns how they are run.

@@ -9,7 +9,7 @@ use slag_models::gpus::GpuChoice;
 
 use super::common::{
     InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
-    open_models, parse_error, print, profile_parser,
+    open_models, parse_error, print, profile_parser, warn_of_expiry,
 };
 use super::exit::Exit;
 use super::memory::{default_memory_bytes, parse_memory};
@@ -105,7 +105,7 @@ pub struct EncodeArgs {
     /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
-    /// Memory for the scene, photos and lists: a number with KiB, MiB or GiB [default: half of the free memory].
+    /// Memory for the scene, photos and lists: a number with MiB or GiB, MB or GB [default: half of the free memory].
     #[arg(long, value_name = "BYTES", value_parser = parse_memory)]
     pub memory: Option<u64>,
     /// Name of the scene [default: the name of the store's folder].
@@ -312,6 +312,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let summary = args.fleet.encode(&settings, &engines, progress, cancel.as_ref())?;
     let lines = lines(&settings, &summary, expected.as_ref());
     print(json, &summary, lines)?;
+    warn_of_expiry(&settings.output.store);
     if let (Some(path), Some(recorder)) = (&args.report, &recorder) {
         fs_err::write(path, report::of_encode(&settings.output.scene_name, &summary, recorder)?)?;
     }

@@ -8,10 +8,10 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
 use slag_common::tuf::format_utc;
 
-use super::common::print;
+use super::common::{print, warn_of_expiry};
 use super::exit::Exit;
 use crate::store::ceremony::{Change, Changed, KeysStatus, default_root_folder, sign_draft};
-use crate::store::metadata::{Metadata, clock_unix_secs};
+use crate::store::metadata::{Metadata, MetadataReader, signing_unix_secs};
 
 /// `keys`.
 #[derive(Debug, Subcommand)]
@@ -30,6 +30,8 @@ pub enum KeysCommand {
     },
     /// Shows root, keys and expiry, and the SHA-256 for `slag-edge trust add --sha256`.
     Status(KeysArgs),
+    /// Signs the root anew with the same keys, for five more years, before or after it expires. Robots follow by themselves.
+    Renew(KeysArgs),
     /// Replaces all keys of some roles by new ones. Robots follow by themselves.
     Rotate {
         /// The roles.
@@ -84,12 +86,17 @@ impl KeysArgs {
         self.root_keys.clone().unwrap_or_else(|| default_root_folder(&self.store))
     }
 
-    /// Opens the metadata of a store that exists.
-    fn open(&self) -> Result<Metadata> {
+    /// Refuses a path without a store.
+    fn check(&self) -> Result<()> {
         if !self.store.join("metadata").is_dir() {
             bail!("{}: there is no store; run `slag-encoder keys init`, or encode", self.store.display());
         }
-        Ok(Metadata::open(&self.store)?)
+        Ok(())
+    }
+
+    fn change(&self, change: &Change, now_unix_secs: u64) -> Result<Changed> {
+        self.check()?;
+        Ok(Metadata::open(&self.store)?.change_keys(change, &self.root_folder(), now_unix_secs)?)
     }
 }
 
@@ -107,7 +114,7 @@ pub enum Role {
 }
 
 pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
-    let now = clock_unix_secs();
+    let now = signing_unix_secs();
     match command {
         KeysCommand::Init { at, n_root_keys, threshold } => {
             if threshold > n_root_keys {
@@ -118,15 +125,18 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
             metadata.make_root(&at.root_folder(), *n_root_keys as usize, *threshold, now)?;
             show(json, &metadata.keys_status(&at.root_folder())?)
         }
-        KeysCommand::Status(at) => show(json, &at.open()?.keys_status(&at.root_folder())?),
+        KeysCommand::Status(at) => {
+            at.check()?;
+            warn_of_expiry(&at.store);
+            show(json, &MetadataReader::new(&at.store).keys_status(&at.root_folder())?)
+        }
+        KeysCommand::Renew(at) => changed(json, &at.change(&Change::Roles(Vec::new()), now)?),
         KeysCommand::Rotate { roles, at } => {
             let names = roles.iter().filter_map(|role| Some(role.to_possible_value()?.get_name().to_owned()));
             let change = Change::Roles(names.collect());
-            changed(json, &at.open()?.change_keys(&change, &at.root_folder(), now)?)
+            changed(json, &at.change(&change, now)?)
         }
-        KeysCommand::Revoke { id, at } => {
-            changed(json, &at.open()?.change_keys(&Change::Key(id.clone()), &at.root_folder(), now)?)
-        }
+        KeysCommand::Revoke { id, at } => changed(json, &at.change(&Change::Key(id.clone()), now)?),
         KeysCommand::Sign { draft, root_keys } => {
             let n_keys = sign_draft(draft, root_keys)?;
             let line =
@@ -134,7 +144,10 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
             print(json, &Signed { n_keys }, line)?;
             Ok(Exit::Done)
         }
-        KeysCommand::Install { draft, at } => changed(json, &at.open()?.install_root(draft, now)?),
+        KeysCommand::Install { draft, at } => {
+            at.check()?;
+            changed(json, &Metadata::open(&at.store)?.install_root(draft, now)?)
+        }
     }
 }
 

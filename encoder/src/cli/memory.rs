@@ -58,7 +58,7 @@ mod tests {
             parse_memory("67108863"),
             Err("\"67108863\" is too little; expected at least 64MiB".into())
         );
-        assert_eq!(parse_memory("GB"), Err("unit \"GB\": expected none, KiB, MiB or GiB".into()));
+        assert_eq!([parse_memory("2GB"), parse_memory("2G")], [Ok(2_000_000_000), Ok(2 << 30)]);
     }
 
     #[test]

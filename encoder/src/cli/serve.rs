@@ -1,17 +1,21 @@
 //! `serve`: publishes a store over HTTP.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::Result;
 use clap::Args;
 use slag_service::listen::Listen;
 use slag_service::tls::TlsFiles;
 
-use super::common::{ModelArgs, runtime, stopped};
+use super::common::{ModelArgs, runtime, stopped, warn_of_expiry};
 use super::exit::Exit;
 use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
 use crate::view::{self, Shown, Viewer};
+
+/// Time between two looks whether metadata expires soon.
+const EXPIRY_INTERVAL: Duration = Duration::from_secs(86_400);
 
 /// `serve`.
 #[derive(Debug, Args)]
@@ -61,6 +65,14 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
         };
         let page = view::router(Viewer::new(shown));
         let router = serve::router_with(&args.store, limits, access, page)?;
+        let store = args.store.clone();
+        tokio::spawn(async move {
+            let mut days = tokio::time::interval(EXPIRY_INTERVAL);
+            loop {
+                days.tick().await;
+                warn_of_expiry(&store);
+            }
+        });
         serve::serve_router(router, args.listen.clone(), limits, tls, listening, stopped()).await
     })?;
     Ok(Exit::Done)

@@ -1,23 +1,22 @@
 //! `store`: what a store holds, whether it is whole, and what can go.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::{Result, anyhow};
+use anyhow::Result;
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::byte_size::ByteSize;
 use slag_common::tuf::format_utc;
 
-use super::common::print;
-use super::encode;
+use super::common::{print, warn_of_expiry};
 use super::exit::Exit;
 use crate::encode::{JobStatus, job_status};
 use crate::progress::Progress;
-use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, clock_unix_secs};
+use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, signing_unix_secs};
 use crate::store::{
-    BadObject, Exported, Fault, GenerationRecord, Published, Store, StoreReader, Verified, export,
+    CatalogueCopy, Exported, Fault, GenerationRecord, Published, Store, StoreReader, Verified, export,
 };
 
 /// `store`.
@@ -25,13 +24,8 @@ use crate::store::{
 pub enum StoreCommand {
     /// Lists the generations of a store with their cells and bytes.
     Ls(StoreArgs),
-    /// Reads every byte that a store publishes, and names what is damaged or missing. `repair` and `encode` write it anew.
+    /// Reads every byte that a store publishes, and names what is damaged or missing: another encode writes it anew.
     Verify(StoreArgs),
-    /// Makes what is damaged or missing again: the catalogue and metadata from the manifest, objects from the views that
-    /// the encode kept (`--keep-views`), by the command that the catalogue has of it.
-    ///
-    /// Publishes nothing: robots fetch the same files as before.
-    Repair(StoreArgs),
     /// Removes what neither the current generation nor the one before it needs.
     Gc(StoreArgs),
     /// Writes the store as static files, from which robots fetch over any web server; again after each encode and refresh.
@@ -75,13 +69,12 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
                 history: Vec::new(),
                 job: None,
             };
-            match Store::create_or_open(&at.store) {
-                Ok(store) => {
-                    listed.history = store.generations()?;
-                    listed.job = job_status(&store)?;
+            match CatalogueCopy::of(&at.store, &std::env::temp_dir())? {
+                Some(catalogue) => {
+                    listed.history = catalogue.generations()?;
+                    listed.job = job_status(catalogue.db(), &at.store)?;
                 }
-                // An encode may run; manifests are there in any case.
-                Err(error) => tracing::warn!("without the catalogue: {error}"),
+                None => tracing::warn!("without the history: the catalogue db/ is not there, damaged, or being changed"),
             }
             print(json, &listed, &listed)?;
             Ok(Exit::Done)
@@ -92,10 +85,10 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             progress.begin("verify", "object", listing.n_objects() as u64, 0);
             let verified = listing.verify(|| progress.advance(1));
             progress.end();
+            warn_of_expiry(&at.store);
             print(json, &verified, Lines(&verified))?;
             Ok(if verified.bad.is_empty() { Exit::Done } else { Exit::Failed })
         }
-        StoreCommand::Repair(at) => repair(&at.store, progress, json),
         StoreCommand::Gc(at) => {
             // A mistyped path must not create a store.
             StoreReader::open(&at.store)?;
@@ -115,76 +108,13 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
         StoreCommand::Refresh { at, days } => {
             // A mistyped path must not create a store.
             StoreReader::open(&at.store)?;
-            let refreshed = Metadata::open(&at.store)?.refresh(clock_unix_secs(), *days)?;
+            let refreshed = Metadata::open(&at.store)?.refresh(signing_unix_secs(), *days)?;
             let expires = format_utc(refreshed.expires_unix_secs);
             let line = format!("timestamp {} until {expires}\n", refreshed.timestamp_version);
+            warn_of_expiry(&at.store);
             print(json, &refreshed, line)?;
             Ok(Exit::Done)
         }
-    }
-}
-
-/// Verifies, makes again what is bad, and verifies that.
-fn repair(path: &Path, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let reader = StoreReader::open(path)?;
-    // Mends metadata and catalogue on its way.
-    let store = Store::create_or_open(path)?;
-    let verify = || {
-        let listing = reader.listing();
-        progress.begin("verify", "object", listing.n_objects() as u64, 0);
-        let verified = listing.verify(|| progress.advance(1));
-        progress.end();
-        verified
-    };
-    let before = verify();
-    let generation = reader.manifest().generation;
-    let record = store.generations()?.into_iter().find(|record| record.generation == generation);
-    drop(store);
-    let mut failure = None;
-    if !before.bad.is_empty() {
-        let command = record.and_then(|record| record.command);
-        let remade = match &command {
-            Some(command) => encode::remake(command, path, progress),
-            None => Err(anyhow!("the command that made generation {generation} is not known")),
-        };
-        failure = remade.err().map(|error| format!("{error:#}"));
-    }
-    let after = if before.bad.is_empty() { before.clone() } else { verify() };
-    let is_mended = |bad: &&BadObject| after.bad.iter().all(|still| still.hash != bad.hash);
-    let repaired = Repaired {
-        n_objects: after.n_objects,
-        mended: before.bad.iter().filter(is_mended).cloned().collect(),
-        bad: after.bad,
-        failure,
-    };
-    print(json, &repaired, &repaired)?;
-    Ok(if repaired.bad.is_empty() { Exit::Done } else { Exit::Failed })
-}
-
-/// The result of a repair.
-#[derive(Serialize)]
-struct Repaired {
-    n_objects: usize,
-    /// Objects that were bad and are whole.
-    mended: Vec<BadObject>,
-    /// Objects that still are bad.
-    bad: Vec<BadObject>,
-    /// Why nothing could be made again.
-    failure: Option<String>,
-}
-
-impl fmt::Display for Repaired {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for object in &self.mended {
-            writeln!(f, "{}: made again ({})", object.path.display(), object.holds.join("; "))?;
-        }
-        for object in &self.bad {
-            writeln!(f, "{}: still bad ({})", object.path.display(), object.holds.join("; "))?;
-        }
-        if let Some(failure) = &self.failure {
-            writeln!(f, "nothing was made again: {failure}")?;
-        }
-        writeln!(f, "{} objects, {} made again, {} bad", self.n_objects, self.mended.len(), self.bad.len())
     }
 }
 
@@ -272,7 +202,7 @@ impl fmt::Display for Lines<'_> {
         writeln!(
             f,
             "{}",
-            if bad.is_empty() { "" } else { "; `store repair` or another encode writes what is bad anew" }
+            if bad.is_empty() { "" } else { "; another encode into this store writes what is bad anew" }
         )
     }
 }

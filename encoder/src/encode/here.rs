@@ -13,7 +13,7 @@ use super::error::EncodeError;
 use super::executor::{CellsToBuild, Executor, ViewsRun};
 use super::pipeline;
 use super::plan::Plan;
-use super::report::{SkippedView, StageReport};
+use super::report::{LeftOut, StageReport};
 use super::sink::ViewRecord;
 use super::view::{ViewStages, Work};
 
@@ -40,16 +40,15 @@ impl Executor for Here {
             .take_while(|_| !context.is_cancelled() && budget.may_begin(is_over()))
             .enumerate()
             .map(|(i, view)| (i < n_alone, view));
-        let skipped = Mutex::new(Vec::new());
+        let skipped = Mutex::new(LeftOut::default());
         let start = Instant::now();
         let mut reports = work_off(&stages, run.threads, source, context, |view, error| {
             if run.strict {
                 return Err(error);
             }
-            tracing::warn!("view {} is left out: {error}", view.name);
             let reason = error.to_string();
             context.progress().left_out(&view.name, &reason);
-            locked(&skipped).push(SkippedView { view: view.name.clone(), reason });
+            locked(&skipped).push(view.name.clone(), reason);
             Ok(())
         })?;
         let wall_secs = start.elapsed().as_secs_f64();
@@ -60,7 +59,7 @@ impl Executor for Here {
             let n_done = plan.job.done_views()?.len();
             return Err(EncodeError::Interrupted { n_done, n_views: plan.order.len() });
         }
-        let skipped = skipped.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let skipped = skipped.into_inner().unwrap_or_else(PoisonError::into_inner).end();
         Ok(ViewsRun { stages: reports, skipped, images_on: stages.images_on() })
     }
 }
@@ -79,7 +78,7 @@ pub(crate) fn work_off<'v>(
 ) -> Result<Vec<StageReport>, EncodeError> {
     let list = stages.stages();
     let source = source.map(|(is_alone, view)| (is_alone, Work::begin(view, stages.has_photos())));
-    pipeline::run(&list, n_threads, source, |at, (is_alone, work)| {
+    let done = pipeline::run(&list, n_threads, source, |at, (is_alone, work)| {
         let view = work.view();
         // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
         let result = match list[at].on_cpu {
@@ -92,7 +91,9 @@ pub(crate) fn work_off<'v>(
             Err(error) if error.is_of_one_view() => on_bad_view(view, error).map(|()| None),
             result => result.map(|work| Some((is_alone, work?))),
         }
-    })
+    });
+    stages.rotated.warn();
+    done
 }
 
 /// Lets views begin until the time is over, but always a first one.

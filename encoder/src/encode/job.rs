@@ -1,10 +1,10 @@
 //! The state of an unfinished encode: which views are done, and their files of contributions.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use slag_common::{Hash32, View};
+use slag_common::{Hash32, View, durable};
 
 use super::error::EncodeError;
 use super::sink::{ViewRecord, ViewSink};
@@ -34,13 +34,13 @@ pub struct JobStatus {
     pub step: Option<String>,
 }
 
-/// Returns the state of the encode that a store keeps views of, if there is one.
+/// Returns the state of the encode that a store keeps views of, if there is one. `db`: the store's catalogue, or a copy.
 ///
 /// # Errors
 /// [`EncodeError::Records`].
-pub fn job_status(store: &Store) -> Result<Option<JobStatus>, EncodeError> {
-    let records = |source| records_error(store, source);
-    let tree = store.db().open_tree(TREE).map_err(records)?;
+pub fn job_status(db: &sled::Db, store: &Path) -> Result<Option<JobStatus>, EncodeError> {
+    let records = |source| EncodeError::Records { path: store.to_owned(), source };
+    let tree = db.open_tree(TREE).map_err(records)?;
     if !tree.contains_key(IDENTITY_KEY).map_err(records)? {
         return Ok(None);
     }
@@ -123,7 +123,7 @@ impl<'a> Job<'a> {
             job.flush()?;
         }
         fs_err::create_dir_all(job.views_folder())?;
-        slag_common::durable::write(&job.identity_path(), of_scene.to_string().as_bytes())?;
+        durable::write(&job.identity_path(), of_scene.to_string().as_bytes())?;
         Ok(job)
     }
 
@@ -267,11 +267,23 @@ impl<'a> Job<'a> {
         self.folder.join(VIEWS_FOLDER)
     }
 
-    /// Records go first: a file without a record is redone, a record without a file would be an error.
     fn clear(&self) -> Result<(), EncodeError> {
-        self.records.clear().map_err(|source| records_error(self.store, source))?;
-        self.flush()?;
-        if self.folder.exists() {
+        self.clear_steps(3)
+    }
+
+    /// Does the first steps of [`Self::clear`]; after each, a crash leaves this job or none.
+    fn clear_steps(&self, n_steps: usize) -> Result<(), EncodeError> {
+        // Without it, nothing takes the files up again once their records are gone.
+        if n_steps > 0 && self.identity_path().exists() {
+            fs_err::remove_file(self.identity_path())?;
+            durable::sync_folder(&self.folder)?;
+        }
+        // A file without a record is redone, a record without a file would be an error.
+        if n_steps > 1 {
+            self.records.clear().map_err(|source| records_error(self.store, source))?;
+            self.flush()?;
+        }
+        if n_steps > 2 && self.folder.exists() {
             fs_err::remove_dir_all(&self.folder)?;
         }
         Ok(())
@@ -375,16 +387,31 @@ mod tests {
         let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
         job.begin("views").expect("records");
         keep(&job, "a");
-        let status = job_status(&store).expect("reads").expect("a job");
+        let status = job_status(store.db(), store.dir()).expect("reads").expect("a job");
         assert_eq!((status.n_views, status.is_published, status.step.as_deref()), (1, false, Some("views")));
         drop(job);
         drop(store);
         fs_err::remove_dir_all(dir.path().join("db")).expect("there");
         let store = Store::create_or_open(dir.path()).expect("opens");
-        assert_eq!(job_status(&store).expect("reads"), None);
+        assert_eq!(job_status(store.db(), store.dir()).expect("reads"), None);
         let done = |job: &Job<'_>| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
         assert_eq!(done(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
         assert!(matches!(open_with(&store, 2, &[("a", 1)]), Err(EncodeError::OtherJob { n_done: 1, .. })));
+    }
+
+    /// A published job that a crash left half dropped neither comes back nor keeps another scene out.
+    #[test]
+    fn a_job_that_was_dropped_in_part_stays_dropped() {
+        for n_steps in 0..=3 {
+            let dir = tempfile::tempdir().expect("a folder");
+            let store = Store::create_or_open(dir.path()).expect("opens");
+            let job = open_with(&store, 1, &[("a", 1)]).expect("begins");
+            keep(&job, "a");
+            job.keep_published().expect("marks");
+            open_with(&store, 1, &[("a", 1)]).expect("goes on").clear_steps(n_steps).expect("drops");
+            let other = open_with(&store, 2, &[("a", 1)]).unwrap_or_else(|e| panic!("{n_steps} steps: {e}"));
+            assert!(other.done_views().expect("reads").is_empty(), "{n_steps} steps");
+        }
     }
 
     /// A published job may be dropped, but not the views that a later run adds to it before it is published again.

@@ -71,6 +71,7 @@ pub(crate) mod fleet_parts {
     pub(crate) use super::identity::of_scene;
     pub(crate) use super::inputs::reserve_photos;
     pub(crate) use super::plan::{Plan, segmenter_of};
+    pub(crate) use super::report::LeftOut;
     pub(crate) use super::sink::{PhotoSource, ViewRecord, ViewSink};
     pub(crate) use super::view::{ViewStages, ViewTools};
 }

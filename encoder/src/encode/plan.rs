@@ -136,7 +136,7 @@ fn lost_views(
     inputs: &Inputs,
     context: &RunContext<'_>,
 ) -> Result<Option<LostViews>, EncodeError> {
-    let kept = job_status(store)?.filter(|status| status.n_views > 0);
+    let kept = job_status(store.db(), store.dir())?.filter(|status| status.n_views > 0);
     let Some(kept) = kept.filter(|status| status.is_published) else { return Ok(None) };
     if Job::is_kept(store, of_scene)? {
         return Ok(None);

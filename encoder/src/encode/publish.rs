@@ -36,11 +36,38 @@ pub(super) fn publish(
     let manifest = manifest(&plan, &built, generation, text_model);
     executor.begin_publication()?;
     plan.store.publish_by(&manifest, &built.extras, plan.settings.output.command.clone())?;
-    let models = plan.settings.output.models.clone();
-    plan.store.remember_models(&ModelsRecord { encoder: manifest.encoder.id, models })?;
     let mut summary = summary(&plan, &views, built, &manifest);
     // With views left to do the contributions stay: the next encode goes on from them.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
+    let (store, planned_peak) = (plan.store, plan.planned_peak);
+    if let Err(error) = tidy_up(plan, has_open, manifest.encoder.id, context) {
+        let path = store.dir().display();
+        tracing::warn!("generation {generation} is published, but {path} was not tidied up: {error}");
+    }
+    summary.busy_secs = context.busy_secs();
+    for stage in &summary.view_stages {
+        *summary.busy_secs.entry(stage.stage.clone()).or_default() += stage.busy_secs;
+    }
+    let end = Instant::now();
+    summary.wall_secs = end.duration_since(context.start()).as_secs_f64();
+    summary.phases = context.phases(end);
+    summary.memory = planned_peak.zip(memory::peak_bytes()).map(|(planned, peak_bytes)| MemoryReport {
+        planned_bytes: planned.len_bytes,
+        planned_phase: planned.phase,
+        peak_bytes,
+    });
+    Ok(summary)
+}
+
+/// Records the models, ends the job, and removes what no generation needs.
+fn tidy_up(
+    plan: Plan<'_>,
+    has_open: bool,
+    encoder: Hash32,
+    context: &RunContext<'_>,
+) -> Result<(), EncodeError> {
+    let models = plan.settings.output.models.clone();
+    plan.store.remember_models(&ModelsRecord { encoder, models })?;
     match plan.settings.run.keep_views || has_open {
         true => {
             let job = plan.store.job_dir()?;
@@ -50,19 +77,7 @@ pub(super) fn publish(
         false => plan.job.finish()?,
     }
     plan.store.prune()?;
-    summary.busy_secs = context.busy_secs();
-    for stage in &summary.view_stages {
-        *summary.busy_secs.entry(stage.stage.clone()).or_default() += stage.busy_secs;
-    }
-    let end = Instant::now();
-    summary.wall_secs = end.duration_since(context.start()).as_secs_f64();
-    summary.phases = context.phases(end);
-    summary.memory = plan.planned_peak.zip(memory::peak_bytes()).map(|(planned, peak_bytes)| MemoryReport {
-        planned_bytes: planned.len_bytes,
-        planned_phase: planned.phase,
-        peak_bytes,
-    });
-    Ok(summary)
+    Ok(())
 }
 
 fn manifest(

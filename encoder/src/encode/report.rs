@@ -21,6 +21,28 @@ pub struct SkippedView {
     pub reason: String,
 }
 
+/// Views that are left out. The first ones are named as it happens, the others counted.
+#[derive(Default)]
+pub(crate) struct LeftOut(Vec<SkippedView>);
+
+impl LeftOut {
+    const N_NAMED: usize = 3;
+
+    pub(crate) fn push(&mut self, view: String, reason: String) {
+        if self.0.len() < Self::N_NAMED {
+            tracing::warn!("view {view} is left out: {reason}");
+        }
+        self.0.push(SkippedView { view, reason });
+    }
+
+    pub(crate) fn end(self) -> Vec<SkippedView> {
+        if let Some(n @ 1..) = self.0.len().checked_sub(Self::N_NAMED) {
+            tracing::warn!("{n} more views are left out; --json and --report name them");
+        }
+        self.0
+    }
+}
+
 /// The size of one cell and of its shards.
 #[derive(Clone, Debug, Serialize)]
 pub struct CellReport {

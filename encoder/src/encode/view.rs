@@ -16,7 +16,7 @@ use super::settings::{Regions, ViewSettings};
 use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
 use crate::embed::{self, EmbedError, PatchUse, PhotoPatches, SharedEncoders, Surroundings};
-use crate::ingest::{self, LoadedImage};
+use crate::ingest::{self, LoadedImage, RotatedPhotos};
 use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
@@ -55,6 +55,7 @@ pub(crate) struct ViewStages<'a> {
     encoders: Encoders,
     /// The device that runs the image model, once it is open.
     images_on: Arc<OnceLock<Option<String>>>,
+    pub(super) rotated: RotatedPhotos,
 }
 
 /// The image encoders.
@@ -131,7 +132,7 @@ impl<'a> ViewStages<'a> {
             true => Encoders::OfViews(Mutex::default()),
             false => Encoders::Shared(SharedEncoders::new(tools.gpus, Box::new(open))),
         };
-        Self { tools, context, preprocess, encoders, images_on }
+        Self { tools, context, preprocess, encoders, images_on, rotated: RotatedPhotos::default() }
     }
 
     /// Returns the load of each GPU by the models of a stage.
@@ -195,10 +196,14 @@ impl<'a> ViewStages<'a> {
                 }
                 Next::Decode
             }
-            Next::Decode => match ingest::load_image(view)? {
-                loaded if self.tools.segmenter.wants_depth() => Next::Depth(loaded),
-                loaded => Next::Segment(loaded, None),
-            },
+            Next::Decode => {
+                let loaded = ingest::load_image(view)?;
+                self.rotated.add(&loaded);
+                match self.tools.segmenter.wants_depth() {
+                    true => Next::Depth(loaded),
+                    false => Next::Segment(loaded, None),
+                }
+            }
             Next::Depth(loaded) => {
                 let width = self.tools.settings.raster_width;
                 let raster_view = raster_view(&loaded, width.base_px(loaded.view.intrinsics.width_px));

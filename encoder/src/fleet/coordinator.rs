@@ -16,7 +16,7 @@ use super::run::Run;
 use super::worker::pause;
 use super::{inputs, objects};
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{Executor, Plan, RunContext, ViewRecord, ViewsRun};
+use crate::encode::fleet_parts::{Executor, LeftOut, Plan, RunContext, ViewRecord, ViewsRun};
 use crate::encode::{self, EncodeError, EncodeSettings, EncodeSummary, Engines, SkippedView};
 use crate::progress::Progress;
 
@@ -71,7 +71,7 @@ impl Coordinator {
         );
         let views = run_plan.views.into_iter().enumerate();
         let open = views.map(|(number, view)| (view.id, (number, view.name))).collect();
-        Ok(ViewsInWork { bucket: &self.bucket, run, queue, open, skipped: Vec::new() })
+        Ok(ViewsInWork { bucket: &self.bucket, run, queue, open, skipped: LeftOut::default() })
     }
 }
 
@@ -112,7 +112,7 @@ struct ViewsInWork<'a> {
     queue: Option<Enqueuer>,
     /// Number in the plan and name, by identity.
     open: BTreeMap<Hash32, (usize, String)>,
-    skipped: Vec<SkippedView>,
+    skipped: LeftOut,
 }
 
 impl ViewsInWork<'_> {
@@ -157,8 +157,7 @@ impl ViewsInWork<'_> {
             if is_strict {
                 return Err(FleetError::View { view, reason });
             }
-            tracing::warn!("view {view} is left out: {reason}");
-            self.skipped.push(SkippedView { view, reason });
+            self.skipped.push(view, reason);
         }
         Ok(())
     }
@@ -180,6 +179,6 @@ impl ViewsInWork<'_> {
         if let Some(queue) = &self.queue {
             queue.close();
         }
-        Ok(self.skipped)
+        Ok(self.skipped.end())
     }
 }

@@ -7,6 +7,7 @@ mod undistort;
 
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
@@ -30,6 +31,40 @@ pub struct LoadedImage {
     pub undistorter: Option<Undistorter>,
     /// Pixels inside the lens image, row-major; `None` if all are.
     pub valid: Option<Vec<bool>>,
+    /// Whether its file has an EXIF orientation, which is ignored: poses are computed from the pixels as stored.
+    pub is_rotated: bool,
+}
+
+/// Counts the photos with an EXIF orientation: a camera that is held upright makes thousands of them.
+#[derive(Debug, Default)]
+pub struct RotatedPhotos(Mutex<(usize, String)>);
+
+impl RotatedPhotos {
+    pub fn add(&self, photo: &LoadedImage) {
+        let mut rotated = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if photo.is_rotated {
+            rotated.0 += 1;
+            if rotated.0 == 1 {
+                rotated.1.clone_from(&photo.view.name);
+            }
+        }
+    }
+
+    /// Warns once of all of them.
+    pub fn warn(&self) {
+        if let Some(line) = self.line() {
+            tracing::warn!("{line}");
+        }
+    }
+
+    /// Returns what [`Self::warn`] says.
+    pub fn line(&self) -> Option<String> {
+        let rotated = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let (n, first) = &*rotated;
+        (*n > 0).then(|| {
+            format!("{n} photos have an EXIF orientation, which is ignored; the first is {first}. If they fit badly, were their poses computed from rotated copies?")
+        })
+    }
 }
 
 /// Reason why a photo cannot be loaded.
@@ -96,23 +131,24 @@ pub fn photo_area_px(view: &View) -> u64 {
 /// Loads the photo of a view and undistorts it.
 ///
 /// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay unchanged.
-/// An EXIF orientation is ignored with a warning, because poses are computed from the pixels as stored.
+/// An EXIF orientation is ignored, see [`RotatedPhotos`].
 ///
 /// # Errors
 /// [`IngestError`] if the file cannot be read or decoded, or its size does not match the camera.
 pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
-    let photo = decode(&view.image_path, &view.intrinsics)?;
+    let (photo, is_rotated) = decode(&view.image_path, &view.intrinsics)?;
     let intrinsics = view.intrinsics.scaled_to(photo.width(), photo.height());
     let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
     if intrinsics.distortion == Distortion::None {
-        return Ok(LoadedImage { view, image: photo, undistorter: None, valid: None });
+        return Ok(LoadedImage { view, image: photo, undistorter: None, valid: None, is_rotated });
     }
     let undistorter = Undistorter::new(intrinsics);
     let (image, valid) = undistorter.image(&photo);
-    Ok(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid) })
+    Ok(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), is_rotated })
 }
 
-fn decode(path: &Path, camera: &Intrinsics) -> Result<RgbImage, IngestError> {
+/// Returns the pixels, and whether the file has an EXIF orientation.
+fn decode(path: &Path, camera: &Intrinsics) -> Result<(RgbImage, bool), IngestError> {
     let failed = |source| IngestError::Decode { path: path.to_owned(), source };
     let open = || Ok::<_, IngestError>(io::BufReader::new(fs_err::File::open(path)?));
     let reader = ImageReader::new(open()?).with_guessed_format()?;
@@ -129,14 +165,8 @@ fn decode(path: &Path, camera: &Intrinsics) -> Result<RgbImage, IngestError> {
             expected_px: [camera.width_px, camera.height_px],
         });
     }
-    match decoder.orientation() {
-        Ok(Orientation::NoTransforms) | Err(_) => {}
-        Ok(orientation) => tracing::warn!(
-            path = %path.display(), ?orientation,
-            "EXIF orientation ignored; if this view fits badly, were its poses computed from a rotated copy?"
-        ),
-    }
-    Ok(DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgb8())
+    let is_rotated = decoder.orientation().is_ok_and(|found| found != Orientation::NoTransforms);
+    Ok((DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgb8(), is_rotated))
 }
 
 /// Returns whether a size is exactly proportional to that of the camera, or is a reduction of it by an integer factor with

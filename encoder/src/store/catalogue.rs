@@ -6,8 +6,8 @@
 //! | `cells` | hash of a manifest, id of a cell | the cell's record: box, shards, hashes; of the manifests that the store has |
 //!
 //! `encode` and `push` keep the state of their work in trees of their own. A writer holds the database for as long as it
-//! writes; readers look into it for a moment, and do without it if it is held. It repeats what files say, but for the
-//! history and the commands, so a damaged one is set aside and made anew from the files.
+//! writes; readers read a copy. It repeats what files say, but for the history and the commands, so a damaged one is set
+//! aside and made anew from the files.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -172,17 +172,6 @@ impl Catalogue {
         }
     }
 
-    /// Returns the cells that a catalogue lists for a manifest, in order of their ids; `None` if it does not know the
-    /// manifest, is held by a writer for longer than `patience`, damaged or absent.
-    pub fn peek(store: &Path, manifest_hash: Hash32, patience: Duration) -> Option<Vec<CellRecord>> {
-        let path = store.join("db");
-        if !path.is_dir() {
-            return None;
-        }
-        let catalogue = Self::load(&path, patience).ok()?;
-        guarded(|| catalogue.cells_of(manifest_hash)).ok().filter(|cells| !cells.is_empty())
-    }
-
     /// Returns the database, for the state of jobs and pushes.
     pub fn db(&self) -> &sled::Db {
         &self.db
@@ -272,14 +261,55 @@ impl Catalogue {
     }
 }
 
+/// What a catalogue says, read from a copy: neither the store nor its lock is touched, so a writer may be at work.
+#[derive(Debug)]
+pub struct CatalogueCopy {
+    catalogue: Catalogue,
+    _folder: tempfile::TempDir,
+}
+
+impl CatalogueCopy {
+    /// Copies a store's catalogue to a folder under `scratch`, which goes with it. `None` if the store has no catalogue, or
+    /// the copy is damaged: a writer may have changed it meanwhile.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn of(store: &Path, scratch: &Path) -> Result<Option<Self>, StoreError> {
+        let db = store.join("db");
+        if !db.is_dir() {
+            return Ok(None);
+        }
+        let folder = tempfile::tempdir_in(scratch)?;
+        // sled keeps all but large values in files of this one folder, and the records are small.
+        for entry in fs_err::read_dir(db)? {
+            let path = entry?.path();
+            if let (true, Some(name)) = (path.is_file(), path.file_name()) {
+                fs_err::copy(&path, folder.path().join(name))?;
+            }
+        }
+        let loaded = Catalogue::load(folder.path(), Duration::ZERO).ok();
+        Ok(loaded.map(|catalogue| Self { catalogue, _folder: folder }))
+    }
+
+    /// Returns the copied database, for the state of jobs.
+    pub fn db(&self) -> &sled::Db {
+        self.catalogue.db()
+    }
+
+    /// Returns all generations ever published, the oldest first.
+    ///
+    /// # Errors
+    /// [`StoreError::Records`].
+    pub fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
+        self.catalogue.generations()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::store::tests::manifest;
     use crate::store::{Extras, Store, StoreReader};
-
-    /// sled releases its lock on a thread of its own.
-    const PATIENCE: Duration = Duration::from_secs(5);
 
     fn files_of(folder: &Path, found: &mut Vec<PathBuf>) {
         for entry in fs_err::read_dir(folder).expect("a folder") {
@@ -303,19 +333,20 @@ mod tests {
             },
         ];
         for (number, damage) in damages.iter().enumerate() {
-            let dir = tempfile::tempdir().expect("a folder");
+            let [dir, scratch] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
             let store = Store::create_or_open(dir.path()).expect("opens");
             let shards: Vec<_> =
                 ["a", "b"].map(|text| store.put_bytes(text.as_bytes()).expect("room")).into();
             store.publish(&manifest(6, &shards[..1]), &Extras::new()).expect("publishes");
-            let hash = store.publish(&manifest(7, &shards), &Extras::new()).expect("publishes");
+            store.publish(&manifest(7, &shards), &Extras::new()).expect("publishes");
             drop(store);
             let mut files = Vec::new();
             files_of(&dir.path().join("db"), &mut files);
             files.iter().for_each(|path| damage(path));
             // A reader never believes a damaged catalogue.
-            let seen = Catalogue::peek(dir.path(), hash, PATIENCE);
-            assert!(seen.is_none_or(|cells| cells == manifest(7, &shards).cells), "damage {number}");
+            let seen = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies");
+            let generations = seen.map(|copy| copy.generations().expect("reads")).unwrap_or_default();
+            assert!(generations.iter().all(|record| record.n_cells <= 2), "damage {number}");
             let store = Store::create_or_open(dir.path()).unwrap_or_else(|e| panic!("damage {number}: {e}"));
             assert_eq!(store.cells().expect("reads"), manifest(7, &shards).cells, "damage {number}");
             assert_eq!(store.next_generation().expect("reads"), 8, "damage {number}");
@@ -339,7 +370,6 @@ mod tests {
             store.publish_by(&manifest, &Extras::new(), Some(command.clone())).expect("publishes");
         }
         store.prune().expect("prunes");
-        let (previous, current) = (manifest(2, &shards[..2]), manifest(3, &shards));
         drop(store);
         let store = Store::create_or_open(dir.path()).expect("opens");
         let generations = store.generations().expect("reads");
@@ -347,19 +377,37 @@ mod tests {
             generations.iter().map(|record| (record.generation, record.n_cells)).collect();
         assert_eq!(seen, [(1, 1), (2, 2), (3, 3)]);
         assert!(generations.iter().all(|record| record.command.as_ref() == Some(&command)));
-        drop(store);
-        let peek = |manifest: &Manifest, patience| {
-            Catalogue::peek(dir.path(), Hash32::of(&manifest.to_bytes()), patience)
+        assert_eq!(store.cells().expect("reads"), manifest(3, &shards).cells);
+        let of = |generation: usize| {
+            let manifest = manifest(generation as u64, &shards[..generation]);
+            store.catalogue().cells(Hash32::of(&manifest.to_bytes())).expect("reads").len()
         };
-        assert_eq!(peek(&current, PATIENCE), Some(current.cells.clone()));
-        assert_eq!(peek(&previous, PATIENCE), Some(previous.cells.clone()));
-        assert_eq!(
-            peek(&manifest(1, &shards[..1]), PATIENCE),
-            None,
-            "its cells are forgotten, as its objects are"
-        );
-        let held = Store::create_or_open(dir.path()).expect("opens");
-        assert_eq!(peek(&current, Duration::ZERO), None, "a writer holds it");
-        drop(held);
+        assert_eq!([of(1), of(2), of(3)], [0, 2, 3], "cells are forgotten with their objects");
+    }
+
+    fn snapshot_of(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+        let mut files = Vec::new();
+        files_of(folder, &mut files);
+        files.sort();
+        files.into_iter().map(|path| (path.clone(), fs_err::read(path).expect("readable"))).collect()
+    }
+
+    /// While a writer holds the store, its history is read, and no file of it changes.
+    #[test]
+    fn a_copy_is_read_while_a_writer_is_at_work() {
+        let [dir, scratch] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
+        assert!(CatalogueCopy::of(dir.path(), scratch.path()).expect("no store").is_none());
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        let shard = store.put_bytes(b"a").expect("room");
+        store.publish(&manifest(1, &[shard]), &Extras::new()).expect("publishes");
+        fs_err::write(dir.path().join("tmp/7.part"), "of the writer").expect("writes");
+        let before = snapshot_of(dir.path());
+        let copy = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies").expect("there");
+        let generations = copy.generations().expect("reads");
+        assert_eq!(generations.iter().map(|record| record.generation).collect::<Vec<_>>(), [1]);
+        assert!(snapshot_of(dir.path()) == before, "the store was written to");
+        drop(copy);
+        assert_eq!(fs_err::read_dir(scratch.path()).expect("there").count(), 0);
+        drop(store);
     }
 }

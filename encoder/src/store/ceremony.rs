@@ -13,13 +13,13 @@ use slag_common::tuf::{
 };
 
 use super::error::StoreError;
-use super::metadata::{Metadata, ROOT_SECS, RootFile};
+use super::metadata::{Metadata, MetadataReader, ROOT_SECS, RootFile};
 use super::{files, roles};
 
 /// Which keys are replaced by new ones.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Change {
-    /// All keys of these roles.
+    /// All keys of these roles; of no role, the root is signed anew for its whole time.
     Roles(Vec<String>),
     /// The key of this id, in all roles.
     Key(String),
@@ -125,34 +125,6 @@ impl Metadata {
         Ok(Changed { root_version, root_sha256: Some(sha256_hex(&next)), draft: None })
     }
 
-    /// Describes the keys. `root_folder`: where root's keys may lie.
-    ///
-    /// # Errors
-    /// [`StoreError`].
-    pub fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
-        let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
-        let mut here: Vec<String> =
-            roles::read_folder(root_folder)?.iter().map(|key| Key::of(key).id()).collect();
-        let online = roles::ONLINE.iter().filter_map(|role| roles::read(&self.store, role).ok());
-        here.extend(online.map(|key| Key::of(&key).id()));
-        let mut keys = Vec::new();
-        for role in std::iter::once(Root::TYPE).chain(roles::ONLINE) {
-            keys.extend(root.body.roles[role].keyids.iter().map(|id| KeyStatus {
-                role: role.to_owned(),
-                id: id.clone(),
-                is_here: here.contains(id),
-            }));
-        }
-        Ok(KeysStatus {
-            root_version: root.head.version,
-            root_sha256: sha256_hex(&bytes),
-            root_expires_unix_secs: root.expires_unix_secs,
-            threshold: root.body.roles[Root::TYPE].threshold,
-            keys,
-            timestamp_expires_unix_secs: self.timestamp()?.map(|timestamp| timestamp.expires_unix_secs),
-        })
-    }
-
     /// Returns the present root with new keys in place of those that are replaced.
     fn next_root(&self, present: &Root, change: &Change, root_folder: &Path) -> Result<Root, StoreError> {
         let is_replaced = |role: &str, id: &str| match change {
@@ -184,6 +156,36 @@ impl Metadata {
         let used: Vec<&String> = next.roles.values().flat_map(|keys| &keys.keyids).collect();
         next.keys.retain(|id, _| used.contains(&id));
         Ok(next)
+    }
+}
+
+impl MetadataReader {
+    /// Describes the keys. `root_folder`: where root's keys may lie.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
+        let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
+        let mut here: Vec<String> =
+            roles::read_folder(root_folder)?.iter().map(|key| Key::of(key).id()).collect();
+        let online = roles::ONLINE.iter().filter_map(|role| roles::read(&self.store, role).ok());
+        here.extend(online.map(|key| Key::of(&key).id()));
+        let mut keys = Vec::new();
+        for role in std::iter::once(Root::TYPE).chain(roles::ONLINE) {
+            keys.extend(root.body.roles[role].keyids.iter().map(|id| KeyStatus {
+                role: role.to_owned(),
+                id: id.clone(),
+                is_here: here.contains(id),
+            }));
+        }
+        Ok(KeysStatus {
+            root_version: root.head.version,
+            root_sha256: sha256_hex(&bytes),
+            root_expires_unix_secs: root.expires_unix_secs,
+            threshold: root.body.roles[Root::TYPE].threshold,
+            keys,
+            timestamp_expires_unix_secs: self.timestamp()?.map(|timestamp| timestamp.expires_unix_secs),
+        })
     }
 
     fn no_root(&self) -> StoreError {

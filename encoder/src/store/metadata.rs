@@ -10,6 +10,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io;
+use std::ops::Deref;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -32,6 +33,9 @@ pub const TIMESTAMP_DAYS: u32 = 30;
 const SECS_PER_DAY: u64 = 86_400;
 const TARGETS_SECS: u64 = 365 * SECS_PER_DAY;
 pub(super) const ROOT_SECS: u64 = 5 * 365 * SECS_PER_DAY;
+/// 2026-01-01: nothing is signed as of an earlier time, whatever a machine's clock says that forgot the time. What is signed as of
+/// 1970 has expired before any robot sees it.
+pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 
 /// What a signature of the timestamp states.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -50,10 +54,103 @@ pub(super) struct RootFile {
     pub bytes: Vec<u8>,
 }
 
+/// The metadata of a store, to read.
+pub struct MetadataReader {
+    pub(super) store: PathBuf,
+}
+
 /// The metadata of a store, held by one writer at a time.
 pub struct Metadata {
-    pub(super) store: PathBuf,
+    reader: MetadataReader,
     _lock: File,
+}
+
+impl Deref for Metadata {
+    type Target = MetadataReader;
+
+    fn deref(&self) -> &MetadataReader {
+        &self.reader
+    }
+}
+
+impl MetadataReader {
+    /// Reads the metadata of a store, without a lock.
+    pub fn new(store: &Path) -> Self {
+        Self { store: store.to_owned() }
+    }
+
+    /// Returns the targets metadata that the timestamp names; `None` before the first publication.
+    pub(super) fn published(&self) -> Result<Option<SignedMetadata<Targets>>, StoreError> {
+        let Some(timestamp) = self.timestamp()? else { return Ok(None) };
+        let name = format!("{}.snapshot.json", timestamp.body.snapshot().version);
+        let Some(snapshot) = self.read::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)? else { return Ok(None) };
+        let name = format!("{}.targets.json", snapshot.body.meta["targets.json"].version);
+        self.read::<Targets>(&name, MAX_TARGETS_BYTES)
+    }
+
+    pub(super) fn timestamp(&self) -> Result<Option<SignedMetadata<Timestamp>>, StoreError> {
+        self.read::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)
+    }
+
+    /// Returns the newest root and its bytes; `None` before the first one.
+    pub(super) fn newest_root(&self) -> Result<Option<RootFile>, StoreError> {
+        let name = format!("{}.root.json", self.next_version(Root::TYPE)? - 1);
+        let Some(bytes) = read_file(&self.store, &name, MAX_ROOT_BYTES)? else { return Ok(None) };
+        let refuse = |cause| StoreError::Metadata { path: self.path(&name), cause };
+        Ok(Some(RootFile { root: SignedMetadata::parse(Root::TYPE, &bytes).map_err(refuse)?, bytes }))
+    }
+
+    /// Returns the version after the highest one of a role's numbered files.
+    fn next_version(&self, role: &str) -> Result<u64, StoreError> {
+        let suffix = format!(".{role}.json");
+        let mut highest = 0;
+        for entry in fs_err::read_dir(folder(&self.store))? {
+            let name = entry?.file_name();
+            let number = name.to_str().and_then(|name| name.strip_suffix(&suffix)?.parse::<u64>().ok());
+            highest = highest.max(number.unwrap_or(0));
+        }
+        Ok(highest.saturating_add(1))
+    }
+
+    fn read<T: Body>(&self, name: &str, max_bytes: u64) -> Result<Option<SignedMetadata<T>>, StoreError> {
+        let Some(bytes) = read_file(&self.store, name, max_bytes)? else { return Ok(None) };
+        let refuse = |cause| StoreError::Metadata { path: self.path(name), cause };
+        SignedMetadata::parse(T::TYPE, &bytes).map(Some).map_err(refuse)
+    }
+
+    pub(super) fn path(&self, name: &str) -> PathBuf {
+        folder(&self.store).join(name)
+    }
+
+    /// Returns what expires soon, or has expired: robots then refuse the store. Each text says until when, and what to do.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn expiry_warnings(&self, now_unix_secs: u64) -> Result<Vec<String>, StoreError> {
+        let store = self.store.display();
+        let expires = |what: &str, at: u64, command: &str| {
+            let word = if at <= now_unix_secs { "expired" } else { "expires" };
+            let at = format_utc(at);
+            format!("{store}: {what} metadata {word} at {at}, and robots refuse it then; run `slag-encoder {command} --store {store}`")
+        };
+        let mut warnings = Vec::new();
+        if now_unix_secs < RELEASE_UNIX_SECS {
+            let (now, floor) = (format_utc(now_unix_secs), format_utc(RELEASE_UNIX_SECS));
+            warnings.push(format!(
+                "this machine's clock says {now}, before this program was made: {store} is signed as of {floor}; set \
+                 the clock, then run `slag-encoder store refresh --store {store}`"
+            ));
+        }
+        let root = self.newest_root()?.map(|root| root.root.expires_unix_secs);
+        if let Some(at) = root.filter(|at| *at < now_unix_secs.saturating_add(ROOT_SECS / 10)) {
+            warnings.push(expires("root", at, "keys renew"));
+        }
+        let timestamp = self.timestamp()?.map(|timestamp| timestamp.expires_unix_secs);
+        if let Some(at) = timestamp.filter(|at| *at < now_unix_secs.saturating_add(3 * SECS_PER_DAY)) {
+            warnings.push(expires("timestamp", at, "store refresh"));
+        }
+        Ok(warnings)
+    }
 }
 
 impl Metadata {
@@ -68,7 +165,7 @@ impl Metadata {
         let file = fs_err::OpenOptions::new().write(true).create(true).truncate(false).open(&path)?;
         let lock = file.into_parts().0;
         lock.lock().map_err(|e| io::Error::new(e.kind(), format!("locking {}: {e}", path.display())))?;
-        Ok(Self { store: store.to_owned(), _lock: lock })
+        Ok(Self { reader: MetadataReader::new(store), _lock: lock })
     }
 
     /// Publishes a manifest; nothing changes if it is published already. Makes keys and root at the first time.
@@ -78,7 +175,7 @@ impl Metadata {
     /// # Errors
     /// [`StoreError`].
     pub fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
-        let now_unix_secs = created_unix_secs.max(clock_unix_secs());
+        let now_unix_secs = created_unix_secs.max(signing_unix_secs());
         if self.newest_root()?.is_none() {
             self.make_root(&roles::root_folder(&self.store), 1, 1, now_unix_secs)?;
         }
@@ -108,19 +205,6 @@ impl Metadata {
         self.sign_timestamp(FileMeta::of(version, &bytes), now_unix_secs, days)
     }
 
-    /// Returns the targets metadata that the timestamp names; `None` before the first publication.
-    pub(super) fn published(&self) -> Result<Option<SignedMetadata<Targets>>, StoreError> {
-        let Some(timestamp) = self.timestamp()? else { return Ok(None) };
-        let name = format!("{}.snapshot.json", timestamp.body.snapshot().version);
-        let Some(snapshot) = self.read::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)? else { return Ok(None) };
-        let name = format!("{}.targets.json", snapshot.body.meta["targets.json"].version);
-        self.read::<Targets>(&name, MAX_TARGETS_BYTES)
-    }
-
-    pub(super) fn timestamp(&self) -> Result<Option<SignedMetadata<Timestamp>>, StoreError> {
-        self.read::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)
-    }
-
     /// Makes keys and the first root. `root_folder`: where root's keys lie, `n_root_keys` of them.
     ///
     /// # Errors
@@ -145,14 +229,6 @@ impl Metadata {
             root_folder.display()
         );
         Ok(())
-    }
-
-    /// Returns the newest root and its bytes; `None` before the first one.
-    pub(super) fn newest_root(&self) -> Result<Option<RootFile>, StoreError> {
-        let name = format!("{}.root.json", self.next_version(Root::TYPE)? - 1);
-        let Some(bytes) = read_file(&self.store, &name, MAX_ROOT_BYTES)? else { return Ok(None) };
-        let refuse = |cause| StoreError::Metadata { path: self.path(&name), cause };
-        Ok(Some(RootFile { root: SignedMetadata::parse(Root::TYPE, &bytes).map_err(refuse)?, bytes }))
     }
 
     pub(super) fn sign_all(&self, targets: &Targets, now_unix_secs: u64) -> Result<(), StoreError> {
@@ -191,36 +267,19 @@ impl Metadata {
         }
     }
 
-    /// Returns the version after the highest one of a role's numbered files.
-    fn next_version(&self, role: &str) -> Result<u64, StoreError> {
-        let suffix = format!(".{role}.json");
-        let mut highest = 0;
-        for entry in fs_err::read_dir(folder(&self.store))? {
-            let name = entry?.file_name();
-            let number = name.to_str().and_then(|name| name.strip_suffix(&suffix)?.parse::<u64>().ok());
-            highest = highest.max(number.unwrap_or(0));
-        }
-        Ok(highest.saturating_add(1))
-    }
-
-    fn read<T: Body>(&self, name: &str, max_bytes: u64) -> Result<Option<SignedMetadata<T>>, StoreError> {
-        let Some(bytes) = read_file(&self.store, name, max_bytes)? else { return Ok(None) };
-        let refuse = |cause| StoreError::Metadata { path: self.path(name), cause };
-        SignedMetadata::parse(T::TYPE, &bytes).map(Some).map_err(refuse)
-    }
-
     pub(super) fn write(&self, name: &str, bytes: &[u8]) -> Result<(), StoreError> {
         Ok(durable::write(&self.path(name), bytes)?)
-    }
-
-    pub(super) fn path(&self, name: &str) -> PathBuf {
-        folder(&self.store).join(name)
     }
 }
 
 /// Returns the system's time, seconds since 1970.
 pub fn clock_unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
+}
+
+/// Returns the time as of which metadata is signed: the system's, unless its clock stands before this program was made.
+pub fn signing_unix_secs() -> u64 {
+    clock_unix_secs().max(RELEASE_UNIX_SECS)
 }
 
 /// Reads a metadata file of a store by the name that clients ask for; `None` if there is no such file.

@@ -5,7 +5,10 @@ use std::path::Path;
 use slag_common::manifest::{self, Manifest};
 use slag_common::tuf::{Kept, Source, TargetFile, Trusted, TufError, find_target, refresh};
 
-use super::metadata::{Metadata, clock_unix_secs, read_published};
+use super::ceremony::{Change, default_root_folder};
+use super::metadata::{
+    Metadata, MetadataReader, RELEASE_UNIX_SECS, clock_unix_secs, read_published, signing_unix_secs,
+};
 use super::tests::manifest as manifest_of;
 use super::{Extras, Store, StoreError};
 
@@ -97,6 +100,47 @@ fn a_refresh_keeps_clients_and_needs_no_root_key() {
     let refreshed = Metadata::open(dir.path()).expect("opens").refresh(later, 1).expect("signs");
     assert_eq!(refreshed.snapshot_version, 2);
     update(&mut kept, dir.path(), later).expect("fresh");
+}
+
+/// A root that was made while the clock stood at 1970 has expired for every robot: a refresh does not help, a renewal does, and the
+/// warnings say so. Nobody is warned of a root that has years to go.
+#[test]
+fn an_expired_root_is_warned_of_and_renewed() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let metadata = Metadata::open(dir.path()).expect("opens");
+    metadata.make_root(&default_root_folder(dir.path()), 1, 1, 0).expect("makes");
+    drop(metadata);
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    publish(&store, 1, NOW);
+    let mut kept = client(dir.path());
+    let is_refused = |kept: &mut Kept| matches!(update(kept, dir.path(), NOW), Err(TufError::Expired { .. }));
+    assert!(is_refused(&mut kept));
+    let warned = || MetadataReader::new(dir.path()).expiry_warnings(NOW).expect("reads");
+    let [warning] = &warned()[..] else { panic!("{:?}", warned()) };
+    assert!(warning.contains("root metadata expired at 1974-12-31") && warning.contains("keys renew"), "{warning}");
+    let metadata = Metadata::open(dir.path()).expect("opens");
+    metadata.refresh(NOW, 30).expect("signs");
+    assert!(is_refused(&mut kept), "a refresh does not help");
+    let renewal = Change::Roles(Vec::new());
+    let renewed = metadata.change_keys(&renewal, &default_root_folder(dir.path()), NOW).expect("renews");
+    assert_eq!((renewed.root_version, renewed.draft), (2, None));
+    update(&mut kept, dir.path(), NOW).expect("the same client follows");
+    assert_eq!(warned(), [""; 0]);
+    // Half a year before its end.
+    let later = NOW + (5 * 365 - 180) * DAY;
+    metadata.refresh(later, 30).expect("signs");
+    let warnings = MetadataReader::new(dir.path()).expiry_warnings(later).expect("reads");
+    assert!(warnings.len() == 1 && warnings[0].contains("root metadata expires at"), "{warnings:?}");
+    // A clock that stands at 1970 now.
+    let warnings = MetadataReader::new(dir.path()).expiry_warnings(5).expect("reads");
+    assert!(warnings.len() == 1 && warnings[0].contains("set the clock"), "{warnings:?}");
+}
+
+/// What is signed by a machine whose clock stands at 1970 has not expired before robots see it.
+#[test]
+fn nothing_is_signed_as_of_1970() {
+    assert_eq!(RELEASE_UNIX_SECS, 20_454 * DAY, "2026-01-01");
+    assert!(signing_unix_secs() >= RELEASE_UNIX_SECS);
 }
 
 /// A key that the root does not name would lock every client out.

@@ -40,8 +40,7 @@ pub(crate) mod tests;
 mod verify;
 mod writer;
 
-pub(crate) use catalogue::Catalogue;
-pub use catalogue::{CommandRecord, GenerationRecord};
+pub use catalogue::{CatalogueCopy, CommandRecord, GenerationRecord};
 pub use error::StoreError;
 pub use export::{Exported, export};
 pub use models::ModelsRecord;

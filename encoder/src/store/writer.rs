@@ -81,6 +81,11 @@ impl Store {
         Ok(path)
     }
 
+    #[cfg(test)]
+    pub(super) fn catalogue(&self) -> &Catalogue {
+        &self.catalogue
+    }
+
     /// Returns the record database, for the state of jobs and pushes. Records are durable once flushed.
     pub fn db(&self) -> &sled::Db {
         self.catalogue.db()

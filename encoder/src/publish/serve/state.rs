@@ -16,7 +16,7 @@ use slag_service::problem::Problem;
 use tokio::sync::Semaphore;
 
 use super::limits::Limits;
-use crate::store::{Catalogue, Published, Stamp, StoreError, StoreReader};
+use crate::store::{Stamp, StoreError, StoreReader};
 
 /// Pause before a manifest that did not open is read again. The fault may lie in another file or pass by
 /// itself (no file descriptors left), so the manifest's own change is not the only sign.
@@ -45,7 +45,7 @@ impl Snapshot {
         Ok(Self {
             targets: both().filter_map(|published| target(&published.bytes)).collect(),
             manifest: reader.current().bytes.clone().into(),
-            index: index_of(dir, reader.current()),
+            index: CellIndex::new(&reader.manifest().cells),
             objects: both().flat_map(|published| published.object_lens()).collect(),
             reader,
         })
@@ -53,19 +53,6 @@ impl Snapshot {
 
     pub(super) fn world(&self) -> &Manifest {
         self.reader.manifest()
-    }
-}
-
-/// Makes the index of a generation's cells, from the catalogue where no writer holds it.
-fn index_of(dir: &Path, published: &Published) -> CellIndex {
-    let cells = &published.manifest.cells;
-    match Catalogue::peek(dir, published.hash, Duration::ZERO) {
-        Some(known) if known == *cells => CellIndex::new(&known),
-        Some(_) => {
-            tracing::warn!("the catalogue of {} differs from the manifest, which counts", dir.display());
-            CellIndex::new(cells)
-        }
-        None => CellIndex::new(cells),
     }
 }
 

@@ -189,7 +189,7 @@ fn photos(
         camera_from_world: glam::DAffine3::IDENTITY,
     };
     let image = picture(width_px, height_px, 1);
-    let loaded = LoadedImage { view, image, undistorter: None, valid: None };
+    let loaded = LoadedImage { view, image, undistorter: None, valid: None, is_rotated: false };
     let what = format!(
         "photos, grid {}{}",
         settings.points_per_side,
