@@ -20,8 +20,7 @@ fn an_encode_heals_a_store_from_kept_views() {
         (serde_json::from_slice::<serde_json::Value>(&output.stdout).expect("JSON"), errors)
     };
     let json = |name: &str| -> (bool, serde_json::Value) {
-        let output =
-            encoder(&["store", name, "--store", text(&store), "--json"]).output().expect("runs");
+        let output = encoder(&["store", name, "--store", text(&store), "--json"]).output().expect("runs");
         (output.status.success(), serde_json::from_slice(&output.stdout).expect("JSON"))
     };
     encode();

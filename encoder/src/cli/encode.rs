@@ -8,8 +8,8 @@ use slag_common::shard::Profile;
 use slag_models::gpus::GpuChoice;
 
 use super::common::{
-    InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
-    open_models, parse_error, print, profile_parser, warn_of_expiry,
+    InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
+    parse_error, print, profile_parser, warn_of_expiry,
 };
 use super::exit::Exit;
 use super::memory::{default_memory_bytes, parse_memory};
@@ -24,7 +24,7 @@ use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
 use crate::encode::front::Expectation;
 use crate::encode::{
-    self, CellSettings, EncodeSettings, Engines, InputSettings, Masks, OutputSettings, Preset, RasterWidth,
+    CellSettings, EncodeSettings, Engines, InputSettings, Masks, OutputSettings, Preset, RasterWidth,
     Regions, RunSettings, ViewSettings, ViewsLimit,
 };
 use crate::occupancy::OccupancySettings;

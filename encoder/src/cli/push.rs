@@ -3,10 +3,9 @@
 use std::fmt::Write;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use anyhow::Result;
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{Args, Subcommand};
 
 use super::common::{print, runtime, stopped};
 use super::exit::Exit;
@@ -41,100 +40,27 @@ pub struct QdrantArgs {
     pub batch: NonZeroUsize,
     /// One collection for the scene, or one for each cell.
     #[arg(long, value_enum, default_value = "one")]
-    pub layout: LayoutArg,
+    pub layout: qdrant::Layout,
     /// Makes a snapshot of each collection at the end, on the server's disk.
     #[arg(long)]
     pub snapshots: bool,
     /// Settings of the collections.
     #[command(flatten)]
-    pub index: IndexArgs,
-}
-
-/// Settings of collections: new ones are created with them, existing ones are changed to them.
-#[derive(Clone, Debug, Args)]
-pub struct IndexArgs {
-    /// Edges of each node of the HNSW graph: more are more accurate and take more memory; 0 builds no graph
-    /// [default: Qdrant's, or the collection's own].
-    #[arg(long, value_name = "N")]
-    hnsw_m: Option<u64>,
-    /// Neighbours considered per node while the graph is built: more are more accurate and take more time
-    /// [default: Qdrant's, or the collection's own].
-    #[arg(long, value_name = "N")]
-    hnsw_ef_construct: Option<u64>,
-    /// Compressed copies of the vectors, kept in memory [default: Qdrant's, or the collection's own].
-    #[arg(long, value_enum)]
-    quantisation: Option<QuantisationArg>,
-    /// Leaves vectors, graph and payload on disk, for scenes larger than the server's memory.
-    #[arg(long)]
-    on_disk: bool,
-}
-
-impl From<&IndexArgs> for qdrant::IndexSettings {
-    fn from(args: &IndexArgs) -> Self {
-        Self {
-            hnsw_m: args.hnsw_m,
-            hnsw_ef_construct: args.hnsw_ef_construct,
-            quantisation: args.quantisation.map(Into::into),
-            on_disk: args.on_disk,
-        }
-    }
-}
-
-/// `--layout`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum LayoutArg {
-    /// One collection, NAME.
-    One,
-    /// A collection for each cell, NAME-cell-ID: each can be snapshotted, dropped and restored alone.
-    Cells,
-}
-
-impl From<LayoutArg> for qdrant::Layout {
-    fn from(arg: LayoutArg) -> Self {
-        match arg {
-            LayoutArg::One => Self::One,
-            LayoutArg::Cells => Self::Cells,
-        }
-    }
-}
-
-/// `--quantisation`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum QuantisationArg {
-    /// None.
-    None,
-    /// Scalar: a byte a component, a quarter of the vectors' size.
-    Int8,
-    /// Binary: a bit a component, 1/32 of the size.
-    Binary,
-    /// Product: a byte for four components, 1/16 of the size.
-    Product,
-}
-
-impl From<QuantisationArg> for qdrant::Quantisation {
-    fn from(arg: QuantisationArg) -> Self {
-        match arg {
-            QuantisationArg::None => Self::None,
-            QuantisationArg::Int8 => Self::Int8,
-            QuantisationArg::Binary => Self::Binary,
-            QuantisationArg::Product => Self::Product,
-        }
-    }
+    pub index: qdrant::IndexSettings,
 }
 
 pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let options = qdrant::PushOptions {
         api_key: args.api_key.clone(),
         n_points_per_batch: args.batch,
-        layout: args.layout.into(),
-        index: (&args.index).into(),
+        layout: args.layout,
+        index: args.index,
         snapshots: args.snapshots,
         ..qdrant::PushOptions::new(&args.url, &args.collection)
     };
     // A push keeps its state in the store, so it takes the writer's lock.
     let store = Store::create_or_open(&args.store)?;
     let reader = store.reader()?;
-    let vectors = Arc::new(qdrant::ExactShards::new(reader.clone()));
     let mut shown = None;
     let on_batch = |at: qdrant::PushProgress| {
         let before = shown.replace(at.n_points);
@@ -143,8 +69,7 @@ pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Res
             Some(before) => progress.advance(at.n_points - before),
         }
     };
-    let pushed =
-        runtime()?.block_on(qdrant::push(&reader, vectors, store.db(), &options, on_batch, stopped()));
+    let pushed = runtime()?.block_on(qdrant::push(&reader, store.db(), &options, on_batch, stopped()));
     progress.end();
     let report = pushed?;
     print(json, &report, lines(args, &report))?;
@@ -154,8 +79,8 @@ pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Res
 /// Returns the report as text.
 fn lines(args: &QdrantArgs, report: &qdrant::PushReport) -> String {
     let place = match args.layout {
-        LayoutArg::One => format!("collection {}", args.collection),
-        LayoutArg::Cells => format!("{} collections {}-cell-ID", report.n_collections, args.collection),
+        qdrant::Layout::One => format!("collection {}", args.collection),
+        qdrant::Layout::Cells => format!("{} collections {}-cell-ID", report.n_collections, args.collection),
     };
     let mut lines = format!(
         "{} points in {place}: {} sent now, {} Gaussians without evidence left out, {} attempts repeated\n",

@@ -56,13 +56,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
         let listening = |url| println!("listening on {url}");
         let limits = serve::Limits::default();
         let open_text = open_text(args.models.clone());
-        let shown = Shown {
-            store: Some(args.store.clone()),
-            splat: None,
-            views: Vec::new(),
-            up: None,
-            open_text,
-        };
+        let shown =
+            Shown { store: Some(args.store.clone()), splat: None, views: Vec::new(), up: None, open_text };
         let page = view::router(Viewer::new(shown));
         let router = serve::router_with(&args.store, limits, access, page)?;
         let store = args.store.clone();

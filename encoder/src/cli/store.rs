@@ -74,7 +74,9 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
                     listed.history = catalogue.generations()?;
                     listed.job = job_status(catalogue.db(), &at.store)?;
                 }
-                None => tracing::warn!("without the history: the catalogue db/ is not there, damaged, or being changed"),
+                None => tracing::warn!(
+                    "without the history: the catalogue db/ is not there, damaged, or being changed"
+                ),
             }
             print(json, &listed, &listed)?;
             Ok(Exit::Done)

@@ -124,8 +124,7 @@ impl CellMaker<'_> {
             shard::build(scene, cell_id, cell, embeddings, encoder_id, score_context, settings, &extras)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
-            let (hash, len_bytes) =
-                self.context.time("write", || self.store.put_bytes(&shard.bytes))?;
+            let (hash, len_bytes) = self.context.time("write", || self.store.put_bytes(&shard.bytes))?;
             let record = ShardRecord {
                 hash,
                 len_bytes,

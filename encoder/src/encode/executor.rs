@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::Hash32;
+use slag_common::photo_poses::BuiltPhotoPoses;
 
 use super::cell::Merged;
 use super::context::RunContext;

@@ -30,6 +30,7 @@ pub struct Coordinator {
 }
 
 impl Coordinator {
+    /// `queue`: where work is handed out; without it, workers have shares.
     pub fn new(bucket: Arc<Bucket>, queue: Option<QueueSettings>) -> Self {
         Self { bucket, queue, run: Mutex::default() }
     }
@@ -59,8 +60,7 @@ impl Coordinator {
         let open: Vec<usize> = plan.order.iter().copied().filter(is_open).collect();
         let run_plan = inputs::upload(&self.bucket, plan, &open, context)?;
         let run = Run::begin(&self.bucket, &run_plan)?;
-        let open_queue =
-            |queue| Enqueuer::open(self.bucket.runtime(), queue, run, run_plan.of_scene);
+        let open_queue = |queue| Enqueuer::open(self.bucket.runtime(), queue, run, run_plan.of_scene);
         let queue = self.queue.as_ref().map(open_queue).transpose()?;
         let heartbeat = Heartbeat::start(&self.bucket, run);
         *self.run.lock().unwrap_or_else(PoisonError::into_inner) = Some((run, heartbeat));
@@ -146,9 +146,7 @@ impl ViewsInWork<'_> {
     fn take_failed(&mut self, is_strict: bool) -> Result<(), FleetError> {
         for name in self.bucket.list(&self.run.failed_folder())? {
             let number: Option<usize> = name.strip_suffix(".json").and_then(|number| number.parse().ok());
-            let Some(id) =
-                self.open.iter().find(|(_, (n, _))| Some(*n) == number).map(|(id, _)| *id)
-            else {
+            let Some(id) = self.open.iter().find(|(_, (n, _))| Some(*n) == number).map(|(id, _)| *id) else {
                 continue;
             };
             let key = format!("{}/{name}", self.run.failed_folder());

@@ -12,8 +12,8 @@ use super::documents::{self, InputFile, PlannedView, RunPlan};
 use super::error::FleetError;
 use super::objects;
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{Plan, RunContext};
 use crate::encode::Masks;
+use crate::encode::fleet_parts::{Plan, RunContext};
 use crate::ingest;
 use crate::segment;
 

@@ -23,7 +23,11 @@ const VERSION: u32 = 1;
 const HEAD_BYTES: usize = 32;
 
 /// Returns the object of a view.
-pub(super) fn pack_view(record: ViewRecord, outlines: &[u8], contributions: &[u8]) -> std::io::Result<Vec<u8>> {
+pub(super) fn pack_view(
+    record: ViewRecord,
+    outlines: &[u8],
+    contributions: &[u8],
+) -> std::io::Result<Vec<u8>> {
     let record = serde_json::to_vec(&record)?;
     let mut bytes = Vec::with_capacity(HEAD_BYTES + record.len() + outlines.len() + contributions.len());
     bytes.extend(VIEW_MAGIC);

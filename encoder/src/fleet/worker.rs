@@ -18,8 +18,8 @@ use super::run::Run;
 use super::run_folder::RunFolder;
 use super::views::ViewWork;
 use crate::blobs::Bucket;
-use crate::encode::{EncodeError, Engines};
 use crate::encode::fleet_parts::{RunContext, segmenter_of};
+use crate::encode::{EncodeError, Engines};
 use crate::progress::Progress;
 
 /// Pause between two looks at the state of a run: in a folder, and over a network.
@@ -44,6 +44,7 @@ pub enum Dispatch {
 /// How a worker works.
 #[derive(Clone, Debug)]
 pub struct WorkerSettings {
+    /// Which views it takes.
     pub dispatch: Dispatch,
     /// Threads, and views worked on at a time.
     pub n_threads: usize,
@@ -127,8 +128,7 @@ fn work_for(
             Box::new(Queue::open(bucket.runtime(), queue, run, of_scene, n_held)?)
         }
     };
-    let scene =
-        context.install(|| engines.rasterizer.load(&prepared.scene)).map_err(EncodeError::from)?;
+    let scene = context.install(|| engines.rasterizer.load(&prepared.scene)).map_err(EncodeError::from)?;
     let work = ViewWork {
         bucket,
         prepared: &prepared,

@@ -40,6 +40,7 @@ pub struct LoadedImage {
 pub struct RotatedPhotos(Mutex<(usize, String)>);
 
 impl RotatedPhotos {
+    /// Counts a photo, if it has an orientation.
     pub fn add(&self, photo: &LoadedImage) {
         let mut rotated = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if photo.is_rotated {

@@ -13,7 +13,8 @@ const MARGIN: f64 = 12.0;
 /// Draws the map: x to the right, y up.
 pub(super) fn svg(recorded: &Recorded) -> String {
     let corners = recorded.cells.iter().flat_map(|cell| [cell.min, cell.max]);
-    let points: Vec<DVec3> = corners.chain(recorded.views.iter().map(|view| view.position_in_world)).collect();
+    let points: Vec<DVec3> =
+        corners.chain(recorded.views.iter().map(|view| view.position_in_world)).collect();
     let low = points.iter().copied().reduce(DVec3::min).unwrap_or_default();
     let size = (points.iter().copied().reduce(DVec3::max).unwrap_or_default() - low).max(DVec3::splat(1e-6));
     let scale = (WIDTH - 2.0 * MARGIN) / size.x.max(size.y);

@@ -9,14 +9,18 @@ use serde_json::Value;
 use crate::encode::EncodeSummary;
 use crate::html::Page;
 use crate::progress::FoundObject;
-pub use recorder::Recorder;
 use recorder::RecordedView;
+pub use recorder::Recorder;
 
 /// Makes the page of an encode that was recorded.
 ///
 /// # Errors
 /// None: the summary is a record of numbers and texts.
-pub fn of_encode(scene: &str, summary: &EncodeSummary, recorder: &Recorder<'_>) -> serde_json::Result<String> {
+pub fn of_encode(
+    scene: &str,
+    summary: &EncodeSummary,
+    recorder: &Recorder<'_>,
+) -> serde_json::Result<String> {
     let recorded = recorder.recorded();
     let mut rest = serde_json::to_value(summary)?;
     let mut take = |name: &str| rest.as_object_mut().and_then(|members| members.remove(name));

@@ -131,7 +131,9 @@ impl MetadataReader {
         let expires = |what: &str, at: u64, command: &str| {
             let word = if at <= now_unix_secs { "expired" } else { "expires" };
             let at = format_utc(at);
-            format!("{store}: {what} metadata {word} at {at}, and robots refuse it then; run `slag-encoder {command} --store {store}`")
+            format!(
+                "{store}: {what} metadata {word} at {at}, and robots refuse it then; run `slag-encoder {command} --store {store}`"
+            )
         };
         let mut warnings = Vec::new();
         if now_unix_secs < RELEASE_UNIX_SECS {

@@ -117,7 +117,10 @@ fn an_expired_root_is_warned_of_and_renewed() {
     assert!(is_refused(&mut kept));
     let warned = || MetadataReader::new(dir.path()).expiry_warnings(NOW).expect("reads");
     let [warning] = &warned()[..] else { panic!("{:?}", warned()) };
-    assert!(warning.contains("root metadata expired at 1974-12-31") && warning.contains("keys renew"), "{warning}");
+    assert!(
+        warning.contains("root metadata expired at 1974-12-31") && warning.contains("keys renew"),
+        "{warning}"
+    );
     let metadata = Metadata::open(dir.path()).expect("opens");
     metadata.refresh(NOW, 30).expect("signs");
     assert!(is_refused(&mut kept), "a refresh does not help");

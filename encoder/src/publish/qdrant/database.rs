@@ -1,24 +1,34 @@
 //! Requests to the database, repeated while their errors may pass.
 
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
+use qdrant_client::qdrant::{
+    CollectionInfo, Condition, CountPointsBuilder, CreateFieldIndexCollectionBuilder, DeletePointsBuilder,
+    Distance, FieldType, Filter, PayloadSchemaInfo, PointStruct, UpdateCollection, UpsertPointsBuilder,
+};
 use qdrant_client::{Qdrant, QdrantError};
+use slag_common::manifest::Manifest;
 use slag_common::retry::{Backoff, Retries};
 
-use super::error::PushError;
-use super::options::PushOptions;
+use super::points::generation;
+use super::settings::vectors_of;
+use super::{IndexSettings, PushError, PushOptions, Snapshot};
 
 /// Longest pause between two attempts.
 const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 
 /// The client of a database.
 pub(super) struct Database<'a> {
-    pub(super) client: Qdrant,
+    client: Qdrant,
     /// For requests that take as long as their collection is large.
-    pub(super) patient_client: Qdrant,
+    patient_client: Qdrant,
     options: &'a PushOptions,
     n_retries: AtomicU64,
+    /// The last error that was told of: one that repeats is told once.
+    told: Mutex<String>,
 }
 
 impl<'a> Database<'a> {
@@ -31,17 +41,17 @@ impl<'a> Database<'a> {
                 // The check prints to standard output.
                 .skip_compatibility_check()
                 .build()
-                .map_err(|cause| database_error(options, "set up the client", cause))
+                .map_err(|cause| database_error(options, "set up the client", &cause))
         };
         Ok(Self {
             client: client(options.timeout)?,
             patient_client: client(options.snapshot_timeout)?,
             options,
             n_retries: AtomicU64::new(0),
+            told: Mutex::default(),
         })
     }
 
-    /// Returns the names of all collections.
     pub(super) async fn collection_names(&self) -> Result<Vec<String>, PushError> {
         let listed = self.attempt("list the collections", || self.client.list_collections()).await?;
         Ok(listed.collections.into_iter().map(|collection| collection.name).collect())
@@ -53,11 +63,7 @@ impl<'a> Database<'a> {
     }
 
     /// Sends a request until it succeeds, fails permanently, or no attempts are left.
-    pub(super) async fn attempt<T, F>(
-        &self,
-        action: &'static str,
-        request: impl Fn() -> F,
-    ) -> Result<T, PushError>
+    async fn attempt<T, F>(&self, action: &'static str, request: impl Fn() -> F) -> Result<T, PushError>
     where
         F: Future<Output = Result<T, QdrantError>>,
     {
@@ -69,7 +75,7 @@ impl<'a> Database<'a> {
                 Err(error) => error,
             };
             let Some(pause) = retries.failed(false).filter(|_| may_pass(&error)) else {
-                return Err(database_error(self.options, action, error));
+                return Err(database_error(self.options, action, &error));
             };
             self.n_retries.fetch_add(1, Ordering::Relaxed);
             let asked = match &error {
@@ -78,39 +84,190 @@ impl<'a> Database<'a> {
                 }
                 _ => Duration::ZERO,
             };
-            tracing::warn!("{action}: {error}; trying again");
+            let text = format!("{action}: {}", words(&error));
+            let before = std::mem::replace(
+                &mut *self.told.lock().unwrap_or_else(PoisonError::into_inner),
+                text.clone(),
+            );
+            if before != text {
+                tracing::warn!("{text}; trying again");
+            }
             tokio::time::sleep(pause.max(asked).min(MAX_RETRY_DELAY)).await;
         }
     }
 }
 
-fn database_error(options: &PushOptions, action: &'static str, cause: QdrantError) -> PushError {
-    PushError::Database { url: options.url.clone(), action, cause: Box::new(cause) }
+fn database_error(options: &PushOptions, action: &'static str, cause: &QdrantError) -> PushError {
+    PushError::Database { url: options.url.clone(), action, cause: words(cause) }
 }
 
-/// gRPC status codes (`statuscodes.md` of its specification).
-mod code {
-    pub(super) const CANCELLED: i32 = 1;
-    pub(super) const UNKNOWN: i32 = 2;
-    pub(super) const DEADLINE_EXCEEDED: i32 = 4;
-    pub(super) const RESOURCE_EXHAUSTED: i32 = 8;
-    pub(super) const ABORTED: i32 = 10;
-    pub(super) const INTERNAL: i32 = 13;
-    pub(super) const UNAVAILABLE: i32 = 14;
+/// Returns what an error says, without the metadata of its response.
+fn words(error: &QdrantError) -> String {
+    match error {
+        QdrantError::ResponseError { status } | QdrantError::ResourceExhaustedError { status, .. } => {
+            status.message().to_owned()
+        }
+        other => other.to_string(),
+    }
 }
 
 /// Returns whether the same request may succeed later.
 fn may_pass(error: &QdrantError) -> bool {
     match error {
         QdrantError::ResourceExhaustedError { .. } | QdrantError::Io(_) => true,
+        // Codes of gRPC (`statuscodes.md` of its specification).
         QdrantError::ResponseError { status } => match status.code() as i32 {
-            code::UNAVAILABLE | code::DEADLINE_EXCEEDED | code::RESOURCE_EXHAUSTED | code::ABORTED => true,
-            // The client's own time limit, and a connection that broke during a request.
-            code::CANCELLED | code::UNKNOWN => true,
-            // A refused connection.
-            code::INTERNAL => status.message().starts_with("Failed to connect"),
+            // Unavailable, deadline exceeded, resource exhausted, aborted; cancelled and unknown: the client's own time
+            // limit, and a connection that broke during a request.
+            14 | 4 | 8 | 10 | 1 | 2 => true,
+            // Internal: a refused connection.
+            13 => status.message().starts_with("Failed to connect"),
             _ => false,
         },
         _ => false,
+    }
+}
+
+/// A collection that is to hold a scene, or a cell of it.
+pub(super) struct Collection<'a> {
+    pub(super) database: &'a Database<'a>,
+    pub(super) name: String,
+    pub(super) manifest: &'a Manifest,
+}
+
+impl Collection<'_> {
+    /// Returns the collection as it is, if it exists; fails if it cannot take this scene. Changes nothing.
+    pub(super) async fn existing(&self) -> Result<Option<CollectionInfo>, PushError> {
+        let exists = || self.database.client.collection_exists(self.name.as_str());
+        if !self.database.attempt("look for the collection", exists).await? {
+            return Ok(None);
+        }
+        let info = self.describe().await?;
+        self.check_vectors(&info)?;
+        match self.count_others().await? {
+            0 => Ok(Some(info)),
+            n_points => {
+                let scene = self.manifest.scene.clone();
+                Err(PushError::OtherScene { collection: self.name.clone(), scene, n_points })
+            }
+        }
+    }
+
+    fn check_vectors(&self, info: &CollectionInfo) -> Result<(), PushError> {
+        let params = info.config.clone().and_then(|config| config.params);
+        let describe = |size: u64, distance: i32| {
+            let distance = Distance::try_from(distance).unwrap_or(Distance::UnknownDistance);
+            format!("vectors of {size} components, distance {}", distance.as_str_name())
+        };
+        let found = match vectors_of(params.and_then(|params| params.vectors_config)) {
+            Some(vectors) if vectors.multivector_config.is_some() => "multivectors".to_owned(),
+            Some(vectors) => describe(vectors.size, vectors.distance),
+            None => "named vectors, or none".to_owned(),
+        };
+        let expected = describe(self.manifest.encoder.dim.into(), Distance::Cosine.into());
+        match found == expected {
+            true => Ok(()),
+            false => Err(PushError::Collection { collection: self.name.clone(), found, expected }),
+        }
+    }
+
+    /// Returns the collection's settings and payload indexes.
+    pub(super) async fn describe(&self) -> Result<CollectionInfo, PushError> {
+        let describe = || self.database.client.collection_info(self.name.as_str());
+        let info = self.database.attempt("describe the collection", describe).await?;
+        Ok(info.result.unwrap_or_default())
+    }
+
+    /// Creates the collection, without payload indexes.
+    pub(super) async fn create(&self, index: &IndexSettings) -> Result<(), PushError> {
+        let request = index.create(&self.name, self.manifest.encoder.dim.into());
+        let create = || self.database.client.create_collection(request.clone());
+        self.database.attempt("create the collection", create).await.map(drop)
+    }
+
+    pub(super) async fn update(&self, request: UpdateCollection) -> Result<(), PushError> {
+        let update = || self.database.client.update_collection(request.clone());
+        self.database.attempt("change the collection's settings", update).await.map(drop)
+    }
+
+    pub(super) async fn delete(&self) -> Result<(), PushError> {
+        let delete = || self.database.client.delete_collection(self.name.as_str());
+        self.database.attempt("delete the collection", delete).await.map(drop)
+    }
+
+    /// Creates the payload indexes that are not in `existing`: an earlier push may have been cut off between
+    /// the collection and its indexes, or may not have been geo-referenced.
+    pub(super) async fn ensure_indexes(
+        &self,
+        existing: &HashMap<String, PayloadSchemaInfo>,
+    ) -> Result<(), PushError> {
+        let place = self.manifest.geo_reference.map(|_| ("location", FieldType::Geo));
+        let fields = [("scene", FieldType::Keyword), ("generation", FieldType::Integer)];
+        let missing = fields.into_iter().chain(place).filter(|(field, _)| !existing.contains_key(*field));
+        for (field, kind) in missing {
+            let index = || {
+                let request = CreateFieldIndexCollectionBuilder::new(&self.name, field, kind).wait(true);
+                self.database.client.create_field_index(request)
+            };
+            self.database.attempt("index a payload field", index).await?;
+        }
+        Ok(())
+    }
+
+    pub(super) async fn upsert(&self, batch: Vec<PointStruct>) -> Result<(), PushError> {
+        let request = UpsertPointsBuilder::new(&self.name, batch).wait(true).build();
+        let upsert = || self.database.client.upsert_points(request.clone());
+        self.database.attempt("upsert points", upsert).await.map(drop)
+    }
+
+    /// Deletes the points of Gaussians that this generation no longer has.
+    pub(super) async fn remove_other_generations(&self) -> Result<(), PushError> {
+        let delete = || {
+            let others = Filter::must_not([Condition::matches("generation", generation(self.manifest))]);
+            self.database.client.delete_points(DeletePointsBuilder::new(&self.name).points(others).wait(true))
+        };
+        self.database.attempt("delete points of earlier generations", delete).await.map(drop)
+    }
+
+    /// Counts the points of other scenes.
+    pub(super) async fn count_others(&self) -> Result<u64, PushError> {
+        self.count(Filter::must_not([Condition::matches("scene", self.manifest.scene.clone())])).await
+    }
+
+    /// Counts the points that pass a filter.
+    pub(super) async fn count(&self, filter: Filter) -> Result<u64, PushError> {
+        let count = || {
+            let request = CountPointsBuilder::new(&self.name).exact(true).filter(filter.clone());
+            self.database.client.count(request)
+        };
+        let counted = self.database.attempt("count points", count).await?;
+        Ok(counted.result.map_or(0, |result| result.count))
+    }
+
+    /// Asks for a snapshot and waits for it.
+    pub(super) async fn create_snapshot(&self) -> Result<Snapshot, PushError> {
+        let create = || self.database.patient_client.create_snapshot(self.name.as_str());
+        let created = self.database.attempt("create a snapshot", create).await?;
+        let collection = self.name.clone();
+        match created.snapshot_description {
+            None => Err(PushError::NoSnapshot { collection }),
+            Some(made) => Ok(Snapshot {
+                collection,
+                name: made.name,
+                size_bytes: u64::try_from(made.size).unwrap_or(0),
+                sha256: made.checksum,
+            }),
+        }
+    }
+
+    /// Returns whether the database still has a snapshot.
+    pub(super) async fn has_snapshot(&self, snapshot: &Snapshot) -> Result<bool, PushError> {
+        let list = || self.database.client.list_snapshots(self.name.as_str());
+        let listed = self.database.attempt("list snapshots", list).await?;
+        Ok(listed.snapshot_descriptions.iter().any(|listed| {
+            listed.name == snapshot.name
+                && u64::try_from(listed.size) == Ok(snapshot.size_bytes)
+                && listed.checksum == snapshot.sha256
+        }))
     }
 }

@@ -8,27 +8,154 @@
 //! interrupted push continues there. Upserts by id are idempotent: a batch whose acknowledgement was lost
 //! may be sent again.
 
-mod collection;
 mod database;
-mod error;
-mod index;
-mod layout;
-mod options;
 mod points;
 mod push;
-mod record;
-mod report;
-mod snapshot;
-mod source;
-
-pub use error::PushError;
-pub use index::{IndexSettings, Quantisation, SettingChange};
-pub use layout::Layout;
-pub use options::PushOptions;
-pub use push::push;
-pub use report::{PushProgress, PushReport};
-pub use snapshot::Snapshot;
-pub use source::{CellVectors, ExactShards, SourceError, VectorSource};
-
+mod settings;
 #[cfg(test)]
 mod tests;
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::ValueEnum;
+use serde::{Deserialize, Serialize};
+use slag_common::container::ContainerError;
+use slag_common::shard::Profile;
+
+use crate::store::StoreError;
+
+pub(crate) use push::push;
+pub use settings::{IndexSettings, Quantisation, SettingChange};
+
+/// Which collections a scene is pushed to.
+///
+/// Shard keys, which divide one collection, need a distributed Qdrant; a collection a cell needs nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Layout {
+    /// One collection, NAME.
+    #[default]
+    One,
+    /// A collection for each cell, NAME-cell-ID: each can be snapshotted, dropped and restored alone.
+    Cells,
+}
+
+/// Target and pace of a push.
+#[derive(Clone)]
+pub(crate) struct PushOptions {
+    /// gRPC address of the database.
+    pub(crate) url: String,
+    /// The collection, or the beginning of the names of one a cell; created if absent.
+    pub(crate) collection: String,
+    pub(crate) layout: Layout,
+    pub(crate) index: IndexSettings,
+    /// Whether each collection has a snapshot at the end.
+    pub(crate) snapshots: bool,
+    pub(crate) api_key: Option<String>,
+    pub(crate) n_points_per_batch: NonZeroUsize,
+    /// Attempts after the first, for errors that may pass.
+    pub(crate) n_retries: u32,
+    /// Pause before the second attempt; it doubles with each.
+    pub(crate) retry_delay: Duration,
+    /// Time limit of one request, and of one for a snapshot.
+    pub(crate) timeout: Duration,
+    pub(crate) snapshot_timeout: Duration,
+}
+
+impl PushOptions {
+    /// Returns options with eight retries over about a minute.
+    pub(crate) fn new(url: impl Into<String>, collection: impl Into<String>) -> Self {
+        Self {
+            url: url.into(),
+            collection: collection.into(),
+            layout: Layout::One,
+            index: IndexSettings::default(),
+            snapshots: false,
+            api_key: None,
+            n_points_per_batch: const { NonZeroUsize::new(256).expect("not zero") },
+            n_retries: 8,
+            retry_delay: Duration::from_millis(250),
+            timeout: Duration::from_secs(60),
+            snapshot_timeout: Duration::from_secs(3600),
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct PushProgress {
+    /// Points of this generation in the database.
+    pub(crate) n_points: u64,
+    /// Points of this generation at the end.
+    pub(crate) n_points_expected: u64,
+}
+
+/// A snapshot of a collection, on the database's disk.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Snapshot {
+    pub(crate) collection: String,
+    pub(crate) name: String,
+    pub(crate) size_bytes: u64,
+    /// SHA-256 of the file, hexadecimal; servers before 1.8 state none.
+    pub(crate) sha256: Option<String>,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub(crate) struct PushReport {
+    /// Points of this generation, all in the database.
+    pub(crate) n_points: u64,
+    /// Points sent by this run; earlier runs sent the others.
+    pub(crate) n_sent: u64,
+    /// Gaussians without an embedding, left out.
+    pub(crate) n_without_evidence: u64,
+    /// Repeated attempts.
+    pub(crate) n_retries: u64,
+    /// Collections of this generation.
+    pub(crate) n_collections: usize,
+    /// How many of them this run created.
+    pub(crate) n_created_collections: usize,
+    /// Settings of existing collections that this run changed.
+    pub(crate) changed_settings: Vec<SettingChange>,
+    /// Collections of cells that this generation no longer has, deleted.
+    pub(crate) deleted_collections: Vec<String>,
+    /// Collections named like those of cells that this generation does not have, left alone: they hold points of
+    /// other scenes, or none at all and no push from this store is known.
+    pub(crate) left_collections: Vec<String>,
+    /// Snapshots of the collections, where asked for.
+    pub(crate) snapshots: Vec<Snapshot>,
+}
+
+/// Why a push ended early.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum PushError {
+    #[error(
+        "collection {collection:?} has {found}, this scene needs {expected}; choose another collection, or delete this one"
+    )]
+    Collection { collection: String, found: String, expected: String },
+    #[error(
+        "collection {collection:?} holds {n_points} points of other scenes than {scene:?}, and ids would collide; choose another collection"
+    )]
+    OtherScene { collection: String, scene: String, n_points: u64 },
+    /// The database refused a request, or was unreachable in all attempts.
+    #[error(
+        "{url}: {action}: {cause}; does Qdrant run there, and is this its gRPC port (6334 by default; 6333 is REST's)? Check the key and the database's log, then run the push again: it continues"
+    )]
+    Database { url: String, action: &'static str, cause: String },
+    #[error("cell {cell_id} has no shard of profile {}; encode the scene with that profile", Profile::Exact)]
+    NoShard { cell_id: u32 },
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[error("{}: {cause}; encode again", path.display())]
+    Shard { path: PathBuf, cause: ContainerError },
+    #[error("the progress of the push cannot be recorded: {0}; check the store's free space and permissions")]
+    Records(#[from] sled::Error),
+    /// The database counts another number of points than it acknowledged.
+    #[error(
+        "collection {collection:?} has {found} points, {expected} were pushed; another program may have changed it; run the push again: it starts over"
+    )]
+    Count { collection: String, expected: u64, found: u64 },
+    #[error("the database describes no snapshot of collection {collection:?}; see its log")]
+    NoSnapshot { collection: String },
+    #[error("the push was stopped; run the push again: it continues")]
+    Cancelled,
+}

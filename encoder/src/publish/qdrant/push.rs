@@ -1,19 +1,13 @@
 //! The push: collection by collection, cell by cell, batch by batch, recorded after each.
 
-use std::sync::Arc;
-
-use qdrant_client::qdrant::{CollectionInfo, PointStruct};
+use qdrant_client::qdrant::{CollectionInfo, Filter};
+use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest};
 
-use super::collection::Collection;
-use super::database::Database;
-use super::error::PushError;
-use super::options::PushOptions;
-use super::points::{CellPayload, points};
-use super::record::{Record, Records};
-use super::report::{PushProgress, PushReport};
-use super::source::{CellVectors, VectorSource};
+use super::database::{Collection, Database};
+use super::points::CellShard;
+use super::{Layout, PushError, PushOptions, PushProgress, PushReport, Snapshot};
 use crate::store::StoreReader;
 
 /// Pushes the current generation of a store, continuing where an earlier push of it was interrupted.
@@ -23,24 +17,16 @@ use crate::store::StoreReader;
 ///
 /// # Errors
 /// [`PushError`]. All collections are checked before anything is written.
-pub async fn push(
+pub(crate) async fn push(
     reader: &StoreReader,
-    vectors: Arc<dyn VectorSource>,
     records: &sled::Db,
     options: &PushOptions,
     progress: impl FnMut(PushProgress) + Send,
     cancel: impl Future<Output = ()> + Send,
 ) -> Result<PushReport, PushError> {
     let database = Database::new(options)?;
-    let push = Push {
-        database: &database,
-        manifest: reader.manifest(),
-        manifest_hash: reader.current().hash,
-        vectors,
-        records: Records::open(records, &options.url)?,
-        options,
-        report: PushReport::default(),
-    };
+    let records = Records { tree: records.open_tree("push")?, url: options.url.trim_end_matches('/') };
+    let push = Push { database: &database, reader, records, options, report: PushReport::default() };
     tokio::select! {
         biased;
         () = cancel => Err(PushError::Cancelled),
@@ -48,12 +34,80 @@ pub async fn push(
     }
 }
 
+/// Progress of the push of one generation to one collection: finished cells, and points of the next one.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct Record {
+    manifest: Option<Hash32>,
+    n_cells: usize,
+    n_points_in_cell: usize,
+    n_points: u64,
+    n_without_evidence: u64,
+    /// Of the complete collection.
+    #[serde(default)]
+    snapshot: Option<Snapshot>,
+}
+
+/// The records of the collections of one database, in the store.
+struct Records<'a> {
+    tree: sled::Tree,
+    url: &'a str,
+}
+
+impl Records<'_> {
+    fn key(&self, collection: &str) -> String {
+        format!("{}\n{collection}", self.url)
+    }
+
+    fn read(&self, collection: &str) -> Result<Option<Record>, PushError> {
+        let stored = self.tree.get(self.key(collection))?;
+        // An unreadable record (of another version) counts as none: the push starts over.
+        Ok(stored.and_then(|bytes| serde_json::from_slice(&bytes).ok()))
+    }
+
+    /// Writes a record, to the disk.
+    async fn write(&self, collection: &str, record: &Record) -> Result<(), PushError> {
+        let json = serde_json::to_vec(record).expect("a record is JSON");
+        self.tree.insert(self.key(collection), json)?;
+        self.tree.flush_async().await?;
+        Ok(())
+    }
+
+    /// Removes a record, from the disk too.
+    async fn remove(&self, collection: &str) -> Result<(), PushError> {
+        self.tree.remove(self.key(collection))?;
+        self.tree.flush_async().await?;
+        Ok(())
+    }
+}
+
+impl Layout {
+    /// Returns the collections for a scene, with the cells of each.
+    fn divide<'a>(self, name: &str, manifest: &'a Manifest) -> Vec<(String, &'a [CellRecord])> {
+        let cells = manifest.cells.as_slice();
+        match self {
+            Self::One => vec![(name.to_owned(), cells)],
+            Self::Cells => {
+                cells.chunks(1).map(|cell| (cell_collection(name, cell[0].cell_id), cell)).collect()
+            }
+        }
+    }
+}
+
+fn cell_collection(name: &str, cell_id: u32) -> String {
+    format!("{name}-cell-{cell_id}")
+}
+
+/// Returns whether a collection is named as that of a cell, of this scene or an earlier generation of it.
+fn is_of_cell(name: &str, collection: &str) -> bool {
+    let id = collection.strip_prefix(name).and_then(|rest| rest.strip_prefix("-cell-"));
+    // An id has one spelling: `+7` and `007` are not ours.
+    id.and_then(|id| id.parse().ok()).is_some_and(|id| cell_collection(name, id) == collection)
+}
+
 struct Push<'a> {
     database: &'a Database<'a>,
-    manifest: &'a Manifest,
-    manifest_hash: Hash32,
-    vectors: Arc<dyn VectorSource>,
-    records: Records,
+    reader: &'a StoreReader,
+    records: Records<'a>,
     options: &'a PushOptions,
     report: PushReport,
 }
@@ -69,7 +123,7 @@ struct Target<'a> {
 impl<'a> Push<'a> {
     async fn run(mut self, mut progress: impl FnMut(PushProgress) + Send) -> Result<PushReport, PushError> {
         let mut targets = Vec::new();
-        for (name, cells) in self.options.layout.divide(&self.options.collection, self.manifest) {
+        for (name, cells) in self.options.layout.divide(&self.options.collection, self.reader.manifest()) {
             let collection = self.collection(name);
             let existing = collection.existing().await?;
             targets.push(Target { collection, cells, existing });
@@ -78,7 +132,9 @@ impl<'a> Push<'a> {
         for target in &targets {
             self.push_target(target, &mut progress).await?;
         }
-        self.remove_obsolete(&targets).await?;
+        if self.options.layout == Layout::Cells {
+            self.remove_obsolete(&targets).await?;
+        }
         if self.options.snapshots {
             for target in &targets {
                 self.snapshot(&target.collection).await?;
@@ -89,7 +145,7 @@ impl<'a> Push<'a> {
     }
 
     fn collection(&self, name: String) -> Collection<'a> {
-        Collection { database: self.database, name, manifest: self.manifest }
+        Collection { database: self.database, name, manifest: self.reader.manifest() }
     }
 
     /// Makes a collection ready and sends the points that it lacks.
@@ -99,32 +155,31 @@ impl<'a> Push<'a> {
         progress: &mut (impl FnMut(PushProgress) + Send),
     ) -> Result<(), PushError> {
         let (collection, name) = (&target.collection, &target.collection.name);
+        let manifest = self.reader.manifest();
         let mut record = self.prepare(target).await?;
-        let n_points_expected = self.manifest.n_gaussians.saturating_sub(self.manifest.n_without_evidence);
+        let n_points_expected = manifest.n_gaussians.saturating_sub(manifest.n_without_evidence);
         let n_points_before = self.report.n_points;
         for cell in target.cells.iter().skip(record.n_cells) {
-            let (source, cell) = (Arc::clone(&self.vectors), cell.clone());
-            let cell_id = cell.cell_id;
-            let vectors = Arc::new(tokio::task::spawn_blocking(move || source.load(&cell)).await??);
-            vectors.check(cell_id, self.manifest.encoder.dim)?;
-            while record.n_points_in_cell < vectors.input_indices.len() {
-                let batch = self.batch(&vectors, record.n_points_in_cell, cell_id).await?;
-                let n_points = batch.len();
-                collection.upsert(batch).await?;
-                record.n_points_in_cell += n_points;
-                record.n_points += n_points as u64;
-                self.report.n_sent += n_points as u64;
+            // No request is under way that the reading of a shard could hold up.
+            let shard = CellShard::load(self.reader, cell)?;
+            while record.n_points_in_cell < shard.n_points() {
+                let start = record.n_points_in_cell;
+                let end = shard.n_points().min(start.saturating_add(self.options.n_points_per_batch.get()));
+                collection.upsert(shard.points(start..end, manifest)).await?;
+                record.n_points_in_cell = end;
+                record.n_points += (end - start) as u64;
+                self.report.n_sent += (end - start) as u64;
                 self.records.write(name, &record).await?;
                 progress(PushProgress { n_points: n_points_before + record.n_points, n_points_expected });
             }
             record.n_cells += 1;
             record.n_points_in_cell = 0;
-            record.n_without_evidence += vectors.n_without_evidence;
+            record.n_without_evidence += shard.n_without_evidence();
             self.records.write(name, &record).await?;
         }
         self.report.n_points += record.n_points;
         self.report.n_without_evidence += record.n_without_evidence;
-        collection.remove_other_generations(self.generation()).await?;
+        collection.remove_other_generations().await?;
         self.check_count(collection, record.n_points).await
     }
 
@@ -142,16 +197,16 @@ impl<'a> Push<'a> {
                 collection.describe().await?
             }
         };
-        let mut record = self.records.read(name)?.unwrap_or_default();
-        if record.manifest != Some(self.manifest_hash) {
-            record = Record { manifest: Some(self.manifest_hash), ..Record::default() };
-        }
-        if let Some(update) = self.options.index.update(name, &info.config.unwrap_or_default()) {
+        let manifest = Some(self.reader.current().hash);
+        let known = self.records.read(name)?.filter(|record| record.manifest == manifest);
+        let mut record = known.unwrap_or_else(|| Record { manifest, ..Record::default() });
+        let config = info.config.unwrap_or_default();
+        if let Some((request, changes)) = self.options.index.update(name, config) {
             // The snapshot has the former settings.
             record.snapshot = None;
             self.records.write(name, &record).await?;
-            collection.update(update.request).await?;
-            self.report.changed_settings.extend(update.changes);
+            collection.update(request).await?;
+            self.report.changed_settings.extend(changes);
         }
         collection.ensure_indexes(&info.payload_schema).await?;
         Ok(record)
@@ -160,21 +215,15 @@ impl<'a> Push<'a> {
     /// Deletes the collections of cells that the scene no longer has. Those with points of other scenes stay,
     /// and empty ones that no push from this store made.
     async fn remove_obsolete(&mut self, targets: &[Target<'a>]) -> Result<(), PushError> {
-        let layout = self.options.layout;
-        let mut names = match layout {
-            super::Layout::One => return Ok(()),
-            super::Layout::Cells => self.database.collection_names().await?,
-        };
+        let mut names = self.database.collection_names().await?;
         names.sort_unstable();
+        names.retain(|name| is_of_cell(&self.options.collection, name));
+        names.retain(|name| targets.iter().all(|target| target.collection.name != *name));
         for name in names {
-            let wanted = targets.iter().any(|target| target.collection.name == name);
-            if wanted || !layout.names(&self.options.collection, &name) {
-                continue;
-            }
             let collection = self.collection(name.clone());
-            let ours = collection.count_others().await? == 0
-                && (self.records.read(&name)?.is_some() || collection.count(None).await? > 0);
-            if ours {
+            let is_ours = collection.count_others().await? == 0
+                && (self.records.read(&name)?.is_some() || collection.count(Filter::default()).await? > 0);
+            if is_ours {
                 collection.delete().await?;
                 self.records.remove(&name).await?;
                 self.report.deleted_collections.push(name);
@@ -189,53 +238,22 @@ impl<'a> Push<'a> {
     /// and the database still has it, or else a new one.
     async fn snapshot(&mut self, collection: &Collection<'a>) -> Result<(), PushError> {
         let mut record = self.records.read(&collection.name)?.unwrap_or_default();
-        let mut kept = record.snapshot.take();
-        if let Some(snapshot) = &kept
-            && !collection.has_snapshot(snapshot).await?
-        {
-            kept = None;
+        let is_there = match &record.snapshot {
+            Some(snapshot) => collection.has_snapshot(snapshot).await?,
+            None => false,
+        };
+        if !is_there {
+            record.snapshot = Some(collection.create_snapshot().await?);
+            self.records.write(&collection.name, &record).await?;
         }
-        let snapshot = match kept {
-            Some(snapshot) => snapshot,
-            None => {
-                let snapshot = collection.create_snapshot().await?;
-                record.snapshot = Some(snapshot.clone());
-                self.records.write(&collection.name, &record).await?;
-                snapshot
-            }
-        };
-        self.report.snapshots.push(snapshot);
+        self.report.snapshots.extend(record.snapshot);
         Ok(())
-    }
-
-    /// Returns the generation as the database's integer type.
-    fn generation(&self) -> i64 {
-        i64::try_from(self.manifest.generation).unwrap_or(i64::MAX)
-    }
-
-    /// Builds the batch that begins at a point of a cell, off the asynchronous threads.
-    async fn batch(
-        &self,
-        vectors: &Arc<CellVectors>,
-        start: usize,
-        cell_id: u32,
-    ) -> Result<Vec<PointStruct>, PushError> {
-        let n_points = self.options.n_points_per_batch.get();
-        let end = vectors.input_indices.len().min(start.saturating_add(n_points));
-        let cell = CellPayload {
-            scene: self.manifest.scene.clone(),
-            generation: self.generation(),
-            cell_id,
-            geo_reference: self.manifest.geo_reference,
-        };
-        let (vectors, dim) = (Arc::clone(vectors), self.manifest.encoder.dim as usize);
-        Ok(tokio::task::spawn_blocking(move || points(&vectors, start..end, dim, &cell)).await?)
     }
 
     /// Compares the number of points in the collection with the number pushed; if they differ, the next push
     /// starts this collection over.
     async fn check_count(&self, collection: &Collection<'a>, expected: u64) -> Result<(), PushError> {
-        let found = collection.count(None).await?;
+        let found = collection.count(Filter::default()).await?;
         if found == expected {
             return Ok(());
         }

@@ -3,13 +3,13 @@
 
 use qdrant_client::qdrant::{
     BinaryQuantization, CollectionParamsDiff, CompressionRatio, CreateCollection, CreateCollectionBuilder,
-    Disabled, Distance, HnswConfigDiff, Memory, PayloadStorageParams, ProductQuantization,
-    QuantizationConfig, QuantizationConfigDiff, QuantizationType, ScalarQuantization, UpdateCollection,
-    VectorParamsBuilder, VectorParamsDiff, VectorsConfigDiff, quantization_config::Quantization as Stored,
+    Disabled, Distance, HnswConfigDiff, ProductQuantization, QuantizationConfig, QuantizationConfigDiff,
+    QuantizationType, ScalarQuantization, UpdateCollection, VectorParamsBuilder, VectorParamsDiff,
+    VectorsConfigDiff, quantization_config::Quantization as Stored,
     quantization_config_diff::Quantization as Diff, vectors_config_diff,
 };
 
-use super::server::{Held, Server};
+use super::server::Server;
 use super::*;
 
 /// A creation without any setting: vectors and distance alone.
@@ -149,56 +149,6 @@ async fn a_collection_of_other_settings_is_changed_once_and_only_where_asked() {
     assert_eq!(held.quantization_config, None);
     assert_eq!(held.hnsw_config.and_then(|hnsw| hnsw.ef_construct), Some(200));
     fixture.assert_arrived(&server, 1);
-}
-
-/// Settings of the vectors override those of the collection, and `memory` the older flags.
-#[tokio::test]
-async fn settings_are_changed_where_they_are_in_force() {
-    let fixture = fixture();
-    let (server, url) = Server::start(None).await;
-    let mut held = Held::new(VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build());
-    // As asked at the level of the collection, otherwise at that of the vectors.
-    held.config.hnsw_config = Some(graph());
-    held.config.quantization_config =
-        Some(QuantizationConfig { quantization: Some(Stored::Scalar(scalar())) });
-    let params = held.config.params.as_mut().expect("has some");
-    params.on_disk_payload = true;
-    params.payload = Some(PayloadStorageParams { memory: Some(Memory::Cached.into()) });
-    let vectors = held.vectors();
-    vectors.on_disk = Some(true);
-    vectors.memory = Some(Memory::Cached.into());
-    vectors.hnsw_config =
-        Some(HnswConfigDiff { m: Some(8), memory: Some(Memory::Pinned.into()), ..Default::default() });
-    let slow = ScalarQuantization { always_ram: Some(false), ..scalar() };
-    vectors.quantization_config = Some(QuantizationConfig { quantization: Some(Stored::Scalar(slow)) });
-    server.with(|state| state.collections.insert("yard".into(), held));
-
-    let options = PushOptions { index: ALL, ..options(&url) };
-    let report = fixture.push(&options).await.expect("changes");
-    let expected = [
-        change("hnsw-m", "8", "32"),
-        change("quantisation", "int8, not kept in memory", "int8"),
-        change("vectors", "in memory", "on disk"),
-        change("graph", "in memory", "on disk"),
-        change("payload", "in memory", "on disk"),
-    ];
-    assert_eq!(report.changed_settings, expected);
-    let mut held = server.with(|state| state.collections["yard"].clone());
-    let vectors = *held.vectors();
-    let cold = Some(i32::from(Memory::Cold));
-    let graph = vectors.hnsw_config.expect("kept");
-    assert_eq!((graph.m, graph.ef_construct, graph.memory), (Some(32), Some(200), cold));
-    assert_eq!(vectors.memory, cold);
-    assert_eq!(
-        vectors.quantization_config.and_then(|q| q.quantization),
-        Some(Stored::Scalar(scalar())),
-        "the vectors' own"
-    );
-    let payload = held.config.params.and_then(|params| params.payload);
-    assert_eq!(payload.and_then(|payload| payload.memory), cold);
-    let again = fixture.push(&options).await.expect("nothing to do");
-    assert_eq!(again.changed_settings, []);
-    assert_eq!(server.with(|state| state.updated.len()), 1);
 }
 
 /// A server whose operator quantises by default does so unless the push says `none`.
