@@ -26,39 +26,18 @@ const RETRY_PAUSE: Duration = Duration::from_millis(300);
 /// A bucket cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum BlobError {
-    /// The address is no bucket's.
     #[error(
         "{url}: {problem}; expected file:///FOLDER, s3://BUCKET/PREFIX, or gs:// and az:// where the program was built with them"
     )]
-    Address {
-        /// The address.
-        url: String,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// A request failed, after the client's own retries.
+    Address { url: String, problem: String },
     #[error(
         "{url}/{key}: {source}; check the address, the credentials (for S3 AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT) and the free space"
     )]
-    Request {
-        /// The bucket.
-        url: String,
-        /// The key.
-        key: String,
-        /// The cause.
-        source: object_store::Error,
-    },
-    /// The folder cannot be made, or the bucket's threads cannot be started.
+    Request { url: String, key: String, source: object_store::Error },
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// An object that must be there is not.
     #[error("{url}/{key} is missing; was the prefix emptied while it was in use?")]
-    Missing {
-        /// The bucket.
-        url: String,
-        /// The key.
-        key: String,
-    },
+    Missing { url: String, key: String },
 }
 
 /// A bucket, from a prefix on.
@@ -144,9 +123,6 @@ impl Bucket {
     }
 
     /// Returns an object; `None` if it is not there.
-    ///
-    /// # Errors
-    /// [`BlobError::Request`].
     pub fn get(&self, key: &str) -> Result<Option<Bytes>, BlobError> {
         let at = self.key(key);
         match self.ask(|| async { self.store.get(&at).await?.bytes().await }) {
@@ -157,18 +133,12 @@ impl Bucket {
     }
 
     /// Returns an object that must be there.
-    ///
-    /// # Errors
-    /// [`BlobError`].
     pub fn require(&self, key: &str) -> Result<Bytes, BlobError> {
         let missing = || BlobError::Missing { url: self.url.clone(), key: key.to_owned() };
         self.get(key)?.ok_or_else(missing)
     }
 
     /// Returns the length of an object; `None` if it is not there.
-    ///
-    /// # Errors
-    /// [`BlobError::Request`].
     pub fn len_of(&self, key: &str) -> Result<Option<u64>, BlobError> {
         let at = self.key(key);
         match self.ask(|| self.store.head(&at)) {
@@ -192,35 +162,23 @@ impl Bucket {
 
     /// Puts an object unless there is one; returns whether there was none. If the answer is lost, the put is made again
     /// and may find its own object; where it matters who put it, use [`Self::claim`].
-    ///
-    /// # Errors
-    /// [`BlobError::Request`].
     pub fn put_new(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         self.put_with(key, bytes.into(), PutMode::Create)
     }
 
     /// Puts an object unless there is one; returns whether the one that is there has these bytes, which only the caller would
     /// put.
-    ///
-    /// # Errors
-    /// [`BlobError`].
     pub fn claim(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         let bytes = bytes.into();
         Ok(self.put_new(key, bytes.clone())? || self.require(key)? == bytes)
     }
 
     /// Puts an object in place of what is there.
-    ///
-    /// # Errors
-    /// [`BlobError::Request`].
     pub fn put(&self, key: &str, bytes: impl Into<Bytes>) -> Result<(), BlobError> {
         self.put_with(key, bytes.into(), PutMode::Overwrite).map(drop)
     }
 
     /// Returns the names of the objects in a folder, without the folder's name, ascending.
-    ///
-    /// # Errors
-    /// [`BlobError::Request`].
     pub fn list(&self, folder: &str) -> Result<Vec<String>, BlobError> {
         let at = self.key(folder);
         let listed = self.ask(|| self.store.list(Some(&at)).try_collect::<Vec<_>>());

@@ -32,53 +32,22 @@ pub struct Scores {
 /// Scores cannot be computed.
 #[derive(Debug, thiserror::Error)]
 pub enum QueryError {
-    /// The field cannot be read.
     #[error(transparent)]
     Field(#[from] ReadFieldError),
-    /// A shard cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The query's dimension differs from the store's.
     #[error(
         "the query has {found} components, the store's embeddings {expected}; use the models it was encoded with ({encoder})"
     )]
-    Dimension {
-        /// Components of the store's embeddings.
-        expected: usize,
-        /// Components of the query.
-        found: usize,
-        /// The store's encoder.
-        encoder: String,
-    },
-    /// A field names an unknown Gaussian.
+    Dimension { expected: usize, found: usize, encoder: String },
     #[error("cell {cell_id}: Gaussian {index} of a scene of {n}; the store is damaged, encode again")]
-    Index {
-        /// The cell.
-        cell_id: u32,
-        /// The index found.
-        index: u32,
-        /// Gaussians in the scene.
-        n: usize,
-    },
-    /// A cell has no shard of a profile.
+    Index { cell_id: u32, index: u32, n: usize },
     #[error("cell {cell_id} has no {profile} shard; encode again with {} in --profiles", with_exact(*profile))]
-    NoShard {
-        /// The cell.
-        cell_id: u32,
-        /// The profile.
-        profile: Profile,
-    },
-    /// The store was published without objects.
+    NoShard { cell_id: u32, profile: Profile },
     #[error("the store has no objects; encode again, without --no-objects")]
     NoObjects,
-    /// A shard is damaged.
     #[error("cell {cell_id}: {source}")]
-    Shard {
-        /// The cell.
-        cell_id: u32,
-        /// The damage.
-        source: slag_common::container::ContainerError,
-    },
+    Shard { cell_id: u32, source: slag_common::container::ContainerError },
 }
 
 /// Returns the profiles that a command needs beside any others: exact shards tell which Gaussian is which.
@@ -90,9 +59,6 @@ fn with_exact(profile: Profile) -> String {
 }
 
 /// Scores every Gaussian against a unit query vector.
-///
-/// # Errors
-/// [`QueryError`].
 pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError> {
     let table = read_regions(reader)?;
     check_dim(reader, &table, query)?;
@@ -136,8 +102,6 @@ fn scores_of_cells(
 /// Scores every Gaussian as a profile's shards decode it: what a robot that holds them knows.
 ///
 /// Total weights are left at zero: shards do not keep them.
-/// # Errors
-/// [`QueryError`].
 pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -> Result<Scores, QueryError> {
     let manifest = reader.manifest();
     let dim = manifest.encoder.dim as usize;
@@ -197,9 +161,6 @@ pub struct PublishedObjects {
 
 impl PublishedObjects {
     /// Reads the objects; `None` if the scene has no objects, or no exact shards to identify Gaussians by.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn find(reader: &StoreReader) -> Result<Option<Self>, QueryError> {
         match Self::read(reader) {
             Err(QueryError::NoObjects | QueryError::NoShard { .. }) => Ok(None),
@@ -208,9 +169,6 @@ impl PublishedObjects {
     }
 
     /// Reads the objects from the exact shards.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn read(reader: &StoreReader) -> Result<Self, QueryError> {
         let manifest = reader.manifest();
         let dim = manifest.encoder.dim as usize;

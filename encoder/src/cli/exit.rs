@@ -5,7 +5,6 @@ use std::process::ExitCode;
 /// How a run of the program ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
-    /// All done.
     Done,
     /// Failed; the message says why.
     Failed,

@@ -11,7 +11,6 @@ use crate::store::{Published, StoreError, StoreReader};
 /// A generation of a store.
 #[derive(Clone, Copy, Debug)]
 pub struct Generation<'a> {
-    /// The store.
     pub reader: &'a StoreReader,
     /// Its current generation or the one before it.
     pub published: &'a Published,
@@ -20,33 +19,16 @@ pub struct Generation<'a> {
 /// Two generations cannot be compared.
 #[derive(Debug, thiserror::Error)]
 pub enum DiffError {
-    /// A shard cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// A shard is damaged.
     #[error("cell {cell_id}: {source}; encode again: what is damaged is written anew")]
-    Shard {
-        /// The cell.
-        cell_id: u32,
-        /// The damage.
-        source: ContainerError,
-    },
-    /// A generation was published without objects.
+    Shard { cell_id: u32, source: ContainerError },
     #[error("generation {generation} has no objects to compare; encode again, without --no-objects")]
-    NoObjects {
-        /// The generation.
-        generation: u64,
-    },
-    /// The vectors of the generations do not compare.
+    NoObjects { generation: u64 },
     #[error(
         "the generations are of different encoders, {old} and {new}; encode one of them again with the other's models"
     )]
-    Encoders {
-        /// The earlier generation's encoder.
-        old: String,
-        /// The later one's.
-        new: String,
-    },
+    Encoders { old: String, new: String },
 }
 
 /// Reads the objects of a generation from the finest shards of each cell, by id.

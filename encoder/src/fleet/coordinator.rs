@@ -36,9 +36,6 @@ impl Coordinator {
     }
 
     /// Encodes a scene as [`encode::encode`] does, by the fleet.
-    ///
-    /// # Errors
-    /// As of [`encode::encode`].
     pub fn encode(
         &self,
         settings: &EncodeSettings,

@@ -95,7 +95,6 @@ pub(super) fn parse<T: DeserializeOwned>(bucket: &Bucket, key: &str, bytes: &[u8
     serde_json::from_slice(bytes).map_err(|e| FleetError::damaged(bucket, key, e))
 }
 
-/// Returns a document's bytes.
 pub(super) fn to_bytes(document: &impl Serialize) -> Result<Vec<u8>, FleetError> {
     Ok(serde_json::to_vec(document).map_err(std::io::Error::from)?)
 }

@@ -6,100 +6,45 @@ use crate::encode::EncodeError;
 /// The queue cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum QueueError {
-    /// No connection.
     #[error(
         "{url}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials"
     )]
-    Connect {
-        /// The address.
-        url: String,
-        /// The cause.
-        problem: String,
-    },
+    Connect { url: String, problem: String },
 }
 
 /// Why a coordinator or worker ends.
 #[derive(Debug, thiserror::Error)]
 pub enum FleetError {
-    /// The bucket.
     #[error(transparent)]
     Blob(#[from] BlobError),
-    /// The queue.
     #[error(transparent)]
     Queue(#[from] QueueError),
-    /// A view cannot be done on this machine.
     #[error(transparent)]
     Encode(#[from] EncodeError),
-    /// A file of this machine.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// The run was planned by another version.
     #[error(
         "run {run} was planned by slag-encoder {planned}, this is {own}: install the same program on all machines of the fleet"
     )]
-    Version {
-        /// The run.
-        run: u64,
-        /// The coordinator's version.
-        planned: String,
-        /// This one's.
-        own: String,
-    },
-    /// This machine would make other contributions.
+    Version { run: u64, planned: String, own: String },
     #[error(
         "run {run} was planned with {planned}, this worker would encode with {own} and make other contributions; give the worker the coordinator's --models, --segmenter, --provider and program"
     )]
-    Identity {
-        /// The run.
-        run: u64,
-        /// The coordinator's models, segmenter and settings.
-        planned: String,
-        /// This worker's.
-        own: String,
-    },
-    /// The coordinator has died, or cannot reach the bucket.
+    Identity { run: u64, planned: String, own: String },
     #[error(
         "run {run}: its coordinator has shown no heartbeat for {secs} s. What is done lies in {url}: start the same encode again, then its workers"
     )]
-    Abandoned {
-        /// Number of the run.
-        run: u64,
-        /// Time without a heartbeat.
-        secs: u64,
-        /// The bucket.
-        url: String,
-    },
-    /// Another coordinator has taken the run's place.
+    Abandoned { run: u64, secs: u64, url: String },
     #[error(
         "run {run} was superseded: another `encode --blobs` uses {url}. Let one of them finish, or give the other another prefix"
     )]
-    Superseded {
-        /// The run.
-        run: u64,
-        /// The bucket.
-        url: String,
-    },
-    /// An object is not what its name says.
+    Superseded { run: u64, url: String },
     #[error("{url}/{key}: {problem}; delete it, and it is made again")]
-    Damaged {
-        /// The bucket.
-        url: String,
-        /// The object.
-        key: String,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// The memory of the worker.
+    Damaged { url: String, key: String, problem: String },
     #[error(transparent)]
     Memory(#[from] crate::memory::MemoryError),
-    /// A view failed, and `strict` is set.
     #[error("view {view}: {reason}")]
-    View {
-        /// The view.
-        view: String,
-        /// Why.
-        reason: String,
-    },
+    View { view: String, reason: String },
 }
 
 impl FleetError {

@@ -18,9 +18,6 @@ use crate::ingest;
 use crate::segment;
 
 /// Uploads the scene and the files of the views to do, and returns the plan of a run. `open`: their numbers.
-///
-/// # Errors
-/// [`FleetError`].
 pub(super) fn upload(
     bucket: &Bucket,
     plan: &Plan<'_>,
@@ -98,7 +95,6 @@ impl ViewFiles {
         Self { bucket, folder: folder.to_owned(), views }
     }
 
-    /// Returns the folder of masks.
     pub(super) fn mask_folder(&self) -> PathBuf {
         self.folder.join("masks")
     }
@@ -149,9 +145,6 @@ impl ViewFiles {
     }
 
     /// Brings the photo and masks of a view to where the view says.
-    ///
-    /// # Errors
-    /// [`FleetError`].
     pub(super) fn fetch(&self, view: &View) -> Result<(), FleetError> {
         let Some(planned) = self.planned(view) else { return Ok(()) };
         let mut files = vec![(&planned.photo, self.photo_path(planned))];
@@ -166,9 +159,6 @@ impl ViewFiles {
 }
 
 /// Brings an input from the bucket and checks its content.
-///
-/// # Errors
-/// [`FleetError`].
 pub(super) fn fetch_input(bucket: &Bucket, hash: Hash32) -> Result<axum::body::Bytes, FleetError> {
     let key = documents::input_key(hash);
     let bytes = bucket.require(&key)?;
@@ -179,9 +169,6 @@ pub(super) fn fetch_input(bucket: &Bucket, hash: Hash32) -> Result<axum::body::B
 }
 
 /// Brings an input into a file.
-///
-/// # Errors
-/// [`FleetError`].
 pub(super) fn fetch_file(bucket: &Bucket, file: &InputFile, path: &Path) -> Result<(), FleetError> {
     let bytes = fetch_input(bucket, file.hash)?;
     if let Some(folder) = path.parent() {

@@ -34,9 +34,6 @@ pub(super) struct Prepared {
 
 impl Prepared {
     /// Brings scene and masks to `folder`. `segmenter`: this machine's mask model.
-    ///
-    /// # Errors
-    /// [`FleetError`].
     pub(super) fn fetch(
         bucket: &Arc<Bucket>,
         (run, plan): (Run, RunPlan),
@@ -75,9 +72,6 @@ impl Prepared {
     }
 
     /// Refuses to work where the contributions would be others than the coordinator expects.
-    ///
-    /// # Errors
-    /// [`FleetError::Identity`].
     pub(super) fn check(
         &self,
         engines: &Engines<'_>,
@@ -97,9 +91,6 @@ impl Prepared {
     }
 
     /// Checks that what the worker holds for scene and views fits into its memory.
-    ///
-    /// # Errors
-    /// [`FleetError::Memory`].
     pub(super) fn check_memory(&self, memory_bytes: u64, n_threads: usize) -> Result<(), FleetError> {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());

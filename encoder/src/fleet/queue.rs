@@ -71,7 +71,6 @@ impl QueueSettings {
     }
 }
 
-/// Returns the name of a run's stream.
 fn stream_name(run: Run, of_scene: Hash32) -> String {
     format!("SLAG-{}-{}", &of_scene.to_string()[..16], run.0)
 }
@@ -90,9 +89,6 @@ pub(super) struct Enqueuer {
 
 impl Enqueuer {
     /// Connects; the stream is made when it is filled.
-    ///
-    /// # Errors
-    /// [`QueueError::Connect`].
     pub(super) fn open(
         runtime: &Arc<Runtime>,
         settings: &QueueSettings,
@@ -241,9 +237,6 @@ impl Held {
 
 impl Queue {
     /// Connects, and asks for at most `n_most` views at a time from then on, until it is dropped.
-    ///
-    /// # Errors
-    /// [`QueueError::Connect`].
     pub(super) fn open(
         runtime: &Arc<Runtime>,
         settings: &QueueSettings,

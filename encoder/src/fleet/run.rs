@@ -89,9 +89,6 @@ impl Run {
     }
 
     /// Returns whether workers have views to do.
-    ///
-    /// # Errors
-    /// [`FleetError::Blob`].
     pub(super) fn is_open(self, bucket: &Bucket) -> Result<bool, FleetError> {
         Ok(!self.has_ended(bucket)? && bucket.len_of(&self.key(DONE))?.is_none())
     }
@@ -101,9 +98,6 @@ impl Run {
     }
 
     /// Lets workers go: all views are in the bucket, or have failed.
-    ///
-    /// # Errors
-    /// [`FleetError::Blob`].
     pub(super) fn views_are_done(self, bucket: &Bucket) -> Result<(), FleetError> {
         Ok(bucket.put(&self.key(DONE), "")?)
     }
@@ -119,9 +113,6 @@ impl Run {
     }
 
     /// Fails if another coordinator has taken the run's place.
-    ///
-    /// # Errors
-    /// [`FleetError::Superseded`].
     pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
         match self.has_ended(bucket)? {
             true => Err(self.superseded(bucket)),

@@ -23,9 +23,6 @@ pub(super) struct RunFolder {
 
 impl RunFolder {
     /// Makes a folder for a run under `parent`, and removes those that killed workers left there.
-    ///
-    /// # Errors
-    /// [`FleetError::Io`].
     pub(super) fn make(parent: &Path, run: Run) -> Result<Self, FleetError> {
         fs_err::create_dir_all(parent)?;
         remove_left(parent);

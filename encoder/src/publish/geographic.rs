@@ -11,29 +11,16 @@ use slag_common::manifest::Manifest;
 /// Why a scene cannot be placed on the earth.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum GeographicError {
-    /// The scene has no geo-reference.
     #[error(
         "the scene is not geo-referenced; ask in the world frame (x, y, z), or encode it with a geo-reference"
     )]
     NotGeoReferenced,
-    /// The latitude is out of range.
     #[error("latitude {found_deg} is not within -90..=90 degrees; check the order of lat and lon")]
-    Latitude {
-        /// Found.
-        found_deg: f64,
-    },
-    /// The longitude is out of range.
+    Latitude { found_deg: f64 },
     #[error("longitude {found_deg} is not within -180..=180 degrees")]
-    Longitude {
-        /// Found.
-        found_deg: f64,
-    },
-    /// The height is not finite.
+    Longitude { found_deg: f64 },
     #[error("height {found_m} is not a finite number of metres")]
-    Height {
-        /// Found.
-        found_m: f64,
-    },
+    Height { found_m: f64 },
 }
 
 fn reference_of(manifest: &Manifest) -> Result<&GeoReference, GeographicError> {
@@ -42,9 +29,6 @@ fn reference_of(manifest: &Manifest) -> Result<&GeoReference, GeographicError> {
 
 /// Returns a geographic position in the world frame, metres. Without a height, the position has the height
 /// of the world frame's origin.
-///
-/// # Errors
-/// [`GeographicError`].
 pub fn world_from_geographic(
     manifest: &Manifest,
     latitude_deg: f64,
@@ -174,9 +158,6 @@ fn closed(ring: Vec<Coord>) -> Polygon {
 /// `n_gaussians` and `area_m2` (geodesic, on the WGS 84 ellipsoid).
 ///
 /// The foreign member `scene` has the name, the generation, and the convex `outline` of all cells.
-///
-/// # Errors
-/// [`GeographicError::NotGeoReferenced`].
 pub fn coverage(manifest: &Manifest) -> Result<FeatureCollection, GeographicError> {
     let reference = reference_of(manifest)?;
     let features = manifest.cells.iter().map(|cell| {

@@ -32,9 +32,6 @@ pub struct ByLevel<'a> {
 
 impl<'a> ByLevel<'a> {
     /// Reads the field once and computes the lengths of the levels' sums.
-    ///
-    /// # Errors
-    /// [`QueryError::Field`].
     pub fn read(reader: &'a StoreReader) -> Result<Self, QueryError> {
         let table = read_regions(reader)?;
         let lengths = |cell: &CellRecord| {
@@ -47,9 +44,6 @@ impl<'a> ByLevel<'a> {
     }
 
     /// Scores every Gaussian against a unit query vector, as [`super::scores`] does.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn scores(&self, query: &[f32]) -> Result<Scores, QueryError> {
         check_dim(self.reader, &self.table, query)?;
         let of_regions = self.table.scores_by_level(query);

@@ -30,26 +30,12 @@ pub struct Hit {
 /// A splat is not the one that a store was encoded from.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneMismatch {
-    /// It has another number of Gaussians.
     #[error("the splat has {found} Gaussians, the store was encoded from one of {expected}; give that splat")]
-    Count {
-        /// Gaussians of the store.
-        expected: u64,
-        /// Gaussians of the splat.
-        found: usize,
-    },
-    /// A Gaussian lies elsewhere.
+    Count { expected: u64, found: usize },
     #[error(
         "Gaussian {index} lies at {found} in the splat, at {expected} in the store; give the splat that the store was encoded from"
     )]
-    Position {
-        /// Its index.
-        index: u32,
-        /// Its position in the store.
-        expected: DVec3,
-        /// Its position in the splat.
-        found: DVec3,
-    },
+    Position { index: u32, expected: DVec3, found: DVec3 },
 }
 
 impl Scores {
@@ -73,9 +59,6 @@ impl Scores {
 
 /// Returns Gaussians of the input with their positions, in the order given. Those that no shard knows the index of are left
 /// out; a scene encoded with exact shards or input indices has none.
-///
-/// # Errors
-/// [`QueryError`].
 pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result<Vec<Hit>, QueryError> {
     let mut positions: HashMap<u32, Option<DVec3>> = indices.iter().map(|index| (*index, None)).collect();
     if positions.is_empty() {
@@ -114,9 +97,6 @@ fn indexed_shard(
 }
 
 /// Checks that a splat is the one that a store was encoded from: by its number of Gaussians, and by the positions of some.
-///
-/// # Errors
-/// [`SceneMismatch`].
 pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Result<(), SceneMismatch> {
     let manifest = reader.manifest();
     let expected = manifest.n_gaussians + manifest.n_rejected;

@@ -10,9 +10,6 @@ use crate::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 const BACKGROUND: [f32; 3] = [0.9; 3];
 
 /// Draws a scene with the Gaussians of `cosines` (`[N]`) at or above the threshold lit, at the view's own size.
-///
-/// # Errors
-/// [`RasterError`].
 pub fn draw_lit(
     scene: &Gaussians,
     cosines: &[f32],

@@ -41,11 +41,9 @@ pub struct GenerationRecord {
     pub scene: String,
     /// Its number.
     pub generation: u64,
-    /// Hash of its manifest.
     pub manifest_hash: Hash32,
     /// When it was made, seconds since 1970.
     pub created_unix_secs: u64,
-    /// Number of cells.
     pub n_cells: usize,
     /// Number of Gaussians in them.
     pub n_gaussians: u64,
@@ -118,9 +116,6 @@ pub(crate) struct Catalogue {
 impl Catalogue {
     /// Opens the database of a store for writing; a damaged one is renamed to `db.damaged`, and an empty one takes its
     /// place. Waits up to `patience` for another writer.
-    ///
-    /// # Errors
-    /// [`StoreError::Locked`], [`StoreError::Records`], [`StoreError::Io`].
     pub fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
         let path = store.join("db");
         let refused = |fault| match fault {
@@ -271,9 +266,6 @@ pub struct CatalogueCopy {
 impl CatalogueCopy {
     /// Copies a store's catalogue to a folder under `scratch`, which goes with it. `None` if the store has no catalogue, or
     /// the copy is damaged: a writer may have changed it meanwhile.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`].
     pub fn of(store: &Path, scratch: &Path) -> Result<Option<Self>, StoreError> {
         let db = store.join("db");
         if !db.is_dir() {
@@ -297,9 +289,6 @@ impl CatalogueCopy {
     }
 
     /// Returns all generations ever published, the oldest first.
-    ///
-    /// # Errors
-    /// [`StoreError::Records`].
     pub fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.catalogue.generations()
     }

@@ -28,7 +28,6 @@ pub enum Change {
 /// A root that was made.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Changed {
-    /// Its version.
     pub root_version: u64,
     /// SHA-256 of the root, hex; absent while it is a draft.
     pub root_sha256: Option<String>,
@@ -39,9 +38,7 @@ pub struct Changed {
 /// A key that the newest root names.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct KeyStatus {
-    /// The role.
     pub role: String,
-    /// Its id.
     pub id: String,
     /// Whether its secret half lies here.
     pub is_here: bool,
@@ -67,9 +64,6 @@ pub struct KeysStatus {
 impl Metadata {
     /// Makes new keys, and a root that names them. It is installed at once if root's keys in `root_folder` are enough;
     /// otherwise it is a draft.
-    ///
-    /// # Errors
-    /// [`StoreError`].
     pub fn change_keys(
         &self,
         change: &Change,
@@ -161,9 +155,6 @@ impl Metadata {
 
 impl MetadataReader {
     /// Describes the keys. `root_folder`: where root's keys may lie.
-    ///
-    /// # Errors
-    /// [`StoreError`].
     pub fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
         let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
         let mut here: Vec<String> =

@@ -18,7 +18,6 @@ impl Source for Folder<'_> {
     }
 }
 
-/// Publishes a generation.
 fn publish(dir: &Path, generation: u64) {
     let scene = Manifest { created_unix_secs: 1, ..manifest_of(generation, &[]) };
     Store::create_or_open(dir).expect("opens").publish(&scene, &Extras::new()).expect("publishes");

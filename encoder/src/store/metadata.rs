@@ -40,7 +40,6 @@ pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 /// What a signature of the timestamp states.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Refreshed {
-    /// Version of the timestamp.
     pub timestamp_version: u64,
     /// Version of the snapshot that it names.
     pub snapshot_version: u64,
@@ -123,9 +122,6 @@ impl MetadataReader {
     }
 
     /// Returns what expires soon, or has expired: robots then refuse the store. Each text says until when, and what to do.
-    ///
-    /// # Errors
-    /// [`StoreError`].
     pub fn expiry_warnings(&self, now_unix_secs: u64) -> Result<Vec<String>, StoreError> {
         let store = self.store.display();
         let expires = |what: &str, at: u64, command: &str| {
@@ -157,9 +153,6 @@ impl MetadataReader {
 
 impl Metadata {
     /// Opens the metadata for writing. An encode that runs does not hinder it; another signature is waited for.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`].
     pub fn open(store: &Path) -> Result<Self, StoreError> {
         let folder = folder(store);
         files::ensure_folder(&folder)?;
@@ -173,9 +166,6 @@ impl Metadata {
     /// Publishes a manifest; nothing changes if it is published already. Makes keys and root at the first time.
     /// `created_unix_secs`: when the manifest was made; the clock counts if it is later, because a manifest may be dated
     /// back to be reproducible.
-    ///
-    /// # Errors
-    /// [`StoreError`].
     pub fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
         let now_unix_secs = created_unix_secs.max(signing_unix_secs());
         if self.newest_root()?.is_none() {

@@ -19,7 +19,6 @@ pub type Extras = BTreeMap<String, Hash32>;
 /// A published generation.
 #[derive(Clone, Debug)]
 pub struct Published {
-    /// The manifest.
     pub manifest: Manifest,
     /// Its bytes, as robots get them.
     pub bytes: Vec<u8>,
@@ -128,9 +127,6 @@ impl StoreReader {
     }
 
     /// Returns which models the current generation was encoded with, if the store recorded it.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`].
     pub fn models(&self) -> Result<Option<ModelsRecord>, StoreError> {
         let record = ModelsRecord::read(&self.dir)?;
         Ok(record.filter(|record| record.encoder == self.manifest().encoder.id))
@@ -162,9 +158,6 @@ impl StoreReader {
     }
 
     /// Reads an object and verifies its hash.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`], [`StoreError::ObjectHash`].
     pub fn read_object(&self, hash: Hash32) -> Result<AlignedBytes, StoreError> {
         let path = self.object_path(hash);
         let bytes = AlignedBytes::read(&path)?;

@@ -28,7 +28,6 @@ pub enum Fault {
 /// An object that robots or queries would fail on.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct BadObject {
-    /// Its hash.
     pub hash: Hash32,
     /// Its file.
     pub path: PathBuf,
@@ -71,7 +70,6 @@ impl StoreReader {
 }
 
 impl Listing<'_> {
-    /// Returns the number of objects.
     pub fn n_objects(&self) -> usize {
         self.holds.len()
     }

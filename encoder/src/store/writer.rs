@@ -72,9 +72,6 @@ impl Store {
     }
 
     /// Returns the folder for working files of an encode, and creates it if it does not exist.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`].
     pub fn job_dir(&self) -> Result<PathBuf, StoreError> {
         let path = self.dir.join("job");
         files::ensure_folder(&path)?;
@@ -92,9 +89,6 @@ impl Store {
     }
 
     /// Returns a reader of what is published.
-    ///
-    /// # Errors
-    /// As [`StoreReader::open`].
     pub fn reader(&self) -> Result<StoreReader, StoreError> {
         StoreReader::open(&self.dir)
     }
@@ -126,9 +120,6 @@ impl Store {
     }
 
     /// Writes an object; as [`Store::put_object`].
-    ///
-    /// # Errors
-    /// [`StoreError::Io`].
     pub fn put_bytes(&self, bytes: &[u8]) -> Result<(Hash32, u64), StoreError> {
         self.put_object(|out| out.write_all(bytes))
     }
@@ -149,9 +140,6 @@ impl Store {
     }
 
     /// Returns the generation that the next published manifest should have.
-    ///
-    /// # Errors
-    /// [`StoreError::Records`].
     pub fn next_generation(&self) -> Result<u64, StoreError> {
         Ok(self.catalogue.last_generation()?.map_or(1, |current| current.saturating_add(1)))
     }
@@ -170,9 +158,6 @@ impl Store {
     }
 
     /// As [`Store::publish`]; the catalogue remembers the command that made the generation.
-    ///
-    /// # Errors
-    /// As [`Store::publish`].
     pub fn publish_by(
         &self,
         manifest: &Manifest,
@@ -213,9 +198,6 @@ impl Store {
     }
 
     /// Remembers which models the store was encoded with.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`].
     pub fn remember_models(&self, record: &ModelsRecord) -> Result<(), StoreError> {
         let bytes = serde_json::to_vec(record).map_err(io::Error::from)?;
         self.replace(&ModelsRecord::path(&self.dir), &bytes)
@@ -253,9 +235,6 @@ impl Store {
     }
 
     /// Returns the published cells in order of their ids, from the catalogue; none before the first publication.
-    ///
-    /// # Errors
-    /// [`StoreError`].
     pub fn cells(&self) -> Result<Vec<CellRecord>, StoreError> {
         match manifest_file::read_bytes(&self.dir.join(manifest_file::MANIFEST))? {
             Some(manifest) => self.catalogue.cells(Hash32::of(&manifest)),
@@ -264,9 +243,6 @@ impl Store {
     }
 
     /// Returns all generations ever published, the oldest first, from the catalogue.
-    ///
-    /// # Errors
-    /// [`StoreError::Records`].
     pub fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.catalogue.generations()
     }

@@ -12,49 +12,26 @@ use crate::store::StoreError;
 /// Why the page gets no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewError {
-    /// A splat alone is shown.
     #[error("only a splat is shown, which cannot be asked; encode it, and give its store with --store")]
     NoStore,
-    /// The store cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// A field cannot be read.
     #[error(transparent)]
     Field(#[from] ReadFieldError),
-    /// A shard is damaged.
     #[error("cell {cell_id}: {source}; encode again: what is damaged is written anew")]
-    Shard {
-        /// The cell.
-        cell_id: u32,
-        /// The damage.
-        source: ContainerError,
-    },
-    /// The splat is not the store's.
+    Shard { cell_id: u32, source: ContainerError },
     #[error(
         "the splat has {found} Gaussians, but the store was encoded from one with {expected}; give that one with --scene"
     )]
-    OtherSplat {
-        /// Gaussians of the splat that the store was encoded from.
-        expected: u64,
-        /// Gaussians of the splat that was given.
-        found: usize,
-    },
-    /// There is no such cell.
+    OtherSplat { expected: u64, found: usize },
     #[error("there is no cell {cell_id} of this generation; GET /v1/view lists the cells")]
-    NoCell {
-        /// The cell.
-        cell_id: u32,
-    },
-    /// There is nothing to compare with.
+    NoCell { cell_id: u32 },
     #[error("the store has one generation alone; encode again into it, and what changed is shown")]
     OneGeneration,
-    /// Two generations cannot be compared.
     #[error(transparent)]
     Changes(#[from] DiffError),
-    /// The text model cannot be opened.
     #[error("{0}")]
     Models(String),
-    /// The text cannot be encoded.
     #[error(transparent)]
     Text(#[from] InferenceError),
 }

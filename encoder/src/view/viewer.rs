@@ -19,9 +19,7 @@ use crate::store::StoreReader;
 /// Opens the text encoder of a store; the error says what to do.
 pub type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
 
-/// What is shown.
 pub struct Shown {
-    /// The store.
     pub store: Option<PathBuf>,
     /// The splat; of the store, if there is one.
     pub splat: Option<Splat>,

@@ -25,10 +25,8 @@ pub use slag_service::access::{Access, AccessSettings};
 /// Why the service does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// The store cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The address cannot be listened on.
     #[error(transparent)]
     Listen(#[from] ListenError),
 }
@@ -53,9 +51,6 @@ pub async fn serve(
 }
 
 /// Serves routes as [`serve`] does.
-///
-/// # Errors
-/// [`ServeError::Listen`].
 pub async fn serve_router(
     router: axum::Router,
     listen: impl Into<Listen>,

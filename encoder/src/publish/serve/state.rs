@@ -25,7 +25,6 @@ const RETRY_PAUSE: Duration = Duration::from_secs(10);
 /// One generation, as it is served.
 pub(super) struct Snapshot {
     pub(super) reader: StoreReader,
-    /// The manifest.
     pub(super) manifest: Bytes,
     pub(super) index: CellIndex,
     /// Lengths of the shards that may be fetched: those of the current manifest and of the one before.
