@@ -25,7 +25,7 @@ const RETRY_PAUSE: Duration = Duration::from_millis(300);
 
 /// A bucket cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum BlobError {
+pub(crate) enum BlobError {
     #[error(
         "{url}: {problem}; expected file:///FOLDER, s3://BUCKET/PREFIX, or gs:// and az:// where the program was built with them"
     )]
@@ -42,7 +42,7 @@ pub enum BlobError {
 
 /// A bucket, from a prefix on.
 #[derive(Clone, Debug)]
-pub struct Bucket {
+pub(crate) struct Bucket {
     store: Arc<dyn ObjectStore>,
     prefix: Key,
     url: String,
@@ -56,7 +56,7 @@ impl Bucket {
     ///
     /// # Errors
     /// [`BlobError::Address`]; the bucket itself is first asked by a request.
-    pub fn open(
+    pub(crate) fn open(
         address: &str,
         variables: impl IntoIterator<Item = (String, String)>,
     ) -> Result<Self, BlobError> {
@@ -88,17 +88,17 @@ impl Bucket {
     }
 
     /// Returns the address.
-    pub fn url(&self) -> &str {
+    pub(crate) fn url(&self) -> &str {
         &self.url
     }
 
     /// Returns whether it is a folder, which answers at once.
-    pub fn is_local(&self) -> bool {
+    pub(crate) fn is_local(&self) -> bool {
         self.is_local
     }
 
     /// Returns the threads that wait for the network.
-    pub fn runtime(&self) -> &Arc<Runtime> {
+    pub(crate) fn runtime(&self) -> &Arc<Runtime> {
         &self.runtime
     }
 
@@ -123,7 +123,7 @@ impl Bucket {
     }
 
     /// Returns an object; `None` if it is not there.
-    pub fn get(&self, key: &str) -> Result<Option<Bytes>, BlobError> {
+    pub(crate) fn get(&self, key: &str) -> Result<Option<Bytes>, BlobError> {
         let at = self.key(key);
         match self.ask(|| async { self.store.get(&at).await?.bytes().await }) {
             Ok(bytes) => Ok(Some(bytes)),
@@ -133,13 +133,13 @@ impl Bucket {
     }
 
     /// Returns an object that must be there.
-    pub fn require(&self, key: &str) -> Result<Bytes, BlobError> {
+    pub(crate) fn require(&self, key: &str) -> Result<Bytes, BlobError> {
         let missing = || BlobError::Missing { url: self.url.clone(), key: key.to_owned() };
         self.get(key)?.ok_or_else(missing)
     }
 
     /// Returns the length of an object; `None` if it is not there.
-    pub fn len_of(&self, key: &str) -> Result<Option<u64>, BlobError> {
+    pub(crate) fn len_of(&self, key: &str) -> Result<Option<u64>, BlobError> {
         let at = self.key(key);
         match self.ask(|| self.store.head(&at)) {
             Ok(found) => Ok(Some(found.size)),
@@ -162,24 +162,24 @@ impl Bucket {
 
     /// Puts an object unless there is one; returns whether there was none. If the answer is lost, the put is made again
     /// and may find its own object; where it matters who put it, use [`Self::claim`].
-    pub fn put_new(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
+    pub(crate) fn put_new(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         self.put_with(key, bytes.into(), PutMode::Create)
     }
 
     /// Puts an object unless there is one; returns whether the one that is there has these bytes, which only the caller would
     /// put.
-    pub fn claim(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
+    pub(crate) fn claim(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         let bytes = bytes.into();
         Ok(self.put_new(key, bytes.clone())? || self.require(key)? == bytes)
     }
 
     /// Puts an object in place of what is there.
-    pub fn put(&self, key: &str, bytes: impl Into<Bytes>) -> Result<(), BlobError> {
+    pub(crate) fn put(&self, key: &str, bytes: impl Into<Bytes>) -> Result<(), BlobError> {
         self.put_with(key, bytes.into(), PutMode::Overwrite).map(drop)
     }
 
     /// Returns the names of the objects in a folder, without the folder's name, ascending.
-    pub fn list(&self, folder: &str) -> Result<Vec<String>, BlobError> {
+    pub(crate) fn list(&self, folder: &str) -> Result<Vec<String>, BlobError> {
         let at = self.key(folder);
         let listed = self.ask(|| self.store.list(Some(&at)).try_collect::<Vec<_>>());
         let listed = listed.map_err(|source| self.failed(folder, source))?;

@@ -27,16 +27,16 @@
 //! ```
 
 #[cfg(feature = "fleet")]
-pub mod blobs;
+pub(crate) mod blobs;
 pub mod cells;
 pub mod check;
 pub mod cli;
 pub mod codebook;
-pub mod diff;
+pub(crate) mod diff;
 pub mod embed;
 pub mod encode;
 #[cfg(feature = "fleet")]
-pub mod fleet;
+pub(crate) mod fleet;
 pub mod html;
 pub mod ingest;
 pub mod lanes;
@@ -49,8 +49,8 @@ pub mod progress;
 pub mod publish;
 pub mod query;
 pub mod raster;
-pub mod report;
+pub(crate) mod report;
 pub mod segment;
 pub mod shard;
 pub mod store;
-pub mod view;
+pub(crate) mod view;

@@ -35,7 +35,6 @@ use crate::raster::gpu::GpuOptions;
 use crate::report::{self, Recorder};
 use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
-use crate::store::CommandRecord;
 
 /// `encode`.
 #[derive(Clone, Debug, Args)]
@@ -242,7 +241,6 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             created_unix_secs,
             models: args.models.models.as_deref().map(lasting_name),
             text_model: args.text_model,
-            command: None,
         },
         run: RunSettings {
             threads: args.threads.map_or_else(available_threads, |n| n as usize),
@@ -292,15 +290,8 @@ fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expe
     }
 }
 
-/// Returns this command, for the store's catalogue; `None` where the folder is gone.
-fn this_command() -> Option<CommandRecord> {
-    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
-    Some(CommandRecord { folder: std::env::current_dir().ok()?, words })
-}
-
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let (mut settings, expected) = settings_and_target(args)?;
-    settings.output.command = this_command();
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     settings.run.gpus = args.gpus.numbers(&session);

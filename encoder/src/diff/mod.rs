@@ -10,40 +10,40 @@ use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::objects::{Moved, Thing, changes};
 
-pub use things::{DiffError, Generation};
+pub(crate) use things::{DiffError, Generation};
 
 /// What changed from one generation to another.
 #[derive(Clone, Debug, Serialize)]
-pub struct Diff {
+pub(crate) struct Diff {
     /// The earlier generation.
-    pub old_generation: u64,
+    pub(crate) old_generation: u64,
     /// The later one.
-    pub new_generation: u64,
+    pub(crate) new_generation: u64,
     /// Whether lengths and positions are metres.
-    pub metric: bool,
+    pub(crate) metric: bool,
     /// Things of exactly the same Gaussians.
-    pub n_same: usize,
+    pub(crate) n_same: usize,
     /// Things at the same place whose Gaussians changed.
-    pub n_stayed: usize,
+    pub(crate) n_stayed: usize,
     /// Things of the later generation alone, by their ids.
-    pub appeared: Vec<Thing>,
+    pub(crate) appeared: Vec<Thing>,
     /// Things of the earlier generation alone, by their ids.
-    pub went: Vec<Thing>,
+    pub(crate) went: Vec<Thing>,
     /// Things that lie elsewhere, by the ids that they had.
-    pub moved: Vec<Moved>,
+    pub(crate) moved: Vec<Moved>,
     /// Cells of the later generation.
-    pub n_cells: usize,
+    pub(crate) n_cells: usize,
     /// Those that have a shard which the earlier generation does not have.
-    pub n_cells_changed: usize,
+    pub(crate) n_cells_changed: usize,
     /// Bytes of shards that a robot with the earlier generation has to fetch, by profile.
-    pub fetch_bytes: BTreeMap<String, u64>,
+    pub(crate) fetch_bytes: BTreeMap<String, u64>,
 }
 
 /// Compares two generations.
 ///
 /// # Errors
 /// [`DiffError`] if a shard cannot be read, or the generations are of different encoders, whose vectors do not compare.
-pub fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, DiffError> {
+pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, DiffError> {
     let (old_manifest, manifest) = (&old.published.manifest, &new.published.manifest);
     if old_manifest.encoder.id != manifest.encoder.id {
         let [old, new] = [old_manifest, manifest].map(|m| format!("{} ({})", m.encoder.name, m.encoder.id));

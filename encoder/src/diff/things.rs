@@ -10,15 +10,15 @@ use crate::store::{Published, StoreError, StoreReader};
 
 /// A generation of a store.
 #[derive(Clone, Copy, Debug)]
-pub struct Generation<'a> {
-    pub reader: &'a StoreReader,
+pub(crate) struct Generation<'a> {
+    pub(crate) reader: &'a StoreReader,
     /// Its current generation or the one before it.
-    pub published: &'a Published,
+    pub(crate) published: &'a Published,
 }
 
 /// Two generations cannot be compared.
 #[derive(Debug, thiserror::Error)]
-pub enum DiffError {
+pub(crate) enum DiffError {
     #[error(transparent)]
     Store(#[from] StoreError),
     #[error("cell {cell_id}: {source}; encode again: what is damaged is written anew")]

@@ -35,7 +35,7 @@ pub(super) fn publish(
         plan.settings.output.text_model.then(|| carry(plan.store, plan.engines.models)).transpose()?;
     let manifest = manifest(&plan, &built, generation, text_model);
     executor.begin_publication()?;
-    plan.store.publish_by(&manifest, &built.extras, plan.settings.output.command.clone())?;
+    plan.store.publish(&manifest, &built.extras)?;
     let mut summary = summary(&plan, &views, built, &manifest);
     // With views left to do the contributions stay: the next encode goes on from them.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();

@@ -19,7 +19,6 @@ use crate::raster::WeightKind;
 use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
-use crate::store::CommandRecord;
 
 /// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and no
 /// better answers (generated scenes of seeds 601 to 605, and the labelled house).
@@ -201,8 +200,6 @@ pub struct OutputSettings {
     pub models: Option<PathBuf>,
     /// Whether the store carries the text side of the models.
     pub text_model: bool,
-    /// The command that asked for it, which `store repair` runs again.
-    pub command: Option<CommandRecord>,
 }
 
 /// How a run goes.
@@ -307,7 +304,6 @@ impl EncodeSettings {
                 created_unix_secs: 0,
                 models: None,
                 text_model: false,
-                command: None,
             },
             run: RunSettings {
                 threads: std::thread::available_parallelism().map_or(1, usize::from),

@@ -21,7 +21,7 @@ use crate::encode::{self, EncodeError, EncodeSettings, EncodeSummary, Engines, S
 use crate::progress::Progress;
 
 /// The executor of an encode whose views are done by workers.
-pub struct Coordinator {
+pub(crate) struct Coordinator {
     bucket: Arc<Bucket>,
     /// Where work is handed out; without it, workers have shares.
     queue: Option<QueueSettings>,
@@ -31,12 +31,12 @@ pub struct Coordinator {
 
 impl Coordinator {
     /// `queue`: where work is handed out; without it, workers have shares.
-    pub fn new(bucket: Arc<Bucket>, queue: Option<QueueSettings>) -> Self {
+    pub(crate) fn new(bucket: Arc<Bucket>, queue: Option<QueueSettings>) -> Self {
         Self { bucket, queue, run: Mutex::default() }
     }
 
     /// Encodes a scene as [`encode::encode`] does, by the fleet.
-    pub fn encode(
+    pub(crate) fn encode(
         &self,
         settings: &EncodeSettings,
         engines: &Engines<'_>,

@@ -5,7 +5,7 @@ use crate::encode::EncodeError;
 
 /// The queue cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum QueueError {
+pub(crate) enum QueueError {
     #[error(
         "{url}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials"
     )]
@@ -14,7 +14,7 @@ pub enum QueueError {
 
 /// Why a coordinator or worker ends.
 #[derive(Debug, thiserror::Error)]
-pub enum FleetError {
+pub(crate) enum FleetError {
     #[error(transparent)]
     Blob(#[from] BlobError),
     #[error(transparent)]

@@ -24,7 +24,7 @@
 //! | `run_folder` | a worker's folder for photos in work |
 //! | `inputs`, `prepared` | scene, photos and masks on their way to and from the bucket |
 
-pub mod coordinator;
+pub(crate) mod coordinator;
 mod dispatch;
 mod documents;
 mod error;
@@ -36,9 +36,8 @@ mod queue;
 mod run;
 mod run_folder;
 mod views;
-pub mod worker;
+pub(crate) mod worker;
 
-pub use coordinator::Coordinator;
-pub use error::{FleetError, QueueError};
-pub use queue::QueueSettings;
-pub use worker::{Dispatch, WorkReport, WorkerSettings, work};
+pub(crate) use coordinator::Coordinator;
+pub(crate) use queue::QueueSettings;
+pub(crate) use worker::{Dispatch, WorkerSettings, work};

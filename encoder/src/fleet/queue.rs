@@ -33,19 +33,19 @@ const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Where work is handed out, and how patiently.
 #[derive(Clone, Debug)]
-pub struct QueueSettings {
+pub(crate) struct QueueSettings {
     /// `nats://HOST:PORT` or `tls://HOST:PORT`, several with commas.
-    pub url: String,
+    pub(crate) url: String,
     /// A credentials file.
-    pub credentials: Option<PathBuf>,
+    pub(crate) credentials: Option<PathBuf>,
     /// A file with the seed of an nkey.
-    pub nkey: Option<PathBuf>,
+    pub(crate) nkey: Option<PathBuf>,
     /// Certificates of authorities that sign the server's, beside the system's.
-    pub ca: Option<PathBuf>,
+    pub(crate) ca: Option<PathBuf>,
     /// Time after which work of which nothing is heard goes to another worker.
-    pub ack_wait: Duration,
+    pub(crate) ack_wait: Duration,
     /// How often a view is handed out before it is given up.
-    pub max_deliver: u32,
+    pub(crate) max_deliver: u32,
 }
 
 impl QueueSettings {

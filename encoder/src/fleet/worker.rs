@@ -27,7 +27,7 @@ const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(1
 
 /// Which views a worker takes.
 #[derive(Clone, Debug)]
-pub enum Dispatch {
+pub(crate) enum Dispatch {
     /// Every `of`-th, from `index` on; after `help_after` without work, what others left.
     Share {
         /// Number of this worker, from 0.
@@ -43,32 +43,32 @@ pub enum Dispatch {
 
 /// How a worker works.
 #[derive(Clone, Debug)]
-pub struct WorkerSettings {
+pub(crate) struct WorkerSettings {
     /// Which views it takes.
-    pub dispatch: Dispatch,
+    pub(crate) dispatch: Dispatch,
     /// Threads, and views worked on at a time.
-    pub n_threads: usize,
+    pub(crate) n_threads: usize,
     /// GPUs for the models.
-    pub gpus: Vec<u32>,
+    pub(crate) gpus: Vec<u32>,
     /// Working memory.
-    pub memory_bytes: u64,
+    pub(crate) memory_bytes: u64,
     /// Folder for photos in work; it need not outlast the worker.
-    pub folder: PathBuf,
+    pub(crate) folder: PathBuf,
     /// The mask model, where the coordinator uses one.
-    pub segmenter: Option<PathBuf>,
+    pub(crate) segmenter: Option<PathBuf>,
     /// Time to wait for a run to begin, and for a heartbeat of its coordinator.
-    pub patience: Duration,
+    pub(crate) patience: Duration,
     /// Whether it goes on to the next run when one is published; to the run that takes a run's place it always does.
-    pub stays: bool,
+    pub(crate) stays: bool,
 }
 
 /// What a worker did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct WorkReport {
+pub(crate) struct WorkReport {
     /// Runs that it took part in.
-    pub n_runs: usize,
+    pub(crate) n_runs: usize,
     /// Views that it was the first to finish.
-    pub n_views: usize,
+    pub(crate) n_views: usize,
 }
 
 pub(super) fn pause(bucket: &Bucket) -> Duration {
@@ -79,7 +79,7 @@ pub(super) fn pause(bucket: &Bucket) -> Duration {
 ///
 /// # Errors
 /// [`FleetError`]: what it had begun is left to others.
-pub fn work(
+pub(crate) fn work(
     bucket: &Arc<Bucket>,
     settings: &WorkerSettings,
     engines: &Engines<'_>,

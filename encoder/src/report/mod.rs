@@ -10,13 +10,13 @@ use crate::encode::EncodeSummary;
 use crate::html::Page;
 use crate::progress::FoundObject;
 use recorder::RecordedView;
-pub use recorder::Recorder;
+pub(crate) use recorder::Recorder;
 
 /// Makes the page of an encode that was recorded.
 ///
 /// # Errors
 /// None: the summary is a record of numbers and texts.
-pub fn of_encode(
+pub(crate) fn of_encode(
     scene: &str,
     summary: &EncodeSummary,
     recorder: &Recorder<'_>,

@@ -45,14 +45,14 @@ impl Recorded {
 }
 
 /// Records the progress of an encode for its report, and passes it on.
-pub struct Recorder<'a> {
+pub(crate) struct Recorder<'a> {
     shown: &'a dyn Progress,
     recorded: Mutex<Recorded>,
 }
 
 impl<'a> Recorder<'a> {
     /// `shown`: what else receives the progress.
-    pub fn new(shown: &'a dyn Progress) -> Self {
+    pub(crate) fn new(shown: &'a dyn Progress) -> Self {
         Self { shown, recorded: Mutex::default() }
     }
 

@@ -1,4 +1,4 @@
-//! The catalogue of a store, in sled: what was published, of which cells, and by which command.
+//! The catalogue of a store, in sled: what was published, and of which cells.
 //!
 //! | tree | key | value, JSON |
 //! |---|---|---|
@@ -6,8 +6,8 @@
 //! | `cells` | hash of a manifest, id of a cell | the cell's record: box, shards, hashes; of the manifests that the store has |
 //!
 //! `encode` and `push` keep the state of their work in trees of their own. A writer holds the database for as long as it
-//! writes; readers read a copy. It repeats what files say, but for the history and the commands, so a damaged one is set
-//! aside and made anew from the files.
+//! writes; readers read a copy. It repeats what files say, but for the history, so a damaged one is set aside and made
+//! anew from the files.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -25,30 +25,19 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 const GENERATIONS: &str = "generations";
 const CELLS: &str = "cells";
 
-/// A command line, and where it ran.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct CommandRecord {
-    /// The folder that relative paths begin at.
-    pub folder: PathBuf,
-    /// Program, command and flags.
-    pub words: Vec<String>,
-}
-
 /// What the catalogue says of a generation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct GenerationRecord {
+pub(crate) struct GenerationRecord {
     /// Name of the scene.
-    pub scene: String,
+    pub(crate) scene: String,
     /// Its number.
-    pub generation: u64,
-    pub manifest_hash: Hash32,
+    pub(crate) generation: u64,
+    pub(crate) manifest_hash: Hash32,
     /// When it was made, seconds since 1970.
-    pub created_unix_secs: u64,
-    pub n_cells: usize,
+    pub(crate) created_unix_secs: u64,
+    pub(crate) n_cells: usize,
     /// Number of Gaussians in them.
-    pub n_gaussians: u64,
-    /// The command that made it, if it is known.
-    pub command: Option<CommandRecord>,
+    pub(crate) n_gaussians: u64,
 }
 
 impl GenerationRecord {
@@ -60,7 +49,6 @@ impl GenerationRecord {
             created_unix_secs: manifest.created_unix_secs,
             n_cells: manifest.cells.len(),
             n_gaussians: manifest.n_gaussians,
-            command: None,
         }
     }
 }
@@ -116,7 +104,7 @@ pub(crate) struct Catalogue {
 impl Catalogue {
     /// Opens the database of a store for writing; a damaged one is renamed to `db.damaged`, and an empty one takes its
     /// place. Waits up to `patience` for another writer.
-    pub fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
+    pub(crate) fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
         let path = store.join("db");
         let refused = |fault| match fault {
             Fault::Held => StoreError::Locked { store: store.to_owned() },
@@ -168,7 +156,7 @@ impl Catalogue {
     }
 
     /// Returns the database, for the state of jobs and pushes.
-    pub fn db(&self) -> &sled::Db {
+    pub(crate) fn db(&self) -> &sled::Db {
         &self.db
     }
 
@@ -190,36 +178,28 @@ impl Catalogue {
     }
 
     /// Returns all generations ever published, the oldest first.
-    pub fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
+    pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.history().map_err(|fault| self.error(fault))
     }
 
     /// Returns the cells of a manifest, in order of their ids.
-    pub fn cells(&self, manifest_hash: Hash32) -> Result<Vec<CellRecord>, StoreError> {
+    pub(crate) fn cells(&self, manifest_hash: Hash32) -> Result<Vec<CellRecord>, StoreError> {
         self.cells_of(manifest_hash).map_err(|fault| self.error(fault))
     }
 
     /// Returns the highest generation published.
-    pub fn last_generation(&self) -> Result<Option<u64>, StoreError> {
+    pub(crate) fn last_generation(&self) -> Result<Option<u64>, StoreError> {
         let last = self.generations.last().map_err(|e| self.error(e.into()))?;
         Ok(last.and_then(|(key, _)| Some(u64::from_be_bytes(key.as_ref().try_into().ok()?))))
     }
 
-    /// Makes the catalogue say what a manifest says, unless it does. `command`: what made it, where that is known.
-    pub fn record(
-        &self,
-        manifest: &Manifest,
-        manifest_hash: Hash32,
-        command: Option<CommandRecord>,
-    ) -> Result<(), StoreError> {
+    /// Makes the catalogue say what a manifest says, unless it does.
+    pub(crate) fn record(&self, manifest: &Manifest, manifest_hash: Hash32) -> Result<(), StoreError> {
         let write = || -> Result<(), Fault> {
             let key = manifest.generation.to_be_bytes();
+            let record = GenerationRecord::of(manifest, manifest_hash);
             let held =
                 self.generations.get(key)?.map(|bytes| decode::<GenerationRecord>(&bytes)).transpose()?;
-            let held_command = held.as_ref().and_then(|held| held.command.clone());
-            let is_same_manifest = held.as_ref().is_some_and(|held| held.manifest_hash == manifest_hash);
-            let command = command.or(held_command.filter(|_| is_same_manifest));
-            let record = GenerationRecord { command, ..GenerationRecord::of(manifest, manifest_hash) };
             if held.as_ref() != Some(&record) {
                 self.generations.insert(key, serde_json::to_vec(&record).expect("a record is JSON"))?;
             }
@@ -240,7 +220,7 @@ impl Catalogue {
     }
 
     /// Forgets the cells of other manifests than these.
-    pub fn keep_cells_of(&self, manifests: &[Hash32]) -> Result<(), StoreError> {
+    pub(crate) fn keep_cells_of(&self, manifests: &[Hash32]) -> Result<(), StoreError> {
         let forget = || -> Result<(), Fault> {
             let mut batch = sled::Batch::default();
             for key in self.cells.iter().keys() {
@@ -258,7 +238,7 @@ impl Catalogue {
 
 /// What a catalogue says, read from a copy: neither the store nor its lock is touched, so a writer may be at work.
 #[derive(Debug)]
-pub struct CatalogueCopy {
+pub(crate) struct CatalogueCopy {
     catalogue: Catalogue,
     _folder: tempfile::TempDir,
 }
@@ -266,7 +246,7 @@ pub struct CatalogueCopy {
 impl CatalogueCopy {
     /// Copies a store's catalogue to a folder under `scratch`, which goes with it. `None` if the store has no catalogue, or
     /// the copy is damaged: a writer may have changed it meanwhile.
-    pub fn of(store: &Path, scratch: &Path) -> Result<Option<Self>, StoreError> {
+    pub(crate) fn of(store: &Path, scratch: &Path) -> Result<Option<Self>, StoreError> {
         let db = store.join("db");
         if !db.is_dir() {
             return Ok(None);
@@ -284,12 +264,12 @@ impl CatalogueCopy {
     }
 
     /// Returns the copied database, for the state of jobs.
-    pub fn db(&self) -> &sled::Db {
+    pub(crate) fn db(&self) -> &sled::Db {
         self.catalogue.db()
     }
 
     /// Returns all generations ever published, the oldest first.
-    pub fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
+    pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.catalogue.generations()
     }
 }
@@ -348,15 +328,14 @@ mod tests {
     }
 
     #[test]
-    fn the_catalogue_keeps_the_history_and_the_commands() {
+    fn the_catalogue_keeps_the_history() {
         let dir = tempfile::tempdir().expect("a folder");
         let store = Store::create_or_open(dir.path()).expect("opens");
         let shards: Vec<_> =
             ["a", "b", "c"].map(|text| store.put_bytes(text.as_bytes()).expect("room")).into();
-        let command = CommandRecord { folder: "/x".into(), words: vec!["encode".into()] };
         for generation in 1..=3 {
             let manifest = manifest(generation, &shards[..generation as usize]);
-            store.publish_by(&manifest, &Extras::new(), Some(command.clone())).expect("publishes");
+            store.publish(&manifest, &Extras::new()).expect("publishes");
         }
         store.prune().expect("prunes");
         drop(store);
@@ -365,7 +344,6 @@ mod tests {
         let seen: Vec<(u64, usize)> =
             generations.iter().map(|record| (record.generation, record.n_cells)).collect();
         assert_eq!(seen, [(1, 1), (2, 2), (3, 3)]);
-        assert!(generations.iter().all(|record| record.command.as_ref() == Some(&command)));
         assert_eq!(store.cells().expect("reads"), manifest(3, &shards).cells);
         let of = |generation: usize| {
             let manifest = manifest(generation as u64, &shards[..generation]);

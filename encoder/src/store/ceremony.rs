@@ -18,7 +18,7 @@ use super::{files, roles};
 
 /// Which keys are replaced by new ones.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Change {
+pub(crate) enum Change {
     /// All keys of these roles; of no role, the root is signed anew for its whole time.
     Roles(Vec<String>),
     /// The key of this id, in all roles.
@@ -27,44 +27,44 @@ pub enum Change {
 
 /// A root that was made.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Changed {
-    pub root_version: u64,
+pub(crate) struct Changed {
+    pub(crate) root_version: u64,
     /// SHA-256 of the root, hex; absent while it is a draft.
     pub root_sha256: Option<String>,
     /// The draft, if it lacks signatures.
-    pub draft: Option<PathBuf>,
+    pub(crate) draft: Option<PathBuf>,
 }
 
 /// A key that the newest root names.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct KeyStatus {
-    pub role: String,
-    pub id: String,
+pub(crate) struct KeyStatus {
+    pub(crate) role: String,
+    pub(crate) id: String,
     /// Whether its secret half lies here.
-    pub is_here: bool,
+    pub(crate) is_here: bool,
 }
 
 /// The keys of a store, and until when they count.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct KeysStatus {
+pub(crate) struct KeysStatus {
     /// Version of the newest root.
-    pub root_version: u64,
+    pub(crate) root_version: u64,
     /// Its SHA-256, hex.
     pub root_sha256: String,
     /// When it expires, seconds since 1970.
-    pub root_expires_unix_secs: u64,
+    pub(crate) root_expires_unix_secs: u64,
     /// Root's keys that must sign a change.
-    pub threshold: u32,
+    pub(crate) threshold: u32,
     /// All keys, by role.
-    pub keys: Vec<KeyStatus>,
+    pub(crate) keys: Vec<KeyStatus>,
     /// When the timestamp expires, seconds since 1970; absent before the first publication.
-    pub timestamp_expires_unix_secs: Option<u64>,
+    pub(crate) timestamp_expires_unix_secs: Option<u64>,
 }
 
 impl Metadata {
     /// Makes new keys, and a root that names them. It is installed at once if root's keys in `root_folder` are enough;
     /// otherwise it is a draft.
-    pub fn change_keys(
+    pub(crate) fn change_keys(
         &self,
         change: &Change,
         root_folder: &Path,
@@ -95,7 +95,7 @@ impl Metadata {
     ///
     /// # Errors
     /// [`StoreError::RootDraft`] unless it follows the present root; [`StoreError`] otherwise.
-    pub fn install_root(&self, draft: &Path, now_unix_secs: u64) -> Result<Changed, StoreError> {
+    pub(crate) fn install_root(&self, draft: &Path, now_unix_secs: u64) -> Result<Changed, StoreError> {
         let RootFile { root: present, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
         let next = fs_err::read(draft)?;
         let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
@@ -155,7 +155,7 @@ impl Metadata {
 
 impl MetadataReader {
     /// Describes the keys. `root_folder`: where root's keys may lie.
-    pub fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
+    pub(crate) fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
         let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
         let mut here: Vec<String> =
             roles::read_folder(root_folder)?.iter().map(|key| Key::of(key).id()).collect();
@@ -188,7 +188,7 @@ impl MetadataReader {
 ///
 /// # Errors
 /// [`StoreError::RootDraft`] if it is no root; [`StoreError`] otherwise.
-pub fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, StoreError> {
+pub(crate) fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, StoreError> {
     let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
     let bytes = fs_err::read(draft)?;
     SignedMetadata::<Root>::parse(Root::TYPE, &bytes).map_err(refuse)?;
@@ -199,6 +199,6 @@ pub fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, StoreError>
 }
 
 /// Returns where a store's root keys lie unless they are kept elsewhere.
-pub fn default_root_folder(store: &Path) -> PathBuf {
+pub(crate) fn default_root_folder(store: &Path) -> PathBuf {
     roles::root_folder(store)
 }

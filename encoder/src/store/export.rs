@@ -20,13 +20,13 @@ use super::reader::{Published, StoreReader};
 
 /// What an export wrote.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Exported {
+pub(crate) struct Exported {
     /// Objects that were not there.
-    pub n_objects: usize,
+    pub(crate) n_objects: usize,
     /// Their bytes.
-    pub len_bytes: u64,
+    pub(crate) len_bytes: u64,
     /// Objects removed that neither generation needs.
-    pub n_removed: usize,
+    pub(crate) n_removed: usize,
 }
 
 /// Writes what robots need of a store into a folder, or brings one up to date. Robots that fetch meanwhile find the old
@@ -34,7 +34,7 @@ pub struct Exported {
 ///
 /// # Errors
 /// [`StoreError`]; [`StoreError::ObjectHash`] for a damaged shard, before anything names it.
-pub fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
+pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     let (reader, metadata) = loop {
         let reader = StoreReader::open(store)?;
         let metadata = read_metadata(store)?;

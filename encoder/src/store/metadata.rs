@@ -27,9 +27,9 @@ use super::error::StoreError;
 use super::{files, roles};
 
 /// The newest timestamp.
-pub const TIMESTAMP_FILE: &str = "timestamp.json";
+pub(crate) const TIMESTAMP_FILE: &str = "timestamp.json";
 /// Days for which a timestamp counts, unless a refresh says otherwise.
-pub const TIMESTAMP_DAYS: u32 = 30;
+pub(crate) const TIMESTAMP_DAYS: u32 = 30;
 const SECS_PER_DAY: u64 = 86_400;
 const TARGETS_SECS: u64 = 365 * SECS_PER_DAY;
 pub(super) const ROOT_SECS: u64 = 5 * 365 * SECS_PER_DAY;
@@ -39,27 +39,27 @@ pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 
 /// What a signature of the timestamp states.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Refreshed {
-    pub timestamp_version: u64,
+pub(crate) struct Refreshed {
+    pub(crate) timestamp_version: u64,
     /// Version of the snapshot that it names.
-    pub snapshot_version: u64,
+    pub(crate) snapshot_version: u64,
     /// When clients refuse it, seconds since 1970.
-    pub expires_unix_secs: u64,
+    pub(crate) expires_unix_secs: u64,
 }
 
 /// A root, parsed, and its bytes.
 pub(super) struct RootFile {
-    pub root: SignedMetadata<Root>,
-    pub bytes: Vec<u8>,
+    pub(crate) root: SignedMetadata<Root>,
+    pub(crate) bytes: Vec<u8>,
 }
 
 /// The metadata of a store, to read.
-pub struct MetadataReader {
+pub(crate) struct MetadataReader {
     pub(super) store: PathBuf,
 }
 
 /// The metadata of a store, held by one writer at a time.
-pub struct Metadata {
+pub(crate) struct Metadata {
     reader: MetadataReader,
     _lock: File,
 }
@@ -74,7 +74,7 @@ impl Deref for Metadata {
 
 impl MetadataReader {
     /// Reads the metadata of a store, without a lock.
-    pub fn new(store: &Path) -> Self {
+    pub(crate) fn new(store: &Path) -> Self {
         Self { store: store.to_owned() }
     }
 
@@ -122,7 +122,7 @@ impl MetadataReader {
     }
 
     /// Returns what expires soon, or has expired: robots then refuse the store. Each text says until when, and what to do.
-    pub fn expiry_warnings(&self, now_unix_secs: u64) -> Result<Vec<String>, StoreError> {
+    pub(crate) fn expiry_warnings(&self, now_unix_secs: u64) -> Result<Vec<String>, StoreError> {
         let store = self.store.display();
         let expires = |what: &str, at: u64, command: &str| {
             let word = if at <= now_unix_secs { "expired" } else { "expires" };
@@ -153,7 +153,7 @@ impl MetadataReader {
 
 impl Metadata {
     /// Opens the metadata for writing. An encode that runs does not hinder it; another signature is waited for.
-    pub fn open(store: &Path) -> Result<Self, StoreError> {
+    pub(crate) fn open(store: &Path) -> Result<Self, StoreError> {
         let folder = folder(store);
         files::ensure_folder(&folder)?;
         let path = folder.join("lock");
@@ -166,7 +166,7 @@ impl Metadata {
     /// Publishes a manifest; nothing changes if it is published already. Makes keys and root at the first time.
     /// `created_unix_secs`: when the manifest was made; the clock counts if it is later, because a manifest may be dated
     /// back to be reproducible.
-    pub fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
+    pub(crate) fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
         let now_unix_secs = created_unix_secs.max(signing_unix_secs());
         if self.newest_root()?.is_none() {
             self.make_root(&roles::root_folder(&self.store), 1, 1, now_unix_secs)?;
@@ -182,7 +182,7 @@ impl Metadata {
     ///
     /// # Errors
     /// [`StoreError::NotPublished`] before the first publication; [`StoreError`] otherwise.
-    pub fn refresh(&self, now_unix_secs: u64, days: u32) -> Result<Refreshed, StoreError> {
+    pub(crate) fn refresh(&self, now_unix_secs: u64, days: u32) -> Result<Refreshed, StoreError> {
         let not_published = || StoreError::NotPublished { path: self.path(TIMESTAMP_FILE) };
         let targets = self.published()?.ok_or_else(not_published)?;
         let timestamp = self.timestamp()?.ok_or_else(not_published)?;
@@ -201,7 +201,7 @@ impl Metadata {
     ///
     /// # Errors
     /// [`StoreError::HasRoot`]; [`StoreError`] otherwise.
-    pub fn make_root(
+    pub(crate) fn make_root(
         &self,
         root_folder: &Path,
         n_root_keys: usize,
@@ -265,12 +265,12 @@ impl Metadata {
 }
 
 /// Returns the system's time, seconds since 1970.
-pub fn clock_unix_secs() -> u64 {
+pub(crate) fn clock_unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
 /// Returns the time as of which metadata is signed: the system's, unless its clock stands before this program was made.
-pub fn signing_unix_secs() -> u64 {
+pub(crate) fn signing_unix_secs() -> u64 {
     clock_unix_secs().max(RELEASE_UNIX_SECS)
 }
 
@@ -278,7 +278,7 @@ pub fn signing_unix_secs() -> u64 {
 ///
 /// # Errors
 /// [`StoreError::Io`]; [`StoreError::Metadata`] for one that is too long.
-pub fn read_published(store: &Path, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
+pub(crate) fn read_published(store: &Path, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
     let max_bytes = match name.split_once('.') {
         Some(("timestamp", "json")) => MAX_TIMESTAMP_BYTES,
         // One spelling a number, so that no name leaves the folder.

@@ -22,14 +22,14 @@
 //! of metadata and records is made good at the next [`Store::create_or_open`].
 
 mod catalogue;
-pub mod ceremony;
+pub(crate) mod ceremony;
 #[cfg(test)]
 mod ceremony_tests;
 mod error;
 mod export;
 mod files;
 mod manifest_file;
-pub mod metadata;
+pub(crate) mod metadata;
 #[cfg(test)]
 mod metadata_tests;
 mod models;
@@ -40,11 +40,11 @@ pub(crate) mod tests;
 mod verify;
 mod writer;
 
-pub use catalogue::{CatalogueCopy, CommandRecord, GenerationRecord};
+pub(crate) use catalogue::{CatalogueCopy, GenerationRecord};
 pub use error::StoreError;
-pub use export::{Exported, export};
-pub use models::ModelsRecord;
+pub(crate) use export::{Exported, export};
+pub(crate) use models::ModelsRecord;
 pub(crate) use reader::Stamp;
 pub use reader::{Extras, Published, StoreReader};
-pub use verify::{BadObject, Fault, Listing, Verified};
+pub(crate) use verify::{Fault, Verified};
 pub use writer::{Pruned, Store};

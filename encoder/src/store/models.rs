@@ -13,11 +13,11 @@ const FILE: &str = "models.json";
 
 /// The models of the last encode into a store.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ModelsRecord {
+pub(crate) struct ModelsRecord {
     /// The encoder's id, as the manifest has it.
-    pub encoder: Hash32,
+    pub(crate) encoder: Hash32,
     /// Name or folder of the models; `None` for the embedded ones.
-    pub models: Option<PathBuf>,
+    pub(crate) models: Option<PathBuf>,
 }
 
 impl ModelsRecord {

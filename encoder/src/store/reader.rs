@@ -127,7 +127,7 @@ impl StoreReader {
     }
 
     /// Returns which models the current generation was encoded with, if the store recorded it.
-    pub fn models(&self) -> Result<Option<ModelsRecord>, StoreError> {
+    pub(crate) fn models(&self) -> Result<Option<ModelsRecord>, StoreError> {
         let record = ModelsRecord::read(&self.dir)?;
         Ok(record.filter(|record| record.encoder == self.manifest().encoder.id))
     }

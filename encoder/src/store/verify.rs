@@ -16,7 +16,7 @@ use super::reader::{Published, StoreReader};
 /// What is wrong with an object.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Fault {
+pub(crate) enum Fault {
     /// It is not there.
     Missing,
     /// Its content has another hash or length than the manifest lists.
@@ -27,29 +27,29 @@ pub enum Fault {
 
 /// An object that robots or queries would fail on.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct BadObject {
-    pub hash: Hash32,
+pub(crate) struct BadObject {
+    pub(crate) hash: Hash32,
     /// Its file.
-    pub path: PathBuf,
+    pub(crate) path: PathBuf,
     /// What is wrong.
-    pub fault: Fault,
+    pub(crate) fault: Fault,
     /// What it holds, such as `cell 3, balanced, generation 2`.
-    pub holds: Vec<String>,
+    pub(crate) holds: Vec<String>,
 }
 
 /// What was read, and what of it is bad.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Verified {
+pub(crate) struct Verified {
     /// Objects that the current generation and the one before it list.
-    pub n_objects: usize,
+    pub(crate) n_objects: usize,
     /// Bytes read.
-    pub len_bytes: u64,
+    pub(crate) len_bytes: u64,
     /// Bad ones, by hash.
-    pub bad: Vec<BadObject>,
+    pub(crate) bad: Vec<BadObject>,
 }
 
 /// The objects that a store publishes.
-pub struct Listing<'a> {
+pub(crate) struct Listing<'a> {
     reader: &'a StoreReader,
     /// What each holds, by hash and length if a manifest states it.
     holds: BTreeMap<(Hash32, Option<u64>), Vec<String>>,
@@ -57,7 +57,7 @@ pub struct Listing<'a> {
 
 impl StoreReader {
     /// Lists the objects of the current generation and the one before it.
-    pub fn listing(&self) -> Listing<'_> {
+    pub(crate) fn listing(&self) -> Listing<'_> {
         let mut holds: BTreeMap<_, Vec<String>> = BTreeMap::new();
         for published in std::iter::once(self.current()).chain(self.previous()) {
             for (hash, len_bytes, what) in contents(published) {
@@ -70,12 +70,12 @@ impl StoreReader {
 }
 
 impl Listing<'_> {
-    pub fn n_objects(&self) -> usize {
+    pub(crate) fn n_objects(&self) -> usize {
         self.holds.len()
     }
 
     /// Reads every object, several at a time. `on_read`: called after each, from any thread.
-    pub fn verify(&self, on_read: impl Fn() + Sync) -> Verified {
+    pub(crate) fn verify(&self, on_read: impl Fn() + Sync) -> Verified {
         let bytes_read = AtomicU64::new(0);
         let check = |((hash, len_bytes), holds): (&(Hash32, Option<u64>), &Vec<String>)| {
             let path = self.reader.object_path(*hash);

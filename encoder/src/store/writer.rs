@@ -10,7 +10,7 @@ use std::time::Duration;
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest, TextModelRecord};
 
-use super::catalogue::{Catalogue, CommandRecord, GenerationRecord};
+use super::catalogue::{Catalogue, GenerationRecord};
 use super::error::StoreError;
 use super::files::{self, Access, HashingWriter};
 use super::manifest_file;
@@ -154,16 +154,6 @@ impl Store {
     /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is damaged,
     /// [`StoreError::Generation`] unless the generation is above the current one.
     pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
-        self.publish_by(manifest, extras, None)
-    }
-
-    /// As [`Store::publish`]; the catalogue remembers the command that made the generation.
-    pub fn publish_by(
-        &self,
-        manifest: &Manifest,
-        extras: &Extras,
-        command: Option<CommandRecord>,
-    ) -> Result<Hash32, StoreError> {
         let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
         let shards = shards.map(|shard| (shard.hash, Some(shard.len_bytes)));
         let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
@@ -193,12 +183,12 @@ impl Store {
             self.replace(&path, &bytes)?;
         }
         Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
-        self.catalogue.record(manifest, hash, command)?;
+        self.catalogue.record(manifest, hash)?;
         Ok(hash)
     }
 
     /// Remembers which models the store was encoded with.
-    pub fn remember_models(&self, record: &ModelsRecord) -> Result<(), StoreError> {
+    pub(crate) fn remember_models(&self, record: &ModelsRecord) -> Result<(), StoreError> {
         let bytes = serde_json::to_vec(record).map_err(io::Error::from)?;
         self.replace(&ModelsRecord::path(&self.dir), &bytes)
     }
@@ -243,7 +233,7 @@ impl Store {
     }
 
     /// Returns all generations ever published, the oldest first, from the catalogue.
-    pub fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
+    pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.catalogue.generations()
     }
 
@@ -257,11 +247,11 @@ impl Store {
         };
         // It only serves fetches under way.
         if let Ok(Some((manifest, bytes))) = read(manifest_file::MANIFEST_PREVIOUS) {
-            self.catalogue.record(&manifest, Hash32::of(&bytes), None)?;
+            self.catalogue.record(&manifest, Hash32::of(&bytes))?;
         }
         if let Some((manifest, bytes)) = read(manifest_file::MANIFEST)? {
             Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
-            self.catalogue.record(&manifest, Hash32::of(&bytes), None)?;
+            self.catalogue.record(&manifest, Hash32::of(&bytes))?;
         }
         Ok(())
     }

@@ -11,7 +11,7 @@ use crate::store::StoreError;
 
 /// Why the page gets no answer.
 #[derive(Debug, thiserror::Error)]
-pub enum ViewError {
+pub(crate) enum ViewError {
     #[error("only a splat is shown, which cannot be asked; encode it, and give its store with --store")]
     NoStore,
     #[error(transparent)]

@@ -13,8 +13,7 @@ mod shards;
 mod splat;
 mod viewer;
 
-pub use error::ViewError;
-pub use photos::up_of;
-pub use routes::router;
-pub use splat::Splat;
-pub use viewer::{OpenText, Shown, Viewer};
+pub(crate) use photos::up_of;
+pub(crate) use routes::router;
+pub(crate) use splat::Splat;
+pub(crate) use viewer::{OpenText, Shown, Viewer};

@@ -24,7 +24,7 @@ fn photo(view: &View) -> Photo {
 }
 
 /// Returns the direction that is up in most photos: the mean of the cameras' upward axes; nothing if these cancel out.
-pub fn up_of(views: &[View]) -> Option<Vec3> {
+pub(crate) fn up_of(views: &[View]) -> Option<Vec3> {
     let up = |view: &View| view.camera_from_world.inverse().transform_vector3(DVec3::NEG_Y).normalize();
     let sum: DVec3 = views.iter().map(up).sum();
     (sum.length() > 0.2 * views.len() as f64).then(|| sum.normalize().as_vec3())

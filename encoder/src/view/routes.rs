@@ -29,7 +29,7 @@ type AppState = State<Arc<Viewer>>;
 type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
 
 /// Returns the page and its routes.
-pub fn router(viewer: Viewer) -> Router {
+pub(crate) fn router(viewer: Viewer) -> Router {
     Router::new()
         .route("/v1/changes", axum::routing::get(changes))
         .route("/v1/view", axum::routing::get(describe))

@@ -14,7 +14,7 @@ pub(super) const PROGRAM: &str = "slag-encoder";
 const MAX_GAUSSIANS: usize = 65_536;
 
 /// A splat, cut into cells of its own where there is no store.
-pub struct Splat {
+pub(crate) struct Splat {
     name: String,
     pub(super) scene: Gaussians,
     split: CellSplit,
@@ -22,7 +22,7 @@ pub struct Splat {
 
 impl Splat {
     /// Takes a splat; `is_alone`: there is no store whose cells count.
-    pub fn new(name: String, scene: Gaussians, is_alone: bool) -> Self {
+    pub(crate) fn new(name: String, scene: Gaussians, is_alone: bool) -> Self {
         let limits = CellLimits { max_gaussians: MAX_GAUSSIANS, max_width: None };
         let split = match is_alone {
             true => cells::split(&scene, limits),

@@ -17,18 +17,18 @@ use crate::diff::{self, Diff};
 use crate::store::StoreReader;
 
 /// Opens the text encoder of a store; the error says what to do.
-pub type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
+pub(crate) type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
 
-pub struct Shown {
-    pub store: Option<PathBuf>,
+pub(crate) struct Shown {
+    pub(crate) store: Option<PathBuf>,
     /// The splat; of the store, if there is one.
-    pub splat: Option<Splat>,
+    pub(crate) splat: Option<Splat>,
     /// The photos, in the world of the splat.
-    pub views: Vec<View>,
+    pub(crate) views: Vec<View>,
     /// Upward; the world's z if absent.
-    pub up: Option<Vec3>,
+    pub(crate) up: Option<Vec3>,
     /// Opens the store's text encoder, at the first question.
-    pub open_text: OpenText,
+    pub(crate) open_text: OpenText,
 }
 
 /// A text encoder.
@@ -53,7 +53,7 @@ impl OpenedText {
 }
 
 /// Answers the page.
-pub struct Viewer {
+pub(crate) struct Viewer {
     shown: Shown,
     /// Locked while another generation is opened, so that one request opens it.
     generation: Mutex<Option<Arc<Generation>>>,
@@ -63,7 +63,7 @@ pub struct Viewer {
 
 impl Viewer {
     /// Makes a viewer; nothing is opened yet.
-    pub fn new(shown: Shown) -> Self {
+    pub(crate) fn new(shown: Shown) -> Self {
         Self { shown, generation: Mutex::default(), text: Mutex::default() }
     }
 
