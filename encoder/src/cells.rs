@@ -1,9 +1,11 @@
-//! The adaptive split of a scene into cells.
+//! The adaptive split of a scene into cells, and the grid to which each cell's positions are rounded.
 
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::frames::Aabb;
+use slag_common::shard::PositionForm;
+use slag_math::stats::{Rank, quantile};
 
 use crate::memory::{MemoryPlan, Phase};
 
@@ -18,6 +20,41 @@ const EXTENT_SIGMAS: f64 = 3.0;
 /// become a cell.
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
+/// Most cells that are cut only because positions must be exact. More means that the error is finer than the scene's
+/// coordinates; each cell is a file of some kilobytes.
+pub const MAX_CELLS_FOR_PRECISION: usize = 4096;
+
+/// Largest error of a position, per axis.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub enum PositionError {
+    /// World units.
+    Within(f64),
+    /// A quarter of the 10th percentile of the largest scales of a cell's Gaussians: the size of its small ones.
+    OfSize,
+}
+
+impl PositionError {
+    /// Returns one centimetre for a metric model, else the size of the Gaussians.
+    pub fn default_for(metric: bool) -> Self {
+        if metric { Self::Within(0.01) } else { Self::OfSize }
+    }
+
+    /// Returns the error that the Gaussians of `part` may have.
+    fn of_part(self, scene: &Gaussians, part: &[u32]) -> f64 {
+        if let Self::Within(error) = self {
+            return error;
+        }
+        let largest = |g: &u32| scene.scales[*g as usize].into_iter().fold(0.0, f32::max);
+        let mut sizes: Vec<f32> = part.iter().map(largest).collect();
+        let size = quantile(&mut sizes, 100, Rank::After).map_or(0.0, |size| f64::from(size) / 4.0);
+        // Never finer than an input in 32 bits is at the place of the nearest Gaussians: strays do not count.
+        let farthest = |g: &u32| scene.means_in_world[*g as usize].abs().max_element() as f32;
+        let mut places: Vec<f32> = part.iter().map(farthest).collect();
+        let place = quantile(&mut places, 100, Rank::After).map_or(0.0, f64::from);
+        size.max(place * f64::from(f32::EPSILON) / 2.0)
+    }
+}
+
 /// Limits of a cell's size.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CellLimits {
@@ -25,6 +62,69 @@ pub struct CellLimits {
     pub max_gaussians: usize,
     /// Longest edge of the box around a cell's means, world units; `None` where units are not metres.
     pub max_width: Option<f64>,
+    /// A cell is so small that its positions keep this error.
+    pub position_error: PositionError,
+}
+
+impl CellLimits {
+    /// Limits the number of Gaussians, not the width.
+    pub fn by_count(max_gaussians: usize) -> Self {
+        Self { max_gaussians, max_width: None, position_error: PositionError::OfSize }
+    }
+}
+
+/// The places that a cell's positions are rounded to: multiples of `step` from the smallest corner of the means' box.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct PositionGrid {
+    /// World units; 0 along a flat axis.
+    pub step: [f64; 3],
+    /// Bits per axis, and 0.
+    pub bits: [u8; 4],
+}
+
+impl PositionGrid {
+    /// Returns the smallest grid over a box whose places are within `error` of every point; `None` if none is.
+    fn within(bounds: &Aabb, error: f64) -> Option<Self> {
+        let size = bounds.size().to_array();
+        // A decoded position is rounded to a double.
+        let rounding = bounds.min.abs().max(bounds.max.abs()).max_element() * f64::EPSILON;
+        let uniform = |bits: u8| [bits; 3];
+        let forms = packed_bits(size).into_iter().chain([uniform(16), uniform(32)]);
+        let mut grids = forms.map(|bits| Self::new(size, bits));
+        grids.find(|grid| {
+            (0..3).all(|axis| {
+                size[axis] <= 0.0 || grid.bits[axis] > 0 && grid.step[axis] / 2.0 + rounding <= error
+            })
+        })
+    }
+
+    fn new(size: [f64; 3], bits: [u8; 3]) -> Self {
+        let step =
+            std::array::from_fn(|axis| if bits[axis] > 0 { step(size[axis], bits[axis]) } else { 0.0 });
+        Self { step, bits: [bits[0], bits[1], bits[2], 0] }
+    }
+}
+
+fn step(size: f64, bits: u8) -> f64 {
+    size / ((1u64 << bits) - 1).max(1) as f64
+}
+
+/// Returns the bits of each axis, 32 in all, that make the coarsest step as fine as possible; `None` for the bits that mark
+/// another form.
+fn packed_bits(size: [f64; 3]) -> Option<[u8; 3]> {
+    let mut bits = [0u8; 3];
+    loop {
+        // Each bit goes to the coarsest axis.
+        let coarseness =
+            |axis: usize| if bits[axis] == 0 { 2.0 * size[axis] } else { step(size[axis], bits[axis]) };
+        let axis = (0..3).max_by(|a, b| coarseness(*a).total_cmp(&coarseness(*b)))?;
+        let n_bits: u8 = bits.iter().sum();
+        if n_bits == 32 || size[axis] <= 0.0 || bits[axis] == 31 {
+            break;
+        }
+        bits[axis] += 1;
+    }
+    (bits != [16; 3]).then_some(bits)
 }
 
 /// A piece of the scene.
@@ -36,10 +136,12 @@ pub struct Cell {
     pub mean_bounds: Aabb,
     /// Box around the extents.
     pub bounds: Aabb,
+    /// Where its positions may lie.
+    pub grid: PositionGrid,
 }
 
 /// The partition of a scene into cells.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct CellSplit {
     /// The cells; a cell's id is its index.
     pub cells: Vec<Cell>,
@@ -49,9 +151,17 @@ pub struct CellSplit {
     pub local_of_gaussian: Vec<u32>,
     /// Unusable Gaussians.
     pub n_rejected: usize,
+    /// Cells that are smaller than count and width ask for, so that positions keep their error.
+    pub n_for_precision: usize,
 }
 
 impl CellSplit {
+    /// Returns the limits that decided the split: the same ones cut a scene in the same way.
+    pub fn deciding(&self, limits: CellLimits) -> (usize, Option<f64>, Option<PositionError>) {
+        let precision = (self.n_for_precision > 0).then_some(limits.position_error);
+        (limits.max_gaussians, limits.max_width, precision)
+    }
+
     /// Reserves the partition: each Gaussian's cell, its index there, and its place in the cell's list.
     pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
         memory.reserve_held(
@@ -65,13 +175,14 @@ impl CellSplit {
 /// Gaussians from which the halves of a box are worth a thread each.
 const MIN_GAUSSIANS_TO_SHARE: usize = 1 << 13;
 
-/// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis, a box that is too wide in the
-/// middle of it. The result depends only on the Gaussians and the limits.
+/// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis; a box that is too wide, or too wide
+/// for exact positions, in the middle of it. The result depends only on the Gaussians and the limits.
 pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
     let indices = (0..scene.len() as u32).into_par_iter();
     let mut indices: Vec<u32> = indices.filter(|i| scene.is_usable(*i as usize)).collect();
     let n_rejected = scene.len() - indices.len();
-    let cells = split_part(scene, &mut indices, limits);
+    let (cells, for_precision): (Vec<Cell>, Vec<bool>) =
+        Splitter { scene, limits }.split(&mut indices, false).into_iter().unzip();
     let mut cell_of_gaussian = vec![NO_CELL; scene.len()];
     let mut local_of_gaussian = vec![0; scene.len()];
     for (cell_id, cell) in cells.iter().enumerate() {
@@ -80,42 +191,81 @@ pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
             local_of_gaussian[*gaussian as usize] = local as u32;
         }
     }
-    CellSplit { cells, cell_of_gaussian, local_of_gaussian, n_rejected }
+    let n_for_precision = for_precision.into_iter().filter(|is| *is).count();
+    CellSplit { cells, cell_of_gaussian, local_of_gaussian, n_rejected, n_for_precision }
 }
 
-/// Returns the cells of a part, those of its lower half first.
-fn split_part(scene: &Gaussians, part: &mut [u32], limits: CellLimits) -> Vec<Cell> {
-    if part.is_empty() {
-        return Vec::new();
+/// What becomes of a part of the scene.
+enum Next {
+    /// Cut before this many Gaussians of the part, which is in order; `for_precision`: only exact positions ask for it.
+    Cut {
+        at: usize,
+        for_precision: bool,
+    },
+    Keep(PositionGrid),
+}
+
+#[derive(Clone, Copy)]
+struct Splitter<'a> {
+    scene: &'a Gaussians,
+    limits: CellLimits,
+}
+
+impl Splitter<'_> {
+    /// Returns the cells of a part, those of its lower half first, and whether precision made each.
+    fn split(self, part: &mut [u32], for_precision: bool) -> Vec<(Cell, bool)> {
+        if part.is_empty() {
+            return Vec::new();
+        }
+        let mean_bounds = bounds_of_means(self.scene, part);
+        let (at, for_precision) = match self.next(part, &mean_bounds) {
+            Next::Keep(grid) => return vec![(finish(self.scene, part, mean_bounds, grid), for_precision)],
+            Next::Cut { at, for_precision: now } => (at, for_precision || now),
+        };
+        let is_shared = part.len() >= MIN_GAUSSIANS_TO_SHARE;
+        let (low, high) = part.split_at_mut(at);
+        let (mut low, mut high) = (|| self.split(low, for_precision), || self.split(high, for_precision));
+        let (mut cells, high) = if is_shared { rayon::join(low, high) } else { (low(), high()) };
+        cells.extend(high);
+        cells
     }
-    let mean_bounds = bounds_of_means(scene, part);
-    let size = mean_bounds.size();
-    let axis = (0..3).max_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(0);
-    let coordinate = |i: &u32| scene.means_in_world[*i as usize][axis];
-    let too_wide =
-        limits.max_width.is_some_and(|max| size[axis] > max) && part.len() > MIN_GAUSSIANS_TO_NARROW;
-    let cut = if part.len() > limits.max_gaussians.max(1) {
-        let middle = part.len() / 2;
-        // Ties are broken by index: the halves are the same sets every time.
-        part.select_nth_unstable_by(middle, |a, b| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b)));
-        middle
-    } else if too_wide {
-        let plane = mean_bounds.centre()[axis];
-        part.sort_unstable_by(|a, b| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b)));
-        part.partition_point(|i| coordinate(i) < plane)
-    } else {
-        return vec![finish(scene, part, mean_bounds)];
-    };
-    let is_shared = part.len() >= MIN_GAUSSIANS_TO_SHARE;
-    let (low, high) = part.split_at_mut(cut);
-    let (of_low, of_high) = (|| split_part(scene, low, limits), || split_part(scene, high, limits));
-    let (mut cells, high) = if is_shared { rayon::join(of_low, of_high) } else { serially(of_low, of_high) };
-    cells.extend(high);
-    cells
-}
 
-fn serially<A, B>(a: impl FnOnce() -> A, b: impl FnOnce() -> B) -> (A, B) {
-    (a(), b())
+    fn next(self, part: &mut [u32], mean_bounds: &Aabb) -> Next {
+        let Self { scene, limits } = self;
+        let size = mean_bounds.size();
+        let axis = (0..3).max_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(0);
+        let coordinate = |i: &u32| scene.means_in_world[*i as usize][axis];
+        // Ties are broken by index: the halves are the same sets every time.
+        let order = |a: &u32, b: &u32| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b));
+        if part.len() > limits.max_gaussians.max(1) {
+            let middle = part.len() / 2;
+            part.select_nth_unstable_by(middle, order);
+            return Next::Cut { at: middle, for_precision: false };
+        }
+        let is_wide = limits.max_width.is_some_and(|max| size[axis] > max);
+        let narrows = is_wide && part.len() > MIN_GAUSSIANS_TO_NARROW;
+        let error = limits.position_error.of_part(scene, part);
+        let grid = if narrows { None } else { PositionGrid::within(mean_bounds, error) };
+        if let Some(grid) = grid
+            && PositionForm::of(grid.bits) != PositionForm::Full
+        {
+            return Next::Keep(grid);
+        }
+        part.sort_unstable_by(order);
+        if let Some(grid) = grid {
+            // Twice the bits for all, unless strays beyond a gap are the reason.
+            let gap = |k: &usize| coordinate(&part[*k]) - coordinate(&part[*k - 1]) > size[axis] / 2.0;
+            let at = (1..part.len()).find(gap);
+            return at.map_or(Next::Keep(grid), |at| Next::Cut { at, for_precision: true });
+        }
+        let plane = mean_bounds.centre()[axis];
+        let at = match part.partition_point(|i| coordinate(i) < plane) {
+            // The next larger coordinate is the plane's, rounded: a cut is there in any case.
+            0 => part.partition_point(|i| coordinate(i) <= mean_bounds.min[axis]),
+            at => at,
+        };
+        Next::Cut { at, for_precision: !narrows }
+    }
 }
 
 fn bounds_of_means(scene: &Gaussians, part: &[u32]) -> Aabb {
@@ -124,7 +274,7 @@ fn bounds_of_means(scene: &Gaussians, part: &[u32]) -> Aabb {
     bounds
 }
 
-fn finish(scene: &Gaussians, part: &[u32], mean_bounds: Aabb) -> Cell {
+fn finish(scene: &Gaussians, part: &[u32], mean_bounds: Aabb, grid: PositionGrid) -> Cell {
     let mut keyed: Vec<(u64, u32)> =
         part.iter().map(|i| (morton(scene.means_in_world[*i as usize], &mean_bounds), *i)).collect();
     keyed.sort_unstable();
@@ -135,7 +285,7 @@ fn finish(scene: &Gaussians, part: &[u32], mean_bounds: Aabb) -> Cell {
         bounds.min = bounds.min.min(mean - half);
         bounds.max = bounds.max.max(mean + half);
     }
-    Cell { gaussians: keyed.into_iter().map(|(_, i)| i).collect(), mean_bounds, bounds }
+    Cell { gaussians: keyed.into_iter().map(|(_, i)| i).collect(), mean_bounds, bounds, grid }
 }
 
 /// Returns a Gaussian's extent along each world axis: `EXTENT_SIGMAS * sqrt(diag(R S² Rᵀ))`.
@@ -193,8 +343,9 @@ mod tests {
             means.extend(std::iter::repeat_n(first, repeat));
             means.push([f64::NAN, 0.0, 0.0]);
             let scene = scene(&means, 0.5);
-            let result = split(&scene, CellLimits { max_gaussians, max_width: Some(max_width) });
-            prop_assert_eq!(result.n_rejected, 1);
+            let limits = CellLimits { max_width: Some(max_width), ..CellLimits::by_count(max_gaussians) };
+            let result = split(&scene, limits);
+            prop_assert_eq!((result.n_rejected, result.n_for_precision), (1, 0));
             let mut seen = vec![0; means.len()];
             for (id, cell) in result.cells.iter().enumerate() {
                 prop_assert!(cell.gaussians.len() <= max_gaussians);

@@ -6,10 +6,9 @@ use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
 use slag_common::{Gaussians, Hash32};
-use slag_encoder::cells;
+use slag_encoder::cells::{self, Cell, CellLimits, PositionError};
 use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
 use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable, ViewContributions};
-use slag_encoder::shard::positions::PositionError;
 use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
 use slag_math::matrix::Rows;
 use slag_math::random::Random;
@@ -215,47 +214,48 @@ fn vectors_that_are_no_numbers_are_no_evidence() {
     }
 }
 
-/// Returns the exact shard of a scene of one cell, in which each Gaussian shows one mask.
-fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes {
-    let n = vectors.len();
-    let scene = Gaussians {
-        means_in_world,
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        scales: vec![[0.1; 3]; n],
-        opacities: vec![0.5; n],
-        sh_dc: vec![[0.0; 3]; n],
-        ..Gaussians::default()
-    };
-    let split = cells::split(&scene, cells::CellLimits { max_gaussians: n, max_width: None });
-    let cell = &split.cells[0];
-    let entry = |i: usize| Contribution { local: split.local_of_gaussian[i], region: i as u32, weight: 2.0 };
-    let mut entries: Vec<Contribution> = (0..n).map(entry).collect();
-    entries.sort_by_key(|entry| entry.local);
-    let (field, _, vectors) = one_cell(vectors, entries, cell.gaussians.clone());
-    let has_evidence = (0..n).map(|k| field.has_evidence(k)).collect();
-    let embeddings = CellEmbeddings { dim: DIM, vectors, has_evidence };
+/// Returns the exact shard of a cell, and the error that is stated for its positions.
+fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (AlignedBytes, f64) {
     let bank = TextBank::directions(DIM);
     let metric = ScoreMetric::new(DIM, &bank);
     let spread = metric.spread(Rows::all(&embeddings.vectors, DIM));
     let settings = ShardSettings {
         profiles: vec![Profile::Exact],
         codebook: CodebookSettings::default(),
-        position_error: PositionError::Within(0.01),
         input_indices: false,
         appearance: false,
     };
     let score_context = ScoreMetricContext { metric, bank, spread };
-    let built = shard::build(
-        &scene,
-        0,
-        cell,
-        &embeddings,
-        Hash32([0; 32]),
-        &score_context,
-        &settings,
-        &CellExtras::default(),
-    );
-    AlignedBytes::copy_of(&built.shards[0].bytes)
+    let (id, extras) = (Hash32([0; 32]), CellExtras::default());
+    let built = shard::build(scene, 0, cell, embeddings, id, &score_context, &settings, &extras);
+    (AlignedBytes::copy_of(&built.shards[0].bytes), built.position_error)
+}
+
+fn scene_at(means_in_world: Vec<DVec3>, scale: f32) -> Gaussians {
+    let n = means_in_world.len();
+    Gaussians {
+        means_in_world,
+        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        scales: vec![[scale; 3]; n],
+        opacities: vec![0.5; n],
+        sh_dc: vec![[0.0; 3]; n],
+        ..Gaussians::default()
+    }
+}
+
+/// Returns the exact shard of a scene of one cell, in which each Gaussian shows one mask.
+fn one_shard(vectors: &[Vec<f32>], means: Vec<DVec3>) -> AlignedBytes {
+    let n = vectors.len();
+    let scene = scene_at(means, 0.1);
+    let limits = CellLimits { position_error: PositionError::Within(0.01), ..CellLimits::by_count(n) };
+    let split = cells::split(&scene, limits);
+    let cell = &split.cells[0];
+    let entry = |i: usize| Contribution { local: split.local_of_gaussian[i], region: i as u32, weight: 2.0 };
+    let mut entries: Vec<Contribution> = (0..n).map(entry).collect();
+    entries.sort_by_key(|entry| entry.local);
+    let (field, _, embeddings) = one_cell(vectors, entries, cell.gaussians.clone());
+    let has_evidence = (0..n).map(|k| field.has_evidence(k)).collect();
+    exact_shard(&scene, cell, &CellEmbeddings { dim: DIM, vectors: embeddings, has_evidence }).0
 }
 
 /// Gaussians lie by centroid, then along the Morton curve; those without evidence come last. Oracle: bits interleaved one by one.
@@ -269,7 +269,7 @@ fn gaussians_are_in_the_order_of_the_format() {
         .collect();
     let means: Vec<DVec3> =
         (0..n).map(|_| DVec3::new(uniform(random), 30.0 * uniform(random), -uniform(random))).collect();
-    let bytes = exact_shard(&vectors, means.clone());
+    let bytes = one_shard(&vectors, means.clone());
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
     let indices = shard.exact.expect("exact").input_indices;
     let least = means.iter().copied().reduce(DVec3::min).expect("means");
@@ -307,7 +307,7 @@ fn embeddings_stored_as_f16() {
         })
         .collect();
     let means = (0..n).map(|i| DVec3::new(i as f64, 0.0, 1.0)).collect();
-    let bytes = exact_shard(&vectors, means);
+    let bytes = one_shard(&vectors, means);
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
     let exact = shard.exact.expect("exact");
     assert_eq!(exact.input_indices.len(), n);
@@ -332,6 +332,62 @@ fn embeddings_stored_as_f16() {
     assert!(worst_step <= 1.0 && worst_vector <= 5e-4, "{worst_step} {worst_vector}");
 }
 
+/// Strays at any distance, scenes at any distance, Gaussians of any size: no stored position is farther from its mean than was
+/// asked for, nor than the manifest states.
+#[test]
+fn positions_keep_their_error_with_strays() {
+    let random = &mut Random::new(11);
+    let n = 600;
+    for (n_strays, distance, place, scale, error) in [
+        (1, 1e3, 0.0, 0.02, PositionError::OfSize),
+        (20, 1e4, 0.0, 0.02, PositionError::OfSize),
+        (1, 1e5, 0.0, 0.02, PositionError::OfSize),
+        (20, 1e6, 0.0, 0.02, PositionError::OfSize),
+        (20, 1e9, 0.0, 0.02, PositionError::OfSize),
+        (20, 3e38, 0.0, 0.02, PositionError::OfSize),
+        (20, 1e9, 0.0, 0.0, PositionError::OfSize),
+        (20, 1e6, 0.0, 0.02, PositionError::Within(0.01)),
+        (20, 3e38, 0.0, 0.02, PositionError::Within(0.01)),
+        (0, 0.0, 0.0, 0.02, PositionError::Within(1e-6)),
+        (0, 0.0, 1e9, 0.02, PositionError::Within(1e-3)),
+        (3, 1e6, 1e15, 0.02, PositionError::Within(0.01)),
+        (20, 1e30, 1e-30, 1e-35, PositionError::OfSize),
+    ] {
+        let at = |k: usize, random: &mut Random| {
+            let towards = DVec3::from_array(std::array::from_fn(|_| uniform(random) * 2.0 - 1.0));
+            if k < n_strays { towards * distance } else { DVec3::splat(place) + 4.0 * towards }
+        };
+        let means: Vec<DVec3> = (0..n).map(|k| at(k, random)).collect();
+        let limits = CellLimits { position_error: error, ..CellLimits::by_count(n) };
+        let mut largest = 0.0f64;
+        let scene = scene_at(means, scale);
+        let split = cells::split(&scene, limits);
+        for cell in &split.cells {
+            let n = cell.gaussians.len();
+            let embeddings =
+                CellEmbeddings { dim: DIM, vectors: vec![0.0; n * DIM], has_evidence: vec![false; n] };
+            let (bytes, stated) = exact_shard(&scene, cell, &embeddings);
+            let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+            for (k, input) in shard.exact.expect("exact").input_indices.iter().enumerate() {
+                let mean = scene.means_in_world[*input as usize];
+                let off = (shard.position_in_world(k) - mean).abs().max_element();
+                assert!(off <= stated, "{distance}: {off} {stated}");
+                // Of the size of Gaussians, but no finer than an f32.
+                let allowed = match error {
+                    PositionError::Within(error) => error,
+                    PositionError::OfSize if (*input as usize) < n_strays => distance * 6e-8,
+                    PositionError::OfSize => f64::from(scale / 4.0).max(2.4e-7),
+                };
+                assert!(off <= allowed, "{n_strays} at {distance}: {off} {allowed}");
+                largest = largest.max(off / allowed);
+            }
+        }
+        assert_eq!(split.cells.iter().map(|cell| cell.gaussians.len()).sum::<usize>(), n);
+        let n_cells = split.cells.len();
+        println!("| {n_strays} strays at {distance:e}: {n_cells} cells, {largest:.3} of the error |");
+    }
+}
+
 /// Centroids are within the stated radius of their members, positions within half a step.
 #[test]
 fn shards_keep_their_bounds() {
@@ -347,7 +403,7 @@ fn shards_keep_their_bounds() {
     // A cell of 25 m, 1,000 km from the origin.
     let means: Vec<DVec3> =
         (0..n).map(|_| DVec3::from_array(std::array::from_fn(|_| 1e6 + 25.0 * uniform(random)))).collect();
-    let bytes = exact_shard(&vectors, means.clone());
+    let bytes = one_shard(&vectors, means.clone());
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
     let input = |i: usize| shard.exact.expect("exact").input_indices[i] as usize;
     let half_step = DVec3::from(shard.header.position_step) / 2.0;

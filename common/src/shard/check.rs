@@ -5,7 +5,7 @@ use std::ops::Range;
 use half::f16;
 
 use super::format::{
-    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, ScoreErrors, ShardHeader, VERSION, section,
+    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, PositionForm, ScoreErrors, ShardHeader, VERSION, section,
 };
 use super::indices::{self, IndicesHeader, PackedIndices};
 use super::layout::ShardLayout;
@@ -95,9 +95,10 @@ impl ShardLayout {
                 Some((errors, [steps, scales, values]))
             }
         };
-        let positions = match header.has_packed_positions() {
-            true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
-            false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
+        let positions = match PositionForm::of(header.position_bits) {
+            PositionForm::Packed => layout.column::<u32>(section::POSITIONS, "positions", n)?,
+            PositionForm::Wide => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
+            PositionForm::Full => layout.column::<[u32; 3]>(section::POSITIONS, "positions", n)?,
         };
         let packed_indices = match layout.find(section::PACKED_INDICES) {
             None => None,
@@ -160,8 +161,11 @@ fn check_header(header: &ShardHeader) -> Result<(), String> {
         ));
     }
     let bits = header.position_bits;
-    if bits[3] != 0 || header.has_packed_positions() && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
-        return Err(format!("positions of {bits:?} bits, expected 32 in all at most, or [16, 16, 16, 0]"));
+    let is_packed = PositionForm::of(bits) == PositionForm::Packed;
+    if bits[3] != 0 || is_packed && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
+        return Err(format!(
+            "positions of {bits:?} bits, expected 32 in all at most, [16, 16, 16, 0] or [32, 32, 32, 0]"
+        ));
     }
     if !(0.0..=MAX_LENGTH).contains(&header.centroid_step) {
         return Err(format!(

@@ -18,6 +18,8 @@ pub enum Positions<'a> {
     Packed(&'a [u32]),
     /// x, y, z.
     Wide(&'a [[u16; 3]]),
+    /// x, y, z.
+    Full(&'a [[u32; 3]]),
 }
 
 impl Positions<'_> {
@@ -25,12 +27,14 @@ impl Positions<'_> {
         match self {
             Self::Packed(words) => container::bytes_of(words),
             Self::Wide(steps) => container::bytes_of(steps),
+            Self::Full(steps) => container::bytes_of(steps),
         }
     }
 
     fn steps(&self, index: usize, bits: [u8; 4]) -> [u32; 3] {
         match self {
             Self::Wide(steps) => steps[index].map(u32::from),
+            Self::Full(steps) => steps[index],
             Self::Packed(words) => {
                 let word = u64::from(words[index]);
                 let part = |shift: u8, bits: u8| (word >> shift & ((1 << bits) - 1)) as u32;

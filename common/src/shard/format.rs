@@ -21,7 +21,7 @@ pub const MAX_DIM: usize = 8192;
 pub mod section {
     /// [`super::ShardHeader`].
     pub const HEADER: u32 = 1;
-    /// `[N]` u32 or `[N][3]` u16, see [`Positions`](crate::shard::Positions).
+    /// `[N]` u32, `[N][3]` u16 or `[N][3]` u32, see [`Positions`](crate::shard::Positions).
     pub const POSITIONS: u32 = 2;
     /// `[K + 1]` u32.
     pub const CENTROID_STARTS: u32 = 3;
@@ -103,7 +103,7 @@ pub struct ShardHeader {
     pub n_components: u32,
     /// Subspaces of the residual code, G; even; 0 without a residual code.
     pub n_subspaces: u32,
-    /// Bits of a position's x, y and z: 32 in all at most, or 16 each for the u16 form.
+    /// Bits of a position's x, y and z, see [`PositionForm`].
     pub position_bits: [u8; 4],
     /// Factor of the 8-bit components of centroids.
     pub centroid_step: f32,
@@ -121,9 +121,24 @@ pub struct ShardHeader {
     pub encoder_id: [u8; 32],
 }
 
-impl ShardHeader {
-    /// Returns whether positions are packed into 32 bits rather than stored as three u16.
-    pub(super) fn has_packed_positions(&self) -> bool {
-        self.position_bits[..3] != [16; 3]
+/// How positions are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PositionForm {
+    /// 32 bits in all.
+    Packed,
+    /// 16 bits an axis.
+    Wide,
+    /// 32 bits an axis.
+    Full,
+}
+
+impl PositionForm {
+    /// Returns the form of `position_bits`.
+    pub fn of(bits: [u8; 4]) -> Self {
+        match bits {
+            [16, 16, 16, _] => Self::Wide,
+            [32, 32, 32, _] => Self::Full,
+            _ => Self::Packed,
+        }
     }
 }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use bytemuck::Pod;
 
 use super::columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView};
-use super::format::{ScoreErrors, ShardHeader};
+use super::format::{PositionForm, ScoreErrors, ShardHeader};
 use super::indices::{IndicesHeader, PackedIndices};
 use crate::appearance::Appearance;
 use crate::objects::{Objects, ObjectsLayout};
@@ -81,9 +81,10 @@ impl ShardLayout {
         }
         ShardView {
             header: self.header,
-            positions: match self.header.has_packed_positions() {
-                true => Positions::Packed(cast(bytes, &self.positions)),
-                false => Positions::Wide(cast(bytes, &self.positions)),
+            positions: match PositionForm::of(self.header.position_bits) {
+                PositionForm::Packed => Positions::Packed(cast(bytes, &self.positions)),
+                PositionForm::Wide => Positions::Wide(cast(bytes, &self.positions)),
+                PositionForm::Full => Positions::Full(cast(bytes, &self.positions)),
             },
             centroid_starts: cast(bytes, &self.centroid_starts),
             centroids: cast(bytes, &self.centroids),

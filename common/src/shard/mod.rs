@@ -27,7 +27,7 @@ mod tests;
 pub use crate::quantise::quantise;
 pub use columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView};
 pub use format::{
-    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, ScoreErrors, ShardHeader, VERSION, section,
+    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, PositionForm, ScoreErrors, ShardHeader, VERSION, section,
 };
 pub use indices::{IndexColumn, IndicesHeader, PackedIndices};
 pub use layout::ShardLayout;

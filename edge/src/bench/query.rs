@@ -240,6 +240,7 @@ fn bytes_touched(shards: &[ShardView<'_>], effort: Effort, found: &Columns) -> u
     let position = first.map_or(0, |shard| match shard.positions {
         Positions::Packed(_) => 4,
         Positions::Wide(_) => 6,
+        Positions::Full(_) => 12,
     });
     shards.par_iter().map(of_shard).sum::<u64>()
         + effort.n_blocks_read * block

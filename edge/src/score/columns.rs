@@ -50,6 +50,7 @@ fn position_in_world(shard: &ShardView<'_>, index: usize) -> [f64; 3] {
     let header = &shard.header;
     let steps = match shard.positions {
         Positions::Wide(steps) => steps[index].map(u32::from),
+        Positions::Full(steps) => steps[index],
         Positions::Packed(steps) => {
             let [x, y, z, _] = header.position_bits.map(u32::from);
             let packed = u64::from(steps[index]);

@@ -18,7 +18,7 @@ use super::sam::SamArgs;
 use super::summary::lines;
 use super::target::{REFINEMENTS, TUNED, TargetArgs};
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
-use crate::cells::CellLimits;
+use crate::cells::{CellLimits, PositionError};
 use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
@@ -34,7 +34,6 @@ use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::report::{self, Recorder};
 use crate::shard::ShardSettings;
-use crate::shard::positions::PositionError;
 
 /// `encode`.
 #[derive(Clone, Debug, Args)]
@@ -229,8 +228,11 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             limits: CellLimits {
                 max_gaussians: args.cell_gaussians as usize,
                 max_width: metric.then_some(args.cell_width_m),
+                position_error: args
+                    .position_error
+                    .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
             },
-            shards: shard_settings(args, preset.codebook, metric),
+            shards: shard_settings(args, preset.codebook),
             objects: preset.objects && !args.objects.no_objects && regions.have_masks(),
             occupancy: args.occupancy.map(|voxel_m| OccupancySettings { voxel_m }),
             photo_poses: args.photo_poses,
@@ -262,7 +264,7 @@ fn parse_components(text: &str) -> Result<usize, String> {
     components.ok_or_else(|| format!("expected an even number from 2 to {MAX_COMPONENTS}"))
 }
 
-fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> ShardSettings {
+fn shard_settings(args: &EncodeArgs, preset: CodebookSettings) -> ShardSettings {
     ShardSettings {
         profiles: args.profiles.clone(),
         codebook: CodebookSettings {
@@ -271,9 +273,6 @@ fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> 
             max_components: args.max_components.unwrap_or(preset.max_components),
             ..preset
         },
-        position_error: args
-            .position_error
-            .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
         input_indices: args.input_indices,
         appearance: args.appearance,
     }

@@ -9,7 +9,7 @@ use super::error::EncodeError;
 use super::inputs::Inputs;
 use super::kept::InputsRecord;
 use super::settings::{EncodeSettings, MAX_RASTER_WIDTH_PX, ViewSettings};
-use crate::cells::CellLimits;
+use crate::cells::PositionError;
 use crate::ingest;
 use crate::segment::Segmenter;
 
@@ -42,8 +42,11 @@ struct SceneIdentity<'a> {
     perturbation: Option<String>,
     scene: Hash32,
     settings: &'a ViewSettings,
-    cells: CellLimits,
+    cells: CellsIdentity,
 }
+
+/// See [`CellSplit::deciding`](crate::cells::CellSplit::deciding).
+type CellsIdentity = (usize, Option<f64>, Option<PositionError>);
 
 /// How models run: other hardware and another split of the work change vectors in the last bits.
 #[derive(Serialize)]
@@ -75,8 +78,8 @@ pub(super) fn identities(
     inputs: &Inputs,
 ) -> Result<Identities, EncodeError> {
     let scene = hash_scene(&inputs.scene);
-    let of =
-        |scene| hash_of(&scene_identity(&settings.view, settings.cells.limits, engines, segmenter, scene));
+    let cells = inputs.split.deciding(settings.cells.limits);
+    let of = |scene| hash_of(&scene_identity(&settings.view, cells, engines, segmenter, scene));
     let of_scene = of(scene)?;
     let record = InputsRecord { scene, settings: of(Hash32([0; 32]))? };
     let of_view = |view: &View| -> Result<Hash32, EncodeError> {
@@ -99,7 +102,7 @@ pub(super) fn identities(
 /// None that is known: settings can be serialised.
 pub(crate) fn of_scene(
     settings: &ViewSettings,
-    cells: CellLimits,
+    cells: CellsIdentity,
     engines: &Engines<'_>,
     segmenter: &dyn Segmenter,
     scene: &Gaussians,
@@ -109,7 +112,7 @@ pub(crate) fn of_scene(
 
 fn scene_identity<'a>(
     settings: &'a ViewSettings,
-    cells: CellLimits,
+    cells: CellsIdentity,
     engines: &Engines<'a>,
     segmenter: &dyn Segmenter,
     scene: Hash32,
@@ -177,12 +180,7 @@ mod tests {
         };
         Inputs {
             scene: Gaussians::default(),
-            split: CellSplit {
-                cells: Vec::new(),
-                cell_of_gaussian: Vec::new(),
-                local_of_gaussian: Vec::new(),
-                n_rejected: 0,
-            },
+            split: CellSplit::default(),
             views: vec![view],
             missing: Vec::new(),
             geo_reference: None,

@@ -53,6 +53,15 @@ impl Inputs {
         if split.cells.is_empty() {
             return Err(EncodeError::NoGaussians { path: inputs.scene.clone(), n_gaussians: scene.len() });
         }
+        if split.n_for_precision > cells::MAX_CELLS_FOR_PRECISION {
+            let (n, most) = (split.n_for_precision, cells::MAX_CELLS_FOR_PRECISION);
+            let problem = format!(
+                "{:?} would take {n} more cells, expected at most {most}; give a larger --position-error, or remove Gaussians far from \
+                 the scene",
+                limits.position_error
+            );
+            return Err(EncodeError::Setting { setting: "position_error", problem });
+        }
         Ok(Self { scene, split, views, missing, geo_reference })
     }
 }

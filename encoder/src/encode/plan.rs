@@ -248,12 +248,7 @@ mod tests {
         let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
         settings.run.memory_bytes = 100_000 * 204;
         let scene = Gaussians { means_in_world: vec![glam::DVec3::ZERO; 100_000], ..Gaussians::default() };
-        let split = CellSplit {
-            cells: Vec::new(),
-            cell_of_gaussian: Vec::new(),
-            local_of_gaussian: Vec::new(),
-            n_rejected: 0,
-        };
+        let split = CellSplit::default();
         let inputs = Inputs { scene, split, views: Vec::new(), missing: Vec::new(), geo_reference: None };
         let refused =
             memory_plan(&settings, &inputs, 512).rest(0).expect_err("the objects' lists come on top");

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::shard::Profile;
 
 use super::error::EncodeError;
-use crate::cells::CellLimits;
+use crate::cells::{CellLimits, PositionError};
 use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
@@ -18,7 +18,6 @@ use crate::occupancy::OccupancySettings;
 use crate::raster::WeightKind;
 use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
-use crate::shard::positions::PositionError;
 
 /// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and no
 /// better answers (generated scenes of seeds 601 to 605, and the labelled house).
@@ -286,11 +285,14 @@ impl EncodeSettings {
             },
             aggregation: Aggregation::REFINED,
             cells: CellSettings {
-                limits: CellLimits { max_gaussians: MAX_CELL_GAUSSIANS, max_width: metric.then_some(25.0) },
+                limits: CellLimits {
+                    max_gaussians: MAX_CELL_GAUSSIANS,
+                    max_width: metric.then_some(25.0),
+                    position_error: PositionError::default_for(metric),
+                },
                 shards: ShardSettings {
                     profiles: Profile::ALL.to_vec(),
                     codebook: CodebookSettings::default(),
-                    position_error: PositionError::default_for(metric),
                     input_indices: false,
                     appearance: false,
                 },
@@ -379,7 +381,7 @@ impl EncodeSettings {
             ),
             (
                 "position_error",
-                !matches!(cells.shards.position_error, PositionError::Within(error) if !is_positive(error)),
+                !matches!(cells.limits.position_error, PositionError::Within(error) if !is_positive(error)),
                 "expected a finite error above 0",
             ),
         ];
@@ -430,7 +432,7 @@ mod tests {
         assert_eq!(refused(&|s| s.cells.shards.codebook.compact_error = -0.1), "compact_error");
         assert_eq!(refused(&|s| s.cells.shards.codebook.balanced_error = f32::NAN), "balanced_error");
         assert_eq!(
-            refused(&|s| s.cells.shards.position_error = PositionError::Within(0.0)),
+            refused(&|s| s.cells.limits.position_error = PositionError::Within(0.0)),
             "position_error"
         );
         assert_eq!(refused(&|s| s.cells.occupancy = Some(OccupancySettings { voxel_m: 0.0 })), "occupancy");

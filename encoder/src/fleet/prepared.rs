@@ -78,8 +78,8 @@ impl Prepared {
         segmenter: &dyn Segmenter,
         context: &RunContext<'_>,
     ) -> Result<(), FleetError> {
-        let found =
-            context.install(|| of_scene(&self.settings, self.plan.limits, engines, segmenter, &self.scene));
+        let cells = self.split.deciding(self.plan.limits);
+        let found = context.install(|| of_scene(&self.settings, cells, engines, segmenter, &self.scene));
         match found.map_err(FleetError::from)? == self.plan.of_scene {
             true => Ok(()),
             false => Err(FleetError::Identity {

@@ -154,7 +154,7 @@ mod tests {
             of_scene: Hash32([1; 32]),
             scene: Hash32([2; 32]),
             settings: settings.view,
-            limits: CellLimits { max_gaussians: 5, max_width: None },
+            limits: CellLimits::by_count(5),
             data_set: None,
             views: Vec::new(),
         }

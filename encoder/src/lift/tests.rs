@@ -328,6 +328,7 @@ fn a_views_weights_are_grouped_by_cell() {
         cell_of_gaussian: vec![1, 0, 1, NO_CELL],
         local_of_gaussian: vec![1, 0, 0, 0],
         n_rejected: 1,
+        ..CellSplit::default()
     };
     let weight = |gaussian, region| RegionWeight { gaussian, region, weight: (gaussian + region) as f32 };
     let weights = [weight(0, 0), weight(0, 1), weight(1, 1), weight(2, 0), weight(3, 0)];

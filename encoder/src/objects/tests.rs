@@ -35,7 +35,7 @@ fn world() -> World {
         (0..n).map(|i| DVec3::new(f64::from(i / PER_THING) * 10.0, f64::from(i % PER_THING) * 0.1, 0.0));
     let gaussians = gaussians_at(means.collect());
     // Cells of at most 70: the things are cut.
-    let split = split(&gaussians, CellLimits { max_gaussians: 70, max_width: None });
+    let split = split(&gaussians, CellLimits::by_count(70));
     let mut random = Random::new(3);
     let mut views = Vec::new();
     for view in 0..6u32 {

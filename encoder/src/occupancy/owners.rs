@@ -61,7 +61,7 @@ mod tests {
     use slag_math::random::Random;
 
     use super::*;
-    use crate::cells::Cell;
+    use crate::cells::{Cell, PositionGrid};
 
     /// Oracle: every cell compared with every block.
     #[test]
@@ -70,11 +70,10 @@ mod tests {
         let cell = |random: &mut Random| {
             let min = DVec3::from([0; 3].map(|_| random.between(-30.0, 30.0)));
             let bounds = Aabb { min, max: min + DVec3::from([0; 3].map(|_| random.between(0.0, 9.0))) };
-            Cell { gaussians: Vec::new(), mean_bounds: bounds, bounds }
+            Cell { gaussians: Vec::new(), mean_bounds: bounds, bounds, grid: PositionGrid::default() }
         };
         let cells: Vec<Cell> = (0..40).map(|_| cell(&mut random)).collect();
-        let split =
-            CellSplit { cells, cell_of_gaussian: Vec::new(), local_of_gaussian: Vec::new(), n_rejected: 0 };
+        let split = CellSplit { cells, ..CellSplit::default() };
         let lattice = Lattice { voxel: 0.1 };
         let blocks: Vec<Block> = (0..2000)
             .map(|_| Block { at: [0; 3].map(|_| random.between(-120.0, 120.0) as i32), occupied: 1, free: 0 })

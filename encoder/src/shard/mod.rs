@@ -1,7 +1,7 @@
 //! Stage 6: a cell's field becomes its shards.
 
 mod photos;
-pub mod positions;
+mod positions;
 
 use half::f16;
 use rayon::prelude::*;
@@ -22,7 +22,7 @@ use crate::memory::{MemoryPlan, Phase};
 use crate::objects::SceneObjects;
 use crate::objects::shards::{CellObjects, CentroidBasis};
 pub use photos::photo_poses;
-use positions::{PositionError, QuantisedPositions};
+use positions::QuantisedPositions;
 use slag_math::matrix::Rows;
 
 /// A cell's shard, with its entry in the manifest.
@@ -60,8 +60,6 @@ pub struct ShardSettings {
     pub profiles: Vec<Profile>,
     /// Precision of embeddings.
     pub codebook: CodebookSettings,
-    /// Precision of positions.
-    pub position_error: PositionError,
     /// Whether compact and balanced shards have the indices of their Gaussians in the input splat file, too.
     pub input_indices: bool,
     /// Whether shards tell how their Gaussians look.
@@ -145,7 +143,7 @@ pub fn build(
     let in_input = || locals.iter().map(|local| cell.gaussians[*local as usize]).collect::<Vec<u32>>();
     let appearance = settings.appearance.then(|| AppearanceColumns::of(scene, &in_input()));
     let packed_indices = settings.input_indices.then(|| IndexColumn::pack(&in_input()));
-    let positions = QuantisedPositions::new(scene, cell, &locals, settings.position_error);
+    let positions = QuantisedPositions::new(scene, cell, &locals);
     let header = ShardHeader {
         cell_id,
         n_gaussians: locals.len() as u32,
@@ -153,10 +151,10 @@ pub fn build(
         dim: dim as u32,
         n_components: codebook.n_components as u32,
         n_subspaces: 0,
-        position_bits: positions.bits,
+        position_bits: cell.grid.bits,
         centroid_step: codebook.centroid_step,
         origin_in_world: cell.mean_bounds.min.to_array(),
-        position_step: positions.step,
+        position_step: cell.grid.step,
         box_min: cell.bounds.min.to_array(),
         box_max: cell.bounds.max.to_array(),
         errors: codebook.errors,
@@ -238,7 +236,7 @@ pub fn build(
         shards: shards.collect(),
         n_centroids: header.n_centroids,
         n_subspaces: balanced.header.n_subspaces,
-        position_error: positions.step.into_iter().fold(0.0, f64::max) / 2.0,
+        position_error: positions.error,
         moments: codebook.moments,
         n_without_evidence: without.len(),
     }

@@ -23,15 +23,10 @@ pub(crate) struct Splat {
 impl Splat {
     /// Takes a splat; `is_alone`: there is no store whose cells count.
     pub(crate) fn new(name: String, scene: Gaussians, is_alone: bool) -> Self {
-        let limits = CellLimits { max_gaussians: MAX_GAUSSIANS, max_width: None };
+        let limits = CellLimits::by_count(MAX_GAUSSIANS);
         let split = match is_alone {
             true => cells::split(&scene, limits),
-            false => CellSplit {
-                cells: Vec::new(),
-                cell_of_gaussian: Vec::new(),
-                local_of_gaussian: Vec::new(),
-                n_rejected: 0,
-            },
+            false => CellSplit::default(),
         };
         Self { name, scene, split }
     }

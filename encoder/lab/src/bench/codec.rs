@@ -14,10 +14,9 @@ use super::machine::Machine;
 use super::plot::{Plot, Scale, Series, Style};
 use super::timing::timed_ms;
 use crate::generate::field::Field;
-use slag_encoder::cells::{CellLimits, split};
+use slag_encoder::cells::{CellLimits, PositionError, split};
 use slag_encoder::codebook::residual::trained;
 use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
-use slag_encoder::shard::positions::PositionError;
 use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
 use slag_encoder::store::{StoreError, StoreReader};
 use slag_math::matrix::{Panels, Rows};
@@ -283,13 +282,8 @@ fn shards(
     codebook: CodebookSettings,
 ) -> Point {
     let dim = embeddings.dim;
-    let settings = ShardSettings {
-        profiles: vec![profile],
-        codebook,
-        position_error: PositionError::Within(0.01),
-        input_indices: false,
-        appearance: false,
-    };
+    let settings =
+        ShardSettings { profiles: vec![profile], codebook, input_indices: false, appearance: false };
     let mut decoded = vec![0.0f32; embeddings.vectors.len()];
     let (mut bytes, mut position_bytes, mut ms, mut first) = (0, 0, 0.0, 0);
     let (mut n_centroids, mut n_subspaces) = (0, 0);
@@ -303,7 +297,8 @@ fn shards(
             sh_dc: vec![[0.0; 3]; *n],
             ..Gaussians::default()
         };
-        let cells = split(&scene, CellLimits { max_gaussians: *n, max_width: None });
+        let position_error = PositionError::Within(0.01);
+        let cells = split(&scene, CellLimits { position_error, ..CellLimits::by_count(*n) });
         let locals = &cells.cells[0].gaussians;
         let in_order: Vec<f32> = locals
             .iter()

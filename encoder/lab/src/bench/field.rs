@@ -12,7 +12,7 @@ use slag_common::{Gaussians, Hash32};
 use super::machine::Machine;
 use super::timing::timed_ms;
 use crate::generate::field::{Field, place_in_cube};
-use slag_encoder::cells::{Cell, CellLimits, split};
+use slag_encoder::cells::{Cell, CellLimits, PositionError, split};
 use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext};
 use slag_encoder::progress::Progress;
 use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
@@ -56,12 +56,13 @@ pub fn publish(
     let field = Field::new(n_gaussians, dim);
     let mut writer = FieldWriter::create(dir, &field, dim, settings)?;
     let n = field.cell_gaussians();
+    let limits = CellLimits { position_error: PositionError::Within(0.01), ..CellLimits::by_count(n) };
     let per_side = (field.n_cells() as f64).sqrt().ceil() as usize;
     progress.begin("cells", "cell", field.n_cells() as u64, 0);
     for cell_id in 0..field.n_cells() {
         let corner = DVec3::new((cell_id % per_side) as f64, (cell_id / per_side) as f64, 0.0) * CELL_PITCH_M;
         let scene = grey_gaussians((0..n as u64).map(|k| corner + place_in_cube(k)).collect());
-        let cut = split(&scene, CellLimits { max_gaussians: n, max_width: None });
+        let cut = split(&scene, limits);
         writer.add(&scene, &cut.cells[0], &field.embeddings(cell_id))?;
         progress.advance(1);
     }

@@ -179,7 +179,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     // The page then shows colours on the robot, too.
     settings.cells.shards.appearance = true;
     // Small cells, so that the demo has several.
-    settings.cells.limits = CellLimits { max_gaussians: 16_384, max_width: Some(25.0) };
+    settings.cells.limits = CellLimits { max_gaussians: 16_384, ..settings.cells.limits };
     let engines = Engines::new(&models, &options.session, &CpuRasterizer);
     let summary = tokio::task::block_in_place(|| encode::encode(&settings, &engines, progress, cancel))
         .context("encode")?;

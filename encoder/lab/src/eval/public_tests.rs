@@ -22,7 +22,6 @@ use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, RasterView, Rasterizer};
 use slag_encoder::shard::ShardSettings;
-use slag_encoder::shard::positions::PositionError;
 use slag_encoder::store::StoreReader;
 
 /// Gaussians across and down, 0.1 m apart, 2 m in front of the camera.
@@ -86,11 +85,10 @@ impl Wall {
         settings.view.min_mask_px = 10;
         settings.aggregation = Aggregation::PLAIN;
         settings.cells = CellSettings {
-            limits: CellLimits { max_gaussians: 4096, max_width: None },
+            limits: CellLimits::by_count(4096),
             shards: ShardSettings {
                 profiles: vec![Profile::Compact],
                 codebook: CodebookSettings::default(),
-                position_error: PositionError::Within(0.01),
                 input_indices: false,
                 appearance: false,
             },

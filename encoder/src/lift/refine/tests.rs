@@ -6,7 +6,7 @@ use slag_common::frames::Aabb;
 use slag_math::random::mix64;
 
 use super::*;
-use crate::cells::Cell;
+use crate::cells::{Cell, PositionGrid};
 use crate::lift::photos::MaskOutline;
 use crate::lift::tests::{Scene, open};
 use crate::lift::{CellField, Contribution, ViewContributions};
@@ -37,9 +37,10 @@ fn gaussians() -> Gaussians {
 
 fn split() -> CellSplit {
     let bounds = Aabb::EMPTY;
-    let cell = Cell { gaussians: (0..N as u32).collect(), mean_bounds: bounds, bounds };
+    let grid = PositionGrid::default();
+    let cell = Cell { gaussians: (0..N as u32).collect(), mean_bounds: bounds, bounds, grid };
     let local_of_gaussian = (0..N as u32).collect();
-    CellSplit { cells: vec![cell], cell_of_gaussian: vec![0; N], local_of_gaussian, n_rejected: 0 }
+    CellSplit { cells: vec![cell], cell_of_gaussian: vec![0; N], local_of_gaussian, ..CellSplit::default() }
 }
 
 /// The first two patches are objects, except that every fourth Gaussian belongs to none.

@@ -224,7 +224,7 @@ fn world_of(views: &Views) -> (World, Superpoints) {
     let n = PER_ROW * N_THINGS;
     let mean = |i: u32| DVec3::new(f64::from(i / PER_ROW) * 3.0, f64::from(i % PER_ROW) * 0.1, 0.0);
     let gaussians = gaussians_at((0..n).map(mean).collect());
-    let split = split(&gaussians, CellLimits { max_gaussians: 90, max_width: None });
+    let split = split(&gaussians, CellLimits::by_count(90));
     let view = |of_view: &BTreeMap<u32, BTreeSet<u32>>| {
         let mut regions: Vec<&BTreeSet<u32>> = of_view.values().collect();
         regions.sort_unstable();

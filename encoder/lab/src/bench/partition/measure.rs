@@ -6,11 +6,10 @@ use std::time::Instant;
 
 use anyhow::{Context, Result};
 use slag_common::shard::Profile;
-use slag_encoder::cells::{CellLimits, split};
+use slag_encoder::cells::{CellLimits, PositionError, split};
 use slag_encoder::codebook::CodebookSettings;
 use slag_encoder::progress::Progress;
 use slag_encoder::shard::ShardSettings;
-use slag_encoder::shard::positions::PositionError;
 
 use super::link::{Link, LinkSpeed};
 use super::report::{FetchFigures, PartitionReport, StoreFigures};
@@ -88,12 +87,15 @@ fn publish(settings: &PartitionSettings, site: &Site, width: f64, store: &Path) 
     let shards = ShardSettings {
         profiles: vec![Profile::Compact],
         codebook: CodebookSettings::default(),
-        position_error: PositionError::Within(0.01),
         input_indices: false,
         appearance: false,
     };
     let mut writer = FieldWriter::create(store, &site.field, settings.dim, &shards)?;
-    let limits = CellLimits { max_gaussians: settings.max_gaussians, max_width: Some(width) };
+    let limits = CellLimits {
+        max_gaussians: settings.max_gaussians,
+        max_width: Some(width),
+        position_error: PositionError::Within(0.01),
+    };
     for cell in &split(&site.scene, limits).cells {
         writer.add(&site.scene, cell, &site.embeddings)?;
     }

@@ -9,7 +9,6 @@ use slag_common::shard::Profile;
 use slag_encoder::codebook::CodebookSettings;
 use slag_encoder::progress::Progress;
 use slag_encoder::shard::ShardSettings;
-use slag_encoder::shard::positions::PositionError;
 
 use super::engine::Engine;
 use super::report::{EngineFigures, RobotReport, SearchFigures, TextFigures};
@@ -151,7 +150,6 @@ impl<'a> Scene<'a> {
         let shards = ShardSettings {
             profiles,
             codebook: CodebookSettings::default(),
-            position_error: PositionError::Within(0.01),
             input_indices: false,
             appearance: false,
         };

@@ -10,7 +10,6 @@ use slag_encoder::cli::common::parse_error;
 use slag_encoder::codebook::CodebookSettings;
 use slag_encoder::progress::Progress;
 use slag_encoder::shard::ShardSettings;
-use slag_encoder::shard::positions::PositionError;
 
 use crate::bench::field;
 
@@ -41,7 +40,6 @@ pub(super) fn run(args: &FieldBenchArgs, progress: &dyn Progress) -> Result<Exit
     let settings = ShardSettings {
         profiles: args.profiles.clone(),
         codebook: CodebookSettings { balanced_error: args.balanced_error, ..CodebookSettings::default() },
-        position_error: PositionError::Within(0.01),
         input_indices: false,
         appearance: false,
     };
