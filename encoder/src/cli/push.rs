@@ -7,8 +7,8 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 
+use super::Exit;
 use super::common::{print, runtime, stopped};
-use super::exit::Exit;
 use crate::progress::Progress;
 use crate::publish::qdrant;
 use crate::store::Store;

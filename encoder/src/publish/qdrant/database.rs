@@ -101,14 +101,16 @@ fn database_error(options: &PushOptions, action: &'static str, cause: &QdrantErr
     PushError::Database { url: options.url.clone(), action, cause: words(cause) }
 }
 
-/// Returns what an error says, without the metadata of its response.
+/// Returns what an error says, without the metadata of its response and the transport's insides.
 fn words(error: &QdrantError) -> String {
-    match error {
-        QdrantError::ResponseError { status } | QdrantError::ResourceExhaustedError { status, .. } => {
-            status.message().to_owned()
-        }
-        other => other.to_string(),
-    }
+    let (QdrantError::ResponseError { status } | QdrantError::ResourceExhaustedError { status, .. }) = error
+    else {
+        return error.to_string();
+    };
+    let (text, insides) =
+        status.message().split_once(": tonic::transport::Error").unwrap_or((status.message(), ""));
+    let cause = insides.split("message: \"").nth(1).and_then(|rest| rest.split('"').next());
+    text.to_owned() + &cause.map_or(String::new(), |cause| format!(": {cause}"))
 }
 
 /// Returns whether the same request may succeed later.
@@ -159,11 +161,9 @@ impl Collection<'_> {
             let distance = Distance::try_from(distance).unwrap_or(Distance::UnknownDistance);
             format!("vectors of {size} components, distance {}", distance.as_str_name())
         };
-        let found = match vectors_of(params.and_then(|params| params.vectors_config)) {
-            Some(vectors) if vectors.multivector_config.is_some() => "multivectors".to_owned(),
-            Some(vectors) => describe(vectors.size, vectors.distance),
-            None => "named vectors, or none".to_owned(),
-        };
+        let found = vectors_of(params.and_then(|params| params.vectors_config))
+            .filter(|vectors| vectors.multivector_config.is_none())
+            .map_or("named vectors or several".into(), |vectors| describe(vectors.size, vectors.distance));
         let expected = describe(self.manifest.encoder.dim.into(), Distance::Cosine.into());
         match found == expected {
             true => Ok(()),
@@ -258,16 +258,5 @@ impl Collection<'_> {
                 sha256: made.checksum,
             }),
         }
-    }
-
-    /// Returns whether the database still has a snapshot.
-    pub(super) async fn has_snapshot(&self, snapshot: &Snapshot) -> Result<bool, PushError> {
-        let list = || self.database.client.list_snapshots(self.name.as_str());
-        let listed = self.database.attempt("list snapshots", list).await?;
-        Ok(listed.snapshot_descriptions.iter().any(|listed| {
-            listed.name == snapshot.name
-                && u64::try_from(listed.size) == Ok(snapshot.size_bytes)
-                && listed.checksum == snapshot.sha256
-        }))
     }
 }

@@ -20,7 +20,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::ValueEnum;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use slag_common::container::ContainerError;
 use slag_common::shard::Profile;
 
@@ -91,7 +91,7 @@ pub(crate) struct PushProgress {
 }
 
 /// A snapshot of a collection, on the database's disk.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Snapshot {
     pub(crate) collection: String,
     pub(crate) name: String,

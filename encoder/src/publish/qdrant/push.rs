@@ -7,7 +7,7 @@ use slag_common::manifest::{CellRecord, Manifest};
 
 use super::database::{Collection, Database};
 use super::points::CellShard;
-use super::{Layout, PushError, PushOptions, PushProgress, PushReport, Snapshot};
+use super::{Layout, PushError, PushOptions, PushProgress, PushReport};
 use crate::store::StoreReader;
 
 /// Pushes the current generation of a store, continuing where an earlier push of it was interrupted.
@@ -42,9 +42,6 @@ struct Record {
     n_points_in_cell: usize,
     n_points: u64,
     n_without_evidence: u64,
-    /// Of the complete collection.
-    #[serde(default)]
-    snapshot: Option<Snapshot>,
 }
 
 /// The records of the collections of one database, in the store.
@@ -137,7 +134,8 @@ impl<'a> Push<'a> {
         }
         if self.options.snapshots {
             for target in &targets {
-                self.snapshot(&target.collection).await?;
+                let snapshot = target.collection.create_snapshot().await?;
+                self.report.snapshots.push(snapshot);
             }
         }
         self.report.n_retries = self.database.n_retries();
@@ -199,12 +197,9 @@ impl<'a> Push<'a> {
         };
         let manifest = Some(self.reader.current().hash);
         let known = self.records.read(name)?.filter(|record| record.manifest == manifest);
-        let mut record = known.unwrap_or_else(|| Record { manifest, ..Record::default() });
+        let record = known.unwrap_or_else(|| Record { manifest, ..Record::default() });
         let config = info.config.unwrap_or_default();
         if let Some((request, changes)) = self.options.index.update(name, config) {
-            // The snapshot has the former settings.
-            record.snapshot = None;
-            self.records.write(name, &record).await?;
             collection.update(request).await?;
             self.report.changed_settings.extend(changes);
         }
@@ -231,22 +226,6 @@ impl<'a> Push<'a> {
                 self.report.left_collections.push(name);
             }
         }
-        Ok(())
-    }
-
-    /// Reports the snapshot of a complete collection: the one of an earlier run if the collection is unchanged
-    /// and the database still has it, or else a new one.
-    async fn snapshot(&mut self, collection: &Collection<'a>) -> Result<(), PushError> {
-        let mut record = self.records.read(&collection.name)?.unwrap_or_default();
-        let is_there = match &record.snapshot {
-            Some(snapshot) => collection.has_snapshot(snapshot).await?,
-            None => false,
-        };
-        if !is_there {
-            record.snapshot = Some(collection.create_snapshot().await?);
-            self.records.write(&collection.name, &record).await?;
-        }
-        self.report.snapshots.extend(record.snapshot);
         Ok(())
     }
 

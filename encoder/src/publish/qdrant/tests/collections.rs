@@ -25,7 +25,7 @@ fn merge_hnsw(into: &mut Option<HnswConfigDiff>, from: Option<HnswConfigDiff>) {
     #[expect(deprecated, reason = "older servers know no other field")]
     {
         let into = into.get_or_insert_default();
-        merge!(into, from, m ef_construct on_disk memory);
+        merge!(into, from, m ef_construct on_disk);
     }
 }
 
@@ -54,11 +54,9 @@ fn update(held: &mut Held, request: UpdateCollection) -> Result<(), Status> {
         None => {}
         Some(Some(vectors_config_diff::Config::Params(diff))) => {
             let vectors = held.vectors();
-            merge_hnsw(&mut vectors.hnsw_config, diff.hnsw_config);
-            merge_quantization(&mut vectors.quantization_config, diff.quantization_config);
             #[expect(deprecated, reason = "older servers know no other field")]
             {
-                merge!(vectors, diff, on_disk memory);
+                merge!(vectors, diff, on_disk);
             }
         }
         Some(_) => return Err(Status::unimplemented("only one unnamed vector")),
@@ -69,7 +67,6 @@ fn update(held: &mut Held, request: UpdateCollection) -> Result<(), Status> {
         if let Some(on_disk) = diff.on_disk_payload {
             params.on_disk_payload = on_disk;
         }
-        merge!(params, diff, payload);
     }
     Ok(())
 }
@@ -91,7 +88,7 @@ service!(Collections {
             };
             let mut held = Held::new(vectors);
             held.config.hnsw_config = request.hnsw_config;
-            held.config.quantization_config = request.quantization_config.or(state.default_quantization);
+            held.config.quantization_config = request.quantization_config;
             #[expect(deprecated, reason = "older servers know no other field")]
             if let (Some(params), Some(on_disk)) = (&mut held.config.params, request.on_disk_payload) {
                 params.on_disk_payload = on_disk;
@@ -166,13 +163,8 @@ service!(Snapshots {
             Ok(Response::new(CreateSnapshotResponse { snapshot_description, ..Default::default() }))
         })
     }
-
-    async fn list(&self, request: Request<ListSnapshotsRequest>) -> Result<Response<ListSnapshotsResponse>, Status> {
-        let name = self.admit(request)?.collection_name;
-        let snapshot_descriptions = self.with(|state| state.held(&name).map(|held| held.snapshots.clone()))?;
-        Ok(Response::new(ListSnapshotsResponse { snapshot_descriptions, ..Default::default() }))
-    }
 } refused {
+    list: ListSnapshotsRequest => ListSnapshotsResponse;
     delete: DeleteSnapshotRequest => DeleteSnapshotResponse;
     create_full: CreateFullSnapshotRequest => CreateSnapshotResponse;
     list_full: ListFullSnapshotsRequest => ListSnapshotsResponse;

@@ -150,18 +150,3 @@ async fn a_collection_of_other_settings_is_changed_once_and_only_where_asked() {
     assert_eq!(held.hnsw_config.and_then(|hnsw| hnsw.ef_construct), Some(200));
     fixture.assert_arrived(&server, 1);
 }
-
-/// A server whose operator quantises by default does so unless the push says `none`.
-#[tokio::test]
-async fn none_switches_the_servers_own_quantisation_off() {
-    let fixture = fixture();
-    let default = Some(QuantizationConfig { quantization: Some(Stored::Scalar(scalar())) });
-    for (quantisation, expected) in [(None, default), (Some(Quantisation::None), None)] {
-        let (server, url) = Server::start(None).await;
-        server.with(|state| state.default_quantization = default);
-        let index = IndexSettings { quantisation, ..IndexSettings::default() };
-        fixture.push(&PushOptions { index, ..options(&url) }).await.expect("pushes");
-        let held = server.with(|state| state.collections["yard"].config.quantization_config);
-        assert_eq!(held, expected, "{quantisation:?}");
-    }
-}

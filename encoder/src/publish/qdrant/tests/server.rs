@@ -53,8 +53,6 @@ pub(super) struct State {
     /// Requests that create and update collections, in order.
     pub(super) created: Vec<CreateCollection>,
     pub(super) updated: Vec<UpdateCollection>,
-    /// Quantisation of collections that are created without one, as the server's operator may set it.
-    pub(super) default_quantization: Option<QuantizationConfig>,
     /// Snapshots that are still to be made before one is refused.
     pub(super) n_snapshots_allowed: Option<u32>,
     /// Requests for a payload index that are still to be refused.
