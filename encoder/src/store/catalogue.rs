@@ -1,9 +1,8 @@
-//! The catalogue of a store, in sled: what was published, and of which cells.
+//! The catalogue of a store, in sled: what was published.
 //!
 //! | tree | key | value, JSON |
 //! |---|---|---|
 //! | `generations` | number, big-endian | [`GenerationRecord`], of every generation ever published |
-//! | `cells` | hash of a manifest, id of a cell | the cell's record: box, shards, hashes; of the manifests that the store has |
 //!
 //! `encode` and `push` keep the state of their work in trees of their own. A writer holds the database for as long as it
 //! writes; readers read a copy. It repeats what files say, but for the history, so a damaged one is set aside and made
@@ -15,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
-use slag_common::manifest::{CellRecord, Manifest};
+use slag_common::manifest::Manifest;
 
 use super::error::StoreError;
 
@@ -23,7 +22,6 @@ use super::error::StoreError;
 const CACHE_BYTES: u64 = 16 << 20;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 const GENERATIONS: &str = "generations";
-const CELLS: &str = "cells";
 
 /// What the catalogue says of a generation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -88,17 +86,12 @@ fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, Fault> {
     serde_json::from_slice(bytes).map_err(|e| Fault::Damaged(e.to_string()))
 }
 
-fn cell_key(manifest_hash: Hash32, cell_id: u32) -> Vec<u8> {
-    [&manifest_hash.0[..], &cell_id.to_be_bytes()].concat()
-}
-
 /// The open catalogue.
 #[derive(Debug)]
 pub(crate) struct Catalogue {
     path: PathBuf,
     db: sled::Db,
     generations: sled::Tree,
-    cells: sled::Tree,
 }
 
 impl Catalogue {
@@ -137,15 +130,12 @@ impl Catalogue {
         loop {
             let opened = guarded(|| {
                 let db = config.open()?;
-                let (generations, cells) = (db.open_tree(GENERATIONS)?, db.open_tree(CELLS)?);
+                let generations = db.open_tree(GENERATIONS)?;
                 for name in db.tree_names() {
                     db.open_tree(name)?.iter().try_for_each(|record| record.map(drop))?;
                 }
-                let catalogue = Self { path: path.to_owned(), db, generations, cells };
+                let catalogue = Self { path: path.to_owned(), db, generations };
                 catalogue.history()?;
-                for record in &catalogue.cells {
-                    decode::<CellRecord>(&record?.1)?;
-                }
                 Ok(catalogue)
             });
             match opened {
@@ -173,18 +163,9 @@ impl Catalogue {
         self.generations.iter().values().map(|value| decode(&value?)).collect()
     }
 
-    fn cells_of(&self, manifest_hash: Hash32) -> Result<Vec<CellRecord>, Fault> {
-        self.cells.scan_prefix(manifest_hash.0).values().map(|value| decode(&value?)).collect()
-    }
-
     /// Returns all generations ever published, the oldest first.
     pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
         self.history().map_err(|fault| self.error(fault))
-    }
-
-    /// Returns the cells of a manifest, in order of their ids.
-    pub(crate) fn cells(&self, manifest_hash: Hash32) -> Result<Vec<CellRecord>, StoreError> {
-        self.cells_of(manifest_hash).map_err(|fault| self.error(fault))
     }
 
     /// Returns the highest generation published.
@@ -203,36 +184,9 @@ impl Catalogue {
             if held.as_ref() != Some(&record) {
                 self.generations.insert(key, serde_json::to_vec(&record).expect("a record is JSON"))?;
             }
-            if self.cells_of(manifest_hash)? != manifest.cells {
-                let mut batch = sled::Batch::default();
-                for key in self.cells.scan_prefix(manifest_hash.0).keys() {
-                    batch.remove(key?);
-                }
-                for cell in &manifest.cells {
-                    let record = serde_json::to_vec(cell).expect("a cell record is JSON");
-                    batch.insert(cell_key(manifest_hash, cell.cell_id), record);
-                }
-                self.cells.apply_batch(batch)?;
-            }
             self.db.flush().map(drop).map_err(Fault::from)
         };
         guarded(write).map_err(|fault| self.error(fault))
-    }
-
-    /// Forgets the cells of other manifests than these.
-    pub(crate) fn keep_cells_of(&self, manifests: &[Hash32]) -> Result<(), StoreError> {
-        let forget = || -> Result<(), Fault> {
-            let mut batch = sled::Batch::default();
-            for key in self.cells.iter().keys() {
-                let key = key?;
-                if !manifests.iter().any(|manifest| key.starts_with(&manifest.0)) {
-                    batch.remove(key);
-                }
-            }
-            self.cells.apply_batch(batch)?;
-            self.db.flush().map(drop).map_err(Fault::from)
-        };
-        guarded(forget).map_err(|fault| self.error(fault))
     }
 }
 
@@ -275,106 +229,4 @@ impl CatalogueCopy {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::store::tests::manifest;
-    use crate::store::{Extras, Store, StoreReader};
-
-    fn files_of(folder: &Path, found: &mut Vec<PathBuf>) {
-        for entry in fs_err::read_dir(folder).expect("a folder") {
-            let path = entry.expect("an entry").path();
-            if path.is_dir() { files_of(&path, found) } else { found.push(path) }
-        }
-    }
-
-    /// Every file of the database overwritten, cut or removed: the store opens, knows its cells, counts on from its
-    /// manifest, and readers are told the truth meanwhile.
-    #[test]
-    fn a_damaged_catalogue_is_made_anew_from_the_files() {
-        let damages: [fn(&Path); 4] = [
-            |path| fs_err::write(path, vec![0xA5; 4096]).expect("writes"),
-            |path| fs_err::write(path, b"").expect("writes"),
-            |path| fs_err::remove_file(path).expect("there"),
-            |path| {
-                let mut bytes = fs_err::read(path).expect("there");
-                bytes.iter_mut().step_by(97).for_each(|byte| *byte ^= 0x41);
-                fs_err::write(path, bytes).expect("writes");
-            },
-        ];
-        for (number, damage) in damages.iter().enumerate() {
-            let [dir, scratch] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
-            let store = Store::create_or_open(dir.path()).expect("opens");
-            let shards: Vec<_> =
-                ["a", "b"].map(|text| store.put_bytes(text.as_bytes()).expect("room")).into();
-            store.publish(&manifest(6, &shards[..1]), &Extras::new()).expect("publishes");
-            store.publish(&manifest(7, &shards), &Extras::new()).expect("publishes");
-            drop(store);
-            let mut files = Vec::new();
-            files_of(&dir.path().join("db"), &mut files);
-            files.iter().for_each(|path| damage(path));
-            // A reader never believes a damaged catalogue.
-            let seen = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies");
-            let generations = seen.map(|copy| copy.generations().expect("reads")).unwrap_or_default();
-            assert!(generations.iter().all(|record| record.n_cells <= 2), "damage {number}");
-            let store = Store::create_or_open(dir.path()).unwrap_or_else(|e| panic!("damage {number}: {e}"));
-            assert_eq!(store.cells().expect("reads"), manifest(7, &shards).cells, "damage {number}");
-            assert_eq!(store.next_generation().expect("reads"), 8, "damage {number}");
-            let generations = store.generations().expect("reads");
-            let numbers: Vec<u64> = generations.iter().map(|record| record.generation).collect();
-            assert_eq!(numbers, [6, 7], "damage {number}");
-            store.publish(&manifest(8, &shards), &Extras::new()).expect("publishes");
-            assert!(StoreReader::open(dir.path()).expect("whole").listing().verify(|| {}).bad.is_empty());
-        }
-    }
-
-    #[test]
-    fn the_catalogue_keeps_the_history() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        let shards: Vec<_> =
-            ["a", "b", "c"].map(|text| store.put_bytes(text.as_bytes()).expect("room")).into();
-        for generation in 1..=3 {
-            let manifest = manifest(generation, &shards[..generation as usize]);
-            store.publish(&manifest, &Extras::new()).expect("publishes");
-        }
-        store.prune().expect("prunes");
-        drop(store);
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        let generations = store.generations().expect("reads");
-        let seen: Vec<(u64, usize)> =
-            generations.iter().map(|record| (record.generation, record.n_cells)).collect();
-        assert_eq!(seen, [(1, 1), (2, 2), (3, 3)]);
-        assert_eq!(store.cells().expect("reads"), manifest(3, &shards).cells);
-        let of = |generation: usize| {
-            let manifest = manifest(generation as u64, &shards[..generation]);
-            store.catalogue().cells(Hash32::of(&manifest.to_bytes())).expect("reads").len()
-        };
-        assert_eq!([of(1), of(2), of(3)], [0, 2, 3], "cells are forgotten with their objects");
-    }
-
-    fn snapshot_of(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-        let mut files = Vec::new();
-        files_of(folder, &mut files);
-        files.sort();
-        files.into_iter().map(|path| (path.clone(), fs_err::read(path).expect("readable"))).collect()
-    }
-
-    /// While a writer holds the store, its history is read, and no file of it changes.
-    #[test]
-    fn a_copy_is_read_while_a_writer_is_at_work() {
-        let [dir, scratch] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
-        assert!(CatalogueCopy::of(dir.path(), scratch.path()).expect("no store").is_none());
-        let store = Store::create_or_open(dir.path()).expect("opens");
-        let shard = store.put_bytes(b"a").expect("room");
-        store.publish(&manifest(1, &[shard]), &Extras::new()).expect("publishes");
-        fs_err::write(dir.path().join("tmp/7.part"), "of the writer").expect("writes");
-        let before = snapshot_of(dir.path());
-        let copy = CatalogueCopy::of(dir.path(), scratch.path()).expect("copies").expect("there");
-        let generations = copy.generations().expect("reads");
-        assert_eq!(generations.iter().map(|record| record.generation).collect::<Vec<_>>(), [1]);
-        assert!(snapshot_of(dir.path()) == before, "the store was written to");
-        drop(copy);
-        assert_eq!(fs_err::read_dir(scratch.path()).expect("there").count(), 0);
-        drop(store);
-    }
-}
+mod tests;

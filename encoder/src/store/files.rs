@@ -1,11 +1,14 @@
-//! Files that survive a power cut: written beside, synced, renamed, the folder synced.
+//! Files that survive a power cut: written beside, synced, renamed, the folder synced; and those of manifests.
 
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, Read, Write};
 use std::path::Path;
 
 use fs_err::File;
 use slag_common::Hash32;
 pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
+use slag_common::manifest::{self, ManifestError};
+
+use super::error::StoreError;
 
 /// Counts and hashes what passes on its way to a file.
 pub(super) struct HashingWriter {
@@ -56,4 +59,24 @@ pub(super) fn ensure_folder_unsynced(path: &Path) -> io::Result<()> {
         Err(e) if e.kind() == io::ErrorKind::AlreadyExists => Ok(()),
         made => made,
     }
+}
+
+/// The current manifest.
+pub(super) const MANIFEST: &str = "manifest";
+/// The one before it, which fetches in progress may still need.
+pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
+
+/// Reads a manifest's bytes; `None` if there is no such file.
+pub(super) fn read_manifest_bytes(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
+    let file = match File::open(path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => file?,
+    };
+    let mut bytes = Vec::new();
+    file.take(manifest::MAX_BYTES + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > manifest::MAX_BYTES {
+        let cause = ManifestError::TooLong { len_bytes: bytes.len() as u64 };
+        return Err(StoreError::Manifest { path: path.to_owned(), cause });
+    }
+    Ok(Some(bytes))
 }

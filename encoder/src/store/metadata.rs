@@ -271,7 +271,11 @@ pub(crate) fn clock_unix_secs() -> u64 {
 
 /// Returns the time as of which metadata is signed: the system's, unless its clock stands before this program was made.
 pub(crate) fn signing_unix_secs() -> u64 {
-    clock_unix_secs().max(RELEASE_UNIX_SECS)
+    signing_time(clock_unix_secs())
+}
+
+pub(super) fn signing_time(clock_unix_secs: u64) -> u64 {
+    clock_unix_secs.max(RELEASE_UNIX_SECS)
 }
 
 /// Reads a metadata file of a store by the name that clients ask for; `None` if there is no such file.

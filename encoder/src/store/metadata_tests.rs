@@ -7,7 +7,7 @@ use slag_common::tuf::{Kept, Source, TargetFile, Trusted, TufError, find_target,
 
 use super::ceremony::{Change, default_root_folder};
 use super::metadata::{
-    Metadata, MetadataReader, RELEASE_UNIX_SECS, clock_unix_secs, read_published, signing_unix_secs,
+    Metadata, MetadataReader, RELEASE_UNIX_SECS, clock_unix_secs, read_published, signing_time,
 };
 use super::tests::manifest as manifest_of;
 use super::{Extras, Store, StoreError};
@@ -143,7 +143,7 @@ fn an_expired_root_is_warned_of_and_renewed() {
 #[test]
 fn nothing_is_signed_as_of_1970() {
     assert_eq!(RELEASE_UNIX_SECS, 20_454 * DAY, "2026-01-01");
-    assert!(signing_unix_secs() >= RELEASE_UNIX_SECS);
+    assert_eq!([signing_time(5), signing_time(NOW)], [RELEASE_UNIX_SECS, NOW]);
 }
 
 /// A key that the root does not name would lock every client out.

@@ -28,7 +28,6 @@ mod ceremony_tests;
 mod error;
 mod export;
 mod files;
-mod manifest_file;
 pub(crate) mod metadata;
 #[cfg(test)]
 mod metadata_tests;

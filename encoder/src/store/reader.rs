@@ -10,7 +10,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::manifest::{Manifest, TextModelRecord};
 
 use super::error::StoreError;
-use super::manifest_file;
+use super::files;
 use super::models::ModelsRecord;
 
 /// Objects by name that belong to a generation but are not sent to robots.
@@ -69,7 +69,7 @@ pub(crate) struct Stamp {
 impl Stamp {
     /// Returns the version of a store's manifest; `None` if there is none or its metadata cannot be read.
     pub(crate) fn of_manifest(dir: &Path) -> Option<Self> {
-        Self::of(&dir.join(manifest_file::MANIFEST)).ok()
+        Self::of(&dir.join(files::MANIFEST)).ok()
     }
 
     fn of(path: &Path) -> io::Result<Self> {
@@ -97,14 +97,14 @@ impl StoreReader {
     /// # Errors
     /// [`StoreError::NotPublished`] before the first publication, [`StoreError`] otherwise.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
-        let path = dir.join(manifest_file::MANIFEST);
+        let path = dir.join(files::MANIFEST);
         // Before the content: a manifest that is replaced in between is then noticed, not missed.
         let stamp = Stamp::of(&path).map_err(|e| match e.kind() {
             io::ErrorKind::NotFound => StoreError::NotPublished { path },
             _ => e.into(),
         })?;
-        let current = Published::read(dir, manifest_file::MANIFEST)?;
-        let previous = match Published::read(dir, manifest_file::MANIFEST_PREVIOUS) {
+        let current = Published::read(dir, files::MANIFEST)?;
+        let previous = match Published::read(dir, files::MANIFEST_PREVIOUS) {
             Ok(previous) => Some(previous),
             Err(StoreError::NotPublished { .. }) => None,
             Err(e) => {
@@ -123,7 +123,7 @@ impl StoreReader {
 
     /// Returns whether the store still has the manifest that this reader read (one `stat`).
     pub fn is_current(&self) -> bool {
-        Stamp::of(&self.dir.join(manifest_file::MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
+        Stamp::of(&self.dir.join(files::MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
     }
 
     /// Returns which models the current generation was encoded with, if the store recorded it.
@@ -179,7 +179,7 @@ pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
 
 /// Reads a manifest; returns its bytes too.
 pub(super) fn read_manifest(path: &Path) -> Result<(Manifest, Vec<u8>), StoreError> {
-    let Some(bytes) = manifest_file::read_bytes(path)? else {
+    let Some(bytes) = files::read_manifest_bytes(path)? else {
         return Err(StoreError::NotPublished { path: path.to_owned() });
     };
     let refused = |cause| StoreError::Manifest { path: path.to_owned(), cause };

@@ -91,12 +91,10 @@ fn published_scene_is_read_back_verified() {
     assert_eq!(&*reader.read_object(shards[1].0).expect("intact"), b"bb");
     fs_err::write(reader.object_path(shards[1].0), b"bx").expect("writable");
     assert!(matches!(reader.read_object(shards[1].0), Err(StoreError::ObjectHash { .. })));
-    assert_eq!(store.cells().expect("records"), manifest(1, &shards).cells);
 
     assert!(reader.is_current());
     store.publish(&manifest(2, &shards[..1]), &Extras::new()).expect("publishes");
     assert!(!reader.is_current());
-    assert_eq!(store.cells().expect("records").len(), 1);
     assert_eq!(store.reader().expect("published").previous().map(|p| p.hash), Some(hash));
 }
 
@@ -223,7 +221,6 @@ fn records_behind_the_manifest_are_repaired() {
     }
     let store = Store::create_or_open(dir.path()).expect("opens");
     assert_eq!(store.next_generation().expect("records"), 3);
-    assert_eq!(store.cells().expect("records"), manifest(2, &shards[1..]).cells);
     assert_eq!(fs_err::read_dir(dir.path().join("tmp")).expect("folder").count(), 0);
 }
 

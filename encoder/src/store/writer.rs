@@ -8,12 +8,11 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use slag_common::Hash32;
-use slag_common::manifest::{CellRecord, Manifest, TextModelRecord};
+use slag_common::manifest::{Manifest, TextModelRecord};
 
-use super::catalogue::{Catalogue, GenerationRecord};
+use super::catalogue::Catalogue;
 use super::error::StoreError;
 use super::files::{self, Access, HashingWriter};
-use super::manifest_file;
 use super::metadata::Metadata;
 use super::models::ModelsRecord;
 use super::reader::{self, Extras, Published, StoreReader};
@@ -162,11 +161,11 @@ impl Store {
             self.check_object(hash, len_bytes)?;
         }
         let bytes = manifest.to_bytes();
-        let path = self.dir.join(manifest_file::MANIFEST);
+        let path = self.dir.join(files::MANIFEST);
         let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
         Manifest::parse(&bytes).map_err(refuse)?;
         let hash = Hash32::of(&bytes);
-        let current = manifest_file::read_bytes(&path)?;
+        let current = files::read_manifest_bytes(&path)?;
         let again = current.as_deref() == Some(&bytes);
         match self.catalogue.last_generation()? {
             Some(generation) if manifest.generation <= generation && !again => {
@@ -178,7 +177,7 @@ impl Store {
         self.replace(&reader::extras_path(&self.dir, hash), &extras_json)?;
         if !again {
             if let Some(current) = current {
-                self.replace(&self.dir.join(manifest_file::MANIFEST_PREVIOUS), &current)?;
+                self.replace(&self.dir.join(files::MANIFEST_PREVIOUS), &current)?;
             }
             self.replace(&path, &bytes)?;
         }
@@ -220,21 +219,7 @@ impl Store {
                 }
             }
         }
-        self.catalogue.keep_cells_of(&extras.into_iter().collect::<Vec<_>>())?;
         Ok(pruned)
-    }
-
-    /// Returns the published cells in order of their ids, from the catalogue; none before the first publication.
-    pub fn cells(&self) -> Result<Vec<CellRecord>, StoreError> {
-        match manifest_file::read_bytes(&self.dir.join(manifest_file::MANIFEST))? {
-            Some(manifest) => self.catalogue.cells(Hash32::of(&manifest)),
-            None => Ok(Vec::new()),
-        }
-    }
-
-    /// Returns all generations ever published, the oldest first, from the catalogue.
-    pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
-        self.catalogue.generations()
     }
 
     /// Brings metadata and catalogue up to the manifests, which a crash may have left ahead of them.
@@ -246,10 +231,10 @@ impl Store {
             Err(e) => Err(e),
         };
         // It only serves fetches under way.
-        if let Ok(Some((manifest, bytes))) = read(manifest_file::MANIFEST_PREVIOUS) {
+        if let Ok(Some((manifest, bytes))) = read(files::MANIFEST_PREVIOUS) {
             self.catalogue.record(&manifest, Hash32::of(&bytes))?;
         }
-        if let Some((manifest, bytes)) = read(manifest_file::MANIFEST)? {
+        if let Some((manifest, bytes)) = read(files::MANIFEST)? {
             Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
             self.catalogue.record(&manifest, Hash32::of(&bytes))?;
         }
