@@ -11,10 +11,11 @@ use slag_common::{Hash32, durable};
 use super::documents::{self, FailedView};
 use super::error::FleetError;
 use super::heartbeat::Heartbeat;
+use super::inputs;
+use super::objects::ViewObject;
 use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
-use super::{inputs, objects};
 use crate::blobs::Bucket;
 use crate::encode::fleet_parts::{Executor, LeftOut, Plan, RunContext, ViewRecord, ViewsRun};
 use crate::encode::{self, EncodeError, EncodeSettings, EncodeSummary, Engines, SkippedView};
@@ -133,10 +134,10 @@ impl ViewsInWork<'_> {
     fn fetch_view(&self, plan: &Plan<'_>, id: Hash32, name: &str) -> Result<(), FleetError> {
         let key = documents::view_key(id);
         let bytes = self.bucket.require(&key)?;
-        let parts = objects::unpack_view(&bytes).map_err(|e| FleetError::damaged(self.bucket, &key, e))?;
-        durable::write(&plan.job.outlines_path(name), &bytes[parts.outlines])?;
-        durable::write(&plan.job.contributions_path(name), &bytes[parts.contributions])?;
-        Ok(plan.job.mark_done(name, parts.record)?)
+        let view = ViewObject::read(&bytes).map_err(|e| FleetError::damaged(self.bucket, &key, e))?;
+        durable::write(&plan.job.outlines_path(name), view.outlines())?;
+        durable::write(&plan.job.contributions_path(name), view.contributions())?;
+        Ok(plan.job.mark_done(name, view.record)?)
     }
 
     /// Leaves out the views that workers could not do; with `is_strict`, fails at the first one.

@@ -3,22 +3,15 @@
 use crate::blobs::BlobError;
 use crate::encode::EncodeError;
 
-/// The queue cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum QueueError {
-    #[error(
-        "{url}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials"
-    )]
-    Connect { url: String, problem: String },
-}
-
 /// Why a coordinator or worker ends.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum FleetError {
     #[error(transparent)]
     Blob(#[from] BlobError),
-    #[error(transparent)]
-    Queue(#[from] QueueError),
+    #[error(
+        "{url}: {problem}; check the address, that nats-server runs with JetStream (-js), and the credentials"
+    )]
+    Queue { url: String, problem: String },
     #[error(transparent)]
     Encode(#[from] EncodeError),
     #[error(transparent)]

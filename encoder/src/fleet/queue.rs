@@ -19,7 +19,7 @@ use slag_common::Hash32;
 use tokio::runtime::Runtime;
 
 use super::dispatch::{Dispatcher, OpenViews};
-use super::error::{FleetError, QueueError};
+use super::error::FleetError;
 use super::run::Run;
 
 /// The consumer that all workers share.
@@ -49,11 +49,9 @@ pub(crate) struct QueueSettings {
 }
 
 impl QueueSettings {
-    async fn connect(&self) -> Result<Context, QueueError> {
-        let refuse = |problem: &dyn Display| QueueError::Connect {
-            url: self.url.clone(),
-            problem: problem.to_string(),
-        };
+    async fn connect(&self) -> Result<Context, FleetError> {
+        let refuse =
+            |problem: &dyn Display| FleetError::Queue { url: self.url.clone(), problem: problem.to_string() };
         let mut options = ConnectOptions::new().name("slag-encoder");
         if let Some(path) = &self.credentials {
             options = options.credentials_file(path).await.map_err(|e| refuse(&e))?;
@@ -94,7 +92,7 @@ impl Enqueuer {
         settings: &QueueSettings,
         run: Run,
         of_scene: Hash32,
-    ) -> Result<Self, QueueError> {
+    ) -> Result<Self, FleetError> {
         let context = runtime.block_on(settings.connect())?;
         Ok(Self {
             runtime: Arc::clone(runtime),
@@ -243,7 +241,7 @@ impl Queue {
         run: Run,
         of_scene: Hash32,
         n_most: usize,
-    ) -> Result<Self, QueueError> {
+    ) -> Result<Self, FleetError> {
         let context = runtime.block_on(settings.connect())?;
         let held = Arc::new(Held {
             runtime: runtime.handle().clone(),

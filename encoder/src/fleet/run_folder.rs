@@ -2,11 +2,9 @@
 //! begins, which knows them by their locks: a lock ends with its process, however that ends.
 
 use std::fs::File;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::error::FleetError;
-use super::run::Run;
 
 /// Names of folders begin so. The process's number follows, which says little: workers of other machines and containers may share
 /// the parent.
@@ -22,29 +20,19 @@ pub(super) struct RunFolder {
 }
 
 impl RunFolder {
-    /// Makes a folder for a run under `parent`, and removes those that killed workers left there.
-    pub(super) fn make(parent: &Path, run: Run) -> Result<Self, FleetError> {
+    /// Makes a folder under `parent`, and removes those that killed workers left there.
+    pub(super) fn make(parent: &Path) -> Result<Self, FleetError> {
         fs_err::create_dir_all(parent)?;
         remove_left(parent);
-        for attempt in 0.. {
-            let name = format!("{PREFIX}{}-{}-{attempt}", std::process::id(), run.0);
-            // Under its name only once it is locked: another worker that begins now would take it for a left one.
-            let (hidden, path) = (parent.join(format!(".{name}")), parent.join(name));
-            let is_taken = |error: &std::io::Error| {
-                matches!(error.kind(), ErrorKind::AlreadyExists | ErrorKind::DirectoryNotEmpty)
-            };
-            match fs_err::create_dir(&hidden) {
-                Err(error) if is_taken(&error) => continue,
-                made => made?,
-            }
-            let lock = File::create_new(hidden.join(LOCK))?;
-            lock.lock()?;
-            match fs_err::rename(&hidden, &path) {
-                Err(error) if is_taken(&error) => fs_err::remove_dir_all(&hidden)?,
-                renamed => return renamed.map(|()| Self { path, _lock: lock }).map_err(FleetError::Io),
-            }
-        }
-        unreachable!("attempts do not end")
+        let name = format!("{PREFIX}{}-", std::process::id());
+        // Hidden until it is locked: another worker that begins now would take it for a left one.
+        let hidden = tempfile::Builder::new().prefix(&format!(".{name}")).tempdir_in(parent)?;
+        let lock = File::create_new(hidden.path().join(LOCK))?;
+        lock.lock()?;
+        let hidden_name = hidden.path().file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let path = parent.join(hidden_name.trim_start_matches('.'));
+        fs_err::rename(hidden.keep(), &path)?;
+        Ok(Self { path, _lock: lock })
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -79,37 +67,4 @@ fn remove_left(parent: &Path) {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// A folder lives as long as its worker; what a killed worker left goes with the next one, and nothing else does.
-    #[test]
-    fn folders_go_with_their_workers() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let scratch = dir.path().join("scratch");
-        let names = || {
-            let entries = fs_err::read_dir(&scratch).expect("reads");
-            let mut names: Vec<_> = entries.map(|entry| entry.expect("reads").path()).collect();
-            names.sort();
-            names
-        };
-        let first = RunFolder::make(&scratch, Run(1)).expect("made");
-        fs_err::create_dir_all(first.path().join("photos")).expect("made");
-        fs_err::write(first.path().join("photos/a.png"), "a").expect("written");
-        // As a killed worker leaves it, and as neighbours have theirs.
-        let left = scratch.join("slag-worker-left-1");
-        fs_err::create_dir_all(left.join("photos")).expect("made");
-        fs_err::write(left.join(LOCK), "").expect("written");
-        let foreign = [scratch.join("photos"), scratch.join("slag-worker-without-a-lock")];
-        foreign.iter().for_each(|path| fs_err::create_dir_all(path).expect("made"));
-
-        let second = RunFolder::make(&scratch, Run(1)).expect("made");
-        assert_ne!(first.path(), second.path());
-        let mut expected = vec![first.path().to_owned(), second.path().to_owned()];
-        expected.extend(foreign.clone());
-        expected.sort();
-        assert_eq!(names(), expected);
-        drop((first, second));
-        assert_eq!(names(), foreign);
-    }
-}
+mod tests;

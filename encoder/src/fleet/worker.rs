@@ -115,7 +115,7 @@ fn work_for(
     context: &RunContext<'_>,
     report: &mut WorkReport,
 ) -> Result<(), FleetError> {
-    let folder = RunFolder::make(&settings.folder, run)?;
+    let folder = RunFolder::make(&settings.folder)?;
     let of_scene = plan.of_scene;
     let prepared = Prepared::fetch(bucket, (run, plan), folder.path(), settings.segmenter.as_ref(), context)?;
     let segmenter = segmenter_of(&prepared.settings, &settings.gpus, engines)?;

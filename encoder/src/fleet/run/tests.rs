@@ -1,0 +1,51 @@
+use slag_common::Hash32;
+
+use super::*;
+use crate::cells::CellLimits;
+use crate::encode::EncodeSettings;
+
+fn plan() -> RunPlan {
+    let settings = EncodeSettings::new("a".into(), "b".into(), "c".into(), true);
+    RunPlan {
+        program: documents::own_version(),
+        coordinator: 1,
+        engines: "none".into(),
+        of_scene: Hash32([1; 32]),
+        scene: Hash32([2; 32]),
+        settings: settings.view,
+        limits: CellLimits::by_count(5),
+        data_set: None,
+        views: Vec::new(),
+    }
+}
+
+/// A second coordinator takes the place of the first, which cannot publish any more; a published run is not
+/// superseded, but followed.
+#[test]
+fn one_put_decides_who_publishes() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let bucket = Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens");
+    assert!(Run::open(&bucket).expect("reads").is_none());
+    let first = Run::begin(&bucket, &plan()).expect("begins");
+    assert_eq!(Run::open(&bucket).expect("reads").map(|(run, _)| run), Some(first));
+    assert!(first.is_open(&bucket).expect("reads"));
+    let second = Run::begin(&bucket, &plan()).expect("begins");
+    first.check(&bucket).expect_err("superseded");
+    assert!(matches!(first.publish(&bucket), Err(FleetError::Superseded { run: 1, .. })));
+    assert!(second.is_open(&bucket).expect("reads") && !first.is_open(&bucket).expect("reads"));
+    second.views_are_done(&bucket).expect("puts");
+    assert!(Run::open(&bucket).expect("reads").is_none(), "workers have nothing to do");
+    second.check(&bucket).expect("it is still the newest");
+    second.publish(&bucket).expect("publishes");
+    assert!(Run::open(&bucket).expect("reads").is_none());
+    assert_eq!(Run::begin(&bucket, &plan()).expect("begins"), Run(3));
+}
+
+#[test]
+fn a_plan_of_another_version_is_refused() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let bucket = Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens");
+    bucket.put("jobs/00000001/plan.json", r#"{"program": "7.0.0", "news": 1}"#).expect("puts");
+    let message = Run::open(&bucket).expect_err("another version").to_string();
+    assert!(message.contains("7.0.0") && message.contains(env!("CARGO_PKG_VERSION")), "{message}");
+}
