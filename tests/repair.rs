@@ -1,6 +1,7 @@
 //! A store that rots: another encode writes its files anew, from the views that are kept, and its catalogue from the files.
 
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use slag_tests::*;
 
@@ -24,9 +25,14 @@ fn an_encode_heals_a_store_from_kept_views() {
         (output.status.success(), serde_json::from_slice(&output.stdout).expect("JSON"))
     };
     encode();
+    // Commands that read write nothing, not even away what another writer has in work.
+    fs_err::write(store.join("tmp/7.part"), "of a writer").expect("written");
+    let untouched = files(&store);
+    run(&mut encoder(&["keys", "status", "--store", text(&store)]));
     let listed = json("ls").1;
     assert_eq!((&listed["history"][0]["generation"], &listed["job"]["n_views"]), (&1.into(), &4.into()));
     assert!(json("verify").0);
+    assert!(files(&store) == untouched, "a command that reads wrote");
 
     // A byte that rots, files that are gone, and an object that only queries here need.
     let before = content(&store);
@@ -71,4 +77,17 @@ fn a_field(store: &Path) -> String {
         serde_json::from_slice(&fs_err::read(extras).expect("there")).expect("JSON");
     let hash = extras.as_object().expect("a map").values().next().and_then(|hash| hash.as_str());
     hash.expect("a hash").to_owned()
+}
+
+/// Returns all files of a folder and of those in it, by path, with their content.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in fs_err::read_dir(folder).expect("there") {
+        let path = entry.expect("readable").path();
+        match path.is_dir() {
+            true => found.extend(files(&path)),
+            false => drop(found.insert(path.clone(), fs_err::read(&path).expect("readable"))),
+        }
+    }
+    found
 }

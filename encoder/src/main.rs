@@ -3,12 +3,12 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use slag_encoder::cli::{self, Cli, environment};
+use slag_encoder::cli::{self, Cli, devices};
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
     if cli.uses_gpu() {
-        environment::silence_device_selection();
+        devices::silence_device_selection();
     }
     cli.output.init_logging();
     cli::run(cli).into()

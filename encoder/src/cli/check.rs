@@ -7,8 +7,8 @@ use clap::Args;
 use slag_common::poses::SplatFrame;
 use slag_common::{View, durable, poses, splat};
 
+use super::Exit;
 use super::common::{InputArgs, print};
-use super::exit::Exit;
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
 use crate::ingest::{self, FoundFrame, RotatedPhotos};
 use crate::raster::RasterView;

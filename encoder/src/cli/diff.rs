@@ -8,8 +8,8 @@ use clap::Args;
 use slag_common::ByteSize;
 use slag_common::objects::Thing;
 
+use super::Exit;
 use super::common::print;
-use super::exit::Exit;
 use crate::diff::{self, Diff, Generation};
 use crate::store::{Published, StoreReader};
 
@@ -126,10 +126,6 @@ impl fmt::Display for Lines<'_> {
 
 #[cfg(test)]
 mod tests {
-    use glam::DVec3;
-    use slag_common::frames::Aabb;
-    use slag_common::objects::Moved;
-
     use super::*;
 
     #[test]
@@ -138,46 +134,5 @@ mod tests {
         assert_eq!("a/store".parse(), Ok(at("a/store", None)));
         assert_eq!("a/store@3".parse(), Ok(at("a/store", Some(3))));
         assert_eq!("me@home/store".parse(), Ok(at("me@home/store", None)));
-    }
-
-    /// By hand: boxes from (x, 2, 3) to (x + 1, 4, 6) have edges of 1, 2 and 3.
-    #[test]
-    fn each_change_has_its_line() {
-        let thing = |id: u64, x: f64| {
-            let min = DVec3::new(x, 2.0, 3.0);
-            Thing {
-                id,
-                n_gaussians: 9,
-                position_in_world: min + 0.5,
-                box_in_world: Aabb { min, max: min + DVec3::new(1.0, 2.0, 3.0) },
-                photo: "p.jpg".into(),
-                vector: vec![1.0],
-            }
-        };
-        let diff = Diff {
-            old_generation: 4,
-            new_generation: 6,
-            metric: true,
-            n_same: 3,
-            n_stayed: 4,
-            appeared: vec![thing(1, 1.0)],
-            went: vec![thing(2, -2.0)],
-            moved: vec![Moved { from: thing(3, 3.0), to: thing(0x40, 5.5), distance: 2.5 }],
-            n_cells: 8,
-            n_cells_changed: 2,
-            fetch_bytes: [("compact".to_owned(), 900), ("exact".to_owned(), 0)].into(),
-        };
-        let rest = "2.50 3.50, 1.00 x 2.00 x 3.00 m, 9 Gaussians, in p.jpg";
-        let expected = format!(
-            "generation 4 to 6\n\
-            appeared  0000000000000001 at 1.50 {rest}\n\
-            went      0000000000000002 at -1.50 {rest}\n\
-            moved     2.50 m: 0000000000000040 at 6.00 {rest}; was 0000000000000003 at 3.50 {rest}\n\
-            things    7 stayed, 3 of them unchanged\n\
-            to fetch  2 of 8 cells: compact {}, exact {}\n",
-            ByteSize(900),
-            ByteSize(0)
-        );
-        assert_eq!(Lines(&diff).to_string(), expected);
     }
 }

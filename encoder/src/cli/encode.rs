@@ -7,11 +7,11 @@ use clap::{Args, FromArgMatches};
 use slag_common::shard::Profile;
 use slag_models::gpus::GpuChoice;
 
+use super::Exit;
 use super::common::{
     InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
     parse_error, print, profile_parser, warn_of_expiry,
 };
-use super::exit::Exit;
 use super::memory::{default_memory_bytes, parse_memory};
 use super::refine::RefineArgs;
 use super::sam::SamArgs;

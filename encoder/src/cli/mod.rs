@@ -2,16 +2,13 @@
 
 mod check;
 pub mod common;
-mod devices;
+pub mod devices;
 mod diff;
 mod encode;
-pub mod environment;
-mod exit;
 #[cfg_attr(not(feature = "fleet"), path = "no_fleet.rs")]
 mod fleet;
 mod keys;
 pub mod memory;
-mod models;
 pub mod progress;
 #[cfg(feature = "qdrant")]
 mod push;
@@ -25,20 +22,47 @@ mod target;
 mod view;
 mod views;
 
+use std::process::ExitCode;
+
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 use serde_json::json;
 use slag_common::error_line;
-use slag_models::commands::ModelsCommand;
+use slag_models::ModelDir;
+use slag_models::commands::{self, ModelsCommand};
 
 use crate::encode::EncodeError;
 #[cfg(feature = "qdrant")]
 use crate::publish::qdrant;
 use crate::raster::devices::DeviceChoice;
-use common::OutputArgs;
-pub use exit::Exit;
+use common::{OutputArgs, print, session_options};
 #[cfg(feature = "qdrant")]
 use push::PushCommand;
+
+/// How a run of the program ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exit {
+    Done,
+    /// Failed; the message says why.
+    Failed,
+    /// Done without some inputs; the summary names them.
+    Partly,
+    /// Interrupted by the user; the same command resumes.
+    Interrupted,
+}
+
+impl From<Exit> for ExitCode {
+    /// 2 is left to clap: wrong usage.
+    fn from(exit: Exit) -> Self {
+        match exit {
+            Exit::Done => 0,
+            Exit::Failed => 1,
+            Exit::Partly => 3,
+            Exit::Interrupted => 130,
+        }
+        .into()
+    }
+}
 
 /// Makes 3D Gaussian splatting scenes searchable by words.
 #[derive(Debug, Parser)]
@@ -121,12 +145,24 @@ pub fn run(cli: Cli) -> Exit {
         Command::View(args) => view::run(&args),
         Command::Keys(command) => keys::run(&command, json),
         Command::Store(command) => store::run(&command, progress.as_ref(), json),
-        Command::Models(command) => models::run(&command, json),
+        Command::Models(command) => models(&command, json),
         #[cfg(feature = "qdrant")]
         Command::Push(PushCommand::Qdrant(args)) => push::run(&args, progress.as_ref(), json),
         Command::Devices => devices::run(json),
     };
     exit_of(result, json)
+}
+
+fn models(command: &ModelsCommand, json: bool) -> Result<Exit> {
+    let context = commands::Context {
+        variable: &|name| std::env::var_os(name),
+        image: Some(&ModelDir::image_encoder),
+        ask: &|question| !json && commands::ask(question),
+        session: &session_options,
+    };
+    let report = commands::run(command, &context)?;
+    print(json, &report, &report)?;
+    Ok(Exit::Done)
 }
 
 /// Prints the error of a command, if any, and returns the exit code.

@@ -10,8 +10,8 @@ use slag_common::Hash32;
 use slag_common::byte_size::ByteSize;
 use slag_common::tuf::format_utc;
 
+use super::Exit;
 use super::common::{print, warn_of_expiry};
-use super::exit::Exit;
 use crate::encode::{JobStatus, job_status};
 use crate::progress::Progress;
 use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, signing_unix_secs};

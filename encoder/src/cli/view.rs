@@ -4,15 +4,15 @@ use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, anyhow};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use glam::Vec3;
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{View, poses};
 use slag_service::access::AccessSettings;
 use slag_service::listen::Listen;
 
+use super::Exit;
 use super::common::{ModelArgs, parse_frame, runtime, stopped, text_encoder_of};
-use super::exit::Exit;
 use crate::ingest::{self, FrameChoice};
 use crate::publish::serve::{self, Access};
 use crate::view::{OpenText, Shown, Splat, Viewer, router, up_of};
@@ -36,9 +36,9 @@ pub struct ViewArgs {
     /// Says how the splat's frame follows from that of the poses, as for `encode`.
     #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
     pub splat_frame: FrameChoice,
-    /// Axis of the world that points up [default: z in metric stores, else up in most photos, else z].
-    #[arg(long, value_enum, allow_hyphen_values = true)]
-    pub up: Option<UpAxis>,
+    /// Axis of the world that points up: x, y, z, -x, -y or -z [default: z in metric stores, else up in most photos, else z].
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, value_parser = parse_axis)]
+    pub up: Option<Vec3>,
     /// Models; they must be those that the store was encoded with.
     #[command(flatten)]
     pub models: ModelArgs,
@@ -53,36 +53,14 @@ pub struct ViewArgs {
     pub no_open: bool,
 }
 
-/// An axis of the world.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-pub enum UpAxis {
-    /// x.
-    X,
-    /// y.
-    Y,
-    /// z.
-    Z,
-    /// Against x.
-    #[value(name = "-x")]
-    AgainstX,
-    /// Against y.
-    #[value(name = "-y")]
-    AgainstY,
-    /// Against z.
-    #[value(name = "-z")]
-    AgainstZ,
-}
-
-impl UpAxis {
-    fn vector(self) -> Vec3 {
-        match self {
-            Self::X => Vec3::X,
-            Self::Y => Vec3::Y,
-            Self::Z => Vec3::Z,
-            Self::AgainstX => Vec3::NEG_X,
-            Self::AgainstY => Vec3::NEG_Y,
-            Self::AgainstZ => Vec3::NEG_Z,
-        }
+/// Parses an axis of the world.
+fn parse_axis(text: &str) -> Result<Vec3, String> {
+    let (sign, axis) = text.strip_prefix('-').map_or((1.0, text), |axis| (-1.0, axis));
+    match axis {
+        "x" => Ok(sign * Vec3::X),
+        "y" => Ok(sign * Vec3::Y),
+        "z" => Ok(sign * Vec3::Z),
+        _ => Err("expected x, y, z, -x, -y or -z".into()),
     }
 }
 
@@ -138,7 +116,7 @@ fn shown(args: &ViewArgs) -> Result<Shown> {
         }
     };
     let views: Vec<View> = set.map(|set| set.views).unwrap_or_default();
-    let up = args.up.map(UpAxis::vector).or_else(|| up_of(&views));
+    let up = args.up.or_else(|| up_of(&views));
     let open_text = open_text(args.models.clone());
     Ok(Shown { store: args.store.clone(), splat, views, up, open_text })
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 
 use crate::encode::{RasterWidth, ViewOrder, ViewsLimit};
 
@@ -13,7 +13,7 @@ use crate::encode::{RasterWidth, ViewOrder, ViewsLimit};
 pub struct ViewsArgs {
     /// Order in which views are taken [default: coverage with a limit or a budget, else names].
     #[arg(long, value_enum, value_name = "ORDER")]
-    view_order: Option<ViewOrderArg>,
+    view_order: Option<ViewOrder>,
     /// Seconds after which no further view is begun; the finished views are published.
     #[arg(long, value_name = "SECS", value_parser = parse_secs)]
     pub time_budget: Option<Duration>,
@@ -31,16 +31,6 @@ pub struct ViewsArgs {
     pub dropped: Vec<String>,
 }
 
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum ViewOrderArg {
-    /// Those first that together show most of the scene, by a small raster of all views.
-    Coverage,
-    /// By their names.
-    Names,
-    /// Evenly spread over the names.
-    Nth,
-}
-
 impl ViewsArgs {
     /// Returns whether photos are added to those of the poses file or left out.
     pub(super) fn changes_photos(&self) -> bool {
@@ -49,13 +39,11 @@ impl ViewsArgs {
 
     /// Returns the order of the flags.
     pub(super) fn order(&self, views_limit: ViewsLimit) -> ViewOrder {
-        match self.view_order {
-            Some(ViewOrderArg::Coverage) => ViewOrder::Coverage,
-            Some(ViewOrderArg::Names) => ViewOrder::Names,
-            Some(ViewOrderArg::Nth) => ViewOrder::Nth,
-            None if views_limit != ViewsLimit::All || self.time_budget.is_some() => ViewOrder::Coverage,
-            None => ViewOrder::Names,
-        }
+        let default = match views_limit != ViewsLimit::All || self.time_budget.is_some() {
+            true => ViewOrder::Coverage,
+            false => ViewOrder::Names,
+        };
+        self.view_order.unwrap_or(default)
     }
 }
 

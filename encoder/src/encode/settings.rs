@@ -4,6 +4,7 @@ use std::num::NonZeroU32;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 use slag_common::shard::Profile;
 
@@ -248,14 +249,14 @@ impl ViewsLimit {
 }
 
 /// The order in which views are taken; it matters where not all of them are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum ViewOrder {
     /// By their names.
     Names,
     /// Evenly spread over the names, which mostly is the order in which they were taken.
     Nth,
-    /// Those first that together show most of the scene; see [`super::coverage`].
+    /// Those first that together show most of the scene, by a small raster of all views.
     Coverage,
 }
 

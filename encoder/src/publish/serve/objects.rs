@@ -1,4 +1,4 @@
-//! `GET /v1/manifest` and `GET /v1/objects/{hash}`.
+//! The files of a store: manifest, objects with byte ranges, and metadata for clients of The Update Framework.
 
 use std::io;
 use std::marker::PhantomData;
@@ -15,6 +15,7 @@ use axum::response::IntoResponse;
 use schemars::SchemaGenerator;
 use slag_common::Hash32;
 use slag_common::manifest::Manifest;
+use slag_common::tuf::Envelope;
 use slag_service::problem::Problem;
 use slag_service::range::{EntityTag, Selection};
 use slag_service::replies::{As, Binary, Described, Reply};
@@ -24,6 +25,7 @@ use tokio_util::io::ReaderStream;
 
 use super::problem;
 use super::state::{AppState, Snapshot};
+use crate::store::metadata::{TIMESTAMP_FILE, read_published};
 
 /// Pieces in which objects are read and sent.
 const PIECE_BYTES: usize = 64 << 10;
@@ -153,4 +155,27 @@ impl AsyncRead for Download {
     ) -> Poll<io::Result<()>> {
         Pin::new(&mut self.file).poll_read(context, buffer)
     }
+}
+
+type Name = Result<UrlPath<String>, PathRejection>;
+
+pub(super) async fn metadata(State(service): AppState, name: Name) -> Result<As<Json<Envelope>>, Problem> {
+    let UrlPath(name) = name.map_err(|e| problem::bad_parameter(e.body_text()))?;
+    // All but the timestamp never change.
+    let lasting = if name == TIMESTAMP_FILE { "no-cache" } else { "public, max-age=31536000, immutable" };
+    let read = service.with_current(move |snapshot| {
+        let read = read_published(snapshot.reader.dir(), &name).map_err(Problem::internal)?;
+        read.ok_or_else(|| problem::not_published(&format!("metadata {name}")))
+    });
+    let about = [(header::CONTENT_TYPE, "application/json"), (header::CACHE_CONTROL, lasting)];
+    Ok(As::new((about, read.await?)))
+}
+
+pub(super) async fn target(State(service): AppState, name: Name) -> Result<As<Binary>, Problem> {
+    let UrlPath(name) = name.map_err(|e| problem::bad_parameter(e.body_text()))?;
+    let found = service.with_current(move |snapshot| {
+        let target = snapshot.targets.get(&name).cloned();
+        target.ok_or_else(|| problem::not_published(&format!("target {name}")))
+    });
+    Ok(As::new(([(header::CONTENT_TYPE, "application/octet-stream")], found.await?)))
 }

@@ -23,9 +23,9 @@ use tower::load_shed::LoadShedLayer;
 use tower_http::limit::RequestBodyLimitLayer;
 use tower_http::timeout::TimeoutLayer;
 
-use super::limits::Limits;
+use super::Limits;
 use super::state::{AppState, Service, metrics};
-use super::{cells, metadata, objects, problem};
+use super::{cells, objects, problem};
 use crate::store::StoreError;
 use crate::store::metadata::TIMESTAMP_FILE;
 
@@ -78,14 +78,14 @@ fn routes() -> Routes<Arc<Service>> {
         .get("/v1/manifest", "manifest of the current generation, with ETag", objects::manifest)
         .parameters([known.clone()])
         .errors(&STORE)
-        .get("/v1/metadata/{name}", "TUF metadata, such as timestamp.json", metadata::metadata)
+        .get("/v1/metadata/{name}", "TUF metadata, such as timestamp.json", objects::metadata)
         .parameters([name(
             "timestamp.json, or VERSION.root.json, VERSION.snapshot.json, VERSION.targets.json",
         )
         .limit("examples", json!([TIMESTAMP_FILE]))])
         .errors(&STORE)
         .errors(&[(404, "The store has no such metadata.")])
-        .get("/v1/targets/{name}", "the TUF target SHA256.manifest", metadata::target)
+        .get("/v1/targets/{name}", "the TUF target SHA256.manifest", objects::target)
         .parameters([name("SHA256.manifest, as the metadata states it")])
         .errors(&STORE)
         .errors(&[(404, "It is no target of the current or the previous generation.")])

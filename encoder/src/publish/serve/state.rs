@@ -15,7 +15,7 @@ use slag_service::metrics::{Exposition, ResponseCounts};
 use slag_service::problem::Problem;
 use tokio::sync::Semaphore;
 
-use super::limits::Limits;
+use super::Limits;
 use crate::store::{Stamp, StoreError, StoreReader};
 
 /// Pause before a manifest that did not open is read again. The fault may lie in another file or pass by

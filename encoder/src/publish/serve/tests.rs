@@ -18,8 +18,6 @@ use super::*;
 use crate::store::tests::{manifest, manifest_of_boxes};
 use crate::store::{Extras, Store, StoreReader};
 
-mod openapi;
-
 /// A store with generations 1 (shards 0 and 1) and 2 (shards 1 and 2), and the shards' bytes.
 struct Fixture {
     dir: tempfile::TempDir,
@@ -467,15 +465,12 @@ async fn nothing_published_is_an_error_at_the_start() {
 }
 
 #[tokio::test]
-async fn the_help_lists_every_resource_and_parameter() {
+async fn every_described_resource_and_parameter_is_answered() {
     let fixture = fixture();
     let router = fixture.router();
-    let help = get_with(&router, "/", &[]).await;
-    let help = String::from_utf8(help.body.to_vec()).expect("text");
     let (_, table) = router::described();
     assert!(table.len() >= 7, "{table:?}");
     for route in &table {
-        assert!(help.contains(&format!("\n{} {} ", route.method, route.path)), "{}: {help}", route.path);
         let path = match route.path {
             "/v1/metadata/{name}" => "/v1/metadata/timestamp.json".to_owned(),
             "/v1/targets/{name}" => format!("/v1/targets/{}.manifest", fixture.manifest_sha256()),
