@@ -3,7 +3,7 @@
 #
 #     jetson/bench.sh OUT [FLAGS OF slag-lab bench robot]
 #
-# The first run builds the programs and the other engines with cargo, which takes an hour on an Orin. Graphs of more than a
+# The first run builds the programs and the other engine with cargo, which takes an hour on an Orin. Graphs of more than a
 # million vectors take hours more: --engines compact,balanced,dense,qdrant-scan,qdrant-hnsw=1000000 leaves them out.
 set -eu
 cd "$(dirname "$0")/.."

@@ -119,7 +119,7 @@ def main() -> None:
         checked = Checked(robot.url)
         checked.look()
         end = time.monotonic() + 60 * args.minutes
-        load = subprocess.Popen([str(edge), "bench", "load", "--url", robot.url, "--seconds",
+        load = subprocess.Popen([str(lab), "bench", "load", "--url", robot.url, "--seconds",
                                  str(int(60 * args.minutes)), "--clients", str(args.clients), "--with", args.rest,
                                  "--pid", str(robot.process.pid)], stdout=subprocess.PIPE, text=True)
         filler, turn = args.disk / "filler", 0

@@ -235,19 +235,8 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
     assert!((iou - reference["miou"].as_f64().expect("a figure")).abs() <= 0.02);
 
     // The program's own evaluation shares no code with the one above.
-    let (scene, truth) = (house.join("point_cloud.ply"), house);
-    let report = run_json(&mut lab(&[
-        "eval",
-        "labelled",
-        "--store",
-        text(store),
-        "--scene",
-        text(&scene),
-        "--truth",
-        text(truth),
-        "--models",
-        text(models),
-    ]));
+    let flags = ["--store", text(store), "--truth", text(house), "--models", text(models)];
+    let report = run_json(&mut lab(&[&["eval", "labelled"], &flags[..]].concat()));
     let figure = |value: &Value| value.as_f64().expect("a figure");
     assert!((figure(&report["mean_area_under_roc"]) - auc).abs() < 1e-4);
     assert!((figure(&report["multi_class"][0]["miou"]) - iou).abs() < 1e-4);

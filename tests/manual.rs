@@ -117,7 +117,7 @@ fn bash_completes_commands_flags_and_values() {
     let manual = manual();
     for (program, keys, completed) in [
         ("slag-edge", "fetch --max-by", "fetch --max-bytes"),
-        ("slag-edge", "bench pau", "bench pause"),
+        ("slag-edge", "models pul", "models pull"),
         ("slag-encoder", "encode --occupanc", "encode --occupancy"),
         ("slag-mcp", "--rob", "--robot"),
         ("slag-ros", "--rmw rmw_cyc", "--rmw rmw_cyclonedds_cpp"),

@@ -1,7 +1,6 @@
 //! The command line: commands, flags and logging.
 
 mod args;
-mod bench;
 mod changes;
 mod config;
 mod failure;
@@ -24,7 +23,6 @@ use std::path::PathBuf;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
-use bench::BenchCommand;
 use changes::ChangesArgs;
 use config::ConfigError;
 pub use failure::Exit;
@@ -73,9 +71,6 @@ enum Command {
     Trust(TrustCommand),
     /// List, pull, verify and describe public text models.
     Models(ModelsArgs),
-    /// Measure a service and this machine; prints JSON.
-    #[command(subcommand)]
-    Bench(BenchCommand),
 }
 
 /// Parses this process's command line, environment and configuration.
@@ -115,7 +110,6 @@ impl Cli {
             Command::Status(args) => (args.json, status::run(args)),
             Command::Trust(command) => (command.is_json(), trust::run(command)),
             Command::Models(args) => (args.json, models::run(args)),
-            Command::Bench(command) => (true, bench::run(command)),
         };
         match result {
             Ok(()) => Exit::Done,
@@ -168,8 +162,6 @@ mod tests {
             (fetch.at_geo, fetch.download.radius, fetch.download.profile),
             (Some((-46.8, -92.0, None)), 50.0, Profile::Compact)
         );
-        assert!(parse("slag-edge bench pause --gaussians 5000").is_ok());
-        assert!(parse("slag-edge bench load --url http://a:1 --clients 8 --seconds 2").is_ok());
         let Command::Serve(serve) = parse("slag-edge serve").expect("parses").command else {
             panic!("serve")
         };
@@ -211,10 +203,9 @@ mod tests {
         assert!(parse("slag-edge status --json --cache d").is_ok());
         assert!(parse("slag-edge models pull clip --accept-licence apple-amlr --json").is_ok());
         assert!(
-            parse("slag-edge bench text --encoder clip --provider tensorrt,cuda,cpu --model-threads 2")
+            parse("slag-edge query chair --encoder clip --provider tensorrt,cuda,cpu --model-threads 2")
                 .is_ok()
         );
-        assert!(parse("slag-edge bench query --cache d --limits 10,20 --runs 3 --threads 1").is_ok());
     }
 
     #[test]
@@ -238,13 +229,10 @@ mod tests {
             "slag-edge trust add http://a --trust-first --root f",
             "slag-edge trust add --trust-first",
             "slag-edge fetch --margin",
-            "slag-edge bench",
-            "slag-edge bench pause --gaussians 1",
             "slag-edge fetch --profile tiny",
             "slag-edge serve --listen nowhere",
             "slag-edge status --quiet --verbose",
             "slag-edge serve --threads 0",
-            "slag-edge bench query --runs 0",
             "slag-edge query chair --provider gpu",
             "slag-edge models",
             "slag-edge models pull",

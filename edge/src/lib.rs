@@ -1,6 +1,5 @@
 //! The robot's side of SLAG: keeps the shards around it and answers text queries offline.
 
-pub mod bench;
 pub mod cli;
 mod clock;
 pub mod fetch;

@@ -1,5 +1,4 @@
-//! The robot's program, its fetches and its benchmark.
+//! The robot's program and its fetches.
 
-mod bench;
 mod binary;
 mod fetch;

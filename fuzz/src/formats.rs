@@ -14,7 +14,6 @@ use slag_encoder::ingest::read_geo_reference;
 use slag_encoder::lift::{CellField, ContributionFile, RegionTable};
 use slag_encoder::masks::rle::Rle;
 use slag_encoder::segment::GivenMasks;
-use slag_lab::bench::scene::BenchScene;
 use slag_models::description::Description;
 
 /// Separates the files of an input that consists of several.
@@ -296,10 +295,6 @@ pub fn region_table(data: &[u8]) -> bool {
 
 pub fn cell_field(data: &[u8]) -> bool {
     CellField::from_bytes(&AlignedBytes::copy_of(&with_checksums(data)), 4).is_ok()
-}
-
-pub fn npz(data: &[u8]) -> bool {
-    in_file("x.npz", data, |path| BenchScene::read(path).is_ok())
 }
 
 pub fn geo(data: &[u8]) -> bool {

@@ -28,7 +28,7 @@ macro_rules! targets {
 
 targets! {
     formats: container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
-    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, npz, geo, query, position;
+    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, geo, query, position;
     services: http_request, tuf;
 }
 

@@ -71,7 +71,6 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "contributions" => vec![contributions()],
         "region_table" => vec![region_table()],
         "cell_field" => vec![cell_field()],
-        "npz" => vec![npz()],
         "geo" => text(r#"{"origin":{"lat":46.8,"lon":-91.9,"alt":150.0}}"#),
         "query" => text(
             "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&kind=gaussians&voxel=0.2&min_count=3",
@@ -343,49 +342,6 @@ fn cell_field() -> Vec<u8> {
         f32s(&[0.9, 0.8]),
     ];
     sections(b"SLAGFELD", 1, &columns)
-}
-
-/// An uncompressed archive with one Gaussian and one camera.
-fn npz() -> Vec<u8> {
-    let array = |descr: &str, shape: &str, data: Vec<u8>| {
-        let head = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}");
-        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-        let len = (10 + head.len() + 1).next_multiple_of(64) - 10;
-        bytes.extend((len as u16).to_le_bytes());
-        writeln!(bytes, "{head:<width$}", width = len - 1).expect("writes to memory");
-        bytes.extend(data);
-        bytes
-    };
-    let floats = |shape: &str, values: &[f32]| array("<f4", shape, f32s(values));
-    let mut pose = [0.0; 16];
-    [0, 5, 10, 15].iter().for_each(|i| pose[*i] = 1.0);
-    let files = [
-        ("means", floats("(1, 3)", &[0.0, 0.0, 2.0])),
-        ("quats", floats("(1, 4)", &[1.0, 0.0, 0.0, 0.0])),
-        ("scales", floats("(1, 3)", &[0.1; 3])),
-        ("opacities", floats("(1,)", &[0.5])),
-        ("viewmats", floats("(1, 4, 4)", &pose)),
-        ("Ks", floats("(1, 3, 3)", &[50.0, 0.0, 16.0, 0.0, 50.0, 12.0, 0.0, 0.0, 1.0])),
-        ("width", array("<i8", "()", 32u64.to_le_bytes().to_vec())),
-        ("height", array("<i8", "()", 24u64.to_le_bytes().to_vec())),
-    ];
-    let (mut out, mut directory) = (Vec::new(), Vec::new());
-    for (name, data) in &files {
-        let name = format!("{name}.npy");
-        let offset = out.len() as u32;
-        let common = [
-            u16s(&[20, 0, 0, 0, 0]),
-            u32s(&[crc32(data), data.len() as u32, data.len() as u32]),
-            u16s(&[name.len() as u16, 0]),
-        ]
-        .concat();
-        out.extend([b"PK\x03\x04".as_slice(), &common, name.as_bytes(), data].concat());
-        let tail = [u16s(&[0, 0, 0]), u32s(&[0, offset])].concat();
-        directory.extend([b"PK\x01\x02".as_slice(), &u16s(&[20]), &common, &tail, name.as_bytes()].concat());
-    }
-    let n = files.len() as u16;
-    let end = [u16s(&[0, 0, n, n]), u32s(&[directory.len() as u32, out.len() as u32]), u16s(&[0])].concat();
-    [out.as_slice(), &directory, b"PK\x05\x06", &end].concat()
 }
 
 fn u16s(values: &[u16]) -> Vec<u8> {

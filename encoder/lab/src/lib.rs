@@ -1,11 +1,19 @@
 //! The laboratory: generated scenes with known contents, evaluation against labels, benchmarks, and the demo.
 //!
-//! It depends on the encoder, never the other way round.
+//! It depends on the encoder and the robot, never the other way round.
 
 #[cfg(feature = "measure")]
-pub mod bench;
+mod bench;
 pub mod cli;
-pub mod demo;
+mod demo;
 #[cfg(feature = "measure")]
-pub mod eval;
+mod eval;
 pub mod generate;
+#[cfg(feature = "measure")]
+mod harness;
+#[cfg(feature = "measure")]
+mod programs;
+#[cfg(feature = "measure")]
+mod scenes;
+#[cfg(feature = "measure")]
+mod table;

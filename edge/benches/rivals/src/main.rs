@@ -1,12 +1,10 @@
-//! Times an engine on vectors and queries that `slag-edge bench query --dump DIR` wrote. `slag-lab bench robot` runs it
+//! Times an engine on vectors and queries that `slag-lab bench query --dump DIR` wrote. `slag-lab bench robot` runs it
 //! once an engine, so that the memory of one engine is not counted for the next, and judges the answers.
 
 mod dense;
 mod dump;
-mod graph;
 mod measure;
 mod qdrant;
-mod usearch_index;
 
 use std::path::PathBuf;
 
@@ -58,10 +56,6 @@ enum Engine {
     QdrantHnswInt8,
     /// qdrant-edge with HNSW and product quantisation to a sixteenth, not scored again.
     QdrantHnswPq,
-    /// usearch's HNSW, f32.
-    UsearchHnsw,
-    /// usearch's HNSW, int8.
-    UsearchHnswInt8,
 }
 
 impl Engine {
@@ -73,7 +67,6 @@ impl Engine {
     fn library(self) -> String {
         match self {
             Self::Dense => "plain f32 loop".into(),
-            Self::UsearchHnsw | Self::UsearchHnswInt8 => format!("usearch {}", usearch::version()),
             _ => "qdrant-edge 0.7.2".into(),
         }
     }

@@ -9,7 +9,6 @@ use serde::Serialize;
 use crate::dense::Dense;
 use crate::dump::{Dump, Meta};
 use crate::qdrant::Qdrant;
-use crate::usearch_index::Usearch;
 use crate::{Args, Engine, Index};
 
 /// Figures of an engine.
@@ -51,9 +50,6 @@ pub fn run(args: &Args, dump: Dump) -> Result<Report> {
         let started = Instant::now();
         let index: Box<dyn Index> = match args.engine {
             Engine::Dense => Box::new(Dense::new(&dump)),
-            Engine::UsearchHnsw | Engine::UsearchHnswInt8 => {
-                Box::new(Usearch::build(&dump, &work, args.engine)?)
-            }
             _ => Box::new(Qdrant::build(&dump, &work, args.engine)?),
         };
         let build_secs = started.elapsed().as_secs_f64();

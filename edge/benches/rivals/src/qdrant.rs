@@ -13,6 +13,9 @@ use qdrant_edge::{
 use crate::dump::Dump;
 use crate::{Engine, Index};
 
+/// Edges of a graph's node, and candidates while it is built.
+const EDGES: usize = 16;
+const CANDIDATES: usize = 100;
 /// Points in one insert: 16 MB of vectors at 512 components.
 const INSERT: usize = 8192;
 
@@ -48,8 +51,8 @@ fn has_graph(engine: Engine) -> bool {
 fn config(dim: usize, engine: Engine) -> Result<EdgeConfig> {
     let graph = HnswIndexConfig {
         // Without edges there is no graph: every search scans.
-        m: if has_graph(engine) { crate::graph::EDGES } else { 0 },
-        ef_construct: crate::graph::CANDIDATES,
+        m: if has_graph(engine) { EDGES } else { 0 },
+        ef_construct: CANDIDATES,
         full_scan_threshold: if has_graph(engine) { 1 } else { usize::MAX / 1024 },
         max_indexing_threads: std::thread::available_parallelism().map_or(0, Into::into),
         on_disk: Some(false),

@@ -26,7 +26,7 @@ fn values(matches: &ArgMatches, id: &str) -> Vec<String> {
 }
 
 const SERVE: &str = "cache = 'all'\nprofile = 'exact'\n[serve]\nlisten = '127.0.0.1:1'\nradius = 7.5\nhost = ['a', 'b']\n\
-    trust-first = true\nrefresh-secs = 9\n[fetch]\nat = '1,2,3'\n[bench.load]\nurl = 'http://a:1'\n";
+    trust-first = true\nrefresh-secs = 9\n[fetch]\nat = '1,2,3'\n";
 
 #[test]
 fn the_line_comes_before_the_environment_and_that_before_the_file() {
@@ -51,8 +51,6 @@ fn the_line_comes_before_the_environment_and_that_before_the_file() {
         // A value of the file does not stand beside another of the line that excludes it.
         ("slag-edge fetch", &environment, "at", &["1,2,3"]),
         ("slag-edge fetch --at-geo 4,5", &environment, "at", &[]),
-        // A file may have what the line must have otherwise.
-        ("slag-edge bench load", &environment, "url", &["http://a:1"]),
     ] {
         let matches = parsed(line, environment, SERVE).unwrap_or_else(|e| panic!("{line}: {e}"));
         assert_eq!(values(&matches, id), expected, "{line}: {id}");
@@ -79,7 +77,7 @@ fn errors_name_the_file_and_the_key() {
         // First trust is a step that somebody takes.
         ("[trust.add]\ntrust-first = true", "trust.add.trust-first", "no flag of this name"),
         // Commands that are not asked for are checked as well.
-        ("[bench.pause]\ngaussians = 1", "bench.pause.gaussians", "1 is not in 1000..=16000000"),
+        ("[trust.show]\njson = 7", "trust.show.json", "expected true or false"),
     ] {
         let error = parsed("slag-edge status", &[], file).expect_err(file).to_string();
         assert!(error.contains(&format!("edge.toml: {key}: ")) && error.contains(what), "{file}: {error}");

@@ -2,104 +2,186 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Barrier, OnceLock};
 use std::time::Instant;
 
+use anyhow::{Context, Result};
+use clap::Args;
 use serde::Serialize;
-
-use super::machine::Machine;
-use super::scene::BenchScene;
-use super::timing::{Spread, timed_ms};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::progress::Progress;
-use slag_encoder::raster::{LoadedScene, RasterError, Rasterizer, StageTime, ViewWeights, WeightKind};
+use slag_encoder::raster::devices::{DeviceChoice, Devices};
+use slag_encoder::raster::gpu::GpuOptions;
+use slag_encoder::raster::{
+    CpuWith, LoadedScene, RasterError, Rasterizer, StageTime, ViewWeights, WeightKind,
+};
+use slag_math::simd::InstructionSet;
+
+use super::scene::{BenchScene, cell_regions, grid_regions};
+use crate::harness::{Machine, Times, timed_ms};
+use crate::table::Table;
+
+/// `bench raster`.
+#[derive(Debug, Args)]
+pub(crate) struct RasterArgs {
+    /// A splat of yours, with --views [default: generated scenes].
+    #[arg(long, value_name = "FILE", requires = "views")]
+    scene: Option<PathBuf>,
+    /// Its poses: the folder of a COLMAP model or transforms.json.
+    #[arg(long, value_name = "PATH", requires = "scene")]
+    views: Option<PathBuf>,
+    /// Gaussians of the generated scenes [default: 100000,1000000,2000000,8000000; none with --scene].
+    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
+    gaussians: Vec<u32>,
+    /// Regions of a view; a scene of yours is also measured with a grid of 8 x 6.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "8,64,512,4096",
+        value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    regions: Vec<u32>,
+    /// Devices to compare: cpu, cpu-each (once per instruction set), gpu, or an adapter's number.
+    #[arg(long, value_name = "DEVICE", value_delimiter = ',', default_value = "cpu")]
+    device: Vec<BenchDevice>,
+    /// Width of views, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 648, value_parser = clap::value_parser!(u32).range(1..=16_384))]
+    width: u32,
+    /// Height of generated views, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 484, value_parser = clap::value_parser!(u32).range(1..=16_384))]
+    height: u32,
+    /// Timed views per case.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
+    repeats: u32,
+    /// Concurrent views where throughput is measured.
+    #[arg(long = "in-flight", value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=256))]
+    in_flight: u32,
+    /// Threads [default: all cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+}
+
+/// A device to measure.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum BenchDevice {
+    Chosen(DeviceChoice),
+    /// The processor with each of its instruction sets.
+    CpuEach,
+}
+
+impl FromStr for BenchDevice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "cpu-each" { Ok(Self::CpuEach) } else { text.parse().map(Self::Chosen) }
+    }
+}
 
 /// A backend and its name in the report.
-pub struct Device {
-    /// Name.
-    pub name: String,
-    /// Backend.
-    pub rasterizer: Box<dyn Rasterizer>,
+struct Device {
+    name: String,
+    rasterizer: Box<dyn Rasterizer>,
+}
+
+/// Opens the devices, measures all of them on each scene, and reports.
+pub(crate) fn run(args: &RasterArgs, progress: &dyn Progress) -> Result<RasterReport> {
+    let threads = args.threads.map_or(0, |n| n as usize);
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("cannot start threads")?;
+    let mut devices = Vec::new();
+    for device in &args.device {
+        match device {
+            BenchDevice::Chosen(choice) => {
+                let options =
+                    GpuOptions { views_in_flight: args.in_flight as usize, ..GpuOptions::default() };
+                let opened = Devices::open(choice, options)?;
+                devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
+            }
+            BenchDevice::CpuEach => devices.extend(
+                InstructionSet::available()
+                    .iter()
+                    .map(|set| Device { name: set.name().into(), rasterizer: Box::new(CpuWith(*set)) }),
+            ),
+        }
+    }
+    let sizes = match (&args.scene, args.gaussians.is_empty()) {
+        (None, true) => vec![100_000, 1_000_000, 2_000_000, 8_000_000],
+        _ => args.gaussians.clone(),
+    };
+    let n_cases = sizes.len() * args.regions.len() + args.scene.iter().count() * (args.regions.len() + 1);
+    progress.begin("bench", "case", n_cases as u64, 0);
+    let bench = RasterBench { n_repeats: args.repeats as usize, n_in_flight: args.in_flight as usize };
+    let mut report = RasterReport { machine: Machine::here(), cases: Vec::new() };
+    let mut measure = |scene: &BenchScene, with_grid: bool| -> Result<()> {
+        let camera = scene.views[0].intrinsics;
+        let (width_px, height_px) = (camera.width_px, camera.height_px);
+        let grid = with_grid.then(|| grid_regions(width_px, height_px, 8, 6));
+        let cells = args.regions.iter().map(|&n| cell_regions(width_px, height_px, n));
+        let maps: Vec<_> = grid.into_iter().chain(cells).collect();
+        report.cases.extend(bench.run(scene, &maps, &devices, progress)?);
+        Ok(())
+    };
+    if let (Some(scene), Some(views)) = (&args.scene, &args.views) {
+        measure(&BenchScene::read(scene, views, args.width)?, true)?;
+    }
+    for n in sizes {
+        measure(&BenchScene::generated(n as usize, args.width, args.height), false)?;
+    }
+    progress.end();
+    Ok(report)
 }
 
 /// Settings of the benchmark.
 #[derive(Clone, Copy, Debug)]
-pub struct RasterBench {
+struct RasterBench {
     /// Timed views per case and device; at least 1.
-    pub n_repeats: usize,
+    n_repeats: usize,
     /// Concurrent views where throughput is measured; at least 1.
-    pub n_in_flight: usize,
+    n_in_flight: usize,
 }
 
-/// Figures of all cases.
 #[derive(Clone, Debug, Serialize)]
-pub struct RasterReport {
-    /// The machine.
-    pub machine: Machine,
+pub(crate) struct RasterReport {
+    machine: Machine,
     /// One per scene, region map and device.
-    pub cases: Vec<RasterCase>,
+    cases: Vec<RasterCase>,
 }
 
 /// Figures of one scene with one region map on one device; counts are means over the views.
 #[derive(Clone, Debug, Serialize)]
-pub struct RasterCase {
-    /// Scene.
-    pub scene: String,
-    /// Device.
-    pub device: String,
-    /// Gaussians of the scene.
-    pub n_gaussians: usize,
-    /// Image width, pixels.
-    pub width_px: u32,
-    /// Image height, pixels.
-    pub height_px: u32,
-    /// Regions of the view.
-    pub n_regions: u32,
+struct RasterCase {
+    scene: String,
+    device: String,
+    n_gaussians: usize,
+    width_px: u32,
+    height_px: u32,
+    n_regions: u32,
     /// Gaussians that reach a pixel of the image.
-    pub n_visible: f64,
+    n_visible: f64,
     /// (Gaussian, tile) pairs.
-    pub n_pairs: f64,
-    /// Contributions returned.
-    pub n_entries: f64,
-    /// Time to load the scene, milliseconds.
-    pub load_ms: f64,
+    n_pairs: f64,
+    n_entries: f64,
+    load_ms: f64,
     /// Time of a view, one at a time.
-    pub weights: Spread,
-    /// Gaussians of the scene over the median time.
-    pub gaussians_per_sec: f64,
-    /// Pairs over the median time.
-    pub pairs_per_sec: f64,
-    /// Pixels over the median time.
-    pub pixels_per_sec: f64,
+    weights: Times,
     /// Share of each stage over all repeats; empty where the device does not report stages.
-    pub stages: Vec<StageShare>,
-    /// Concurrent views.
-    pub n_in_flight: usize,
-    /// Views per second with that many concurrent views.
-    pub views_per_sec: f64,
+    stages: Vec<StageShare>,
+    n_in_flight: usize,
+    views_per_sec: f64,
     /// Sum of absolute differences from the first device's contributions, relative to the sum of these.
-    pub relative_l1: f64,
+    relative_l1: f64,
 }
 
-/// Time of a stage.
 #[derive(Clone, Debug, Serialize)]
-pub struct StageShare {
-    /// Stage.
-    pub stage: &'static str,
+struct StageShare {
+    stage: &'static str,
     /// Share of the time of all stages, 0..=1.
-    pub share: f64,
-    /// Mean time, milliseconds.
-    pub mean_ms: f64,
+    share: f64,
+    mean_ms: f64,
 }
 
 impl RasterBench {
     /// Measures all devices on a scene, for each region map. Devices take turns view by view, so that other load on the
     /// machine affects all of them alike.
-    ///
-    /// # Errors
-    /// [`RasterError`] of the first device that fails.
-    pub fn run(
+    fn run(
         &self,
         scene: &BenchScene,
         region_maps: &[RegionMap],
@@ -146,8 +228,7 @@ impl RasterBench {
             let mean = |count: fn(&ViewWeights) -> usize| {
                 results[i].iter().map(count).sum::<usize>() as f64 / scene.views.len() as f64
             };
-            let weights = Spread::of(timings);
-            let per_sec = |count: f64| count / (weights.median_ms * 1e-3);
+            let weights = Times::of(timings);
             let (width_px, height_px) = (regions.width_px, regions.height_px);
             cases.push(RasterCase {
                 scene: scene.name.clone(),
@@ -160,9 +241,6 @@ impl RasterBench {
                 n_pairs: mean(|v| v.counters.pairs),
                 n_entries: mean(|v| v.entries.len()),
                 load_ms: *load_ms,
-                gaussians_per_sec: per_sec(scene.gaussians.len() as f64),
-                pairs_per_sec: per_sec(mean(|v| v.counters.pairs)),
-                pixels_per_sec: per_sec(f64::from(width_px) * f64::from(height_px)),
                 weights,
                 stages: shares(&stages[i], self.n_repeats),
                 n_in_flight: self.n_in_flight,
@@ -246,43 +324,27 @@ fn relative_l1(found: &[ViewWeights], expected: &[ViewWeights]) -> f64 {
 
 impl fmt::Display for RasterReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Machine { cpu, n_threads, platform, .. } = &self.machine;
-        writeln!(f, "{cpu}, {n_threads} threads, {platform}")?;
-        writeln!(
-            f,
-            "{:<22} {:<8} {:>8} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}  stages",
-            "scene",
-            "device",
-            "regions",
-            "visible",
-            "pairs",
-            "contributions",
-            "median ms",
-            "p90 ms",
-            "views/s",
-            "rel. L1"
-        )?;
+        writeln!(f, "{}\n", self.machine)?;
+        let columns =
+            ["scene", "device", "regions", "visible", "pairs", "contributions", "median ms", "p90 ms"];
+        let mut table = Table::new(columns.into_iter().chain(["views/s", "rel. L1", "stages"]));
         for case in &self.cases {
-            write!(
-                f,
-                "{:<22} {:<8} {:>8} {:>9.0} {:>9.0} {:>9.0} {:>9.2} {:>9.2} {:>8.1} {:>8.1e} ",
-                case.scene,
-                case.device,
-                case.n_regions,
-                case.n_visible,
-                case.n_pairs,
-                case.n_entries,
-                case.weights.median_ms,
-                case.weights.p90_ms,
-                case.views_per_sec,
-                case.relative_l1
-            )?;
-            for stage in &case.stages {
-                write!(f, " {} {:.0} %", stage.stage, stage.share * 100.0)?;
-            }
-            writeln!(f)?;
+            let stages = case.stages.iter().map(|s| format!("{} {:.0} %", s.stage, s.share * 100.0));
+            table.row([
+                case.scene.clone(),
+                case.device.clone(),
+                case.n_regions.to_string(),
+                format!("{:.0}", case.n_visible),
+                format!("{:.0}", case.n_pairs),
+                format!("{:.0}", case.n_entries),
+                format!("{:.2}", case.weights.median_ms),
+                format!("{:.2}", case.weights.p90_ms),
+                format!("{:.1}", case.views_per_sec),
+                format!("{:.1e}", case.relative_l1),
+                stages.collect::<Vec<_>>().join(", "),
+            ]);
         }
-        Ok(())
+        write!(f, "{table}")
     }
 }
 

@@ -1,12 +1,13 @@
-//! Scenes for benchmarks: generated ones of any size, and recorded ones from a NumPy archive.
+//! Scenes for benchmarks of the rasteriser: generated ones of any size, and a user's own.
 
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
-use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3};
-use slag_common::{Distortion, Gaussians, Intrinsics};
+use anyhow::{Result, bail};
+use glam::{DQuat, DVec2, DVec3};
+use slag_common::splat::{self, ReadOptions};
+use slag_common::{Gaussians, poses};
 
-use super::arrays::{Arrays, FixtureError};
 use crate::generate::compose::{looking, pinhole};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
@@ -14,25 +15,22 @@ use slag_math::random::Random;
 
 /// Horizontal field of view of generated views.
 const FIELD_OF_VIEW_RAD: f64 = 65.0 * PI / 180.0;
-/// Viewpoints of a generated scene.
+/// Viewpoints of a scene.
 const N_VIEWS: usize = 4;
 /// Objects on the ground of a generated scene.
 const N_OBJECTS: usize = 60;
 /// Radius of the ground. The backdrop stands on its edge.
 const GROUND_RADIUS_M: f64 = 20.0;
-/// Height of the backdrop.
 const BACKDROP_HEIGHT_M: f64 = 8.0;
 /// Median standard deviation of a surface Gaussian, in spacings: neighbours overlap.
 const SPREAD: f64 = 0.5;
 
 /// A scene and views of it.
-pub struct BenchScene {
-    /// Its name in reports.
-    pub name: String,
-    /// The Gaussians.
-    pub gaussians: Gaussians,
+pub(super) struct BenchScene {
+    pub(super) name: String,
+    pub(super) gaussians: Gaussians,
     /// Views of one image size; at least one.
-    pub views: Vec<RasterView>,
+    pub(super) views: Vec<RasterView>,
 }
 
 impl BenchScene {
@@ -41,7 +39,7 @@ impl BenchScene {
     /// Flat Gaussians cover ground, objects and a backdrop; they shrink as their number grows, are denser towards the middle,
     /// log-normal in size, and of high or low opacity. A few large faint Gaussians float in the air. The cameras stand among
     /// the objects. Equal arguments give equal scenes on machines with the same mathematical library.
-    pub fn generated(n_gaussians: usize, width_px: u32, height_px: u32) -> Self {
+    pub(super) fn generated(n_gaussians: usize, width_px: u32, height_px: u32) -> Self {
         let mut maker = Maker { random: Random::new(1), gaussians: Gaussians::default() };
         let share = |percent: usize| n_gaussians * percent / 100;
         let (n_ground, n_backdrop, n_floating) = (share(30), share(20), share(5));
@@ -61,58 +59,26 @@ impl BenchScene {
         Self { name: format!("generated-{n_gaussians}"), gaussians: maker.gaussians, views }
     }
 
-    /// Reads the arrays `means quats scales opacities viewmats Ks width height` of a NumPy archive, in gsplat's conventions:
-    /// quaternions `wxyz` of any length, decoded scales and opacities.
-    ///
-    /// # Errors
-    /// [`FixtureError`].
-    pub fn read(path: &Path) -> Result<Self, FixtureError> {
-        let mut arrays = Arrays::open(path)?;
-        let means = arrays.rows::<3>("means", None)?;
-        let n = Some(means.len());
-        let rotations = arrays.rows::<4>("quats", n)?;
-        let scales = arrays.rows::<3>("scales", n)?;
-        let opacities = arrays.rows::<1>("opacities", n)?;
-        let poses = arrays.rows::<16>("viewmats", None)?;
-        let cameras = arrays.rows::<9>("Ks", Some(poses.len()))?;
-        let [width_px, height_px] = [arrays.size_px("width")?, arrays.size_px("height")?];
-        let normalized = |q: [f64; 4]| {
-            let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
-            q.map(|c| (c / norm) as f32)
+    /// Reads a splat and its poses, scaled to `width_px`.
+    pub(super) fn read(splat: &Path, views: &Path, width_px: u32) -> Result<Self> {
+        let gaussians = splat::read(splat, &ReadOptions { with_sh_rest: false })?;
+        let view = |view: &slag_common::View| RasterView {
+            camera_from_world: view.camera_from_world,
+            intrinsics: view.intrinsics.without_distortion().scaled_to_width(width_px),
         };
-        let view = |(m, k): (&[f64; 16], &[f64; 9])| RasterView {
-            camera_from_world: DAffine3 {
-                matrix3: DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]),
-                translation: DVec3::new(m[3], m[7], m[11]),
-            },
-            intrinsics: Intrinsics {
-                width_px,
-                height_px,
-                focal_x_px: k[0],
-                focal_y_px: k[4],
-                centre_x_px: k[2],
-                centre_y_px: k[5],
-                distortion: Distortion::None,
-            },
-        };
-        Ok(Self {
-            name: path.file_stem().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
-            gaussians: Gaussians {
-                sh_dc: vec![[0.0; 3]; means.len()],
-                means_in_world: means.into_iter().map(DVec3::from_array).collect(),
-                rotations_wxyz: rotations.into_iter().map(normalized).collect(),
-                scales: scales.into_iter().map(|s| s.map(|v| v as f32)).collect(),
-                opacities: opacities.into_iter().map(|[o]| o as f32).collect(),
-                sh_rest: Vec::new(),
-                sh_degree: 0,
-            },
-            views: poses.iter().zip(&cameras).map(view).collect(),
-        })
+        let read: Vec<RasterView> = poses::read(views, None)?.views.iter().map(view).collect();
+        // A benchmark has regions of one size.
+        let size = |view: &RasterView| (view.intrinsics.width_px, view.intrinsics.height_px);
+        let Some(first) = read.first().map(size) else { bail!("{}: no views", views.display()) };
+        let step = read.len().div_ceil(N_VIEWS);
+        let views = read.into_iter().filter(|view| size(view) == first).step_by(step).collect();
+        let name = splat.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self { name, gaussians, views })
     }
 }
 
 /// Returns a map of `columns` x `rows` equal rectangles.
-pub fn grid_regions(width_px: u32, height_px: u32, columns: u32, rows: u32) -> RegionMap {
+pub(super) fn grid_regions(width_px: u32, height_px: u32, columns: u32, rows: u32) -> RegionMap {
     let region = |x: u32, y: u32| {
         y * rows / height_px * columns + (u64::from(x) * u64::from(columns) / u64::from(width_px)) as u32
     };
@@ -122,7 +88,7 @@ pub fn grid_regions(width_px: u32, height_px: u32, columns: u32, rows: u32) -> R
 
 /// Returns a map of regions with irregular borders: each pixel belongs to the nearest of `n_regions` sites, one at a random
 /// place in each field of a grid.
-pub fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap {
+pub(super) fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap {
     let (width, height) = (f64::from(width_px), f64::from(height_px));
     let columns = ((f64::from(n_regions) * width / height).sqrt().round() as u32).clamp(1, n_regions.max(1));
     let rows = n_regions.div_ceil(columns).max(1);
@@ -237,12 +203,6 @@ impl Maker {
 
 #[cfg(test)]
 mod tests {
-    use std::io::Cursor;
-
-    use npyz::WriterBuilder;
-    use zip::ZipWriter;
-    use zip::write::SimpleFileOptions;
-
     use super::*;
     use slag_encoder::raster::{CpuRasterizer, Rasterizer, WeightKind};
 
@@ -275,80 +235,5 @@ mod tests {
             (grid.region_of_pixel[0], grid.region_of_pixel[16], grid.region_of_pixel[152]),
             (0, 7, 47)
         );
-    }
-
-    /// Writes the arrays of a scene with 2 Gaussians and 1 view, except one array.
-    fn archive(without: &str) -> Vec<u8> {
-        let mut bytes = Cursor::new(Vec::new());
-        let mut npz = ZipWriter::new(&mut bytes);
-        let pose = [1.0, 0.0, 0.0, 5.0, 0.0, 0.0, -1.0, 6.0, 0.0, 1.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0];
-        let arrays: [(&str, &[u64], &[f32]); 6] = [
-            ("means", &[2, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
-            ("quats", &[2, 4], &[2.0, 0.0, 0.0, 0.0, 0.0, 3.0, 0.0, 4.0]),
-            ("scales", &[2, 3], &[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
-            ("opacities", &[2], &[0.25, 0.75]),
-            ("viewmats", &[1, 4, 4], &pose),
-            ("Ks", &[1, 3, 3], &[90.0, 0.0, 31.5, 0.0, 91.0, 23.5, 0.0, 0.0, 1.0]),
-        ];
-        for (name, shape, values) in arrays.into_iter().filter(|(name, _, _)| *name != without) {
-            npz.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
-            let mut file =
-                npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut npz).begin_nd().unwrap();
-            file.extend(values.iter().copied()).unwrap();
-            file.finish().unwrap();
-        }
-        for (name, value) in [("width", 64), ("height", 48)] {
-            npz.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
-            let mut file =
-                npyz::WriteOptions::new().default_dtype().shape(&[]).writer(&mut npz).begin_nd().unwrap();
-            file.push(&i64::from(value)).unwrap();
-            file.finish().unwrap();
-        }
-        npz.finish().unwrap();
-        bytes.into_inner()
-    }
-
-    #[test]
-    fn an_archive_is_read_as_it_was_written() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("two.npz");
-        fs_err::write(&path, archive("")).unwrap();
-        let scene = BenchScene::read(&path).unwrap();
-        assert_eq!((scene.name.as_str(), scene.gaussians.len(), scene.views.len()), ("two", 2, 1));
-        assert_eq!(scene.gaussians.rotations_wxyz, [[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.0, 0.8]]);
-        assert_eq!(scene.gaussians.scales[1], [0.4, 0.5, 0.6]);
-        let view = scene.views[0];
-        assert_eq!(
-            view.camera_from_world.transform_point3(DVec3::new(1.0, 2.0, 3.0)),
-            DVec3::new(6.0, 3.0, 9.0)
-        );
-        let camera = view.intrinsics;
-        assert_eq!(
-            [camera.focal_x_px, camera.focal_y_px, camera.centre_x_px, camera.centre_y_px],
-            [90.0, 91.0, 31.5, 23.5]
-        );
-        assert_eq!([camera.width_px, camera.height_px], [64, 48]);
-
-        fs_err::write(&path, archive("scales")).unwrap();
-        assert!(matches!(BenchScene::read(&path), Err(FixtureError::Missing { array: "scales", .. })));
-    }
-
-    #[test]
-    fn damaged_archives_are_errors() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("damaged.npz");
-        let whole = archive("");
-        assert!(BenchScene::read(&path).is_err());
-        for length in (0..whole.len()).step_by(97) {
-            fs_err::write(&path, &whole[..length]).unwrap();
-            assert!(BenchScene::read(&path).is_err(), "{length}");
-        }
-        for at in (0..whole.len()).step_by(7) {
-            let mut bytes = whole.clone();
-            bytes[at] ^= 0x2d;
-            fs_err::write(&path, &bytes).unwrap();
-            // Some bytes are ignored; none may cause a panic.
-            let _ = BenchScene::read(&path);
-        }
     }
 }

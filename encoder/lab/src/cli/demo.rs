@@ -11,21 +11,20 @@ use slag_models::commands::RunArgs;
 
 use crate::demo;
 
-/// `demo`.
 #[derive(Debug, Args)]
-pub struct DemoArgs {
+pub(super) struct DemoArgs {
     /// Working folder; an earlier demo in it is deleted.
     #[arg(long, value_name = "DIR", default_value = "target/demo")]
-    pub out: PathBuf,
+    out: PathBuf,
     /// Seed of room and yard.
     #[arg(long, default_value_t = 1)]
-    pub seed: u64,
+    seed: u64,
     /// Model runtime.
     #[command(flatten)]
-    pub how: RunArgs,
+    how: RunArgs,
     /// Keeps the services running until ctrl-c, for queries of your own.
     #[arg(long)]
-    pub keep: bool,
+    keep: bool,
 }
 
 pub(super) fn run(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {

@@ -1,11 +1,9 @@
-//! The command line, a file a command: flags in, exit code out.
+//! The command line: flags in, exit code out. The flags of a benchmark or an evaluation stand beside its code.
 
-#[cfg(feature = "measure")]
-mod bench;
 mod demo;
-#[cfg(feature = "measure")]
-mod eval;
 mod generate;
+#[cfg(feature = "measure")]
+mod measure;
 
 use clap::{Parser, Subcommand};
 use slag_encoder::cli::common::OutputArgs;
@@ -18,17 +16,15 @@ pub struct Cli {
     /// Flags that every command has.
     #[command(flatten)]
     pub output: OutputArgs,
-    /// The command.
     #[command(subcommand)]
-    pub command: Command,
+    command: Command,
 }
 
-/// The commands.
 #[derive(Debug, Subcommand)]
-pub enum Command {
+enum Command {
     /// Evaluates stores and encoders against labels.
     #[cfg(feature = "measure")]
-    Eval(eval::EvalArgs),
+    Eval(measure::EvalArgs),
     /// Generates scenes, crops and photos with known contents.
     #[command(subcommand)]
     Generate(generate::GenerateCommand),
@@ -37,7 +33,7 @@ pub enum Command {
     /// Benchmarks this machine.
     #[cfg(feature = "measure")]
     #[command(subcommand)]
-    Bench(bench::BenchCommand),
+    Bench(measure::BenchCommand),
 }
 
 /// Runs a command and returns the exit code.
@@ -47,11 +43,11 @@ pub fn run(cli: Cli) -> Exit {
     let progress = progress.as_ref();
     let result = match cli.command {
         #[cfg(feature = "measure")]
-        Command::Eval(args) => eval::run(&args, progress, json),
+        Command::Eval(args) => measure::eval(&args, progress, json),
         Command::Generate(command) => generate::run(&command, progress),
         Command::Demo(args) => demo::run(&args, progress, json),
         #[cfg(feature = "measure")]
-        Command::Bench(command) => bench::run(&command, progress, json),
+        Command::Bench(command) => measure::bench(&command, progress, json),
     };
     exit_of(result, json)
 }

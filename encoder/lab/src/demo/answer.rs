@@ -6,13 +6,10 @@ use serde::{Deserialize, Serialize};
 /// A cluster of matching Gaussians.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct EdgeAnswer {
-    /// Its position.
     pub position_in_world: DVec3,
     /// Edge lengths of its box.
     pub size: DVec3,
-    /// Its score.
     pub score: f32,
-    /// Number of its Gaussians.
     pub n_gaussians: u64,
     /// Distance from the robot.
     pub distance: Option<f64>,

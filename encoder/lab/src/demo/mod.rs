@@ -57,13 +57,11 @@ pub struct DemoOptions {
 
 /// A finished demo.
 pub struct Demo {
-    /// Its report.
     pub report: DemoReport,
     edge: PathBuf,
     cache: PathBuf,
 }
 
-/// The report of a demo.
 #[derive(Debug, Serialize)]
 pub struct DemoReport {
     /// A picture of each answer, and a map of the scene from above with the cells that the robot fetched.
@@ -81,7 +79,6 @@ pub struct DemoReport {
 /// A question and its answer.
 #[derive(Debug, Serialize)]
 pub struct Question {
-    /// Its text.
     pub text: String,
     /// The best answer.
     pub answer: Option<EdgeAnswer>,

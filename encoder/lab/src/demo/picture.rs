@@ -11,7 +11,6 @@ use super::caption;
 use slag_encoder::query::{draw_lit, luma};
 use slag_encoder::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 
-/// Width of one panel.
 const PANEL_WIDTH_PX: u32 = 320;
 /// Views tried for a panel.
 const N_CANDIDATES: usize = 8;
@@ -90,7 +89,6 @@ fn best_view(scene: &Gaussians, views: &[RasterView], panel: &Panel<'_>) -> Resu
     Ok(*best.0)
 }
 
-/// Pixels of the map per metre.
 const MAP_PX_PER_M: f64 = 48.0;
 /// The map leaves out Gaussians above this height, such as ceilings and lamps.
 const MAP_HEIGHT_M: f64 = 2.2;

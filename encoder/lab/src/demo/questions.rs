@@ -11,7 +11,6 @@ const ABSENT: &str = "an elephant";
 
 /// A question and its correct answers.
 pub(super) struct Asked<'a> {
-    /// The text.
     pub(super) text: String,
     /// The things that it describes; empty if the correct answer is that nothing was found.
     pub(super) truth: Vec<&'a TrueObject>,

@@ -1,173 +1,117 @@
-//! The preset `plain` beside the default, on labelled scenes, with true and with automatic masks, by Gaussian and by
-//! object: the figures that a default is chosen and judged by.
+//! `eval defaults`: the preset `plain` beside the default, on labelled scenes, with true and with automatic masks, by
+//! Gaussian and by object: the figures that a default is chosen and judged by.
 
 use std::fmt;
-use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
 
+use anyhow::Result;
 use serde::Serialize;
-use slag_models::{ModelDir, SessionOptions};
+use slag_common::shard::Profile;
+use slag_encoder::encode::{EncodeSettings, Preset};
+use slag_encoder::progress::Progress;
 
 use super::instances::InstanceReport;
-use super::labelled::labelled;
-use super::labelled_scene::{CompareError, LabelledScene};
-use super::settings::{EvalKind, EvalSettings};
-use slag_encoder::encode::{self, DEFAULT_MASK_LEVELS, EncodeSettings, Engines, Masks, Preset};
-use slag_encoder::lift::Aggregation;
-use slag_encoder::progress::Silent;
-use slag_encoder::raster::{CpuRasterizer, Rasterizer};
-use slag_encoder::store::StoreReader;
+use super::judge::{EvalKind, JudgeSettings, judge};
+use super::run::{MaskSource, Runner, ScenesArgs, truth_of};
+use crate::scenes::SceneFiles;
+use crate::table::{Table, figure};
 
-/// What to compare.
-#[derive(Clone, Debug)]
-pub struct DefaultsSettings {
-    /// Labelled scenes.
-    pub scenes: Vec<PathBuf>,
-    /// Folder for the stores; a later run reuses the views there.
-    pub out: PathBuf,
-    /// The default's settings; the comparison sets inputs, masks and store, and what `plain` does otherwise.
-    pub encode: EncodeSettings,
-}
+/// Encodes of a scene: given and automatic masks, the plain average and the default.
+const N_ENCODES: usize = 4;
 
-/// Where masks come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum MaskSource {
-    /// The labels.
-    Given,
-    /// The built-in segmenter.
-    Automatic,
-}
-
-/// Figures of one scene with one source of masks.
+/// Figures of one scene with one source of masks and one method.
 #[derive(Clone, Debug, Serialize)]
-pub struct DefaultsRow {
-    /// The scene's folder name.
-    pub scene: String,
-    /// Where masks came from.
-    pub masks: MaskSource,
-    /// Whether it is the default rather than the preset `plain`.
-    pub is_default: bool,
-    /// What was scored.
-    pub kind: EvalKind,
-    /// Mean intersection over union of the argmax over all categories.
-    pub miou: Option<f64>,
-    /// The same, with words compared by how near a score is to the word's own best ones.
-    pub miou_by_own_best: Option<f64>,
-    /// Mean average precision over words.
-    pub average_precision: Option<f64>,
-    /// Mean area under the ROC curve over words.
-    pub area_under_roc: Option<f64>,
-    /// Instance recall, by object.
-    pub instances: Option<InstanceReport>,
-    /// Seconds of the encode; few, where the views were there already.
-    pub encode_secs: f64,
+struct Row {
+    scene: String,
+    masks: MaskSource,
+    method: &'static str,
+    kind: EvalKind,
+    miou: Option<f64>,
+    average_precision: Option<f64>,
+    area_under_roc: Option<f64>,
+    /// Absent categories that found nothing, of all.
+    abstained: [usize; 2],
+    instances: Option<InstanceReport>,
+    n_masks: u64,
+    encode_secs: f64,
 }
 
-/// The table.
 #[derive(Clone, Debug, Serialize)]
-pub struct DefaultsReport {
-    /// The encoder.
-    pub encoder: String,
-    /// The default.
-    pub aggregation: Aggregation,
-    /// By scene, masks, method and kind.
-    pub rows: Vec<DefaultsRow>,
+pub(crate) struct DefaultsReport {
+    encoder: String,
+    rows: Vec<Row>,
 }
 
-/// Makes the table and calls `on_row` once a row is measured.
-///
-/// # Errors
-/// [`CompareError`].
-pub fn run(
-    settings: &DefaultsSettings,
-    (models, session): (&ModelDir, &SessionOptions),
-    rasterizer: &dyn Rasterizer,
-    on_row: &mut dyn FnMut(&DefaultsRow),
-    cancel: &AtomicBool,
-) -> Result<DefaultsReport, CompareError> {
-    let mut text = models.text_encoder(session)?;
+fn plain(settings: &mut EncodeSettings) {
+    let plain = Preset::Plain.choices();
+    settings.aggregation = plain.aggregation;
+    settings.cells.objects = plain.objects;
+    settings.view.raster_width = plain.raster_width;
+    settings.view.regions = plain.regions;
+}
+
+pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<DefaultsReport> {
+    let runner = Runner::open(args)?;
+    let mut text = runner.text_encoder()?;
     let mut rows = Vec::new();
-    for dir in &settings.scenes {
-        let scene = LabelledScene::open(dir, &settings.encode.inputs)?;
-        for source in [MaskSource::Given, MaskSource::Automatic] {
-            let (masks, masks_name) = match source {
-                MaskSource::Given => (scene.true_masks(), "given"),
-                MaskSource::Automatic => (Masks::Auto { n_levels: DEFAULT_MASK_LEVELS }, "automatic"),
-            };
-            for is_default in [false, true] {
-                let store = settings.out.join(&scene.name).join(masks_name).join(method_name(is_default));
-                let mut encode = scene.encode_settings(&settings.encode, store)?;
-                encode.view.masks = masks.clone();
+    let scenes = SceneFiles::find_all(&args.scene)?;
+    progress.begin("defaults", "encode", (scenes.len() * N_ENCODES) as u64, 0);
+    for files in &scenes {
+        for (source, is_default) in MaskSource::ALL.into_iter().flat_map(|s| [(s, false), (s, true)]) {
+            let method = if is_default { "default" } else { "plain" };
+            let encoded = runner.encode(files, source, method, |settings| {
+                settings.cells.shards.profiles = vec![Profile::Exact];
                 if !is_default {
-                    let plain = Preset::Plain.choices();
-                    encode.aggregation = plain.aggregation;
-                    encode.cells.objects = plain.objects;
-                    encode.view.raster_width = plain.raster_width;
-                    encode.view.regions = plain.regions;
+                    plain(settings);
                 }
-                let engines = Engines::new(models, session, rasterizer);
-                let start = std::time::Instant::now();
-                encode::encode(&encode, &engines, &Silent, cancel).map_err(Box::new)?;
-                let encode_secs = start.elapsed().as_secs_f64();
-                let reader = StoreReader::open(&encode.output.store)?;
-                let kinds = [EvalKind::Gaussians, EvalKind::Objects];
-                for kind in &kinds[..1 + usize::from(is_default)] {
-                    let eval = EvalSettings { kind: Some(*kind), ..EvalSettings::default() };
-                    let report =
-                        labelled(&reader, &scene.truth, &scene.gaussians, &mut *text, &CpuRasterizer, &eval)?;
-                    let row = DefaultsRow {
-                        scene: scene.name.clone(),
-                        masks: source,
-                        is_default,
-                        kind: *kind,
-                        miou: report.multi_class.first().and_then(|all| all.miou),
-                        miou_by_own_best: report.multi_class_by_own_best.first().and_then(|all| all.miou),
-                        average_precision: report.mean_average_precision,
-                        area_under_roc: report.mean_area_under_roc,
-                        instances: report.instances,
-                        encode_secs,
-                    };
-                    on_row(&row);
-                    rows.push(row);
-                }
+            })?;
+            progress.advance(1);
+            let Some(encoded) = encoded else { continue };
+            let truth = truth_of(&encoded.reader, &files.dir)?;
+            for kind in &[EvalKind::Gaussians, EvalKind::Objects][..1 + usize::from(is_default)] {
+                let settings = JudgeSettings { kind: Some(*kind), ..JudgeSettings::default() };
+                let report = judge(&encoded.reader, &truth, &mut *text, &settings)?;
+                let average_precision = report.mean_average_precision;
+                tracing::info!(
+                    "{} {} {method}, by {kind}: AP {average_precision:.4?}",
+                    files.name,
+                    source.name()
+                );
+                rows.push(Row {
+                    scene: files.name.clone(),
+                    masks: source,
+                    method,
+                    kind: *kind,
+                    miou: report.multi_class.first().and_then(|all| all.miou),
+                    average_precision,
+                    area_under_roc: report.mean_area_under_roc,
+                    abstained: report.abstained,
+                    instances: report.instances,
+                    n_masks: encoded.summary.n_masks as u64,
+                    encode_secs: encoded.secs,
+                });
             }
         }
     }
-    Ok(DefaultsReport { encoder: models.encoder_id().to_string(), aggregation: Aggregation::REFINED, rows })
-}
-
-/// Returns the name of the default or of the preset that it is compared with.
-fn method_name(is_default: bool) -> &'static str {
-    if is_default { "default" } else { "plain" }
+    progress.end();
+    Ok(DefaultsReport { encoder: runner.encoder_id(), rows })
 }
 
 impl fmt::Display for DefaultsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "| scene | masks | aggregation | by | mIoU | by own best | AP | AUC | things found at IoU 0.25, 0.5 | objects that are two things, of all; things split |"
-        )?;
-        writeln!(f, "|---|---|---|---|---|---|---|---|---|---|")?;
+        let columns = ["scene", "masks", "method", "by", "mIoU", "AP", "AUC"];
+        let of_things = ["found at IoU 0.25 and 0.5", "objects that are two things", "things split"];
+        let mut table = Table::new(columns.into_iter().chain(of_things));
         for row in &self.rows {
-            let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
-            let masks = match row.masks {
-                MaskSource::Given => "given",
-                MaskSource::Automatic => "automatic",
-            };
-            let method = method_name(row.is_default);
-            let kind = match row.kind {
-                EvalKind::Gaussians => "Gaussian",
-                EvalKind::Objects => "object",
-            };
-            let figures = [row.miou, row.miou_by_own_best, row.average_precision, row.area_under_roc];
-            let figures = figures.map(show).join(" | ");
-            let found = row.instances.as_ref().map_or(" | ".into(), |found| {
+            let mut cells = vec![row.scene.clone(), row.masks.name().to_owned()];
+            cells.extend([row.method.to_owned(), row.kind.to_string()]);
+            cells.extend([row.miou, row.average_precision, row.area_under_roc].map(figure));
+            if let Some(found) = &row.instances {
                 let InstanceReport { any, n_merged_objects, n_objects, n_split_things, .. } = found;
-                format!("{any} | {n_merged_objects} of {n_objects}; {n_split_things}")
-            });
-            writeln!(f, "| {} | {masks} | {method} | {kind} | {figures} | {found} |", row.scene)?;
+                cells.push(any.to_string());
+                cells.extend([format!("{n_merged_objects} of {n_objects}"), n_split_things.to_string()]);
+            }
+            table.row(cells);
         }
-        Ok(())
+        write!(f, "{table}")
     }
 }

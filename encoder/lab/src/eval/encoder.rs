@@ -4,20 +4,23 @@
 //! those held out from training.
 
 use std::fmt;
-use std::path::Path;
-use std::time::Instant;
+use std::path::PathBuf;
 
+use anyhow::{Context, Result, bail};
+use clap::Args;
 use rayon::prelude::*;
 use serde::Serialize;
-use slag_models::{Crop, InferenceError, ModelDir, ModelError, SessionOptions};
+use slag_encoder::cli::common::{ModelArgs, open_models};
+use slag_models::Crop;
 
-use super::settings::ABSENT;
+use super::judge::ABSENT;
 use crate::generate::crops::{self, Label, Split};
-use crate::generate::grammar::Noun;
+use crate::generate::grammar::{self, Noun};
 use crate::generate::paint::{Colour, Material};
+use crate::harness::Times;
+use crate::table::Table;
 use slag_encoder::progress::Progress;
 use slag_math::dot;
-use slag_math::stats::{Rank, quantile};
 
 /// A crop shows a whole thing if its mask is the true one and more than this share of the thing is visible.
 const WHOLE: f64 = 0.6;
@@ -26,95 +29,71 @@ const SCENES_AT_A_TIME: u64 = 16;
 /// Timed crops and texts.
 const N_TIMED: usize = 64;
 
-/// Error of the evaluation.
-#[derive(Debug, thiserror::Error)]
-pub enum EncoderEvalError {
-    /// A model cannot be opened.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The encoder failed.
-    #[error(transparent)]
-    Encode(#[from] InferenceError),
-    /// The picture cannot be written.
-    #[error("{}: {source}", path.display())]
-    Picture {
-        /// The picture.
-        path: std::path::PathBuf,
-        /// The reason.
-        source: image::ImageError,
-    },
-    /// The scenes gave no crops.
-    #[error("the scenes gave no crops; generate more with --n-scenes")]
-    NoCrops,
+/// `eval encoder`.
+#[derive(Debug, Args)]
+pub(crate) struct EncoderArgs {
+    /// The encoder.
+    #[command(flatten)]
+    models: ModelArgs,
+    /// Number of scenes to take crops from.
+    #[arg(long, value_name = "N", default_value_t = 300)]
+    n_scenes: u64,
+    /// Seed of the first scene; the others follow. The embedded encoders were trained on seeds 1000000 to 1012799.
+    #[arg(long, default_value_t = 9_000_000)]
+    seed: u64,
+    /// Writes a picture of the confusion matrix to this file.
+    #[arg(long, value_name = "PNG")]
+    confusion: Option<PathBuf>,
 }
 
 /// Correct answers over a set of crops.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct Tally {
-    /// Crops.
-    pub n_crops: usize,
-    /// Crops with the correct noun.
-    pub noun: usize,
-    /// Crops with the correct main colour.
-    pub colour: usize,
-    /// Crops with the correct main material.
-    pub material: usize,
+struct Tally {
+    n_crops: usize,
+    noun: usize,
+    colour: usize,
+    material: usize,
 }
 
 /// Correct answers for a noun, over whole things.
 #[derive(Clone, Debug, Serialize)]
-pub struct NounReport {
-    /// The noun.
-    pub noun: String,
-    /// Its crops.
-    pub n_crops: usize,
-    /// Crops with this noun as answer.
-    pub n_right: usize,
+struct NounReport {
+    noun: String,
+    n_crops: usize,
+    n_right: usize,
     /// Most frequent wrong answers, with their counts.
-    pub taken_for: Vec<(String, usize)>,
+    taken_for: Vec<(String, usize)>,
 }
 
-/// Figures of an encoder.
 #[derive(Clone, Debug, Serialize)]
-pub struct EncoderReport {
-    /// Its name.
-    pub encoder: String,
-    /// Number of scenes.
-    pub n_scenes: u64,
+pub(crate) struct EncoderReport {
+    encoder: String,
+    n_scenes: u64,
     /// Seed of the first scene; the others follow.
-    pub first_seed: u64,
+    first_seed: u64,
     /// Tallies of several sets of crops, with their names.
-    pub tallies: Vec<(String, Tally)>,
-    /// Each noun.
-    pub nouns: Vec<NounReport>,
+    tallies: Vec<(String, Tally)>,
+    nouns: Vec<NounReport>,
     /// Lowest cosine of a match.
-    pub threshold: Option<f32>,
+    threshold: Option<f32>,
     /// Share of the crops that match their own noun.
-    pub found: Option<f64>,
+    found: Option<f64>,
     /// Share of the pairs of crop and another noun that match.
-    pub found_others: Option<f64>,
+    found_others: Option<f64>,
     /// Share of the pairs of crop and absent category that match.
-    pub found_absent: Option<f64>,
+    found_absent: Option<f64>,
     /// Median milliseconds per crop with one thread.
-    pub ms_per_crop: f64,
+    ms_per_crop: f64,
     /// Median milliseconds per text with one thread.
-    pub ms_per_text: f64,
+    ms_per_text: f64,
 }
 
 /// Evaluates an encoder on the crops of scenes.
-///
-/// # Errors
-/// [`EncoderEvalError`].
-pub fn evaluate(
-    models: &ModelDir,
-    options: &SessionOptions,
-    nouns: &[Noun],
-    seeds: std::ops::Range<u64>,
-    confusion: Option<&Path>,
-    progress: &dyn Progress,
-) -> Result<EncoderReport, EncoderEvalError> {
-    let mut text = models.text_encoder(options)?;
-    let mut encode = |texts: Vec<String>| -> Result<Vec<Vec<f32>>, EncoderEvalError> {
+pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<EncoderReport> {
+    let (models, session) = open_models(&args.models)?;
+    let (nouns, seeds) = (&grammar::nouns(None)?, args.seed..args.seed + args.n_scenes);
+    let mut text = models.text_encoder(&session)?;
+    let mut encode = |texts: Vec<String>| -> Result<Vec<Vec<f32>>> {
         Ok(texts.iter().map(|content| text.encode(content)).collect::<Result<_, _>>()?)
     };
     let of_nouns = encode(nouns.iter().map(|noun| format!("a {}", noun.name)).collect())?;
@@ -122,9 +101,9 @@ pub fn evaluate(
     let of_materials =
         encode(Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect())?;
     let of_absent = encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?;
-    let ms_per_text = timed(|i| text.encode(&nouns[i % nouns.len()].name).map(|_| ()))?;
+    let text_times = Times::measure(0, N_TIMED, |i| text.encode(&nouns[i % nouns.len()].name).map(|_| ()))?;
 
-    let mut image = models.image_encoder(options)?;
+    let mut image = models.image_encoder(&session)?;
     let mut seen: Vec<Seen> = Vec::new();
     let mut found = [0_u64; 3];
     let mut timing = Vec::new();
@@ -153,9 +132,10 @@ pub fn evaluate(
     }
     progress.end();
     if seen.is_empty() {
-        return Err(EncoderEvalError::NoCrops);
+        bail!("the scenes gave no crops; generate more with --n-scenes");
     }
-    let ms_per_crop = timed(|i| image.encode(&timing[i % timing.len()..][..1]).map(|_| ()))?;
+    let crop = |i: usize| image.encode(&timing[i % timing.len()..][..1]).map(|_| ());
+    let crop_times = Times::measure(0, N_TIMED, crop)?;
     let n = seen.len() as f64;
     let share = |count: u64, of: usize| threshold.map(|_| count as f64 / (n * of as f64));
     let report = EncoderReport {
@@ -168,12 +148,11 @@ pub fn evaluate(
         found: share(found[0], 1),
         found_others: share(found[1], nouns.len() - 1),
         found_absent: share(found[2], ABSENT.len()),
-        ms_per_crop,
-        ms_per_text,
+        ms_per_crop: crop_times.median_ms,
+        ms_per_text: text_times.median_ms,
     };
-    if let Some(path) = confusion {
-        let picture = picture(&seen, nouns.len());
-        picture.save(path).map_err(|source| EncoderEvalError::Picture { path: path.to_owned(), source })?;
+    if let Some(path) = &args.confusion {
+        picture(&seen, nouns.len()).save(path).with_context(|| path.display().to_string())?;
     }
     Ok(report)
 }
@@ -246,42 +225,31 @@ fn picture(seen: &[Seen], n_nouns: usize) -> image::GrayImage {
     })
 }
 
-/// Returns the median time of a call, milliseconds.
-fn timed(mut call: impl FnMut(usize) -> Result<(), InferenceError>) -> Result<f64, InferenceError> {
-    let mut times = Vec::with_capacity(N_TIMED);
-    for i in 0..N_TIMED {
-        let start = Instant::now();
-        call(i)?;
-        times.push(start.elapsed().as_secs_f64() * 1e3);
-    }
-    Ok(quantile(&mut times, 500, Rank::Nearest).unwrap_or_default())
-}
-
 impl fmt::Display for EncoderReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} on {} scenes from seed {}\n", self.encoder, self.n_scenes, self.first_seed)?;
-        writeln!(f, "{:<62} {:>7} {:>7} {:>7} {:>9}", "top-1, %", "crops", "noun", "colour", "material")?;
+        let percent = |n: usize, of: usize| format!("{:.1}", 100.0 * n as f64 / of.max(1) as f64);
+        let mut table = Table::new(["top-1, %", "crops", "noun", "colour", "material"]);
         for (name, t) in &self.tallies {
-            let percent = |n: usize| 100.0 * n as f64 / t.n_crops.max(1) as f64;
-            let [noun, colour, material] = [t.noun, t.colour, t.material].map(percent);
-            writeln!(f, "{name:<62} {:>7} {noun:>7.1} {colour:>7.1} {material:>9.1}", t.n_crops)?;
+            let figures = [t.noun, t.colour, t.material].map(|n| percent(n, t.n_crops));
+            table.row([name.clone(), t.n_crops.to_string()].into_iter().chain(figures));
         }
-        writeln!(f, "\n{:<20} {:>6} {:>6}  taken for", "noun", "crops", "%")?;
+        writeln!(f, "{table}")?;
+        let mut table = Table::new(["noun", "crops", "%", "taken for"]);
         for noun in &self.nouns {
-            let percent = 100.0 * noun.n_right as f64 / noun.n_crops.max(1) as f64;
             let others: Vec<String> =
                 noun.taken_for.iter().map(|(other, n)| format!("{other} {n}")).collect();
-            writeln!(f, "{:<20} {:>6} {percent:>6.0}  {}", noun.noun, noun.n_crops, others.join(", "))?;
+            let figures = [noun.n_crops.to_string(), percent(noun.n_right, noun.n_crops), others.join(", ")];
+            table.row(std::iter::once(noun.noun.clone()).chain(figures));
         }
+        writeln!(f, "{table}")?;
         if let (Some(threshold), Some(own), Some(others), Some(absent)) =
             (self.threshold, self.found, self.found_others, self.found_absent)
         {
+            let [own, others, absent] = [own, others, absent].map(|share| 100.0 * share);
             writeln!(
                 f,
-                "\nabove the threshold {threshold:.3}: own noun {:.1} %, another {:.2} %, absent categories {:.2} %",
-                100.0 * own,
-                100.0 * others,
-                100.0 * absent
+                "above the threshold {threshold:.3}: own noun {own:.1} %, another {others:.2} %, absent categories {absent:.2} %"
             )?;
         }
         writeln!(f, "{:.2} ms per crop, {:.2} ms per text, one thread", self.ms_per_crop, self.ms_per_text)

@@ -13,13 +13,12 @@ const PIECE: f64 = 0.25;
 
 /// Counts of things found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Recall {
-    /// All things.
-    pub n: usize,
+pub(crate) struct Recall {
+    pub(crate) n: usize,
     /// Things found with an intersection over union of at least 0.25.
-    pub n_at_25: usize,
+    pub(crate) n_at_25: usize,
     /// Things found with at least 0.5.
-    pub n_at_50: usize,
+    pub(crate) n_at_50: usize,
 }
 
 impl Recall {
@@ -38,19 +37,33 @@ impl fmt::Display for Recall {
 
 /// Instance recall of objects, over sets of Gaussians.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct InstanceReport {
-    /// Number of objects.
-    pub n_objects: usize,
+pub(crate) struct InstanceReport {
+    pub(crate) n_objects: usize,
     /// Objects that are two things (under-segmentation): two labels, floors and walls included, have a quarter of it each.
-    pub n_merged_objects: usize,
+    pub(crate) n_merged_objects: usize,
     /// Things that are two objects (over-segmentation): two objects have a quarter of it each.
-    pub n_split_things: usize,
+    pub(crate) n_split_things: usize,
     /// Recall by any object, whatever its word: the quality of the segmentation alone.
-    pub any: Recall,
+    pub(crate) any: Recall,
     /// Recall by objects that reach the threshold for the thing's word.
-    pub of_words: Recall,
+    pub(crate) of_words: Recall,
     /// Recall by the word's n best objects, where n is the number of things with that word.
-    pub best_of_words: Recall,
+    pub(crate) best_of_words: Recall,
+}
+
+impl fmt::Display for InstanceReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { n_objects, n_merged_objects, n_split_things, any, of_words, best_of_words } = self;
+        writeln!(f, "{n_objects} objects; things found at IoU 0.25 and 0.5, by any object: {any}")?;
+        writeln!(
+            f,
+            "  by objects above the threshold for the word: {of_words}; by the word's best objects: {best_of_words}"
+        )?;
+        writeln!(
+            f,
+            "  objects that are two things: {n_merged_objects}; things that are two objects: {n_split_things}"
+        )
+    }
 }
 
 /// Compares things with objects.
@@ -121,15 +134,13 @@ mod tests {
         let thing = |id: u16, category: &str| Thing {
             id,
             category: category.into(),
-            aabb_min: None,
-            aabb_max: None,
             words: Vec::new(),
+            train_pixels: 0,
         };
         let truth = Truth {
             things: vec![thing(7, "chair"), thing(8, "chair"), thing(9, "table")],
             background: vec![thing(1, "wall")],
             id_of_gaussian: vec![7, 7, 7, 7, 8, 8, 8, 8, 1, 1],
-            views: Vec::new(),
         };
         let object_of = [0, 0, 0, NONE, 1, 2, 2, NONE, 2, 2];
         let classes = [("chair".to_owned(), vec![7, 8]), ("table".to_owned(), vec![9])];

@@ -13,18 +13,23 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context, Result, anyhow, bail};
+use clap::Args;
 use serde::{Deserialize, Serialize};
 use slag_common::gaussians::SH_C0;
-use slag_common::{Gaussians, View};
-use slag_models::TextEncoder;
-
-use super::error::{EvalError, check_scene};
-use super::metrics::{iou_of_sets, mean};
-use super::settings::EvalSettings;
+use slag_common::shard::Profile;
+use slag_common::{Gaussians, View, poses, splat};
+use slag_encoder::cli::common::{ModelArgs, parse_frame, text_encoder_of};
+use slag_encoder::ingest::{self, FrameChoice};
 use slag_encoder::query;
 use slag_encoder::raster::constants::MAX_IMAGE_PX;
-use slag_encoder::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
+use slag_encoder::raster::{CpuRasterizer, LoadedScene, RasterView, Rasterizer};
 use slag_encoder::store::StoreReader;
+use slag_models::TextEncoder;
+
+use super::metrics::{iou_of_sets, mean};
+use super::truth::check_scene;
+use crate::table::{Table, figure};
 
 /// Alpha above which a rendered pixel is selected, as in OpenGaussian's `render_lerf_by_text.py`.
 const MIN_COVERAGE: f32 = 0.7;
@@ -33,67 +38,78 @@ const SMOOTHING_PX: usize = 30;
 /// Largest relative difference between the aspect ratios of a label and its view.
 const MAX_ASPECT_ERROR: f64 = 0.01;
 
-/// Error in the labels.
-#[derive(Debug, thiserror::Error)]
-pub enum LerfError {
-    /// A file could not be read.
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-    /// A label is malformed.
-    #[error("{}: {what}; expected info {{name, width, height}} and objects [{{category, bbox, segmentation}}]", path.display())]
-    Label {
-        /// The file.
-        path: PathBuf,
-        /// The problem.
-        what: String,
-    },
-    /// The folder has no labels.
-    #[error("{}: no frame_*.json; give the scene's folder under lerf_ovs/label", dir.display())]
-    NoLabels {
-        /// The folder.
-        dir: PathBuf,
-    },
-    /// No labelled frame has a pose.
-    #[error("{}: none of {n} labelled frames has a pose, the first is {first}; give the poses of the same scene", dir.display())]
-    NoViews {
-        /// The folder.
-        dir: PathBuf,
-        /// Labelled frames.
-        n: usize,
-        /// Name of the first.
-        first: String,
-    },
+/// The threshold of the paper's figures.
+const PAPERS_THRESHOLD: f32 = 0.28;
+
+/// `eval lerf`.
+#[derive(Debug, Args)]
+pub(crate) struct LerfArgs {
+    /// Store.
+    #[arg(long, value_name = "DIR")]
+    store: PathBuf,
+    /// The splat that was encoded.
+    #[arg(long, value_name = "FILE")]
+    scene: PathBuf,
+    /// The poses that it was encoded with.
+    #[arg(long, value_name = "PATH")]
+    views: PathBuf,
+    /// Labels of the scene: lerf_ovs/label/SCENE.
+    #[arg(long, value_name = "DIR")]
+    labels: PathBuf,
+    /// Says how the splat's frame follows from that of the poses, see `slag-encoder encode --help`: auto, none or a file.
+    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
+    splat_frame: FrameChoice,
+    /// The models that the store was encoded with.
+    #[command(flatten)]
+    models: ModelArgs,
+    /// Lowest scores of a selected Gaussian; a row of the table each. One that the scene's own labels chose is no
+    /// comparison.
+    #[arg(long, value_name = "COSINE,...", value_delimiter = ',', default_values_t = [PAPERS_THRESHOLD])]
+    threshold: Vec<f32>,
+    /// Scores this profile's shards, as a robot does [default: the field in full precision].
+    #[arg(long, value_name = "NAME")]
+    profile: Option<Profile>,
+}
+
+pub(crate) fn run(args: &LerfArgs) -> Result<LerfReport> {
+    let reader = StoreReader::open(&args.store)?;
+    let mut encoder = text_encoder_of(&reader, &args.models)?;
+    let views = poses::read(&args.views, None)?;
+    let frame = ingest::find_frame(&args.scene, &args.splat_frame, views.source, views.applied)?;
+    let mut scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
+    if let Some(frame) = frame {
+        tracing::info!("{frame}; the splat is brought into the world of the poses");
+        frame.to_poses(&mut scene);
+    }
+    let labels = LerfLabels::read(&args.labels, &views.views)?;
+    judge(&reader, &labels, &scene, &mut *encoder, &args.threshold, args.profile)
 }
 
 /// A thing on a frame.
 #[derive(Clone, Debug, PartialEq)]
-pub struct LabelledThing {
-    /// Its category.
-    pub category: String,
+pub(super) struct LabelledThing {
+    pub(super) category: String,
     /// Its pixels, row-major.
-    pub mask: Vec<bool>,
+    pub(super) mask: Vec<bool>,
     /// Boxes of its parts: smallest and largest x and y, pixels.
-    pub boxes: Vec<[f64; 4]>,
+    pub(super) boxes: Vec<[f64; 4]>,
 }
 
-/// A labelled frame.
 #[derive(Clone, Debug)]
-pub struct LabelledFrame {
-    /// Its name.
-    pub name: String,
+pub(super) struct LabelledFrame {
+    pub(super) name: String,
     /// The camera, at the label's size.
-    pub view: RasterView,
+    pub(super) view: RasterView,
     /// The things, one per category.
-    pub things: Vec<LabelledThing>,
+    pub(super) things: Vec<LabelledThing>,
 }
 
-/// The labels of a scene.
 #[derive(Clone, Debug)]
-pub struct LerfLabels {
+pub(super) struct LerfLabels {
     /// Frames that have a pose.
-    pub frames: Vec<LabelledFrame>,
+    pub(super) frames: Vec<LabelledFrame>,
     /// Names of frames without a pose.
-    pub without_view: Vec<String>,
+    pub(super) without_view: Vec<String>,
 }
 
 #[derive(Deserialize)]
@@ -132,10 +148,7 @@ enum Polygons {
 
 impl LerfLabels {
     /// Reads the labels of a scene with these views.
-    ///
-    /// # Errors
-    /// [`LerfError`].
-    pub fn read(dir: &Path, views: &[View]) -> Result<Self, LerfError> {
+    pub(super) fn read(dir: &Path, views: &[View]) -> Result<Self> {
         let mut paths = Vec::new();
         for entry in fs_err::read_dir(dir)? {
             let path = entry?.path();
@@ -150,27 +163,36 @@ impl LerfLabels {
         let view_of: BTreeMap<String, &View> = views.iter().map(|view| (stem(&view.name), view)).collect();
         let mut labels = Self { frames: Vec::new(), without_view: Vec::new() };
         for path in &paths {
-            let wrong = |what: String| LerfError::Label { path: path.clone(), what };
-            let label: Label =
-                serde_json::from_slice(&fs_err::read(path)?).map_err(|error| wrong(error.to_string()))?;
+            let expected = || {
+                format!(
+                    "{}: expected info {{name, width, height}} and objects [{{category, bbox, segmentation}}]",
+                    path.display()
+                )
+            };
+            let label: Label = serde_json::from_slice(&fs_err::read(path)?).with_context(expected)?;
             let name = stem(&label.info.name);
             match view_of.get(&name) {
-                Some(view) => labels.frames.push(LabelledFrame::new(name, view, label).map_err(wrong)?),
+                Some(view) => {
+                    labels.frames.push(LabelledFrame::new(name, view, label).with_context(expected)?);
+                }
                 None => labels.without_view.push(name),
             }
         }
+        let (dir, n) = (dir.display(), paths.len());
         match (labels.frames.is_empty(), labels.without_view.first()) {
-            (true, None) => Err(LerfError::NoLabels { dir: dir.to_owned() }),
-            (true, Some(first)) => {
-                Err(LerfError::NoViews { dir: dir.to_owned(), n: paths.len(), first: first.clone() })
+            (true, None) => {
+                Err(anyhow!("{dir}: no frame_*.json; give the scene's folder under lerf_ovs/label"))
             }
+            (true, Some(first)) => Err(anyhow!(
+                "{dir}: none of {n} labelled frames has a pose, the first is {first}; give the poses of the same scene"
+            )),
             _ => Ok(labels),
         }
     }
 }
 
 impl LabelledFrame {
-    fn new(name: String, view: &View, label: Label) -> Result<Self, String> {
+    fn new(name: String, view: &View, label: Label) -> Result<Self> {
         let Info { width, height, .. } = label.info;
         let n_pixels = u64::from(width) * u64::from(height);
         let camera = view.intrinsics.without_distortion();
@@ -178,7 +200,7 @@ impl LabelledFrame {
             f64::from(width) * f64::from(camera.height_px) / (f64::from(height) * f64::from(camera.width_px));
         if !(1..=MAX_IMAGE_PX).contains(&n_pixels) || (aspect - 1.0).abs() > MAX_ASPECT_ERROR {
             let of_view = [camera.width_px, camera.height_px];
-            return Err(format!("{width} x {height} pixels of a view of {of_view:?}"));
+            bail!("{width} x {height} pixels of a view of {of_view:?}");
         }
         let size = [width as usize, height as usize];
         let mut things: BTreeMap<String, LabelledThing> = BTreeMap::new();
@@ -239,143 +261,124 @@ fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
 
 /// Figures of a thing on a frame.
 #[derive(Clone, Debug, Serialize)]
-pub struct ThingReport {
-    /// The frame.
-    pub frame: String,
-    /// The thing.
-    pub category: String,
-    /// Intersection over union of the rendered selection and its mask.
-    pub iou: f64,
+pub(super) struct ThingReport {
+    pub(super) frame: String,
+    pub(super) category: String,
+    /// Intersection over union of the rendered selection and its mask, for each threshold.
+    pub(super) ious: Vec<f64>,
     /// Whether the maximum score lies in one of its boxes.
-    pub localised: bool,
+    pub(super) localised: bool,
 }
 
-/// Figures of an evaluation.
 #[derive(Clone, Debug, Serialize)]
-pub struct LerfReport {
-    /// The store's encoder.
-    pub encoder: String,
-    /// Lowest score of a selected Gaussian.
-    pub threshold: f32,
-    /// Each thing on each frame.
-    pub things: Vec<ThingReport>,
-    /// Mean intersection over union.
-    pub miou: Option<f64>,
-    /// Share of the things with an intersection over union above 0.25.
-    pub accuracy_at_25: Option<f64>,
-    /// Share above 0.5.
-    pub accuracy_at_50: Option<f64>,
-    /// Share of the things that are localised.
-    pub localised: Option<f64>,
+pub(crate) struct LerfReport {
+    encoder: String,
+    thresholds: Vec<f32>,
+    pub(super) things: Vec<ThingReport>,
     /// Categories that the encoder cannot encode, and why; their things count as not found.
-    pub unknown_words: BTreeMap<String, String>,
+    pub(super) unknown_words: BTreeMap<String, String>,
     /// Labelled frames without a pose; left out of the means.
-    pub frames_without_view: Vec<String>,
+    pub(super) frames_without_view: Vec<String>,
 }
 
 /// Evaluates a store against labels of frames. `scene` is the splat that was encoded.
-///
-/// # Errors
-/// [`EvalError`].
-pub fn lerf(
+pub(super) fn judge(
     reader: &StoreReader,
     labels: &LerfLabels,
     scene: &Gaussians,
     encoder: &mut dyn TextEncoder,
-    rasterizer: &dyn Rasterizer,
-    settings: &EvalSettings,
-) -> Result<LerfReport, EvalError> {
-    check_scene(reader, scene)?;
-    let threshold = settings.threshold.unwrap_or(reader.manifest().encoder.default_threshold);
-    let mut words: Vec<&str> =
-        labels.frames.iter().flat_map(|f| f.things.iter().map(|t| t.category.as_str())).collect();
-    words.sort_unstable();
-    words.dedup();
-    words.retain(|word| settings.words.is_empty() || settings.words.iter().any(|asked| asked == word));
+    thresholds: &[f32],
+    profile: Option<Profile>,
+) -> Result<LerfReport> {
+    check_scene(reader, scene.len())?;
+    let mut on_frames: BTreeMap<&str, Vec<(&LabelledFrame, &LabelledThing)>> = BTreeMap::new();
+    for (frame, thing) in labels.frames.iter().flat_map(|f| f.things.iter().map(move |t| (f, t))) {
+        on_frames.entry(&thing.category).or_default().push((frame, thing));
+    }
     let (mut things, mut unknown_words) = (Vec::new(), BTreeMap::new());
-    let mut first_error = None;
-    for word in words {
-        let on_frames =
-            labels.frames.iter().filter_map(|f| Some((f, f.things.iter().find(|t| t.category == word)?)));
-        let vector = match encoder.encode(word) {
-            Ok(vector) => vector,
-            Err(error) => {
-                things.extend(on_frames.map(|(frame, _)| ThingReport {
+    for (word, on_frames) in &on_frames {
+        let cosines = match (encoder.encode(word), profile) {
+            (Ok(vector), Some(profile)) => query::scores_of_shards(reader, &vector, profile)?.cosines,
+            (Ok(vector), None) => query::scores(reader, &vector)?.cosines,
+            (Err(error), _) => {
+                unknown_words.insert((*word).to_owned(), error.to_string());
+                things.extend(on_frames.iter().map(|(frame, _)| ThingReport {
                     frame: frame.name.clone(),
-                    category: word.to_owned(),
-                    iou: 0.0,
+                    category: (*word).to_owned(),
+                    ious: vec![0.0; thresholds.len()],
                     localised: false,
                 }));
-                unknown_words.insert(word.to_owned(), error.to_string());
-                first_error.get_or_insert((word.to_owned(), error));
                 continue;
             }
         };
-        let scores = match settings.profile {
-            Some(profile) => query::scores_of_shards(reader, &vector, profile)?,
-            None => query::scores(reader, &vector)?,
-        };
-        let (selected, scored) = drawn(scene, &scores.cosines, threshold);
-        let (selected, scored) = (rasterizer.load(&selected)?, rasterizer.load(&scored)?);
+        let scored = scored(scene, &cosines);
+        let scored = CpuRasterizer.load(&scored)?;
+        let selected: Vec<Gaussians> = thresholds.iter().map(|t| selected(scene, &cosines, *t)).collect();
+        let selected =
+            selected.iter().map(|scene| CpuRasterizer.load(scene)).collect::<Result<Vec<_>, _>>()?;
         for (frame, thing) in on_frames {
-            things.push(judge(selected.as_ref(), scored.as_ref(), frame, thing)?);
+            let ious =
+                selected.iter().map(|s| selection_iou(s.as_ref(), frame, thing)).collect::<Result<_>>()?;
+            let localised = is_localised(scored.as_ref(), frame, thing)?;
+            let (frame, category) = (frame.name.clone(), thing.category.clone());
+            things.push(ThingReport { frame, category, ious, localised });
         }
     }
-    if let (true, Some((first, source))) =
-        (things.is_empty() || unknown_words.len() == n_words(&things), first_error)
-    {
-        return Err(EvalError::NoWords { n: unknown_words.len(), first, source: Box::new(source) });
+    if unknown_words.len() == on_frames.len() {
+        bail!("the encoder knows none of {} words: {unknown_words:?}", on_frames.len());
     }
-    if things.is_empty() {
-        let categories: Vec<&str> =
-            labels.frames.iter().flat_map(|f| f.things.iter().map(|t| t.category.as_str())).collect();
-        return Err(EvalError::NoCategories { categories: categories.join(", ") });
-    }
-    let share =
-        |test: &dyn Fn(&ThingReport) -> bool| mean(things.iter().map(|t| Some(f64::from(u8::from(test(t))))));
     Ok(LerfReport {
         encoder: reader.manifest().encoder.name.clone(),
-        threshold,
-        miou: mean(things.iter().map(|thing| Some(thing.iou))),
-        accuracy_at_25: share(&|thing| thing.iou > 0.25),
-        accuracy_at_50: share(&|thing| thing.iou > 0.5),
-        localised: share(&|thing| thing.localised),
+        thresholds: thresholds.to_vec(),
         things,
         unknown_words,
         frames_without_view: labels.without_view.clone(),
     })
 }
 
-fn n_words(things: &[ThingReport]) -> usize {
-    // Things of one word are adjacent.
-    things.chunk_by(|a, b| a.category == b.category).count()
+impl LerfReport {
+    /// Returns for a threshold the mean IoU, and the shares of things with one above 0.25 and 0.5.
+    pub(super) fn means(&self, at: usize) -> [Option<f64>; 3] {
+        let above =
+            |least: f64| mean(self.things.iter().map(|t| Some(f64::from(u8::from(t.ious[at] > least)))));
+        [mean(self.things.iter().map(|t| Some(t.ious[at]))), above(0.25), above(0.5)]
+    }
+
+    /// Returns whether every word is known, and every frame has a pose.
+    pub(crate) fn is_complete(&self) -> bool {
+        self.unknown_words.is_empty() && self.frames_without_view.is_empty()
+    }
 }
 
-/// Returns the scene with only the selected Gaussians, and the scene with scores as colours.
-fn drawn(scene: &Gaussians, scores: &[f32], threshold: f32) -> (Gaussians, Gaussians) {
+/// Returns the scene with only the Gaussians that reach the threshold.
+fn selected(scene: &Gaussians, scores: &[f32], threshold: f32) -> Gaussians {
     let mut selected = scene.clone();
-    selected.sh_degree = 0;
-    selected.sh_rest.clear();
-    let mut scored = selected.clone();
+    (selected.sh_degree, selected.sh_rest) = (0, Vec::new());
     // Opacity 0 is never drawn.
     let hide =
         |(opacity, score): (&mut f32, &f32)| *opacity = if *score >= threshold { *opacity } else { 0.0 };
     selected.opacities.iter_mut().zip(scores).for_each(hide);
+    selected
+}
+
+/// Returns the scene with scores as colours.
+fn scored(scene: &Gaussians, scores: &[f32]) -> Gaussians {
+    let mut scored = scene.clone();
+    (scored.sh_degree, scored.sh_rest) = (0, Vec::new());
     // A Gaussian without a score counts as the opposite of the query. Scores become colours of 0 to 1, so none is clamped.
     let colour = |score: f32| (if score.is_nan() { -1.0 } else { score } + 1.0) / 2.0;
     scored.sh_dc.iter_mut().zip(scores).for_each(|(sh, score)| *sh = [(colour(*score) - 0.5) / SH_C0; 3]);
-    (selected, scored)
+    scored
 }
 
-fn judge(
-    selected: &dyn LoadedScene,
-    scored: &dyn LoadedScene,
-    frame: &LabelledFrame,
-    thing: &LabelledThing,
-) -> Result<ThingReport, RasterError> {
+fn selection_iou(selected: &dyn LoadedScene, frame: &LabelledFrame, thing: &LabelledThing) -> Result<f64> {
     let drawing = selected.draw(&frame.view, [0.0; 3])?;
     let found = drawing.coverage.iter().map(|coverage| *coverage > MIN_COVERAGE);
-    let iou = iou_of_sets(found.zip(thing.mask.iter().copied())).unwrap_or(0.0);
+    Ok(iou_of_sets(found.zip(thing.mask.iter().copied())).unwrap_or(0.0))
+}
+
+/// Returns whether the best score, smoothed, lies in one of the thing's boxes.
+fn is_localised(scored: &dyn LoadedScene, frame: &LabelledFrame, thing: &LabelledThing) -> Result<bool> {
     let drawing = scored.draw(&frame.view, [0.0; 3])?;
     let (width, height) = (drawing.width_px as usize, drawing.height_px as usize);
     let values: Vec<f32> = drawing.rgb.chunks_exact(3).map(|rgb| rgb[0]).collect();
@@ -383,8 +386,7 @@ fn judge(
     let best = (0..smooth.len()).max_by(|a, b| smooth[*a].total_cmp(&smooth[*b]).then(b.cmp(a)));
     let [x, y] = best.map_or([0.0; 2], |best| [(best % width) as f64, (best / width) as f64]);
     let is_in = |[x1, y1, x2, y2]: &[f64; 4]| (*x1..=*x2).contains(&x) && (*y1..=*y2).contains(&y);
-    let localised = thing.boxes.iter().any(is_in);
-    Ok(ThingReport { frame: frame.name.clone(), category: thing.category.clone(), iou, localised })
+    Ok(thing.boxes.iter().any(is_in))
 }
 
 /// Returns the mean over a square around each pixel, clipped to the image, by a summed-area table (Crow 1984).
@@ -408,29 +410,26 @@ fn box_mean(values: &[f32], width: usize, height: usize, side: usize) -> Vec<f64
 
 impl fmt::Display for LerfReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
-        writeln!(f, "{:<24} {:<24} {:>6} {:>9}", "frame", "thing", "IoU", "localised")?;
+        let names = ["frame", "thing", "localised"].map(str::to_owned);
+        let thresholds = self.thresholds.iter().map(|threshold| format!("IoU at {threshold}"));
+        let mut table = Table::new(names.into_iter().chain(thresholds));
         for t in &self.things {
-            let localised = if t.localised { "yes" } else { "no" };
-            writeln!(f, "{:<24} {:<24} {:>6.3} {localised:>9}", t.frame, t.category, t.iou)?;
+            let localised = if t.localised { "yes" } else { "no" }.to_owned();
+            let ious = t.ious.iter().map(|iou| figure(Some(*iou)));
+            table.row([t.frame.clone(), t.category.clone(), localised].into_iter().chain(ious));
         }
-        writeln!(
-            f,
-            "{} things at threshold {:.3}: mIoU {}, above 0.25: {}, above 0.5: {}, localised {}",
-            self.things.len(),
-            self.threshold,
-            show(self.miou),
-            show(self.accuracy_at_25),
-            show(self.accuracy_at_50),
-            show(self.localised)
-        )?;
+        writeln!(f, "{table}")?;
+        let mut table = Table::new(["threshold", "things", "mIoU", "above 0.25", "above 0.5", "localised"]);
+        let localised = mean(self.things.iter().map(|t| Some(f64::from(u8::from(t.localised)))));
+        for (at, threshold) in self.thresholds.iter().enumerate() {
+            let means = self.means(at).into_iter().chain([localised]).map(figure);
+            table.row([threshold.to_string(), self.things.len().to_string()].into_iter().chain(means));
+        }
+        write!(f, "{table}")?;
         for (word, reason) in &self.unknown_words {
             writeln!(f, "unknown to the encoder and counted as not found: {word} ({reason})")?;
         }
-        for frame in &self.frames_without_view {
-            writeln!(f, "left out without a pose: {frame}")?;
-        }
-        Ok(())
+        self.frames_without_view.iter().try_for_each(|frame| writeln!(f, "left out without a pose: {frame}"))
     }
 }
 

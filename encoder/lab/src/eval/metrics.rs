@@ -1,7 +1,7 @@
 //! Measures of agreement between answers and labels.
 
 /// Returns the area under the ROC curve, ties counted half (Mann and Whitney 1947); `None` without both positives and negatives.
-pub fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
+pub(super) fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     let n_negative = positive.len() as f64 - n_positive;
     if n_positive == 0.0 || n_negative == 0.0 {
@@ -21,7 +21,7 @@ pub fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
 
 /// Returns the average precision: the sum of precision over steps of recall, as in TREC and scikit-learn. Equal scores form
 /// one step. `None` without positives.
-pub fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64> {
+pub(super) fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     if n_positive == 0.0 {
         return None;
@@ -46,7 +46,7 @@ fn descending(scores: &[f32]) -> Vec<usize> {
 
 /// A confusion matrix: answers by true class.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Confusion {
+pub(super) struct Confusion {
     n_classes: usize,
     /// `[true class][answered class]`, the last answer being none.
     counts: Vec<u64>,
@@ -54,12 +54,12 @@ pub struct Confusion {
 
 impl Confusion {
     /// Returns an empty matrix.
-    pub fn new(n_classes: usize) -> Self {
+    pub(super) fn new(n_classes: usize) -> Self {
         Self { n_classes, counts: vec![0; n_classes * (n_classes + 1)] }
     }
 
     /// Counts an answer; `None` is a wrong one.
-    pub fn count(&mut self, truth: usize, answer: Option<usize>) {
+    pub(super) fn count(&mut self, truth: usize, answer: Option<usize>) {
         self.counts[truth * (self.n_classes + 1) + answer.unwrap_or(self.n_classes)] += 1;
     }
 
@@ -68,7 +68,7 @@ impl Confusion {
     }
 
     /// Returns the intersection over union of a class; `None` where it neither occurs nor is answered.
-    pub fn iou(&self, class: usize) -> Option<f64> {
+    pub(super) fn iou(&self, class: usize) -> Option<f64> {
         let both = self.row(class)[class];
         let is_true: u64 = self.row(class).iter().sum();
         let answered: u64 = (0..self.n_classes).map(|truth| self.row(truth)[class]).sum();
@@ -77,20 +77,19 @@ impl Confusion {
     }
 
     /// Returns the share of a class that is answered correctly; `None` where the class does not occur.
-    pub fn accuracy(&self, class: usize) -> Option<f64> {
+    pub(super) fn accuracy(&self, class: usize) -> Option<f64> {
         let is_true: u64 = self.row(class).iter().sum();
         (is_true > 0).then(|| self.row(class)[class] as f64 / is_true as f64)
     }
 }
 
 /// Returns the mean of the values that are present; `None` without any.
-pub fn mean(values: impl IntoIterator<Item = Option<f64>>) -> Option<f64> {
+pub(super) fn mean(values: impl IntoIterator<Item = Option<f64>>) -> Option<f64> {
     let (sum, n) = values.into_iter().flatten().fold((0.0, 0), |(sum, n), v| (sum + v, n + 1));
     (n > 0).then(|| sum / f64::from(n))
 }
 
-/// Returns the intersection over union of two sets.
-pub fn iou_of_sets(pairs: impl IntoIterator<Item = (bool, bool)>) -> Option<f64> {
+pub(super) fn iou_of_sets(pairs: impl IntoIterator<Item = (bool, bool)>) -> Option<f64> {
     let (both, any) = pairs
         .into_iter()
         .fold((0u64, 0u64), |(both, any), (a, b)| (both + u64::from(a && b), any + u64::from(a || b)));

@@ -11,10 +11,9 @@ use slag_common::shard::Profile;
 use slag_common::{Distortion, Gaussians, Intrinsics, poses, splat};
 use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 
-use super::lerf::{LerfLabels, lerf};
+use super::lerf::{self, LerfLabels};
 use super::scan::Scan;
-use super::scannet::{Matching, ScannetReport, Segments, scannet};
-use super::*;
+use super::scannet::{self, ScanReport, ScannetReport, ScannetSettings};
 use slag_encoder::cells::CellLimits;
 use slag_encoder::codebook::CodebookSettings;
 use slag_encoder::encode::{self, CellSettings, EncodeSettings, Engines, Masks};
@@ -180,13 +179,14 @@ fn lerf_labels_are_judged_on_their_frames() {
     label(&dir, "frame_00009", PHOTO_PX, &objects);
     let views = poses::read(&wall.views, None).expect("poses").views;
     let labels = LerfLabels::read(&dir, &views).expect("labels");
-    let settings = EvalSettings::default();
-    let report = lerf(&wall.reader(), &labels, &wall.gaussians, &mut renamed(&[]), &CpuRasterizer, &settings)
-        .expect("judges");
+    let judge = |labels: &LerfLabels, scene: &Gaussians| {
+        lerf::judge(&wall.reader(), labels, scene, &mut renamed(&[]), &[0.28, 2.0], None)
+    };
+    let report = judge(&labels, &wall.gaussians).expect("judges");
     println!("{report}");
     let of = |frame: &str, word: &str| {
         let found = report.things.iter().find(|t| t.frame == frame && t.category == word).expect("judged");
-        (found.iou, found.localised)
+        (found.ious[0], found.localised)
     };
     let (iou, localised) = of("frame_00001", "red");
     assert!(iou > 0.85 && localised, "{iou}");
@@ -196,22 +196,23 @@ fn lerf_labels_are_judged_on_their_frames() {
     assert!(iou > 0.85 && localised, "{iou}");
     assert_eq!(of("frame_00001", "chair"), (0.0, false));
     assert_eq!(report.things.len(), 4);
-    let mean = report.things.iter().map(|t| t.iou).sum::<f64>() / 4.0;
-    assert!((report.miou.expect("a mean") - mean).abs() < 1e-12, "the unknown word is in the mean");
-    assert_eq!((report.accuracy_at_50, report.localised), (Some(0.5), Some(0.5)));
+    let mean = report.things.iter().map(|t| t.ious[0]).sum::<f64>() / 4.0;
+    let [miou, _, above_half] = report.means(0);
+    assert!((miou.expect("a mean") - mean).abs() < 1e-12, "the unknown word is in the mean");
+    assert_eq!((above_half, report.means(1)), (Some(0.5), [Some(0.0); 3]));
     assert_eq!(report.frames_without_view, ["frame_00009"]);
     assert_eq!(report.unknown_words.keys().collect::<Vec<_>>(), ["chair"]);
     assert!(report.to_string().contains("left out without a pose: frame_00009"));
 
     // No word can be encoded: an error rather than an empty mean.
-    let only = EvalSettings { words: vec!["chair".into()], ..EvalSettings::default() };
-    let judged = lerf(&wall.reader(), &labels, &wall.gaussians, &mut renamed(&[]), &CpuRasterizer, &only);
-    assert!(matches!(judged, Err(EvalError::NoWords { n: 1, .. })));
+    let mut only = labels.clone();
+    only.frames.iter_mut().for_each(|frame| frame.things.retain(|thing| thing.category == "chair"));
+    assert!(judge(&only, &wall.gaussians).expect_err("no word").to_string().contains("none of 1 words"));
     // Another splat than the one that was encoded.
     let mut other = wall.gaussians.clone();
     other.means_in_world.pop();
-    let judged = lerf(&wall.reader(), &labels, &other, &mut renamed(&[]), &CpuRasterizer, &settings);
-    assert!(matches!(judged, Err(EvalError::Scene { n_store: 384, n_scene: 383 })));
+    let message = judge(&labels, &other).expect_err("another splat").to_string();
+    assert!(message.contains("the store has 384 Gaussians, the splat 383"), "{message}");
 }
 
 #[test]
@@ -219,12 +220,12 @@ fn wrong_lerf_labels_are_named() {
     let wall = Wall::new();
     let views = poses::read(&wall.views, None).expect("poses").views;
     let dir = wall.folder("wrong");
-    let message = |dir: &Path| LerfLabels::read(dir, &views).expect_err("wrong").to_string();
+    let message = |dir: &Path| format!("{:#}", LerfLabels::read(dir, &views).expect_err("wrong"));
     assert!(message(&dir).contains("no frame_*.json"), "{}", message(&dir));
     label(&dir, "frame_00007", PHOTO_PX, &[]);
     assert!(message(&dir).contains("none of 1 labelled frames has a pose, the first is frame_00007"));
     label(&dir, "frame_00001", [320, 200], &[]);
-    assert!(message(&dir).contains("frame_00001.json: 320 x 200 pixels of a view of [320, 240]"));
+    assert!(message(&dir).contains("320 x 200 pixels of a view of [320, 240]"));
     label(&dir, "frame_00001", [u32::MAX, u32::MAX], &[]);
     assert!(message(&dir).contains("4294967295"), "{}", message(&dir));
     label(&dir, "frame_00001", PHOTO_PX, &[json!({"category": "red", "bbox": [1, 2]})]);
@@ -260,21 +261,17 @@ fn scans_are_judged_by_the_protocol() {
     write_mesh(&dir.join("scene0062_00_vh_clean_2.labels.ply"), &vertices(), true);
     let scan = Scan::read(&dir, None).expect("a scan");
     let mut encoder = renamed(&[("wall", "red"), ("floor", "blue"), ("toilet", "green")]);
-    let settings = EvalSettings::default();
-    let judged =
-        scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Nearest, None, &settings);
-    let report = judged.expect("judges");
+    let judge = |scan: &Scan, scene: &Gaussians, encoder: &mut Renamed, by_index| {
+        let settings = ScannetSettings { by_index, ..ScannetSettings::default() };
+        scannet::judge(&wall.reader(), scan, scene, encoder, settings)
+    };
+    let report = judge(&scan, &wall.gaussians, &mut encoder, false).expect("judges");
     assert_eq!((report.n_labelled, report.n_without_answer), (192 * 2 + 5, 5));
     for subset in &report.subsets {
         assert_eq!(subset.n_classes, 2);
-        assert!(
-            (subset.miou.expect("two classes") - (192.0 / 197.0 + 1.0) / 2.0).abs() < 1e-12,
-            "{subset:?}"
-        );
-        assert!(
-            (subset.macc.expect("two classes") - (192.0 / 197.0 + 1.0) / 2.0).abs() < 1e-12,
-            "{subset:?}"
-        );
+        for figure in [subset.miou, subset.macc] {
+            assert!((figure.expect("two classes") - (192.0 / 197.0 + 1.0) / 2.0).abs() < 1e-12, "{subset:?}");
+        }
     }
     assert_eq!(report.unknown_words.len(), 16);
     let all = ScannetReport::new(vec![report]);
@@ -284,31 +281,19 @@ fn scans_are_judged_by_the_protocol() {
 
     // Swapped words: no answer is correct.
     let mut swapped = renamed(&[("wall", "blue"), ("floor", "red")]);
-    let judged =
-        scannet(&wall.reader(), &scan, &wall.gaussians, &mut swapped, Matching::Nearest, None, &settings);
+    let judged = judge(&scan, &wall.gaussians, &mut swapped, false);
     assert_eq!(judged.expect("judges").subsets[0].miou, Some(0.0));
-    let none = scannet(
-        &wall.reader(),
-        &scan,
-        &wall.gaussians,
-        &mut renamed(&[]),
-        Matching::Nearest,
-        None,
-        &settings,
-    );
-    assert!(matches!(none, Err(EvalError::NoWords { n: 19, .. })));
+    let none = judge(&scan, &wall.gaussians, &mut renamed(&[]), false).expect_err("no word");
+    assert!(none.to_string().contains("none of the 19 words"), "{none}");
 
     // By index: needs equal numbers of vertices and Gaussians, and leaves out transparent Gaussians.
-    let judged =
-        scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Index, None, &settings);
-    let message = judged.expect_err("another length").to_string();
+    let message = judge(&scan, &wall.gaussians, &mut encoder, true).expect_err("another length").to_string();
     assert!(message.contains("391 vertices, the splat has 384 Gaussians"), "{message}");
     write_mesh(&dir.join("scene0062_00_vh_clean_2.labels.ply"), &vertices()[..COLUMNS * ROWS], true);
     let scan = Scan::read(&dir, None).expect("a scan");
     let mut faint = wall.gaussians.clone();
     faint.opacities[..40].fill(0.05);
-    let judged = scannet(&wall.reader(), &scan, &faint, &mut encoder, Matching::Index, None, &settings)
-        .expect("judges");
+    let judged = judge(&scan, &faint, &mut encoder, true).expect("judges");
     assert_eq!((judged.n_labelled, judged.subsets[2].miou), (COLUMNS * ROWS - 40, Some(1.0)));
 }
 
@@ -322,7 +307,7 @@ fn segments_and_groups_give_the_labels() {
     let table = dir.join("labels.tsv");
     let read = || Scan::read(&dir, Some(&table));
     let failed = |what: &str| {
-        let message = read().expect_err("wrong").to_string();
+        let message = format!("{:#}", read().expect_err("wrong"));
         assert!(message.contains(what), "{message}");
     };
     assert!(Scan::read(&dir, None).expect_err("no labels").to_string().contains("--categories"));
@@ -385,22 +370,18 @@ fn filtered_answers_are_the_majority_of_each_segment() {
     splat.opacities[7..40].fill(0.05);
     let scan = Scan::read(&dir, None).expect("a scan");
     let mut encoder = renamed(&[("wall", "red"), ("floor", "blue")]);
-    let settings = EvalSettings::default();
-    let mut judged =
-        |from| scannet(&wall.reader(), &scan, &splat, &mut encoder, Matching::Index, from, &settings);
-    let message = judged(Some(Segments::Scan)).expect_err("no segments").to_string();
-    assert!(message.contains("segs.json") && message.contains("--segments superpoints"), "{message}");
-    assert_eq!(
-        judged(Some(Segments::Auto)).expect("judges").filtered.expect("filtered").segments,
-        Segments::Superpoints
-    );
-
+    let mut judged = |segments| -> anyhow::Result<ScanReport> {
+        let settings = ScannetSettings { by_index: true, segments, profile: None };
+        scannet::judge(&wall.reader(), &scan, &splat, &mut encoder, settings)
+    };
+    let message = format!("{:#}", judged(true).expect_err("no segments"));
+    assert!(message.contains("segs.json"), "{message}");
     let path = dir.join("scene0097_00_vh_clean_2.0.010000.segs.json");
     fs_err::write(&path, json!({"segIndices": segments[1..]}).to_string()).expect("writes");
-    assert!(judged(Some(Segments::Auto)).expect_err("short").to_string().contains("383 segments"));
+    assert!(judged(true).expect_err("short").to_string().contains("383 segments"));
     fs_err::write(&path, json!({"segIndices": segments}).to_string()).expect("writes");
-    assert!(judged(None).expect("judges").filtered.is_none());
-    let report = judged(Some(Segments::Auto)).expect("judges");
+    assert!(judged(false).expect("judges").filtered.is_none());
+    let report = judged(true).expect("judges");
 
     let counted: Vec<usize> = (0..n).filter(|i| !(7..40).contains(i)).collect();
     let voted: Vec<usize> = (0..n)
@@ -428,10 +409,8 @@ fn filtered_answers_are_the_majority_of_each_segment() {
         [0, 1].map(|at| (figures[0][at] + figures[1][at]) / 3.0)
     };
     let filtered = report.filtered.as_ref().expect("filtered");
-    let n_segments = counted.iter().map(|i| segments[*i]).collect::<std::collections::BTreeSet<_>>().len();
-    assert_eq!((filtered.segments, filtered.n_segments), (Segments::Scan, n_segments));
     assert_ne!(voted, answers, "the filter changes answers");
-    for (subsets, expected) in [(&report.subsets, means(&answers)), (&filtered.subsets, means(&voted))] {
+    for (subsets, expected) in [(&report.subsets, means(&answers)), (filtered, means(&voted))] {
         for subset in subsets {
             assert_eq!(subset.n_classes, 3);
             let found = [subset.miou, subset.macc].map(|figure| figure.expect("three classes"));
@@ -439,9 +418,7 @@ fn filtered_answers_are_the_majority_of_each_segment() {
         }
     }
     let text = ScannetReport::new(vec![report]).to_string();
-    for row in
-        ["scene0097_00 PF", "mean PF", "SLAG (paper)", "SLAG PF (paper)    0.375   0.500 |  0.377   0.507"]
-    {
+    for row in ["scene0097_00 PF", "mean PF", "| SLAG PF (paper)      | 0.375      | 0.500 | 0.377"] {
         assert!(text.contains(row), "{row}\n{text}");
     }
 }

@@ -11,58 +11,24 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context, Result, bail};
 use serde::Deserialize;
-use slag_common::splat::SplatError;
 use slag_common::splat::ply::read_vertices;
 
 /// Largest NYU40 id.
 const MAX_ID: u16 = 40;
 
-/// Error in a scan.
-#[derive(Debug, thiserror::Error)]
-pub enum ScanError {
-    /// A file could not be read.
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-    /// A mesh cannot be read.
-    #[error(transparent)]
-    Mesh(#[from] SplatError),
-    /// A file is malformed.
-    #[error("{}: {what}", path.display())]
-    Wrong {
-        /// The file.
-        path: PathBuf,
-        /// The problem, the expectation and the remedy.
-        what: String,
-    },
-    /// Gaussians cannot be compared by index.
-    #[error(
-        "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; --by-index needs a splat trained with its \
-         Gaussians fixed to the vertices; omit it", dir.display()
-    )]
-    Length {
-        /// The scan's folder.
-        dir: PathBuf,
-        /// Its vertices.
-        n_vertices: usize,
-        /// Gaussians of the splat.
-        n_gaussians: usize,
-    },
-}
-
 /// A labelled mesh.
 #[derive(Clone, Debug)]
-pub struct Scan {
-    /// The scene's name.
-    pub name: String,
-    /// Its folder.
-    pub dir: PathBuf,
+pub(super) struct Scan {
+    pub(super) name: String,
+    pub(super) dir: PathBuf,
     /// The vertices, world frame, metres.
-    pub vertices: Vec<[f64; 3]>,
+    pub(super) vertices: Vec<[f64; 3]>,
     /// `[N]`: NYU40 id of each, 0 where there is none.
-    pub labels: Vec<u16>,
+    pub(super) labels: Vec<u16>,
     /// Labels that the table of categories lacks, with their vertices, which count as unlabelled.
-    pub unknown_labels: BTreeMap<String, usize>,
+    pub(super) unknown_labels: BTreeMap<String, usize>,
 }
 
 #[derive(Deserialize)]
@@ -85,71 +51,44 @@ struct Group {
 
 impl Scan {
     /// Reads a scan. `categories` is the data set's table; it is needed where there is no labelled mesh.
-    ///
-    /// # Errors
-    /// [`ScanError`].
-    pub fn read(dir: &Path, categories: Option<&Path>) -> Result<Self, ScanError> {
+    pub(super) fn read(dir: &Path, categories: Option<&Path>) -> Result<Self> {
         let name = dir.canonicalize()?.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let scan = |vertices, labels, unknown_labels| Self {
-            name: name.clone(),
-            dir: dir.to_owned(),
-            vertices,
-            labels,
-            unknown_labels,
-        };
         let path = dir.join(format!("{name}_vh_clean_2.labels.ply"));
         if !path.is_file() {
             let Some(categories) = categories else {
-                let what =
-                    "does not exist; add it, or give scannetv2-labels.combined.tsv with --categories".into();
-                return Err(ScanError::Wrong { path, what });
+                bail!(
+                    "{} does not exist; add it, or give scannetv2-labels.combined.tsv with --categories",
+                    path.display()
+                );
             };
-            return Self::of_segments(dir, &name, categories).map(|(v, l, u)| scan(v, l, u));
+            return Self::of_segments(dir, name, categories);
         }
         let rows = read_vertices(&path, ["x", "y", "z", "label"])?;
         if let Some(row) = rows.iter().find(|row| !(0.0..=f64::from(MAX_ID)).contains(&row[3])) {
-            let what =
-                format!("label {}, expected 0 to {MAX_ID} (NYU40); use the file of the v2 release", row[3]);
-            return Err(ScanError::Wrong { path, what });
+            let label = row[3];
+            bail!(
+                "{}: label {label}, expected 0 to {MAX_ID} (NYU40); use the file of the v2 release",
+                path.display()
+            );
         }
         let (vertices, labels) = rows.iter().map(|[x, y, z, label]| ([*x, *y, *z], *label as u16)).unzip();
-        Ok(scan(vertices, labels, BTreeMap::new()))
+        Ok(Self { name, dir: dir.to_owned(), vertices, labels, unknown_labels: BTreeMap::new() })
     }
 
-    /// Returns the segment of each vertex (`[N]`, numbers of the file) by ScanNet's Segmentator, or `None` where the scan
-    /// has no such file.
-    ///
-    /// # Errors
-    /// [`ScanError`] if the file is malformed or of another mesh.
-    pub fn segments(&self) -> Result<Option<Vec<u32>>, ScanError> {
-        let path = segments_path(&self.dir, &self.name);
-        if !path.is_file() {
-            return Ok(None);
-        }
-        read_segments(&path, self.vertices.len()).map(Some)
+    /// Returns the segment of each vertex (`[N]`, numbers of the file) by ScanNet's Segmentator.
+    pub(super) fn segments(&self) -> Result<Vec<u32>> {
+        read_segments(&segments_path(&self.dir, &self.name), self.vertices.len())
     }
 
-    /// Returns where the file of segments is expected.
-    pub fn segments_path(&self) -> PathBuf {
-        segments_path(&self.dir, &self.name)
-    }
-
-    #[expect(clippy::type_complexity, reason = "the parts of a scan, used once")]
-    fn of_segments(
-        dir: &Path,
-        name: &str,
-        categories: &Path,
-    ) -> Result<(Vec<[f64; 3]>, Vec<u16>, BTreeMap<String, usize>), ScanError> {
-        let wrong = |path: &Path, what: String| ScanError::Wrong { path: path.to_owned(), what };
+    fn of_segments(dir: &Path, name: String, categories: &Path) -> Result<Self> {
         let id_of = read_categories(categories)?;
         let vertices = read_vertices(&dir.join(format!("{name}_vh_clean_2.ply")), ["x", "y", "z"])?;
-        let segments = read_segments(&segments_path(dir, name), vertices.len())?;
+        let segments = read_segments(&segments_path(dir, &name), vertices.len())?;
         let path =
             [".aggregation.json", "_vh_clean.aggregation.json"].map(|end| dir.join(format!("{name}{end}")));
         let path = path.iter().find(|path| path.is_file()).unwrap_or(&path[0]);
-        let aggregation: Aggregation = serde_json::from_slice(&fs_err::read(path)?).map_err(|error| {
-            wrong(path, format!("{error}; expected segGroups, each with label and segments"))
-        })?;
+        let expected = || format!("{}: expected segGroups, each with label and segments", path.display());
+        let aggregation: Aggregation = serde_json::from_slice(&fs_err::read(path)?).with_context(expected)?;
         let mut id_of_segment: HashMap<u32, u16> = HashMap::new();
         let mut unknown: HashMap<u32, &str> = HashMap::new();
         for group in &aggregation.groups {
@@ -167,7 +106,7 @@ impl Scan {
             }
         }
         let labels = segments.iter().map(|s| id_of_segment.get(s).copied().unwrap_or(0)).collect();
-        Ok((vertices, labels, unknown_labels))
+        Ok(Self { name, dir: dir.to_owned(), vertices, labels, unknown_labels })
     }
 }
 
@@ -175,29 +114,27 @@ fn segments_path(dir: &Path, name: &str) -> PathBuf {
     dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"))
 }
 
-/// Reads the segment of each vertex.
-fn read_segments(path: &Path, n_vertices: usize) -> Result<Vec<u32>, ScanError> {
-    let wrong = |what: String| ScanError::Wrong { path: path.to_owned(), what };
-    let segments: Segments = serde_json::from_slice(&fs_err::read(path)?)
-        .map_err(|error| wrong(format!("{error}; expected segIndices, one per vertex")))?;
-    if segments.of_vertex.len() != n_vertices {
-        return Err(wrong(format!(
-            "{} segments, expected one for each of {n_vertices} vertices; use both files of one release",
-            segments.of_vertex.len()
-        )));
+fn read_segments(path: &Path, n_vertices: usize) -> Result<Vec<u32>> {
+    let expected = || format!("{}: expected segIndices, one per vertex", path.display());
+    let segments: Segments = serde_json::from_slice(&fs_err::read(path)?).with_context(expected)?;
+    let n = segments.of_vertex.len();
+    if n != n_vertices {
+        bail!(
+            "{}: {n} segments, expected one for each of {n_vertices} vertices; use both files of one release",
+            path.display()
+        );
     }
     Ok(segments.of_vertex)
 }
 
 /// Reads the NYU40 id of each of the annotators' categories.
-fn read_categories(path: &Path) -> Result<HashMap<String, u16>, ScanError> {
-    let wrong = |what: &str| ScanError::Wrong { path: path.to_owned(), what: what.to_owned() };
+fn read_categories(path: &Path) -> Result<HashMap<String, u16>> {
     let text = fs_err::read_to_string(path)?;
     let mut lines = text.lines();
     let head: Vec<&str> = lines.next().unwrap_or_default().split('\t').collect();
     let column = |name: &str| head.iter().position(|found| *found == name);
     let (Some(raw), Some(id)) = (column("raw_category"), column("nyu40id")) else {
-        return Err(wrong("no columns raw_category and nyu40id; give scannetv2-labels.combined.tsv"));
+        bail!("{}: no columns raw_category and nyu40id; give scannetv2-labels.combined.tsv", path.display());
     };
     let row = |line: &str| {
         let cells: Vec<&str> = line.split('\t').collect();

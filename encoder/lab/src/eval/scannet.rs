@@ -7,24 +7,29 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
+use std::path::PathBuf;
 
+use anyhow::{Result, bail};
+use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
-use slag_common::Gaussians;
-use slag_models::TextEncoder;
-
-use super::error::{EvalError, check_scene};
-use super::filter;
-use super::metrics::{Confusion, mean};
-use super::report::Subset;
-use super::scan::{Scan, ScanError};
-use super::settings::EvalSettings;
-use slag_encoder::lift::superpoint::{NO_SUPERPOINT, SuperpointSettings, Superpoints};
+use slag_common::poses::PoseSource;
+use slag_common::shard::Profile;
+use slag_common::{Gaussians, splat};
+use slag_encoder::cli::common::{ModelArgs, parse_frame, text_encoder_of};
+use slag_encoder::ingest::{self, FrameChoice};
 use slag_encoder::query;
 use slag_encoder::store::StoreReader;
+use slag_models::TextEncoder;
+
+use super::judge::Subset;
+use super::metrics::{Confusion, mean};
+use super::scan::Scan;
+use super::truth::check_scene;
+use crate::table::{Table, figure};
 
 /// The protocol's scenes.
-pub const SCENES: [&str; 10] = [
+const SCENES: [&str; 10] = [
     "scene0000_00",
     "scene0062_00",
     "scene0070_00",
@@ -65,237 +70,107 @@ const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
 const MIN_OPACITY: f32 = 0.1;
 /// Farther from every Gaussian, a vertex has no answer.
 const MAX_DISTANCE_M: f64 = 0.1;
+/// The paper's rows over its ten scenes: mIoU and mAcc of 19, 15 and 10 classes (Szilagyi, Engelmann, Bohg, RA-L 2025).
+const PAPER: [(&str, [[f64; 2]; 3]); 3] = [
+    ("OpenGaussian (paper)", [[0.2473, 0.4154], [0.3013, 0.4825], [0.3829, 0.5519]]),
+    ("SLAG (paper)", [[0.2898, 0.4340], [0.2898, 0.4426], [0.3714, 0.5480]]),
+    ("SLAG PF (paper)", [[0.3754, 0.4999], [0.3771, 0.5070], [0.4546, 0.6008]]),
+];
 
-/// The Gaussian that answers for a vertex.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Matching {
-    /// The Gaussian with the vertex's index.
-    Index,
-    /// The nearest Gaussian.
-    Nearest,
+/// `eval scannet`.
+#[derive(Debug, Args)]
+pub(crate) struct ScannetArgs {
+    /// Store; once per scan.
+    #[arg(long, value_name = "DIR", required = true)]
+    store: Vec<PathBuf>,
+    /// The splat that was encoded; once per scan.
+    #[arg(long, value_name = "FILE", required = true)]
+    scene: Vec<PathBuf>,
+    /// Scan: scans/sceneXXXX_YY; may be repeated.
+    #[arg(long, value_name = "DIR", required = true)]
+    scan: Vec<PathBuf>,
+    /// scannetv2-labels.combined.tsv, for scans without a labelled mesh.
+    #[arg(long, value_name = "FILE")]
+    categories: Option<PathBuf>,
+    /// Says how the splat's frame follows from that of the scan, see `slag-encoder encode --help`: auto, none or a file.
+    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
+    splat_frame: FrameChoice,
+    /// The models that the stores were encoded with.
+    #[command(flatten)]
+    models: ModelArgs,
+    #[command(flatten)]
+    judge: ScannetSettings,
 }
 
-/// Where the segments of the prediction filter come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "snake_case")]
-pub enum Segments {
-    /// The scan's segs.json, or else superpoints.
-    Auto,
-    /// The scan's segs.json.
-    Scan,
-    /// Our superpoints of the splat.
-    Superpoints,
-}
-
-/// Figures of a scene after the prediction filter.
-#[derive(Clone, Debug, Serialize)]
-pub struct FilteredReport {
-    /// Where the segments came from: `Scan` or `Superpoints`.
-    pub segments: Segments,
-    /// Segments with a vertex.
-    pub n_segments: usize,
-    /// 19, 15 and 10 classes.
-    pub subsets: Vec<Subset>,
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub(super) struct ScannetSettings {
+    /// Compares Gaussians and vertices one by one, for splats trained with Gaussians fixed to the vertices (OpenGaussian).
+    #[arg(long)]
+    pub(super) by_index: bool,
+    /// Also evaluates with the paper's prediction filter (PF): all vertices of a segment of ScanNet's segs.json take its
+    /// most frequent class.
+    #[arg(long)]
+    pub(super) segments: bool,
+    /// Scores this profile's shards, as a robot does [default: the field in full precision].
+    #[arg(long, value_name = "NAME")]
+    pub(super) profile: Option<Profile>,
 }
 
 /// Figures of a scene.
 #[derive(Clone, Debug, Serialize)]
-pub struct ScanReport {
-    /// The scene.
-    pub scene: String,
+pub(crate) struct ScanReport {
+    scene: String,
     /// 19, 15 and 10 classes; `n_classes` are those that the scene has.
-    pub subsets: Vec<Subset>,
-    /// The same after the prediction filter, where it was asked for.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub filtered: Option<FilteredReport>,
+    pub(super) subsets: Vec<Subset>,
+    /// The same after the prediction filter.
+    pub(super) filtered: Option<Vec<Subset>>,
     /// Labelled vertices of the 19 classes.
-    pub n_labelled: usize,
+    pub(super) n_labelled: usize,
     /// Labelled vertices without an answer, because no Gaussian is near or it has no evidence; they count as wrong.
-    pub n_without_answer: usize,
+    pub(super) n_without_answer: usize,
     /// Labels that the table of categories lacks, with their vertices, which are not counted.
-    pub unknown_labels: BTreeMap<String, usize>,
+    unknown_labels: BTreeMap<String, usize>,
     /// Classes with words that the encoder does not know, and why; they count as never found.
-    pub unknown_words: BTreeMap<String, String>,
+    pub(super) unknown_words: BTreeMap<String, String>,
 }
 
-/// Figures of several scenes.
 #[derive(Clone, Debug, Serialize)]
-pub struct ScannetReport {
-    /// Each.
-    pub scenes: Vec<ScanReport>,
+pub(crate) struct ScannetReport {
+    scenes: Vec<ScanReport>,
     /// Means over the scenes, of 19, 15 and 10 classes.
-    pub means: Vec<Subset>,
-    /// The same after the prediction filter, where it was asked for.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub filtered_means: Option<Vec<Subset>>,
-    /// The paper's rows, over its ten scenes.
-    pub paper: [PaperRow; 2],
+    means: Vec<Subset>,
+    filtered_means: Option<Vec<Subset>>,
     /// Scenes of the protocol that were not evaluated.
-    pub missing_scenes: Vec<&'static str>,
+    pub(super) missing_scenes: Vec<&'static str>,
 }
 
-/// A row of the paper's ScanNet table, in percent (Szilagyi, Engelmann, Bohg, RA-L 2025).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct PaperRow {
-    /// Its name.
-    pub name: &'static str,
-    /// mIoU and mAcc of 19, 15 and 10 classes.
-    pub percent: [[f64; 2]; 3],
-}
-
-/// The paper's rows without and with its prediction filter.
-const PAPER: [PaperRow; 2] = [
-    PaperRow { name: "SLAG (paper)", percent: [[28.98, 43.40], [28.98, 44.26], [37.14, 54.80]] },
-    PaperRow { name: "SLAG PF (paper)", percent: [[37.54, 49.99], [37.71, 50.70], [45.46, 60.08]] },
-];
-
-/// Evaluates a store against a labelled mesh.
-///
-/// `scene` is the splat that was encoded, in the mesh's frame. With `segments`, the figures after the paper's prediction
-/// filter are beside the plain ones: all vertices of a segment take the class that most of its vertices with an answer
-/// have, ties going to the first of the list. Labels have no part in it; vertices without one vote too.
-///
-/// # Errors
-/// [`EvalError`].
-pub fn scannet(
-    reader: &StoreReader,
-    scan: &Scan,
-    scene: &Gaussians,
-    encoder: &mut dyn TextEncoder,
-    matching: Matching,
-    segments: Option<Segments>,
-    settings: &EvalSettings,
-) -> Result<ScanReport, EvalError> {
-    check_scene(reader, scene)?;
-    let gaussian_of = match matching {
-        Matching::Index => by_index(scan, scene)?,
-        Matching::Nearest => by_distance(scan, scene),
-    };
-    let mut unknown_words = BTreeMap::new();
-    let mut first_error = None;
-    let mut scores: Vec<Option<Vec<f32>>> = Vec::new();
-    for (_, word) in CLASSES {
-        let vector = match encoder.encode(word) {
-            Ok(vector) => vector,
-            Err(error) => {
-                unknown_words.insert(word.to_owned(), error.to_string());
-                first_error.get_or_insert((word.to_owned(), error));
-                scores.push(None);
-                continue;
-            }
-        };
-        scores.push(Some(match settings.profile {
-            Some(profile) => query::scores_of_shards(reader, &vector, profile)?.cosines,
-            None => query::scores(reader, &vector)?.cosines,
-        }));
+pub(crate) fn run(args: &ScannetArgs) -> Result<ScannetReport> {
+    let (n_scans, n_stores, n_scenes) = (args.scan.len(), args.store.len(), args.scene.len());
+    if n_stores != n_scans || n_scenes != n_scans {
+        bail!(
+            "{n_scans} scans, {n_stores} stores and {n_scenes} splats; give --scan, --store and --scene once per scan, \
+             in the same order"
+        );
     }
-    if let (true, Some((first, source))) = (scores.iter().all(Option::is_none), first_error) {
-        return Err(EvalError::NoWords { n: CLASSES.len(), first, source: Box::new(source) });
-    }
-    let score = |class: usize, gaussian: usize| {
-        let of_class = scores[class].as_ref()?;
-        of_class.get(gaussian).copied().filter(|score| !score.is_nan())
-    };
-    let ids_of_19 = CLASSES.map(|(id, _)| id);
-    let filter = segments.map(|from| segments_of(scan, scene, &gaussian_of, from)).transpose()?;
-    let judge = |ids: &[u16], filter: Option<&Superpoints>| {
-        let classes: Vec<usize> =
-            (0..CLASSES.len()).filter(|class| ids.contains(&CLASSES[*class].0)).collect();
-        let answer = |answerer: &Answerer| {
-            let gaussian = answerer.counted()??;
-            let answers = classes.iter().filter_map(|class| Some((*class, score(*class, gaussian)?)));
-            answers.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))).map(|(class, _)| class)
-        };
-        let mut answers: Vec<Option<usize>> = gaussian_of.iter().map(answer).collect();
-        if let Some(segments) = filter {
-            filter::vote(&mut answers, segments);
+    let mut scenes = Vec::new();
+    for ((scan, store), scene) in args.scan.iter().zip(&args.store).zip(&args.scene) {
+        let reader = StoreReader::open(store)?;
+        let mut encoder = text_encoder_of(&reader, &args.models)?;
+        let frame = ingest::find_frame(scene, &args.splat_frame, PoseSource::Scannet, None)?;
+        let mut scene = splat::read(scene, &splat::ReadOptions { with_sh_rest: false })?;
+        if let Some(frame) = frame {
+            tracing::info!("{frame}; the splat is brought into the world of the scan");
+            frame.to_poses(&mut scene);
         }
-        subset(&classes, scan, &gaussian_of, &answers)
-    };
-    let all_subsets = |filter: Option<&Superpoints>| {
-        [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| judge(ids, filter)).to_vec()
-    };
-    let subsets = all_subsets(None);
-    let filtered = filter.map(|(segments, of_vertex)| FilteredReport {
-        segments,
-        n_segments: of_vertex.n,
-        subsets: all_subsets(Some(&of_vertex)),
-    });
-    let counted = scan.labels.iter().zip(&gaussian_of).filter(|(label, _)| ids_of_19.contains(label));
-    let counted: Vec<Option<usize>> = counted.filter_map(|(_, gaussian)| gaussian.counted()).collect();
-    let has_answer = |gaussian: &Option<usize>| {
-        gaussian.is_some_and(|gaussian| (0..CLASSES.len()).any(|class| score(class, gaussian).is_some()))
-    };
-    Ok(ScanReport {
-        scene: scan.name.clone(),
-        subsets,
-        filtered,
-        n_labelled: counted.len(),
-        n_without_answer: counted.iter().filter(|gaussian| !has_answer(gaussian)).count(),
-        unknown_labels: scan.unknown_labels.clone(),
-        unknown_words,
-    })
-}
-
-/// Compares answers with labels; means are over the classes that the scene has, as in the protocol.
-fn subset(classes: &[usize], scan: &Scan, gaussian_of: &[Answerer], answers: &[Option<usize>]) -> Subset {
-    let mut confusion = Confusion::new(CLASSES.len());
-    for ((label, answerer), answer) in scan.labels.iter().zip(gaussian_of).zip(answers) {
-        let truth = classes.iter().copied().find(|class| CLASSES[*class].0 == *label);
-        if let (Some(truth), Some(_)) = (truth, answerer.counted()) {
-            confusion.count(truth, *answer);
-        }
+        let scan = Scan::read(scan, args.categories.as_deref())?;
+        scenes.push(judge(&reader, &scan, &scene, &mut *encoder, args.judge)?);
     }
-    let present: Vec<usize> =
-        classes.iter().copied().filter(|class| confusion.accuracy(*class).is_some()).collect();
-    Subset {
-        n_classes: present.len(),
-        miou: mean(present.iter().map(|class| confusion.iou(*class))),
-        macc: mean(present.iter().map(|class| confusion.accuracy(*class))),
-    }
-}
-
-/// Returns the segment of each vertex, numbered from 0, and where it came from. Vertices that are left out are in none.
-fn segments_of(
-    scan: &Scan,
-    scene: &Gaussians,
-    gaussian_of: &[Answerer],
-    from: Segments,
-) -> Result<(Segments, Superpoints), EvalError> {
-    let of_scan = if from == Segments::Superpoints { None } else { scan.segments()? };
-    if of_scan.is_none() && from == Segments::Scan {
-        let what = "does not exist; add it, or use --segments superpoints".to_owned();
-        return Err(ScanError::Wrong { path: scan.segments_path(), what }.into());
-    }
-    let (used, ids) = match of_scan {
-        Some(ids) => (Segments::Scan, ids),
-        None => {
-            let superpoints = Superpoints::new(scene, None, &SuperpointSettings::of_looks());
-            let of_vertex = |answerer: &Answerer| match answerer {
-                Answerer::Gaussian(gaussian) => superpoints.of_gaussian[*gaussian],
-                Answerer::None | Answerer::LeftOut => NO_SUPERPOINT,
-            };
-            (Segments::Superpoints, gaussian_of.iter().map(of_vertex).collect())
-        }
-    };
-    let mut number_of = HashMap::new();
-    let mut of_gaussian = Vec::with_capacity(ids.len());
-    for (id, answerer) in ids.iter().zip(gaussian_of) {
-        if *answerer == Answerer::LeftOut || (used == Segments::Superpoints && *id == NO_SUPERPOINT) {
-            of_gaussian.push(NO_SUPERPOINT);
-            continue;
-        }
-        // Fewer segments than vertices, which a mesh of less than 4 GiB numbers with 32 bits.
-        let next = number_of.len() as u32;
-        of_gaussian.push(*number_of.entry(*id).or_insert(next));
-    }
-    Ok((used, Superpoints { of_gaussian, n: number_of.len() }))
+    Ok(ScannetReport::new(scenes))
 }
 
 /// The answer's source for a vertex.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Answerer {
-    /// A Gaussian.
     Gaussian(usize),
     /// None is near; the vertex counts as wrong.
     None,
@@ -303,21 +178,121 @@ enum Answerer {
     LeftOut,
 }
 
-impl Answerer {
-    /// Returns `None` where the vertex is left out, and else the Gaussian, if there is one.
-    fn counted(self) -> Option<Option<usize>> {
-        match self {
-            Self::Gaussian(gaussian) => Some(Some(gaussian)),
-            Self::None => Some(None),
-            Self::LeftOut => None,
+/// Evaluates a store against a labelled mesh. `scene` is the splat that was encoded, in the mesh's frame.
+pub(super) fn judge(
+    reader: &StoreReader,
+    scan: &Scan,
+    scene: &Gaussians,
+    encoder: &mut dyn TextEncoder,
+    settings: ScannetSettings,
+) -> Result<ScanReport> {
+    check_scene(reader, scene.len())?;
+    let answerers = if settings.by_index { by_index(scan, scene)? } else { by_distance(scan, scene) };
+    let (mut unknown_words, mut scores) = (BTreeMap::new(), Vec::new());
+    for (_, word) in CLASSES {
+        scores.push(match (encoder.encode(word), settings.profile) {
+            (Ok(vector), Some(profile)) => query::scores_of_shards(reader, &vector, profile)?.cosines,
+            (Ok(vector), None) => query::scores(reader, &vector)?.cosines,
+            (Err(error), _) => {
+                unknown_words.insert(word.to_owned(), error.to_string());
+                Vec::new()
+            }
+        });
+    }
+    if unknown_words.len() == CLASSES.len() {
+        bail!("the encoder knows none of the {} words: {unknown_words:?}", CLASSES.len());
+    }
+    let answers = Answers { scan, answerers: &answerers, scores: &scores };
+    let segments = if settings.segments { Some(scan.segments()?) } else { None };
+    let subsets = |segments: Option<&[u32]>| {
+        let ids_of_19 = CLASSES.map(|(id, _)| id);
+        [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| answers.subset(ids, segments)).to_vec()
+    };
+    let is_judged = |(label, answerer): &(&u16, &Answerer)| {
+        CLASSES.iter().any(|(id, _)| id == *label) && **answerer != Answerer::LeftOut
+    };
+    let judged: Vec<&Answerer> =
+        scan.labels.iter().zip(&answerers).filter(is_judged).map(|(_, answerer)| answerer).collect();
+    let all: Vec<usize> = (0..CLASSES.len()).collect();
+    Ok(ScanReport {
+        scene: scan.name.clone(),
+        subsets: subsets(None),
+        filtered: segments.as_deref().map(|segments| subsets(Some(segments))),
+        n_labelled: judged.len(),
+        n_without_answer: judged.iter().filter(|answerer| answers.best(answerer, &all).is_none()).count(),
+        unknown_labels: scan.unknown_labels.clone(),
+        unknown_words,
+    })
+}
+
+/// What answers each vertex, and its scores of each class.
+struct Answers<'a> {
+    scan: &'a Scan,
+    answerers: &'a [Answerer],
+    /// Of each class; empty for an unknown word.
+    scores: &'a [Vec<f32>],
+}
+
+impl Answers<'_> {
+    /// Returns the best of some classes for a vertex; ties go to the first.
+    fn best(&self, answerer: &Answerer, classes: &[usize]) -> Option<usize> {
+        let Answerer::Gaussian(gaussian) = answerer else { return None };
+        let score =
+            |class: &usize| self.scores[*class].get(*gaussian).copied().filter(|score| !score.is_nan());
+        let scored = classes.iter().filter_map(|class| Some((*class, score(class)?)));
+        scored.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))).map(|(class, _)| class)
+    }
+
+    /// Compares answers with labels; means are over the classes that the scene has, as in the protocol.
+    fn subset(&self, ids: &[u16], segments: Option<&[u32]>) -> Subset {
+        let classes: Vec<usize> =
+            (0..CLASSES.len()).filter(|class| ids.contains(&CLASSES[*class].0)).collect();
+        let mut answers: Vec<Option<usize>> =
+            self.answerers.iter().map(|answerer| self.best(answerer, &classes)).collect();
+        if let Some(segments) = segments {
+            self.vote(&mut answers, segments);
+        }
+        let mut confusion = Confusion::new(CLASSES.len());
+        for ((label, answerer), answer) in self.scan.labels.iter().zip(self.answerers).zip(answers) {
+            let truth = classes.iter().copied().find(|class| CLASSES[*class].0 == *label);
+            if let Some(truth) = truth.filter(|_| *answerer != Answerer::LeftOut) {
+                confusion.count(truth, answer);
+            }
+        }
+        let present: Vec<usize> =
+            classes.iter().copied().filter(|class| confusion.accuracy(*class).is_some()).collect();
+        Subset {
+            n_classes: present.len(),
+            miou: mean(present.iter().map(|class| confusion.iou(*class))),
+            macc: mean(present.iter().map(|class| confusion.accuracy(*class))),
+        }
+    }
+
+    /// The paper's prediction filter: all vertices of a segment take the class that most of its vertices with an answer
+    /// have, ties going to the first of the list. Vertices that are left out do not vote; those without a label do.
+    fn vote(&self, answers: &mut [Option<usize>], segments: &[u32]) {
+        let mut votes: HashMap<u32, [u32; CLASSES.len()]> = HashMap::new();
+        for ((segment, answer), answerer) in segments.iter().zip(&*answers).zip(self.answerers) {
+            if let Some(class) = answer.filter(|_| *answerer != Answerer::LeftOut) {
+                votes.entry(*segment).or_default()[class] += 1;
+            }
+        }
+        for (segment, answer) in segments.iter().zip(answers) {
+            if let Some(counts) = votes.get(segment) {
+                *answer = (0..counts.len()).max_by_key(|class| (counts[*class], std::cmp::Reverse(*class)));
+            }
         }
     }
 }
 
-fn by_index(scan: &Scan, scene: &Gaussians) -> Result<Vec<Answerer>, ScanError> {
+fn by_index(scan: &Scan, scene: &Gaussians) -> Result<Vec<Answerer>> {
     let (n_vertices, n_gaussians) = (scan.vertices.len(), scene.len());
     if n_vertices != n_gaussians {
-        return Err(ScanError::Length { dir: scan.dir.clone(), n_vertices, n_gaussians });
+        bail!(
+            "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; --by-index needs a splat trained with its \
+             Gaussians fixed to the vertices; omit it",
+            scan.dir.display()
+        );
     }
     let answerer = |k: usize| match scene.opacities[k] < MIN_OPACITY {
         true => Answerer::LeftOut,
@@ -352,7 +327,7 @@ fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
 
 impl ScannetReport {
     /// Takes the means over scenes.
-    pub fn new(scenes: Vec<ScanReport>) -> Self {
+    pub(super) fn new(scenes: Vec<ScanReport>) -> Self {
         let means_of = |subsets: &dyn Fn(&ScanReport) -> Option<Vec<Subset>>| -> Option<Vec<Subset>> {
             let of_scenes: Vec<Vec<Subset>> = scenes.iter().map(subsets).collect::<Option<_>>()?;
             let mean_of = |at: usize| Subset {
@@ -363,78 +338,53 @@ impl ScannetReport {
             Some((0..3).map(mean_of).collect())
         };
         let means = means_of(&|scene| Some(scene.subsets.clone())).unwrap_or_default();
-        let filtered_means = means_of(&|scene| Some(scene.filtered.as_ref()?.subsets.clone()));
+        let filtered_means = means_of(&|scene| scene.filtered.clone());
         let missing_scenes =
             SCENES.into_iter().filter(|name| !scenes.iter().any(|s| s.scene == *name)).collect();
-        Self { scenes, means, filtered_means, paper: PAPER, missing_scenes }
+        Self { scenes, means, filtered_means, missing_scenes }
+    }
+
+    /// Returns whether every word and label of every scene is known.
+    pub(crate) fn is_complete(&self) -> bool {
+        self.scenes.iter().all(|s| s.unknown_words.is_empty() && s.unknown_labels.is_empty())
     }
 }
 
 impl fmt::Display for ScannetReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
-        let figures = |subsets: &[Subset]| {
-            let figures = subsets.iter().map(|s| format!("{:>7} {:>7}", show(s.miou), show(s.macc)));
-            figures.collect::<Vec<_>>().join(" |")
+        let columns = ["scene", "mIoU of 19", "mAcc", "mIoU of 15", "mAcc", "mIoU of 10", "mAcc"];
+        let mut table = Table::new(columns);
+        let mut row = |name: String, subsets: &[Subset]| {
+            let figures = subsets.iter().flat_map(|s| [figure(s.miou), figure(s.macc)]);
+            table.row(std::iter::once(name).chain(figures));
         };
-        writeln!(f, "{:<16} {}", "", ["  19 classes    ", "   15 classes    ", "   10 classes"].concat())?;
-        writeln!(f, "{:<16} {}", "scene", ["   mIoU    mAcc"; 3].join(" |"))?;
         for scene in &self.scenes {
-            writeln!(f, "{:<16} {}", scene.scene, figures(&scene.subsets))?;
-            if let Some(filtered) = &scene.filtered {
-                writeln!(f, "{:<16} {}", format!("{} PF", scene.scene), figures(&filtered.subsets))?;
-            }
+            row(scene.scene.clone(), &scene.subsets);
+            scene.filtered.iter().for_each(|subsets| row(format!("{} PF", scene.scene), subsets));
         }
-        writeln!(f, "{:<16} {}", "mean", figures(&self.means))?;
-        if let Some(means) = &self.filtered_means {
-            writeln!(f, "{:<16} {}", "mean PF", figures(means))?;
+        row("mean".into(), &self.means);
+        self.filtered_means.iter().for_each(|means| row("mean PF".into(), means));
+        for (name, figures) in PAPER {
+            let subset = |[miou, macc]: [f64; 2]| Subset { n_classes: 0, miou: Some(miou), macc: Some(macc) };
+            row(name.into(), &figures.map(subset));
         }
-        for row in &self.paper {
-            let figures =
-                row.percent.map(|[miou, macc]| format!("{:>7.3} {:>7.3}", miou / 100.0, macc / 100.0));
-            writeln!(f, "{:<16} {}", row.name, figures.join(" |"))?;
-        }
+        write!(f, "{table}")?;
         for scene in &self.scenes {
-            if let Some(FilteredReport { segments, n_segments, .. }) = &scene.filtered {
-                let from = match segments {
-                    Segments::Superpoints => {
-                        "superpoints of the splat, as the scan has no segs.json or it was not asked for"
-                    }
-                    Segments::Auto | Segments::Scan => "segments of ScanNet's segs.json",
-                };
-                writeln!(f, "{} PF: majority class of {n_segments} {from}", scene.scene)?;
-            }
-        }
-        for scene in &self.scenes {
+            let name = &scene.scene;
             if scene.n_without_answer > 0 {
                 let (n, of) = (scene.n_without_answer, scene.n_labelled);
-                writeln!(
-                    f,
-                    "{}: {n} of {of} labelled vertices have no answer and count as wrong",
-                    scene.scene
-                )?;
+                writeln!(f, "{name}: {n} of {of} labelled vertices have no answer and count as wrong")?;
             }
             for (label, n) in &scene.unknown_labels {
-                writeln!(
-                    f,
-                    "{}: {n} vertices left out: the table of categories lacks {label:?}",
-                    scene.scene
-                )?;
+                writeln!(f, "{name}: {n} vertices left out: the table of categories lacks {label:?}")?;
             }
             for (word, reason) in &scene.unknown_words {
-                writeln!(
-                    f,
-                    "{}: unknown to the encoder and counted as never found: {word} ({reason})",
-                    scene.scene
-                )?;
+                writeln!(f, "{name}: unknown to the encoder and counted as never found: {word} ({reason})")?;
             }
         }
         if !self.missing_scenes.is_empty() {
-            writeln!(
-                f,
-                "the means differ from the protocol's: {} were not evaluated",
-                self.missing_scenes.join(", ")
-            )?;
+            let missing = self.missing_scenes.join(", ");
+            writeln!(f, "the means differ from the protocol's: {missing} were not evaluated")?;
         }
         Ok(())
     }

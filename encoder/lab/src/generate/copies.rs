@@ -3,12 +3,11 @@
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context, Result, anyhow};
 use glam::DVec3;
 use slag_common::splat::{self, ReadOptions};
 use slag_encoder::progress::Progress;
 use slag_math::stats::trimmed_range;
-
-use super::output::GenerateError;
 
 /// Share of the means on either side of an axis that does not count for the distance of copies: floaters.
 const TRIMMED: f64 = 0.005;
@@ -24,7 +23,6 @@ pub struct CopiesSettings {
     pub n_views: u32,
 }
 
-/// What was written.
 #[derive(Clone, Debug)]
 pub struct WrittenCopies {
     /// The splat.
@@ -33,7 +31,6 @@ pub struct WrittenCopies {
     pub views: PathBuf,
     /// The masks, if the scene has any.
     pub masks: Option<PathBuf>,
-    /// Gaussians.
     pub n_gaussians: u64,
     /// Distance between neighbouring copies, world units.
     pub spacing: f64,
@@ -41,23 +38,21 @@ pub struct WrittenCopies {
 
 /// Writes `scene.ply`, `transforms.json`, `images/` and `gt/masks/` from a folder with a labelled scene. Photos and masks are
 /// hard links where the file system allows it. Cameras see neighbouring copies in the distance, where photos show none.
-///
-/// # Errors
-/// [`GenerateError`]; [`GenerateError::Source`] for a folder that is no such scene or has too few photos.
 pub fn write(
     source: &Path,
     folder: &Path,
     settings: CopiesSettings,
     progress: &dyn Progress,
-) -> Result<WrittenCopies, GenerateError> {
+) -> Result<WrittenCopies> {
     let CopiesSettings { n_copies, n_views } = settings;
-    let unfit = |what: String| GenerateError::Source { path: source.to_owned(), what };
+    let unfit = |what: String| anyhow!("{}: {what}", source.display());
     let splat =
         ["scene.ply", "point_cloud.ply"].map(|name| source.join(name)).into_iter().find(|p| p.exists());
     let splat = splat.ok_or_else(|| unfit("no scene.ply or point_cloud.ply".into()))?;
     let mut gaussians = splat::read(&splat, &ReadOptions { with_sh_rest: true })?;
-    let poses: serde_json::Value = serde_json::from_slice(&fs_err::read(source.join("transforms.json"))?)
-        .map_err(|e| unfit(format!("transforms.json: {e}")))?;
+    let poses = source.join("transforms.json");
+    let mut poses: serde_json::Value =
+        serde_json::from_slice(&fs_err::read(&poses)?).with_context(|| poses.display().to_string())?;
     let frames = poses["frames"].as_array().filter(|frames| !frames.is_empty());
     let frames = frames.ok_or_else(|| unfit("transforms.json has no frames".into()))?;
     if u64::from(n_views) > u64::from(n_copies) * frames.len() as u64 {
@@ -129,10 +124,9 @@ pub fn write(
         }
         moved_frames.push(frame);
     }
-    let mut poses = poses;
     poses["frames"] = moved_frames.into();
     let views = folder.join("transforms.json");
-    fs_err::write(&views, serde_json::to_vec(&poses).map_err(std::io::Error::from)?)?;
+    fs_err::write(&views, serde_json::to_vec(&poses)?)?;
     let masks = masks.map(|_| folder.join("gt/masks"));
     Ok(WrittenCopies { scene, views, masks, n_gaussians, spacing })
 }

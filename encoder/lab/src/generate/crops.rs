@@ -3,6 +3,7 @@
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
+use anyhow::Result;
 use glam::DVec3;
 use image::RgbImage;
 use rayon::prelude::*;
@@ -13,7 +14,6 @@ use slag_models::preprocess::{Filter, Preprocess, Resize};
 
 use super::compose::{Layout, looking, pinhole};
 use super::grammar::Noun;
-use super::output::GenerateError;
 use super::paint::{Colour, Material};
 use super::render::{NOTHING, Photo, Solids};
 use slag_encoder::embed::{self, Background};
@@ -83,9 +83,6 @@ pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
 
 /// Writes crops of the scenes of some seeds: `crops.npy` (u8 `[n][edge][edge][3]`, the encoder's input, white outside the
 /// mask), `labels.json` (a [`Label`] per crop) and `nouns.json` (their words). Returns the number of crops.
-///
-/// # Errors
-/// [`GenerateError`].
 pub fn write(
     folder: &Path,
     split: Split,
@@ -93,7 +90,7 @@ pub fn write(
     seeds: std::ops::Range<u64>,
     edge_px: u32,
     progress: &dyn Progress,
-) -> Result<usize, GenerateError> {
+) -> Result<usize> {
     fs_err::create_dir_all(folder)?;
     let preprocess = Preprocess::new(edge_px, Resize::Pad, Filter::Bicubic, [0.0; 3], [1.0; 3]);
     progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
@@ -111,7 +108,7 @@ pub fn write(
     let edge = edge_px as usize;
     npy::write_file(&folder.join("crops.npy"), &[crops.len(), edge, edge, 3], &pixels)?;
     let labels: Vec<&Label> = crops.iter().map(|(_, label)| label).collect();
-    fs_err::write(folder.join("labels.json"), serde_json::to_vec(&labels).map_err(std::io::Error::from)?)?;
+    fs_err::write(folder.join("labels.json"), serde_json::to_vec(&labels)?)?;
     let mut out = fs_err::File::create(folder.join("nouns.json"))?;
     let words: Vec<_> = nouns
         .iter()
@@ -122,7 +119,7 @@ pub fn write(
             })
         })
         .collect();
-    out.write_all(&serde_json::to_vec_pretty(&words).map_err(std::io::Error::from)?)?;
+    out.write_all(&serde_json::to_vec_pretty(&words)?)?;
     Ok(crops.len())
 }
 

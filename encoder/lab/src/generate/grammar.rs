@@ -94,7 +94,6 @@ pub struct Top {
 /// A noun: the rules by which its things are made.
 #[derive(Clone, Debug)]
 pub struct Noun {
-    /// Its name.
     pub name: String,
     /// Its synonyms.
     pub words: Vec<String>,

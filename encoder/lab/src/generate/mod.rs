@@ -3,18 +3,16 @@
 //! Object files hold the rules by which things are made ([`grammar`]). Things stand in rooms, yards and streets
 //! ([`compose`]) and are photographed by ray casting ([`render`]); the Gaussians cover the same surfaces.
 
-pub mod compose;
-pub mod copies;
-pub mod crops;
+pub(crate) mod compose;
+pub(crate) mod copies;
+pub(crate) mod crops;
 mod expression;
-pub mod field;
 pub mod grammar;
-mod output;
-pub mod paint;
-pub mod photos;
-pub mod render;
+pub(crate) mod paint;
+pub(crate) mod photos;
+pub(crate) mod render;
 mod scene;
 mod solid;
 
-pub use output::GenerateError;
-pub use scene::{Scene, TrueObject, WrittenScene};
+pub(crate) use scene::TrueObject;
+pub use scene::{Scene, WrittenScene};

@@ -18,7 +18,6 @@ macro_rules! named {
             /// All values.
             pub const ALL: &[Self] = &[$(Self::$variant),+];
 
-            /// Returns its word.
             pub fn word(self) -> &'static str {
                 match self { $(Self::$variant => $text),+ }
             }
@@ -39,32 +38,20 @@ macro_rules! named {
 named! {
     /// The eleven basic colour terms of English (Berlin and Kay 1969).
     Colour:
-    /// Black.
     Black "black",
-    /// White.
     White "white",
-    /// Grey.
     Grey "grey",
-    /// Red.
     Red "red",
-    /// Green.
     Green "green",
-    /// Blue.
     Blue "blue",
-    /// Yellow.
     Yellow "yellow",
-    /// Orange.
     Orange "orange",
-    /// Brown.
     Brown "brown",
-    /// Purple.
     Purple "purple",
-    /// Pink.
     Pink "pink",
 }
 
 named! {
-    /// A material.
     Material:
     /// Long grain along the part's longest edge.
     Wood "wood",
@@ -103,7 +90,6 @@ named! {
 pub struct Paint {
     /// Colour under white light, 0 to 1.
     pub rgb: [f64; 3],
-    /// Its material.
     pub material: Material,
     /// Seed of the pattern.
     pub seed: u32,

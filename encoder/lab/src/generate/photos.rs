@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
+use anyhow::Result;
 use rayon::prelude::*;
 use slag_common::npy;
 
 use super::compose::{FIELD_OF_VIEW_RAD, Layout, PHOTO_PX, pinhole};
 use super::grammar::Noun;
-use super::output::GenerateError;
 use super::render::{NOTHING, Photo};
 use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
@@ -18,15 +18,12 @@ const N_PHOTOS: u32 = 4;
 /// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`), `things.npy` (u16
 /// `[n][height][width]`: the thing's number, 65535 for the sky) and `depths.npy` (f32 `[n][height][width]`: metres along the
 /// camera's axis, infinite for the sky). Returns the number of photos.
-///
-/// # Errors
-/// [`GenerateError`].
 pub fn write(
     folder: &Path,
     nouns: &[Noun],
     seeds: std::ops::Range<u64>,
     progress: &dyn Progress,
-) -> Result<usize, GenerateError> {
+) -> Result<usize> {
     fs_err::create_dir_all(folder)?;
     progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
     let of_seed = |seed: u64| {
@@ -49,4 +46,30 @@ pub fn write(
     let depths_m: Vec<f32> = photos.iter().flat_map(|photo| photo.depth_m.iter().copied()).collect();
     npy::write_file(&folder.join("depths.npy"), &shape, &depths_m)?;
     Ok(photos.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use slag_common::npy;
+
+    /// Oracle: another program's reader of the format.
+    #[test]
+    fn arrays_are_read_by_another_reader() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let path = dir.path().join("array.npy");
+        let values: Vec<u16> = (0..30).map(|i| i * 2003).collect();
+        npy::write_file(&path, &[5, 2, 3], &values).expect("writes");
+        let bytes = fs_err::read(&path).expect("reads");
+        let array = npyz::NpyFile::new(&bytes[..]).expect("an array");
+        assert_eq!(array.shape(), [5, 2, 3]);
+        assert_eq!(array.into_vec::<u16>().expect("u16"), values);
+        for n in [0usize, 1, 70, 1000] {
+            let values: Vec<f32> = (0..n).map(|i| i as f32 * 0.5).collect();
+            let mut bytes = Vec::new();
+            npy::write(&mut bytes, &[n], &values).expect("writes to memory");
+            let array = npyz::NpyFile::new(&bytes[..]).expect("an array");
+            assert_eq!(array.shape(), [n as u64]);
+            assert_eq!(array.into_vec::<f32>().expect("f32"), values);
+        }
+    }
 }

@@ -106,7 +106,6 @@ impl Thing {
         Self { pieces, centre, radius_m }
     }
 
-    /// Returns its centre.
     pub fn centre(&self) -> DVec3 {
         self.centre
     }
@@ -149,7 +148,6 @@ impl Solids {
         Self { things, light, ambient, tint }
     }
 
-    /// Returns the things.
     pub fn things(&self) -> &[Thing] {
         &self.things
     }

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context, Result};
 use glam::{DQuat, DVec3};
 use serde::Serialize;
 use slag_common::Gaussians;
@@ -13,7 +14,6 @@ use slag_math::random::Xorshift;
 
 use super::compose::{Layout, Walk, photo_intrinsics};
 use super::grammar::{Noun, SceneKind};
-use super::output::GenerateError;
 use super::render::NOTHING;
 
 /// Distance between surface Gaussians, relative to the thing's radius.
@@ -50,7 +50,6 @@ pub struct Scene {
 pub struct TrueObject {
     /// Its id in masks and labels.
     pub id: u16,
-    /// Its category.
     pub category: String,
     /// Its synonyms.
     pub words: Vec<String>,
@@ -68,7 +67,6 @@ pub struct TrueObject {
     pub aabb_min: DVec3,
     /// Largest corner.
     pub aabb_max: DVec3,
-    /// Number of its Gaussians.
     pub n_gaussians: usize,
     /// Pixels that show it, over all photos to encode.
     pub train_pixels: u64,
@@ -141,10 +139,7 @@ impl Scene {
 
     /// Writes `scene.ply`, `images/`, `transforms.json`; the held-out views in `test/`; and the labels in `gt/`: `masks/` and
     /// `test_masks/` (a thing's id at each pixel, 0 for the sky), `instances.json`, `gaussian_instance.npy`.
-    ///
-    /// # Errors
-    /// [`GenerateError`].
-    pub fn write(&mut self, folder: &Path, progress: &dyn Progress) -> Result<WrittenScene, GenerateError> {
+    pub fn write(&mut self, folder: &Path, progress: &dyn Progress) -> Result<WrittenScene> {
         let truth = folder.join("gt");
         for sub in ["images", "test", "gt/masks", "gt/test_masks"] {
             fs_err::create_dir_all(folder.join(sub))?;
@@ -177,7 +172,7 @@ impl Scene {
         [photos, masks]: [&Path; 2],
         poses: &Path,
         progress: &dyn Progress,
-    ) -> Result<Vec<u64>, GenerateError> {
+    ) -> Result<Vec<u64>> {
         let solids = self.layout.solids();
         let mut n_pixels = vec![0; self.objects.len()];
         let mut frames = Vec::new();
@@ -196,9 +191,9 @@ impl Scene {
                 .expect("a photo has one id per pixel");
             let name = format!("{i:04}.png");
             let path = masks.join(&name);
-            mask.save(&path).map_err(|source| GenerateError::Image { path, source })?;
+            mask.save(&path).with_context(|| path.display().to_string())?;
             let path = photos.join(&name);
-            photo.image.save(&path).map_err(|source| GenerateError::Image { path: path.clone(), source })?;
+            photo.image.save(&path).with_context(|| path.display().to_string())?;
             let beside = poses.parent().and_then(|folder| path.strip_prefix(folder).ok()).unwrap_or(&path);
             frames.push(frame(beside.to_string_lossy().into_owned(), view));
             progress.advance(1);

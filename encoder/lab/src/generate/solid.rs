@@ -13,7 +13,6 @@ pub enum Shape {
     Cone {
         /// Radii at the lower and the upper end.
         radii_m: [f64; 2],
-        /// Half the height.
         half_height_m: f64,
     },
     /// An ellipsoid with these half axes.
@@ -23,7 +22,6 @@ pub enum Shape {
 /// A part of an object: a painted shape with a pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Part {
-    /// Its shape.
     pub shape: Shape,
     /// Its pose in the object's or the world's frame: a rotation and a translation.
     pub object_from_part: DAffine3,
@@ -34,7 +32,6 @@ pub struct Part {
 /// A point on a surface.
 #[derive(Clone, Copy, Debug)]
 pub struct Surfel {
-    /// Its position.
     pub position: DVec3,
     /// Outward normal, unit length.
     pub normal: DVec3,
@@ -60,7 +57,6 @@ impl Shape {
         }
     }
 
-    /// Returns its longest axis.
     pub fn longest_axis(self) -> usize {
         let half = match self {
             Self::Box(half) | Self::Ellipsoid(half) => half,
@@ -126,6 +122,7 @@ impl Shape {
     }
 
     /// Returns whether a point lies inside, surface included.
+    #[cfg(any(test, feature = "measure"))]
     pub fn contains(self, p: DVec3) -> bool {
         match self {
             Self::Box(half) => p.abs().cmple(half).all(),

@@ -2,64 +2,53 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
+use anyhow::{Context, Result};
 use serde_json::Value;
 use slag_encoder::progress::Progress;
 
-use super::error::TradeoffError;
-use super::figures::Figures;
-use super::grid::{Grid, LabelledScene, Point};
-use super::paper::PAPER;
-use super::prediction::predictions;
-use super::programs::Programs;
-use super::report::TradeoffReport;
-use crate::bench::machine::Machine;
-use crate::bench::programs::remove;
+use super::grid::{Grid, Point, expand};
+use super::report::{Figures, TradeoffReport};
+use crate::harness::Machine;
+use crate::programs::{fetch_all, json_of, remove};
+use crate::scenes::SceneFiles;
 
-/// What to measure.
+/// Paths of the programs and their common flags.
 #[derive(Clone, Debug)]
-pub struct TradeoffSettings {
-    /// Labelled scenes.
-    pub scenes: Vec<LabelledScene>,
-    /// Points to measure on each.
-    pub grid: Grid,
-    /// Folder for figures, plots, and stores while they are needed.
-    pub out: PathBuf,
+pub(super) struct Programs {
+    pub(super) encoder: PathBuf,
+    pub(super) lab: PathBuf,
+    pub(super) times_queries: bool,
+    /// Flags that select the models and their runtime.
+    pub(super) models: Vec<String>,
+    pub(super) segmenter: Option<PathBuf>,
+    /// Version, models and device in words.
+    pub(super) made_by: String,
 }
 
-/// Measures the points that have no file yet and summarises all.
-///
-/// # Errors
-/// [`TradeoffError`].
-pub fn run(
-    settings: &TradeoffSettings,
+/// Measures the points that have no file yet and summarises all. Points measured before an error are kept.
+pub(super) fn measure(
+    scenes: &[SceneFiles],
+    grid: &Grid,
     programs: &Programs,
+    out: &Path,
     progress: &dyn Progress,
-) -> Result<TradeoffReport, TradeoffError> {
-    let points_dir = settings.out.join("points");
-    fs_err::create_dir_all(&points_dir)?;
-    let mut measured = Vec::new();
-    let mut left_out = Vec::new();
-    progress.begin("tradeoff", "point", (settings.scenes.len() * settings.grid.points.len()) as u64, 0);
-    for (number, scene) in settings.scenes.iter().enumerate() {
-        if settings.scenes[..number].iter().any(|other| other.name == scene.name) {
-            return Err(TradeoffError::SameName { name: scene.name.clone() });
-        }
-        let mut groups: Vec<Vec<&Point>> = Vec::new();
-        for point in &settings.grid.points {
-            match groups.iter_mut().find(|group| group[0].views == point.views) {
-                Some(group) => group.push(point),
-                None => groups.push(vec![point]),
-            }
-        }
+) -> Result<TradeoffReport> {
+    fs_err::create_dir_all(out.join("points"))?;
+    let (mut measured, mut left_out) = (Vec::new(), Vec::new());
+    progress.begin("tradeoff", "point", (scenes.len() * grid.points.len()) as u64, 0);
+    for scene in scenes {
+        let mut groups: BTreeMap<&str, Vec<&Point>> = BTreeMap::new();
+        grid.points.iter().for_each(|point| groups.entry(&point.views).or_default().push(point));
         let mut of_point = BTreeMap::new();
-        for group in groups {
-            for (point, figures) in measure_group(scene, &group, programs, &settings.out, progress)? {
+        for group in groups.into_values() {
+            for (point, figures) in measure_group(scene, &group, programs, out, progress)? {
                 of_point.insert((point.axis.as_str(), point.name.as_str()), figures);
             }
         }
         // In the order of the grid, whatever the order of the work.
-        for point in &settings.grid.points {
+        for point in &grid.points {
             match of_point.remove(&(point.axis.as_str(), point.name.as_str())) {
                 Some(Ok(figures)) => measured.push(figures),
                 Some(Err(reason)) => {
@@ -70,15 +59,9 @@ pub fn run(
         }
     }
     progress.end();
-    let report = TradeoffReport {
-        machine: Machine::here(),
-        paper: PAPER,
-        ordered: settings.grid.ordered.clone(),
-        predictions: predictions(&measured),
-        figures: measured,
-        left_out,
-    };
-    report.write(&settings.out)?;
+    let (machine, ordered) = (Machine::here(), grid.ordered.clone());
+    let report = TradeoffReport { machine, ordered, figures: measured, left_out };
+    report.write(out)?;
     Ok(report)
 }
 
@@ -87,81 +70,34 @@ type Measured<'p> = (&'p Point, Result<Figures, &'static str>);
 
 /// Measures points with the same contributions.
 fn measure_group<'p>(
-    scene: &LabelledScene,
+    scene: &SceneFiles,
     group: &[&'p Point],
     programs: &Programs,
     out: &Path,
     progress: &dyn Progress,
-) -> Result<Vec<Measured<'p>>, TradeoffError> {
+) -> Result<Vec<Measured<'p>>> {
     let store = out.join("store");
     let mut done = Vec::new();
     // Seconds of the views, once known.
     let mut views_seconds = None;
     for point in group {
         let path = out.join("points").join(file_name(scene, point, programs));
-        if path.is_file() {
-            let figures: Figures = serde_json::from_slice(&fs_err::read(&path)?)
-                .map_err(|source| TradeoffError::Measured { path, source })?;
-            views_seconds.get_or_insert(figures.views_seconds);
-            done.push((*point, Ok(figures)));
-            progress.advance(1);
-            continue;
-        }
-        let expand = |flags: &str| scene.expand(flags, &programs.equipment);
-        let flags = [expand(&point.views)?, expand(&point.lift)?, expand(&point.eval)?];
-        let (views, lift, eval) = match flags {
-            [Ok(views), Ok(lift), Ok(eval)] => (views, lift, eval),
-            [Err(reason), ..] | [_, Err(reason), _] | [.., Err(reason)] => {
-                done.push((*point, Err(reason)));
-                progress.advance(1);
-                continue;
+        let figures = if path.is_file() {
+            let malformed = || format!("{}: delete the file to measure the point again", path.display());
+            let kept: Figures = serde_json::from_slice(&fs_err::read(&path)?).with_context(malformed)?;
+            views_seconds.get_or_insert(kept.views_seconds);
+            Ok(kept)
+        } else {
+            let run = Run { programs, scene, point, store: &store };
+            let of_point = || format!("{} / {} on {}", point.axis, point.name, scene.name);
+            let figures = run.measure(&mut views_seconds, out).with_context(of_point)?;
+            if let Ok(figures) = &figures {
+                // Renamed into place: a point is measured completely or not at all.
+                slag_common::durable::write(&path, &serde_json::to_vec_pretty(figures)?)?;
             }
+            figures
         };
-        let run = programs.of(scene, point);
-        // The duration of views that an earlier run left is unknown.
-        if views_seconds.is_none() {
-            remove(&store)?;
-        }
-        let mut encoded = run.encode(&store, &views, &lift)?;
-        if integer(&encoded, "n_views_resumed") != 0 && views_seconds.is_none()
-            || integer(&encoded, "n_views_resumed") < integer(&encoded, "n_views") && views_seconds.is_some()
-        {
-            remove(&store)?;
-            encoded = run.encode(&store, &views, &lift)?;
-            views_seconds = None;
-        }
-        let own_views = run.figure(&encoded, "views_secs")?;
-        let of_views = *views_seconds.get_or_insert(own_views);
-        let judged = run.evaluate(&store, point.profile, &eval)?;
-        let n_gaussians = run.figure(&encoded, "n_gaussians")?.max(1.0);
-        let best = |name: &str| judged[name].as_f64();
-        let all = &judged["multi_class"][0];
-        let figures = Figures {
-            scene: scene.name.clone(),
-            point: (*point).clone(),
-            made_by: programs.made_by.clone(),
-            n_views: integer(&encoded, "n_views"),
-            n_photos: integer(&encoded, "n_views_with_photo"),
-            n_gaussians: n_gaussians as u64,
-            n_masks: integer(&encoded, "n_masks"),
-            coverage: encoded["coverage"]["coverage"].as_f64(),
-            miou: run.figure(all, "miou")?,
-            macc: run.figure(all, "macc")?,
-            map: best("mean_average_precision"),
-            auc: best("mean_area_under_roc"),
-            localised: best("mean_localised"),
-            iou_on_views: best("mean_iou_on_views"),
-            n_unknown_words: judged["unknown_words"].as_object().map_or(0, |words| words.len() as u64),
-            seconds: run.figure(&encoded, "wall_secs")? - own_views + of_views,
-            views_seconds: of_views,
-            coverage_seconds: run.figure(&encoded, "coverage_secs")?,
-            bytes_per_gaussian: run.figure(&encoded["shard_bytes"], point.profile.name())? / n_gaussians,
-            query_ms: run.query_ms(&store, out, point.profile)?,
-        };
-        // Renamed into place last: a point is measured completely or not at all.
-        let text = serde_json::to_vec_pretty(&figures).map_err(std::io::Error::from)?;
-        slag_common::durable::write(&path, &text)?;
-        done.push((*point, Ok(figures)));
+        done.push((*point, figures));
         progress.advance(1);
     }
     remove(&store)?;
@@ -169,13 +105,113 @@ fn measure_group<'p>(
 }
 
 /// Returns the name of a point's file; it depends on scene, point and programs.
-fn file_name(scene: &LabelledScene, point: &Point, programs: &Programs) -> String {
+fn file_name(scene: &SceneFiles, point: &Point, programs: &Programs) -> String {
     let dir = scene.dir.canonicalize().unwrap_or_else(|_| scene.dir.clone());
     // The first word is the version of the figures: files of another one are not read.
-    let key = format!("2 {dir:?} {point:?} {}", programs.made_by);
+    let key = format!("3 {dir:?} {point:?} {}", programs.made_by);
     format!("{}-{}.json", scene.name, &blake3::hash(key.as_bytes()).to_hex()[..16])
 }
 
-fn integer(value: &Value, name: &str) -> u64 {
-    value[name].as_u64().unwrap_or(0)
+/// The programs' runs for one point.
+struct Run<'a> {
+    programs: &'a Programs,
+    scene: &'a SceneFiles,
+    point: &'a Point,
+    store: &'a Path,
+}
+
+impl Run<'_> {
+    fn measure(&self, views_seconds: &mut Option<f64>, out: &Path) -> Result<Result<Figures, &'static str>> {
+        let (point, programs) = (self.point, self.programs);
+        let expand = |flags: &str| expand(flags, self.scene, programs.segmenter.as_ref());
+        let (views, lift, eval) = match [expand(&point.views)?, expand(&point.lift)?, expand(&point.eval)?] {
+            [Ok(views), Ok(lift), Ok(eval)] => (views, lift, eval),
+            [Err(reason), ..] | [_, Err(reason), _] | [.., Err(reason)] => return Ok(Err(reason)),
+        };
+        // The duration of views that an earlier run left is unknown.
+        if views_seconds.is_none() {
+            remove(self.store)?;
+        }
+        let mut encoded = self.encode(&views, &lift)?;
+        let integer = |value: &Value, name: &str| value[name].as_u64().unwrap_or(0);
+        if views_seconds.is_some() && integer(&encoded, "n_views_resumed") < integer(&encoded, "n_views") {
+            remove(self.store)?;
+            encoded = self.encode(&views, &lift)?;
+            *views_seconds = None;
+        }
+        let own_views = figure(&encoded, "views_secs")?;
+        let of_views = *views_seconds.get_or_insert(own_views);
+        let judged = self.evaluate(&eval)?;
+        let n_gaussians = figure(&encoded, "n_gaussians")?.max(1.0);
+        let all = &judged["multi_class"][0];
+        Ok(Ok(Figures {
+            scene: self.scene.name.clone(),
+            point: point.clone(),
+            made_by: programs.made_by.clone(),
+            n_views: integer(&encoded, "n_views"),
+            n_photos: integer(&encoded, "n_views_with_photo"),
+            n_gaussians: n_gaussians as u64,
+            n_masks: integer(&encoded, "n_masks"),
+            miou: figure(all, "miou")?,
+            macc: figure(all, "macc")?,
+            map: judged["mean_average_precision"].as_f64(),
+            auc: judged["mean_area_under_roc"].as_f64(),
+            n_unknown_words: judged["unknown_words"].as_object().map_or(0, |words| words.len() as u64),
+            seconds: figure(&encoded, "wall_secs")? - own_views + of_views,
+            views_seconds: of_views,
+            coverage_seconds: figure(&encoded, "coverage_secs")?,
+            bytes_per_gaussian: figure(&encoded["shard_bytes"], point.profile.name())? / n_gaussians,
+            query_ms: self.query_ms(out)?,
+        }))
+    }
+
+    /// Encodes the scene and returns the summary; the views' contributions are kept.
+    fn encode(&self, views: &[String], lift: &[String]) -> Result<Value> {
+        let mut command = Command::new(&self.programs.encoder);
+        command.args(["--json", "encode", "--metric", "--keep-views", "--scene"]).arg(&self.scene.splat);
+        command.arg("--views").arg(&self.scene.poses).arg("--store").arg(self.store);
+        if let Some(images) = &self.scene.images {
+            command.arg("--images").arg(images);
+        }
+        json_of(command.args(&self.programs.models).args(views).args(lift))
+    }
+
+    /// Evaluates the store's shards of the point's profile.
+    fn evaluate(&self, eval: &[String]) -> Result<Value> {
+        let mut command = Command::new(&self.programs.lab);
+        command.args(["--json", "eval", "labelled", "--truth"]).arg(&self.scene.dir);
+        command.arg("--store").arg(self.store);
+        command.args(["--profile", self.point.profile.name()]);
+        json_of(command.args(&self.programs.models).args(eval))
+    }
+
+    /// Fetches the shards as a robot does, and times queries on them.
+    fn query_ms(&self, out: &Path) -> Result<Option<f64>> {
+        if !self.programs.times_queries {
+            return Ok(None);
+        }
+        let cache = out.join("cache");
+        fetch_all(self.store, &cache, self.point.profile.name())?;
+        let mut bench = Command::new(&self.programs.lab);
+        bench.args([
+            "--json",
+            "bench",
+            "query",
+            "--limits",
+            "1000",
+            "--runs",
+            "40",
+            "--precision",
+            "measured",
+        ]);
+        let timed = json_of(bench.arg("--cache").arg(&cache))?;
+        remove(&cache)?;
+        Ok(timed["searches"][0]["best"]["median_ms"].as_f64())
+    }
+}
+
+/// Returns a figure that a program printed.
+fn figure(printed: &Value, name: &str) -> Result<f64> {
+    let missing = || format!("no {name} in the JSON: the flags leave nothing to measure");
+    printed[name].as_f64().with_context(missing)
 }

@@ -1,86 +1,96 @@
-//! Places to stand, judged on generated scenes by their true surfaces: the voxels that are called free, and the poses that the
-//! robot's program gives for each thing.
+//! `eval goal`: places to stand, judged on generated scenes by their true surfaces: the voxels that are called free, and the
+//! poses that the robot's program gives for each thing.
 
-mod asked;
-mod labels;
-mod report;
 mod truth;
 mod voxels;
 
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow};
+use clap::Args;
 use glam::DVec3;
+use serde::Serialize;
 use serde_json::Value;
+use slag_common::objects::public_id;
+use slag_encoder::objects::NONE;
 use slag_encoder::progress::Progress;
+use slag_encoder::query::PublishedObjects;
+use slag_encoder::store::StoreReader;
 
-use super::robot::{Prepared, Service, flag_value};
+use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
 use crate::generate::grammar::{self, SceneKind};
-use asked::{HEIGHT_M, MIN_VISIBLE, REACH_M, SENSOR_HEIGHT_M, STEP_M};
-pub use report::GoalReport;
-use report::Verdict;
-use truth::Truth;
+use crate::harness::Times;
+use crate::programs::{Prepared, Service, flag_value, sibling};
+use crate::table::{Table, percent};
+use truth::{HEIGHT_M, MIN_SHOWN, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
+use voxels::Voxels;
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
-/// What to judge on.
-#[derive(Clone, Debug)]
-pub struct GoalSettings {
-    /// Folder of scenes, stores and caches; what a run before left there is used.
-    pub out: PathBuf,
+/// Least share of the thing's Gaussians that must be seen. From one side hardly half of them are.
+const MIN_VISIBLE: f64 = 0.02;
+/// Clearance by which a pose may fall short: a cell of the true map on either side.
+const TOLERANCE_M: f64 = 0.03;
+
+/// `eval goal`.
+#[derive(Debug, Args)]
+pub(crate) struct GoalArgs {
+    /// Folder for scenes, stores and caches; what an earlier run left there is used.
+    #[arg(long, value_name = "DIR", default_value = "target/goal")]
+    out: PathBuf,
     /// Kinds of scenes.
-    pub kinds: Vec<SceneKind>,
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "room,yard")]
+    kind: Vec<SceneKind>,
     /// Seeds of each kind.
-    pub seeds: Vec<u64>,
+    #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [21, 22, 23, 24])]
+    seeds: Vec<u64>,
     /// Photos of each scene.
-    pub n_views: u32,
+    #[arg(long, value_name = "N", default_value_t = 96, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    n_views: u32,
     /// Where they are taken.
-    pub walk: Walk,
+    #[arg(long, value_enum, default_value = "everywhere")]
+    walk: Walk,
     /// Radius of the robot.
-    pub radius_m: f64,
-    /// Whether each fault is logged.
-    pub lists_faults: bool,
-    /// Folder of the programs.
-    pub programs: PathBuf,
+    #[arg(long, value_name = "M", default_value_t = 0.3)]
+    radius_m: f64,
+    /// Tell each thing and pose that was not as it should be.
+    #[arg(long)]
+    list: bool,
 }
 
 /// Judges every scene.
-///
-/// # Errors
-/// A program fails, or a scene cannot be read.
-pub fn run(settings: &GoalSettings, progress: &dyn Progress) -> Result<GoalReport> {
+pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport> {
     let mut report = GoalReport::default();
-    progress.begin("goal", "scene", (settings.kinds.len() * settings.seeds.len()) as u64, 0);
-    for kind in &settings.kinds {
-        for seed in &settings.seeds {
-            let name = flag_value(kind)?;
-            let dir = settings.out.join(format!("{name}-{seed}"));
-            // The objects' outlines are the true ones: places are judged here, not segmentation.
-            let encode_flags = &["--occupancy", "--masks", "SCENE/gt/masks"];
-            let (programs, n_views, walk) = (&settings.programs, settings.n_views, settings.walk);
-            let scene =
-                Prepared { programs, dir: &dir, kind: &name, seed: *seed, n_views, walk, encode_flags };
-            scene.make().with_context(|| dir.display().to_string())?;
-            judge(settings, &scene, *kind, &mut report).with_context(|| dir.display().to_string())?;
-            report.scenes.push(format!("{name}-{seed}"));
-            progress.advance(1);
-        }
+    progress.begin("goal", "scene", (args.kind.len() * args.seeds.len()) as u64, 0);
+    for (kind, seed) in args.kind.iter().flat_map(|kind| args.seeds.iter().map(move |seed| (kind, *seed))) {
+        let name = flag_value(kind)?;
+        let dir = args.out.join(format!("{name}-{seed}"));
+        // The objects' outlines are the true ones: places are judged here, not segmentation.
+        let encode_flags = &["--occupancy", "--masks", "SCENE/gt/masks"];
+        let (n_views, walk) = (args.n_views, args.walk);
+        let scene = Prepared { dir: &dir, kind: &name, seed, n_views, walk, encode_flags };
+        let judged = scene.make().and_then(|()| judge(args, &scene, *kind, &mut report));
+        judged.with_context(|| dir.display().to_string())?;
+        report.scenes.push(format!("{name}-{seed}"));
+        progress.advance(1);
     }
     progress.end();
     Ok(report)
 }
 
-fn judge(settings: &GoalSettings, at: &Prepared<'_>, kind: SceneKind, report: &mut GoalReport) -> Result<()> {
+fn judge(args: &GoalArgs, at: &Prepared<'_>, kind: SceneKind, report: &mut GoalReport) -> Result<()> {
     let nouns = grammar::nouns(None)?;
     let layout = Layout::new(&[kind], at.seed, &nouns, &|_, _| true);
     report.voxels.add(voxels::compare(&layout, &at.dir.join("store"))?);
-    let views = layout.photos(settings.walk, settings.n_views);
+    let views = layout.photos(args.walk, args.n_views);
     let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
-    let truth = Truth::new(&layout, settings.radius_m, cameras)?;
-    let labels = labels::read(&at.dir.join("scene"), &at.dir.join("store"))?;
-    let service = Service::start(&at.program("slag-edge"), &["--cache"], &at.dir.join("cache"))?;
+    let truth = Truth::new(&layout, args.radius_m, cameras)?;
+    let labels = labels(&at.dir.join("scene"), &at.dir.join("store"))?;
+    let service = Service::start(&sibling("slag-edge")?, "--cache", &at.dir.join("cache"))?;
     let start = truth.start();
     for (index, placed) in layout.placed.iter().enumerate().filter(|(_, placed)| !placed.shell) {
         let Some(label) = labels.get(index).filter(|label| label.n_pixels >= MIN_PIXELS) else { continue };
@@ -91,7 +101,7 @@ fn judge(settings: &GoalSettings, at: &Prepared<'_>, kind: SceneKind, report: &m
                 let asked = Instant::now();
                 let path = format!(
                     "/v1/goal?id={id}&near={},{},0&radius_m={}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
-                    start.x, start.y, settings.radius_m
+                    start.x, start.y, args.radius_m
                 );
                 let reply = service.get(&path)?;
                 report.millis.push(asked.elapsed().as_secs_f64() * 1e3);
@@ -99,11 +109,11 @@ fn judge(settings: &GoalSettings, at: &Prepared<'_>, kind: SceneKind, report: &m
             }
         };
         let noun = &nouns[placed.noun].name;
-        if settings.lists_faults && verdict.is_fault(is_reachable) {
+        if args.list && verdict.is_fault(is_reachable) {
             let id = label.object.as_deref().unwrap_or("no object");
             tracing::warn!("{}-{} {noun} {id} (reachable: {is_reachable}): {verdict:?}", at.kind, at.seed);
         }
-        report.count(settings.radius_m, is_reachable, &verdict);
+        report.count(args.radius_m, is_reachable, &verdict);
     }
     Ok(())
 }
@@ -121,4 +131,154 @@ fn verdict(truth: &Truth<'_>, thing: usize, reply: &Value) -> Result<Verdict> {
     let (clearance_m, is_reached) = truth.at(position);
     let (shown, height_error_m) = (truth.shown(thing, sensor), position.z.abs());
     Ok(Verdict::Pose { clearance_m, is_reached, shown, height_error_m })
+}
+
+/// A thing of the labels.
+struct Label {
+    /// Pixels that show it, over all photos.
+    n_pixels: u64,
+    /// Its object, as replies name it.
+    object: Option<String>,
+}
+
+/// Returns the things of a scene and its store, in the order of the layout.
+fn labels(scene: &Path, store: &Path) -> Result<Vec<Label>> {
+    let reader = StoreReader::open(store)?;
+    let objects = PublishedObjects::read(&reader)?;
+    let truth = labels::Truth::read(scene, objects.object_of.len())?;
+    let object_of_thing = objects_of_things(&truth.id_of_gaussian, &objects.object_of);
+    // Shell and things are listed apart, each in the order of the layout; shell nouns are placed first.
+    let label = |thing: &labels::Thing| {
+        let object = object_of_thing.get(&thing.id).map(|object| public_id(objects.ids[*object as usize]));
+        Label { n_pixels: thing.train_pixels, object }
+    };
+    Ok(truth.background.iter().chain(&truth.things).map(label).collect())
+}
+
+/// Returns the object of each thing: of those that are the thing by more than half of their Gaussians, the one with most. Boxes are
+/// not compared: strays make them as large as the room.
+fn objects_of_things(thing_of: &[u16], object_of: &[u32]) -> BTreeMap<u16, u32> {
+    let (mut n_of_object, mut n_of_both) = (BTreeMap::new(), BTreeMap::new());
+    for (thing, object) in thing_of.iter().zip(object_of).filter(|(_, object)| **object != NONE) {
+        *n_of_object.entry(*object).or_insert(0u64) += 1;
+        *n_of_both.entry((*object, *thing)).or_insert(0u64) += 1;
+    }
+    let mut most: BTreeMap<u16, (u64, u32)> = BTreeMap::new();
+    for ((object, thing), both) in n_of_both {
+        if 2 * both > n_of_object[&object] && most.get(&thing).is_none_or(|(n, _)| both > *n) {
+            most.insert(thing, (both, object));
+        }
+    }
+    most.into_iter().map(|(thing, (_, object))| (thing, object)).collect()
+}
+
+/// What the robot's program said of a thing.
+#[derive(Clone, Debug)]
+enum Verdict {
+    /// The thing is no object on board.
+    NoObject,
+    /// No pose, for a reason.
+    None(String),
+    /// A pose, and the truth about it.
+    Pose { clearance_m: f64, is_reached: bool, shown: f64, height_error_m: f64 },
+}
+
+impl Verdict {
+    fn is_shown(&self) -> bool {
+        matches!(self, Self::Pose { shown, .. } if *shown >= MIN_SHOWN)
+    }
+
+    /// Returns whether it is wrong.
+    fn is_fault(&self, is_reachable: bool) -> bool {
+        if is_reachable { !self.is_shown() } else { matches!(self, Self::Pose { .. }) }
+    }
+}
+
+#[derive(Clone, Debug, Default, Serialize)]
+pub(crate) struct GoalReport {
+    scenes: Vec<String>,
+    voxels: Voxels,
+    /// Things that the robot truly reaches: places within reach from which they are shown.
+    n_reachable: usize,
+    /// Those with a pose from which the true surfaces show them.
+    n_shown: usize,
+    /// Those with a pose from which they do not.
+    n_hidden: usize,
+    /// Those without a pose, by reason; `no-object` are no object on board.
+    missed: BTreeMap<String, usize>,
+    /// Things that the robot truly does not reach.
+    n_unreachable: usize,
+    /// Those with a pose.
+    n_unreachable_with_pose: usize,
+    n_poses: usize,
+    /// Poses closer than the robot's radius to a true surface, by more than 3 cm.
+    n_too_close: usize,
+    /// Poses in places that no way leads to.
+    n_cut_off: usize,
+    /// Largest distance of a pose's ground from the true one.
+    max_height_error_m: f64,
+    #[serde(skip)]
+    millis: Vec<f64>,
+}
+
+impl GoalReport {
+    fn count(&mut self, radius_m: f64, is_reachable: bool, verdict: &Verdict) {
+        if let Verdict::Pose { clearance_m, is_reached, height_error_m, .. } = verdict {
+            self.n_poses += 1;
+            self.n_cut_off += usize::from(!is_reached);
+            self.n_too_close += usize::from(*clearance_m < radius_m - TOLERANCE_M);
+            self.max_height_error_m = self.max_height_error_m.max(*height_error_m);
+        }
+        if !is_reachable {
+            self.n_unreachable += 1;
+            self.n_unreachable_with_pose += usize::from(matches!(verdict, Verdict::Pose { .. }));
+            return;
+        }
+        self.n_reachable += 1;
+        match verdict {
+            Verdict::NoObject => *self.missed.entry("no-object".into()).or_default() += 1,
+            Verdict::None(reason) => *self.missed.entry(reason.clone()).or_default() += 1,
+            verdict if verdict.is_shown() => self.n_shown += 1,
+            Verdict::Pose { .. } => self.n_hidden += 1,
+        }
+    }
+}
+
+impl fmt::Display for GoalReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Voxels { n_free, n_false, len_bytes } = self.voxels;
+        writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
+        let mut table = Table::new(["figure", "n", "of them"]);
+        let mut row = |name: &str, n: String, of: String| table.row([name.to_owned(), n, of]);
+        row("free voxels", n_free.to_string(), format!("{n_false} false: {}", percent(n_false, n_free)));
+        row("bytes of occupancy in each profile", len_bytes.to_string(), String::new());
+        let share = percent(self.n_shown as u64, self.n_reachable as u64);
+        let shown = format!("{} with a pose that shows them: {share}", self.n_shown);
+        row("reachable things", self.n_reachable.to_string(), shown);
+        let hidden =
+            format!("{} with a pose that does not; without a pose: {:?}", self.n_hidden, self.missed);
+        row("", String::new(), hidden);
+        let with_pose = format!("{} with a pose", self.n_unreachable_with_pose);
+        row("unreachable things", self.n_unreachable.to_string(), with_pose);
+        let (close, cut_off) = (self.n_too_close, self.n_cut_off);
+        let poses = format!("{close} closer to a surface than the radius, {cut_off} cut off");
+        row("poses", self.n_poses.to_string(), poses);
+        row("ground off by at most, m", format!("{:.3}", self.max_height_error_m), String::new());
+        let times = Times::of(self.millis.clone());
+        let millis = format!("{:.1} ms median, {:.1} ms at most", times.median_ms, times.max_ms);
+        row("requests", times.n.to_string(), millis);
+        write!(f, "{table}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: object 0 is thing 1 by 3 of 4, object 1 is it by 2 of 2, object 2 is things 2 and 3 by half each.
+    #[test]
+    fn an_object_is_the_thing_that_it_mostly_is() {
+        let found = objects_of_things(&[1, 1, 1, 2, 1, 1, 2, 3, 3], &[0, 0, 0, 0, 1, 1, 2, 2, NONE]);
+        assert_eq!(found, BTreeMap::from([(1, 0)]));
+    }
 }

@@ -7,10 +7,18 @@ use glam::{DVec2, DVec3};
 use slag_encoder::raster::RasterView;
 use slag_math::distance_transform::squared_distances;
 
-use super::asked::{HEIGHT_M, MIN_SHOWN, REACH_M, SENSOR_HEIGHT_M, STEP_M};
 use crate::generate::compose::{Layout, looking, pinhole};
 use crate::generate::render::Solids;
 
+/// Largest horizontal distance to the thing.
+pub(super) const REACH_M: f64 = 0.8;
+pub(super) const SENSOR_HEIGHT_M: f64 = 0.4;
+/// Height of the robot.
+pub(super) const HEIGHT_M: f64 = 0.5;
+/// Highest step.
+pub(super) const STEP_M: f64 = 0.1;
+/// Least share of the thing's outline that must truly be shown.
+pub(super) const MIN_SHOWN: f64 = 0.1;
 /// Edge of a cell of the true map.
 const CELL_M: f64 = 0.02;
 /// Distance of the surface points that are looked at.
@@ -24,7 +32,7 @@ const FIELD_OF_VIEW_RAD: f64 = 110.0 * PI / 180.0;
 const MIN_SHOWN_PX: u32 = 12;
 
 /// The truth about a layout, for a robot.
-pub struct Truth<'a> {
+pub(super) struct Truth<'a> {
     layout: &'a Layout,
     solids: Solids,
     origin: DVec2,
@@ -37,7 +45,11 @@ pub struct Truth<'a> {
 
 impl<'a> Truth<'a> {
     /// Makes the true map of a robot that starts below the first camera with room for it.
-    pub fn new(layout: &'a Layout, radius_m: f64, cameras: impl Iterator<Item = DVec3>) -> Result<Self> {
+    pub(super) fn new(
+        layout: &'a Layout,
+        radius_m: f64,
+        cameras: impl Iterator<Item = DVec3>,
+    ) -> Result<Self> {
         let shell = || layout.placed.iter().filter(|placed| placed.shell);
         let low = shell().fold(DVec2::INFINITY, |low, placed| low.min(placed.bounds.min.truncate()));
         let high = shell().fold(DVec2::NEG_INFINITY, |high, placed| high.max(placed.bounds.max.truncate()));
@@ -86,13 +98,12 @@ impl<'a> Truth<'a> {
         Ok(Self { layout, solids: layout.solids(), origin, width, squared, is_reached, start })
     }
 
-    /// Returns where the robot starts.
-    pub fn start(&self) -> DVec3 {
+    pub(super) fn start(&self) -> DVec3 {
         self.start
     }
 
     /// Returns the clearance of a place, and whether the robot reaches it.
-    pub fn at(&self, place: DVec3) -> (f64, bool) {
+    pub(super) fn at(&self, place: DVec3) -> (f64, bool) {
         let offset = (place.truncate() - self.origin) / CELL_M;
         let cell = offset.y as usize * self.width + offset.x as usize;
         let clearance_m = self.squared.get(cell).map_or(0.0, |d2| f64::from(*d2).sqrt() * CELL_M);
@@ -100,7 +111,7 @@ impl<'a> Truth<'a> {
     }
 
     /// Returns whether the robot reaches a place from which the thing is shown.
-    pub fn is_reachable(&self, thing: usize) -> bool {
+    pub(super) fn is_reachable(&self, thing: usize) -> bool {
         let height = self.squared.len() / self.width;
         let mut has_surface = vec![false; self.squared.len()];
         for point in surface(self.layout, thing, SPACING_M) {
@@ -125,7 +136,7 @@ impl<'a> Truth<'a> {
     }
 
     /// Returns the share of a thing's outline that a sensor sees, of what it would see without the other things.
-    pub fn shown(&self, thing: usize, sensor: DVec3) -> f64 {
+    pub(super) fn shown(&self, thing: usize, sensor: DVec3) -> f64 {
         let towards = self.solids.things()[thing].centre() - sensor;
         let level = towards.with_z(0.0).length().max(0.05);
         // A camera that looks straight up has no right.

@@ -17,25 +17,22 @@ const SPACING_M: f64 = 0.012;
 
 /// Free voxels, and those that are not.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct Voxels {
-    /// Voxels called free.
-    pub n_free: u64,
+pub(super) struct Voxels {
+    pub(super) n_free: u64,
     /// Those with a true surface inside, or inside a solid.
-    pub n_false: u64,
-    /// Bytes of the occupancy.
-    pub len_bytes: u64,
+    pub(super) n_false: u64,
+    pub(super) len_bytes: u64,
 }
 
 impl Voxels {
-    pub fn add(&mut self, other: Self) {
+    pub(super) fn add(&mut self, other: Self) {
         self.n_free += other.n_free;
         self.n_false += other.n_false;
         self.len_bytes += other.len_bytes;
     }
 }
 
-/// Compares the voxels of a store.
-pub fn compare(layout: &Layout, store: &Path) -> Result<Voxels> {
+pub(super) fn compare(layout: &Layout, store: &Path) -> Result<Voxels> {
     let reader = StoreReader::open(store)?;
     let mut found = Voxels::default();
     let mut surfaces: Option<HashSet<[i32; 3]>> = None;

@@ -1,25 +1,25 @@
 //! Relations between things, judged on generated scenes: each question is asked of the robot's program as relations, as the
 //! plain phrase, and by the noun alone, and the answers are compared with the layout.
 
-mod report;
 mod truth;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow};
+use clap::Args;
 use glam::DVec3;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use slag_common::frames::Aabb;
 use slag_encoder::progress::Progress;
 
-pub use report::{Counts, RelationsReport, Way};
-pub use truth::{Asked, TrueThing};
-
-use crate::eval::robot::{Prepared, Service, flag_value};
 use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
+use crate::programs::{Prepared, Service, flag_value, sibling};
+use crate::table::{Table, percent};
+use truth::{Asked, TrueThing};
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
@@ -32,19 +32,21 @@ const MAX_QUESTIONS: usize = 12;
 /// Most answers to a question.
 const LIMIT: usize = 10;
 
-/// What to judge on.
-#[derive(Clone, Debug)]
-pub struct RelationsSettings {
-    /// Folder of scenes, stores and caches; what a run before left there is used.
-    pub out: PathBuf,
+/// `eval relations`.
+#[derive(Debug, Args)]
+pub(crate) struct RelationsArgs {
+    /// Folder for scenes, stores and caches; what an earlier run left there is used.
+    #[arg(long, value_name = "DIR", default_value = "target/relations")]
+    out: PathBuf,
     /// Kinds of scenes.
-    pub kinds: Vec<SceneKind>,
-    /// Seeds of each kind.
-    pub seeds: Vec<u64>,
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "room,yard")]
+    kind: Vec<SceneKind>,
+    /// Seeds of each kind. One choice of the relations was made on rooms 1 to 4: judge by others.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [11, 12, 13, 14])]
+    seeds: Vec<u64>,
     /// Photos of each scene.
-    pub n_views: u32,
-    /// Folder of the programs.
-    pub programs: PathBuf,
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    n_views: u32,
 }
 
 /// A question with its truth.
@@ -62,43 +64,29 @@ struct Instances {
 }
 
 /// Asks about every scene.
-///
-/// # Errors
-/// A program fails, or a scene cannot be read.
-pub fn run(settings: &RelationsSettings, progress: &dyn Progress) -> Result<RelationsReport> {
+pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<RelationsReport> {
     let mut report = RelationsReport::default();
-    progress.begin("relations", "scene", (settings.kinds.len() * settings.seeds.len()) as u64, 0);
-    for kind in &settings.kinds {
-        for seed in &settings.seeds {
-            let name = flag_value(kind)?;
-            let dir = settings.out.join(format!("{name}-{seed}"));
-            let (programs, encode_flags) = (&settings.programs, &[]);
-            let scene = Prepared {
-                programs,
-                dir: &dir,
-                kind: &name,
-                seed: *seed,
-                n_views: settings.n_views,
-                walk: Walk::Oval,
-                encode_flags,
-            };
-            scene.make().with_context(|| dir.display().to_string())?;
-            judge(settings, &dir, &mut report).with_context(|| dir.display().to_string())?;
-            report.scenes.push(format!("{name}-{seed}"));
-            progress.advance(1);
-        }
+    progress.begin("relations", "scene", (args.kind.len() * args.seeds.len()) as u64, 0);
+    for (kind, seed) in args.kind.iter().flat_map(|kind| args.seeds.iter().map(move |seed| (kind, *seed))) {
+        let name = flag_value(kind)?;
+        let dir = args.out.join(format!("{name}-{seed}"));
+        let (n_views, walk, encode_flags) = (args.n_views, Walk::Oval, &[]);
+        let scene = Prepared { dir: &dir, kind: &name, seed, n_views, walk, encode_flags };
+        let judged = scene.make().and_then(|()| judge(&dir, &mut report));
+        judged.with_context(|| dir.display().to_string())?;
+        report.scenes.push(format!("{name}-{seed}"));
+        progress.advance(1);
     }
     progress.end();
     Ok(report)
 }
 
 /// Asks a robot about a scene.
-fn judge(settings: &RelationsSettings, dir: &Path, report: &mut RelationsReport) -> Result<()> {
+fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
     let text = fs_err::read(dir.join("scene/gt/instances.json"))?;
     let Instances { instances: things } = serde_json::from_slice(&text)?;
     let robot = middle(&things);
-    let edge = settings.programs.join(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
-    let service = Service::start(&edge, &["--cache"], &dir.join("cache"))?;
+    let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
     for question in questions(&things, robot) {
         for way in Way::ALL {
             let answered = ask(&service, &question, way, robot)?;
@@ -218,4 +206,119 @@ fn iou(a: &Aabb, b: &Aabb) -> f64 {
     let shared = (a.max.min(b.max) - a.min.max(b.min)).max(DVec3::ZERO).element_product();
     let both = a.size().element_product() + b.size().element_product() - shared;
     if both > 0.0 { shared / both } else { 0.0 }
+}
+
+/// How a question is asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+enum Way {
+    /// As relations between things.
+    Relations,
+    /// The phrase as one text, with the scene's threshold.
+    Phrase,
+    /// The phrase as one text; its best answer, whatever the score.
+    BestOfPhrase,
+    /// The noun alone, with the scene's threshold.
+    Noun,
+}
+
+impl Way {
+    const ALL: [Self; 4] = [Self::Relations, Self::Phrase, Self::BestOfPhrase, Self::Noun];
+}
+
+/// What came of some questions.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+struct Counts {
+    n_questions: usize,
+    /// Those whose best answer is right; without a thing that is meant: those without an answer.
+    n_right: usize,
+    n_answers: usize,
+    /// Answers that are a thing that is meant.
+    n_answers_right: usize,
+    /// Things that are meant.
+    n_meant: usize,
+    /// Those among the answers.
+    n_meant_found: usize,
+}
+
+impl Counts {
+    fn add(&mut self, other: Self) {
+        self.n_questions += other.n_questions;
+        self.n_right += other.n_right;
+        self.n_answers += other.n_answers;
+        self.n_answers_right += other.n_answers_right;
+        self.n_meant += other.n_meant;
+        self.n_meant_found += other.n_meant_found;
+    }
+}
+
+/// Figures of one way of asking.
+#[derive(Clone, Debug, Serialize)]
+struct Row {
+    /// `None` for all of them.
+    relation: Option<Asked>,
+    has_answer: bool,
+    way: Way,
+    #[serde(flatten)]
+    counts: Counts,
+}
+
+/// The figures by relation, and over all.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct RelationsReport {
+    scenes: Vec<String>,
+    counts: BTreeMap<(Asked, bool, Way), Counts>,
+}
+
+impl RelationsReport {
+    /// Adds what came of a question. `has_answer`: whether a thing is meant.
+    fn count(&mut self, asked: Asked, has_answer: bool, way: Way, counts: Counts) {
+        self.counts.entry((asked, has_answer, way)).or_default().add(counts);
+    }
+
+    fn rows(&self) -> Vec<Row> {
+        let row = |relation, has_answer, way, counts| Row { relation, has_answer, way, counts };
+        let each =
+            self.counts.iter().map(|((asked, has, way), counts)| row(Some(*asked), *has, *way, *counts));
+        let total = |(has_answer, way)| {
+            let mut total = Counts::default();
+            let of = self.counts.iter().filter(|((_, has, by), _)| *has == has_answer && *by == way);
+            of.for_each(|(_, counts)| total.add(*counts));
+            row(None, has_answer, way, total)
+        };
+        let totals = [true, false].into_iter().flat_map(|has| Way::ALL.map(|way| (has, way)));
+        each.chain(totals.map(total)).collect()
+    }
+}
+
+impl Serialize for RelationsReport {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        #[derive(Serialize)]
+        struct Report<'a> {
+            scenes: &'a [String],
+            rows: Vec<Row>,
+        }
+        Report { scenes: &self.scenes, rows: self.rows() }.serialize(to)
+    }
+}
+
+impl fmt::Display for RelationsReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
+        let columns = ["relation", "answer", "asked as", "questions", "best right", "precision", "recall"];
+        let mut table = Table::new(columns);
+        for Row { relation, has_answer, way, counts } in self.rows() {
+            let percent = |n: usize, of: usize| percent(n as u64, of as u64);
+            table.row([
+                relation.map_or("all".into(), |relation| format!("{relation:?}")),
+                if has_answer { "some" } else { "none" }.to_owned(),
+                format!("{way:?}"),
+                counts.n_questions.to_string(),
+                percent(counts.n_right, counts.n_questions),
+                percent(counts.n_answers_right, counts.n_answers),
+                percent(counts.n_meant_found, counts.n_meant),
+            ]);
+        }
+        write!(f, "{table}")
+    }
 }

@@ -2,8 +2,7 @@
 //! with the robot's.
 
 use glam::{DVec2, DVec3};
-use serde::Deserialize;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 
 /// Distance of two boxes at which their things are near each other, metres.
@@ -21,49 +20,37 @@ const RAISED_M: f64 = 0.1;
 
 /// A thing of the layout.
 #[derive(Clone, Debug, Deserialize)]
-pub struct TrueThing {
-    /// Its category.
-    pub category: String,
+pub(super) struct TrueThing {
+    pub(super) category: String,
     /// Kinds of thing that it belongs to.
     #[serde(default)]
-    pub kinds: Vec<String>,
+    pub(super) kinds: Vec<String>,
     /// Smallest corner of its box, metres.
-    pub aabb_min: DVec3,
+    pub(super) aabb_min: DVec3,
     /// Largest corner.
-    pub aabb_max: DVec3,
+    pub(super) aabb_max: DVec3,
     /// Pixels that show it, over all photos.
-    pub train_pixels: u64,
+    pub(super) train_pixels: u64,
 }
 
 /// A relation that is asked about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Asked {
-    /// "on the".
+pub(super) enum Asked {
     On,
-    /// "near the".
     Near,
-    /// "beside the".
     Beside,
-    /// "left of the".
     LeftOf,
-    /// "right of the".
     RightOf,
-    /// "in front of the".
     InFrontOf,
-    /// "behind the".
     Behind,
-    /// "nearest ... to the".
     Nearest,
-    /// "second ... from the".
     Second,
-    /// "largest ... near the".
     Largest,
 }
 
 impl Asked {
-    /// Every relation.
-    pub const ALL: [Self; 10] = [
+    pub(super) const ALL: [Self; 10] = [
         Self::On,
         Self::Near,
         Self::Beside,
@@ -77,7 +64,7 @@ impl Asked {
     ];
 
     /// Returns the question about two words.
-    pub fn text(self, thing: &str, of: &str) -> String {
+    pub(super) fn text(self, thing: &str, of: &str) -> String {
         match self {
             Self::On => format!("{thing} on the {of}"),
             Self::Near => format!("{thing} near the {of}"),
@@ -94,18 +81,17 @@ impl Asked {
 }
 
 impl TrueThing {
-    /// Returns its box.
-    pub fn bounds(&self) -> Aabb {
+    pub(super) fn bounds(&self) -> Aabb {
         Aabb { min: self.aabb_min, max: self.aabb_max }
     }
 
     /// Returns whether a word names it.
-    pub fn is_called(&self, word: &str) -> bool {
+    pub(super) fn is_called(&self, word: &str) -> bool {
         self.category == word || self.kinds.iter().any(|kind| kind == word)
     }
 
     /// Returns whether it looks like what a word names: "chair" names an armchair to some.
-    pub fn sounds_like(&self, word: &str) -> bool {
+    pub(super) fn sounds_like(&self, word: &str) -> bool {
         self.is_called(word) || self.category.contains(word)
     }
 
@@ -119,7 +105,7 @@ impl TrueThing {
 }
 
 /// Returns the things that a question means, by their indices. `robot`: where it is asked.
-pub fn meant(things: &[TrueThing], asked: Asked, thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
+pub(super) fn meant(things: &[TrueThing], asked: Asked, thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
     let named =
         |word: &str| -> Vec<usize> { (0..things.len()).filter(|at| things[*at].sounds_like(word)).collect() };
     let (ones, others) = (named(thing), named(of));
@@ -190,7 +176,6 @@ mod tests {
         TrueThing { category: category.into(), kinds, aabb_min, aabb_max, train_pixels: 1 }
     }
 
-    /// A room by hand.
     #[test]
     fn a_room_by_hand() {
         let things = [

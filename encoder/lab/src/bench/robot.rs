@@ -1,0 +1,421 @@
+//! `bench robot`: the paper's table of query times on the robot, with other engines on the same vectors in the same run.
+//!
+//! A generated field of each size is published, fetched over loopback and queried by the robot's engine. The other engines
+//! (`edge/benches/rivals`) get the same vectors and queries. Each has a process of its own, so that the memory of one is not
+//! counted for the next. One oracle judges all answers: float64 products of the vectors.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::str::FromStr;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use slag_common::shard::Profile;
+use slag_encoder::cli::common::ModelArgs;
+use slag_encoder::cli::memory::free_memory_bytes;
+use slag_encoder::progress::Progress;
+
+use super::field;
+use super::query::{TextArgs, TextReport, time_texts};
+use super::truth::Truth;
+use crate::harness::{Machine, load_1min};
+use crate::programs::{fetch_all, json_of, remove, sibling};
+use crate::table::Table;
+
+/// `bench robot`.
+#[derive(Debug, Args)]
+pub(crate) struct RobotArgs {
+    /// Folder for robot.json, robot.md and the figures; what was measured there before is not measured again.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Numbers of Gaussians.
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [1_000_000, 2_000_000, 4_000_000, 8_000_000], value_parser = clap::value_parser!(u64).range(1000..=100_000_000))]
+    gaussians: Vec<u64>,
+    /// Components of an embedding.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=4096))]
+    dim: u32,
+    /// Numbers of results.
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [1_000, 10_000, 50_000, 100_000], value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    limits: Vec<u64>,
+    /// What to time: profiles of slag-edge, and engines of slag-bench-rivals. NAME=GAUSSIANS leaves an engine out at
+    /// larger sizes: a graph of millions takes hours to build.
+    #[arg(
+        long,
+        value_name = "NAME[=MOST],...",
+        value_delimiter = ',',
+        default_value = "compact,balanced,dense,qdrant-scan,qdrant-scan-int8,qdrant-hnsw,qdrant-hnsw-int8,qdrant-hnsw-pq"
+    )]
+    engines: Vec<Engine>,
+    /// Timed queries of each number of results.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    runs: u32,
+    /// The program slag-bench-rivals; without it the other engines are left out.
+    #[arg(long, value_name = "FILE")]
+    rivals: Option<PathBuf>,
+    #[command(flatten)]
+    models: ModelArgs,
+}
+
+/// An engine, and the most Gaussians that it is given.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Engine {
+    /// A profile of `slag-edge`, or an engine of `edge/benches/rivals`.
+    name: String,
+    most_gaussians: Option<u64>,
+}
+
+impl FromStr for Engine {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (name, most) = text.split_once('=').map_or((text, None), |(name, most)| (name, Some(most)));
+        let is_name = !name.is_empty()
+            && name.chars().all(|c| c.is_ascii_lowercase() || c == '-' || c.is_ascii_digit());
+        match most.map(str::parse).transpose() {
+            Ok(most_gaussians) if is_name => Ok(Self { name: name.to_owned(), most_gaussians }),
+            _ => Err(format!("{text:?} is not NAME or NAME=GAUSSIANS, like qdrant-hnsw=1000000")),
+        }
+    }
+}
+
+impl Engine {
+    /// Returns the profile whose shards `slag-edge` queries; `None` for other engines.
+    fn profile(&self) -> Option<Profile> {
+        Profile::ALL.into_iter().find(|profile| profile.name() == self.name)
+    }
+
+    /// Returns the memory that measuring a size takes, in bytes, or a little more. Other engines hold all vectors in f32;
+    /// qdrant-edge holds them twice while it moves them into immutable segments.
+    fn memory_bytes(&self, n_gaussians: u64, dim: u32) -> u64 {
+        let vectors = n_gaussians * u64::from(dim) * 4;
+        match self.name.as_str() {
+            _ if self.profile().is_some() => n_gaussians * 100,
+            name if name.starts_with("qdrant") => vectors * 23 / 10,
+            _ => vectors * 12 / 10,
+        }
+    }
+
+    /// Returns why it cannot or shall not be measured at a size.
+    fn reason_against(&self, args: &RobotArgs, free: Option<u64>, n_gaussians: u64) -> Option<String> {
+        if let Some(most) = self.most_gaussians.filter(|most| n_gaussians > *most) {
+            return Some(format!("asked for up to {most} Gaussians"));
+        }
+        if self.profile().is_none() && args.rivals.is_none() {
+            return Some("no --rivals program is given".into());
+        }
+        let (needed, free) = (self.memory_bytes(n_gaussians, args.dim), free?);
+        let gb = |bytes: u64| bytes as f64 / 1e9;
+        (needed > free).then(|| format!("needs {:.1} GB of memory, {:.1} are free", gb(needed), gb(free)))
+    }
+}
+
+/// Figures of an engine at one size.
+#[derive(Debug, Serialize, Deserialize)]
+struct Figures {
+    engine: String,
+    library: String,
+    n_gaussians: u64,
+    /// Seconds to build the index from vectors; absent for shards, which the encoder makes.
+    build_secs: Option<f64>,
+    disk_bytes: Option<u64>,
+    rss_bytes: Option<u64>,
+    /// Load average of the last minute before it was measured: above its threads, others shared the machine.
+    load_1min: Option<f64>,
+    searches: Vec<SearchFigures>,
+}
+
+/// Times for one number of results, from the query's vector to ids and scores.
+#[derive(Debug, Serialize, Deserialize)]
+struct SearchFigures {
+    limit: u64,
+    min_ms: f64,
+    median_ms: f64,
+    p99_ms: f64,
+    /// Share of the true best that is found, mean over the queries; absent where the vectors are not at hand.
+    recall: Option<f64>,
+}
+
+#[derive(Debug, Serialize)]
+pub(crate) struct RobotReport {
+    machine: Machine,
+    dim: u32,
+    sizes: Vec<u64>,
+    limits: Vec<u64>,
+    text: Option<TextReport>,
+    figures: Vec<Figures>,
+    pub(crate) not_run: Vec<String>,
+}
+
+/// Measures what has no file in `OUT/figures` yet, and writes `robot.json` and `robot.md` for all of it. What was measured
+/// before an error is kept.
+pub(crate) fn run(args: &RobotArgs, progress: &dyn Progress) -> Result<RobotReport> {
+    let texts = TextArgs { models: args.models.clone(), text: vec!["chair".into()], runs: 100 };
+    let text = time_texts(&texts);
+    let not_run = text.as_ref().err().map(|error| format!("text to vector: {error:#}"));
+    let mut report = RobotReport {
+        machine: Machine::here(),
+        dim: args.dim,
+        sizes: args.gaussians.clone(),
+        limits: args.limits.clone(),
+        text: text.ok(),
+        figures: Vec::new(),
+        not_run: not_run.into_iter().collect(),
+    };
+    fs_err::create_dir_all(args.out.join("figures"))?;
+    let free = free_memory_bytes();
+    for size in &args.gaussians {
+        let mut scene = Scene::new(args, *size);
+        for engine in &args.engines {
+            let path = args.out.join(format!("figures/{}-{size}-{}.json", engine.name, args.dim));
+            if path.is_file() {
+                let malformed = || format!("{}: delete the file to measure again", path.display());
+                report.figures.push(serde_json::from_slice(&fs_err::read(&path)?).with_context(malformed)?);
+            } else if let Some(reason) = engine.reason_against(args, free, *size) {
+                report.not_run.push(format!("{} at {} M: {reason}", engine.name, *size as f64 / 1e6));
+            } else {
+                let figures = scene.measure(engine, progress)?;
+                slag_common::durable::write(&path, &serde_json::to_vec_pretty(&figures)?)?;
+                report.figures.push(figures);
+            }
+        }
+        remove(&scene.dir)?;
+    }
+    fs_err::write(args.out.join("robot.json"), serde_json::to_vec_pretty(&report)?)?;
+    fs_err::write(args.out.join("robot.md"), report.to_string())?;
+    Ok(report)
+}
+
+/// A field of one size, made when it is first needed.
+struct Scene<'a> {
+    args: &'a RobotArgs,
+    n_gaussians: u64,
+    dir: PathBuf,
+    is_published: bool,
+    truth: Option<Truth>,
+}
+
+impl<'a> Scene<'a> {
+    fn new(args: &'a RobotArgs, n_gaussians: u64) -> Self {
+        let dir = args.out.join(format!("field-{n_gaussians}"));
+        Self { args, n_gaussians, dir, is_published: false, truth: None }
+    }
+
+    /// Publishes the field and, for other engines, writes its vectors and queries.
+    fn publish(&mut self, progress: &dyn Progress) -> Result<()> {
+        let Self { args, n_gaussians, dir, .. } = self;
+        if self.is_published {
+            return Ok(());
+        }
+        remove(dir)?;
+        let mut profiles: Vec<Profile> = args.engines.iter().filter_map(Engine::profile).collect();
+        let has_exact = profiles.contains(&Profile::Exact);
+        if args.rivals.is_some() && !has_exact {
+            profiles.push(Profile::Exact);
+        }
+        field::publish(*n_gaussians as usize, args.dim as usize, &dir.join("store"), profiles, progress)?;
+        if args.rivals.is_some() {
+            let (dump, cache) = (dir.join("dump"), self.fetch(Profile::Exact)?);
+            let mut command = Command::new(sibling("slag-lab")?);
+            command.args(["--json", "bench", "query", "--runs", "1", "--limits", "1", "--dump"]).arg(&dump);
+            json_of(command.arg("--cache").arg(&cache))?;
+            if !has_exact {
+                remove(&cache)?;
+            }
+            self.truth = Some(Truth::read(&dump, self.args.dim as usize, self.args.runs as usize)?);
+        }
+        self.is_published = true;
+        Ok(())
+    }
+
+    /// Fetches the shards of a profile as a robot does, and returns the cache.
+    fn fetch(&self, profile: Profile) -> Result<PathBuf> {
+        let cache = self.dir.join(format!("cache-{profile}"));
+        if !cache.exists() {
+            fetch_all(&self.dir.join("store"), &cache, profile.name())?;
+        }
+        Ok(cache)
+    }
+
+    fn measure(&mut self, engine: &Engine, progress: &dyn Progress) -> Result<Figures> {
+        self.publish(progress)?;
+        progress.begin(&engine.name, "engine", 1, 0);
+        let (ids, dump) = (self.dir.join("ids"), self.dir.join("dump"));
+        fs_err::create_dir_all(&ids)?;
+        let limits = self.args.limits.iter().map(u64::to_string).collect::<Vec<_>>().join(",");
+        let mut command = match (engine.profile(), &self.args.rivals) {
+            (Some(profile), _) => {
+                let mut command = Command::new(sibling("slag-lab")?);
+                command.args(["--json", "bench", "query", "--precision", "measured"]);
+                command.arg("--cache").arg(self.fetch(profile)?);
+                if self.truth.is_some() {
+                    command.arg("--queries").arg(dump.join("queries.f32"));
+                }
+                command
+            }
+            (None, Some(rivals)) => {
+                let mut command = Command::new(rivals);
+                command.args(["--engine", &engine.name]).arg("--dump").arg(&dump);
+                command
+            }
+            (None, None) => bail!("{}: no --rivals program is given", engine.name),
+        };
+        command.args(["--limits", &limits, "--runs", &self.args.runs.to_string()]).arg("--ids").arg(&ids);
+        let load_1min = load_1min();
+        let printed = json_of(&mut command)?;
+        let searches = printed["searches"].as_array().into_iter().flatten();
+        let figures = Figures {
+            engine: engine.name.clone(),
+            library: printed["library"].as_str().unwrap_or("slag-edge").to_owned(),
+            n_gaussians: self.n_gaussians,
+            build_secs: printed["build_secs"].as_f64(),
+            disk_bytes: printed["disk_bytes"].as_u64().or_else(|| printed["shard_bytes"].as_u64()),
+            rss_bytes: printed["rss_bytes"].as_u64(),
+            load_1min,
+            searches: searches.map(|of| self.search(of, &engine.name, &ids)).collect::<Result<_>>()?,
+        };
+        remove(&ids)?;
+        progress.end();
+        Ok(figures)
+    }
+
+    /// Reads times as both programs print them, and judges the ids that they wrote.
+    fn search(&self, printed: &Value, name: &str, ids: &Path) -> Result<SearchFigures> {
+        // Ours times two kinds of answers.
+        let times = if printed["best"].is_object() { &printed["best"] } else { printed };
+        let of = |value: &Value, key: &str| {
+            let missing = || format!("{name}: no {key} in its JSON; build it from this version");
+            value[key].as_f64().with_context(missing)
+        };
+        let limit = of(printed, "limit")? as u64;
+        Ok(SearchFigures {
+            limit,
+            min_ms: of(times, "min_ms")?,
+            median_ms: of(times, "median_ms")?,
+            p99_ms: of(times, "p99_ms")?,
+            recall: self
+                .truth
+                .as_ref()
+                .map(|truth| truth.mean_recall(name, limit, ids))
+                .transpose()?
+                .flatten(),
+        })
+    }
+}
+
+/// The paper's table: Qdrant on a Jetson Orin (Szilagyi et al. 2025), by 1, 2, 4 and 8 million Gaussians.
+const PAPER: [(&str, [f64; 4]); 8] = [
+    ("1,000 results, s", [0.02, 0.02, 0.02, 0.03]),
+    ("10,000", [0.09, 0.11, 0.12, 0.23]),
+    ("50,000", [0.43, 0.64, 1.16, 1.32]),
+    ("100,000", [0.52, 0.74, 1.36, 2.37]),
+    ("PyTorch, dense, s", [0.05, 0.09, 0.17, 0.33]),
+    ("Qdrant, RAM, GB", [2.9, 4.9, 9.2, 17.7]),
+    ("Qdrant, disk, GB", [0.8, 1.3, 2.3, 4.3]),
+    ("PyTorch, RAM, GB", [2.0, 4.0, 8.0, 16.0]),
+];
+
+impl fmt::Display for RobotReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "# Queries on the robot: {}\n", self.machine)?;
+        writeln!(
+            f,
+            "`slag-lab bench robot`, {} components; from a text's vector to ids and scores.",
+            self.dim
+        )?;
+        let loads = self.figures.iter().filter_map(|f| f.load_1min);
+        if let Some(most) = loads.reduce(f64::max) {
+            writeln!(f, "Load average before an engine: at most {most:.1}, this run's own work included.")?;
+        }
+        for (model, (text, times)) in self.text.iter().flat_map(|t| t.texts.iter().map(|of| (&t.model, of))) {
+            writeln!(f, "Text to vector adds {:.2} ms ({model}, {text:?}).", times.median_ms)?;
+        }
+        let limits = self.limits.iter().map(|limit| format!("best {limit}"));
+        let head = ["engine", "million Gaussians"].map(str::to_owned).into_iter().chain(limits);
+        let mut table = Table::new(head.chain(["RAM, GB", "disk, GB", "index, s"].map(str::to_owned)));
+        for of in &self.figures {
+            let name = format!("{} ({})", of.engine, of.library);
+            let mut row = vec![name, (of.n_gaussians as f64 / 1e6).to_string()];
+            row.extend(self.limits.iter().map(|limit| {
+                let search = of.searches.iter().find(|search| search.limit == *limit);
+                search.map_or("-".into(), |search| {
+                    let recall = search.recall.map_or("-".into(), |recall| format!("{recall:.3}"));
+                    format!("{:.2} ({:.2}, {recall})", search.median_ms, search.min_ms)
+                })
+            }));
+            let gb =
+                |bytes: Option<u64>| bytes.map_or("-".into(), |bytes| format!("{:.2}", bytes as f64 / 1e9));
+            row.extend([gb(of.rss_bytes), gb(of.disk_bytes)]);
+            row.push(of.build_secs.map_or("-".into(), |secs| format!("{secs:.0}")));
+            table.row(row);
+        }
+        writeln!(f, "\nMilliseconds: median (least, recall).\n\n{table}")?;
+        self.not_run.iter().try_for_each(|line| writeln!(f, "- not run: {line}"))?;
+        let mut paper = Table::new(["the paper: Qdrant on a Jetson Orin", "1 M", "2 M", "4 M", "8 M"]);
+        for (name, row) in PAPER {
+            paper.row(std::iter::once(name.to_owned()).chain(row.map(|v| v.to_string())));
+        }
+        writeln!(f, "\n{paper}\nText encoding adds 0.20 to 0.25 s there (Szilagyi et al. 2025).")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: RobotArgs,
+    }
+
+    #[test]
+    fn engines_have_names_and_most_gaussians() {
+        let read = |text: &str| text.parse::<Engine>();
+        let graph = read("qdrant-hnsw=1000000").expect("well-formed");
+        assert_eq!(
+            (graph.name.as_str(), graph.most_gaussians, graph.profile()),
+            ("qdrant-hnsw", Some(1_000_000), None)
+        );
+        assert!(read("balanced").expect("well-formed").profile().is_some());
+        for wrong in ["", "=1", "a=", "a=b", "a b", "../a"] {
+            assert!(read(wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    /// What an earlier run measured is not measured again, and an engine without its program or memory is named.
+    #[test]
+    fn what_cannot_run_is_named() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let out = dir.path().to_str().expect("UTF-8");
+        let line = ["x", "--out", out, "--gaussians", "1000,2000", "--limits", "10", "--dim", "16"];
+        let line = line.into_iter().chain(["--engines", "dense,qdrant-scan=1000", "--models", "colours"]);
+        let args = Line::parse_from(line).args;
+        let dense = &args.engines[0];
+        let few = RobotArgs { rivals: Some(PathBuf::new()), ..Line::parse_from(["x", "--out", out]).args };
+        assert!(dense.reason_against(&few, Some(10), 1000).is_some_and(|reason| reason.contains("needs")));
+        let kept = r#"{"engine":"dense","library":"l","n_gaussians":1000,"build_secs":61.0,"disk_bytes":52000000,
+            "rss_bytes":null,"load_1min":1.5,"searches":[{"limit":10,"min_ms":0.5,"median_ms":12.3,"p99_ms":20,"recall":0.9}]}"#;
+        fs_err::create_dir_all(dir.path().join("figures")).expect("makes");
+        fs_err::write(dir.path().join("figures/dense-1000-16.json"), kept).expect("writes");
+        let report = run(&args, &slag_encoder::progress::Silent).expect("runs");
+        let page = fs_err::read_to_string(dir.path().join("robot.md")).expect("a page");
+        let lines: Vec<String> =
+            page.lines().map(|l| l.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
+        for line in [
+            "| dense (l) | 0.001 | 12.30 (0.50, 0.900) | - | 0.05 | 61 |",
+            "- not run: dense at 0.002 M: no --rivals program is given",
+            "- not run: qdrant-scan at 0.002 M: asked for up to 1000 Gaussians",
+            "| 100,000 | 0.52 | 0.74 | 1.36 | 2.37 |",
+        ] {
+            assert!(lines.iter().any(|found| found == line), "{line}\n{page}");
+        }
+        // The model of colours knows no chair.
+        assert!(report.not_run[0].starts_with("text to vector: "), "{:?}", report.not_run);
+        assert!(report.figures.len() == 1 && report.text.is_none());
+    }
+}

@@ -1,0 +1,160 @@
+//! The project's programs, run as a user runs them.
+
+use std::ffi::OsStr;
+use std::fmt::Debug;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use anyhow::{Context, Result, anyhow, bail};
+use clap::ValueEnum;
+use serde_json::Value;
+
+use crate::generate::compose::Walk;
+
+/// Longest wait for an answer.
+const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Returns the path of a program beside this one.
+pub(crate) fn sibling(name: &str) -> Result<PathBuf> {
+    let lab = std::env::current_exe().context("cannot find the path of this program")?;
+    let path = lab.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX));
+    if path.is_file() { Ok(path) } else { bail!("{} does not exist; build it first", path.display()) }
+}
+
+/// Runs a command to its end.
+pub(crate) fn finish(command: &mut Command) -> Result<()> {
+    let output = command.stdin(Stdio::null()).output().with_context(|| line(command))?;
+    let message = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    if output.status.success() { Ok(()) } else { Err(anyhow!("{}: {message}", line(command))) }
+}
+
+/// Runs a command and parses the JSON that it prints. Exit code 3 is no error: some inputs were left out, and the figures
+/// count them.
+pub(crate) fn json_of(command: &mut Command) -> Result<Value> {
+    let output = command.stdin(Stdio::null()).output().with_context(|| line(command))?;
+    let printed: Option<Value> = serde_json::from_slice(&output.stdout).ok();
+    // The encoder says `message`, the robot's program `detail`.
+    let error = |value: &Value| {
+        ["message", "detail"].iter().find_map(|key| Some(value["error"][key].as_str()?.to_owned()))
+    };
+    match (printed.as_ref().and_then(error), printed, output.status.code()) {
+        (None, Some(value), Some(0 | 3)) => Ok(value),
+        (Some(message), ..) => bail!("{}: {message}", line(command)),
+        _ => bail!("{}: {}", line(command), String::from_utf8_lossy(&output.stderr).trim()),
+    }
+}
+
+fn line(command: &Command) -> String {
+    let words = std::iter::once(command.get_program()).chain(command.get_args());
+    words.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(" ")
+}
+
+/// Removes a folder where it exists.
+pub(crate) fn remove(dir: &Path) -> std::io::Result<()> {
+    if dir.exists() { fs_err::remove_dir_all(dir) } else { Ok(()) }
+}
+
+/// Returns a value as flags take it.
+pub(crate) fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
+    let name = value.to_possible_value().map(|value| value.get_name().to_owned());
+    name.ok_or_else(|| anyhow!("{value:?} has no name"))
+}
+
+/// A program's `serve` on a free port, which is stopped when dropped.
+pub(crate) struct Service {
+    child: Child,
+    pub(crate) url: String,
+}
+
+impl Service {
+    /// Starts the service. `flag`: that of its folder.
+    pub(crate) fn start(program: &Path, flag: &str, folder: &Path) -> Result<Self> {
+        let mut command = Command::new(program);
+        command.args(["--quiet", "serve", "--listen", "127.0.0.1:0", flag]).arg(folder);
+        let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn();
+        let mut service = Self { child: child.with_context(|| line(&command))?, url: String::new() };
+        let mut first = String::new();
+        if let Some(stdout) = service.child.stdout.take() {
+            BufReader::new(stdout).read_line(&mut first)?;
+        }
+        let url = first.trim().strip_prefix("listening on ");
+        service.url =
+            url.with_context(|| format!("{}: expected its address, found {first:?}", line(&command)))?.into();
+        Ok(service)
+    }
+
+    /// Returns the JSON of a resource, whatever its status.
+    pub(crate) fn get(&self, path: &str) -> Result<Value> {
+        let body = agent().get(format!("{}{path}", self.url)).call()?.body_mut().read_to_string()?;
+        serde_json::from_str(&body).with_context(|| path.to_owned())
+    }
+
+    /// Sends JSON and returns the JSON of the answer, whatever its status.
+    pub(crate) fn post(&self, path: &str, body: &Value) -> Result<Value> {
+        let request = agent().post(format!("{}{path}", self.url)).content_type("application/json");
+        let body = request.send(body.to_string())?.body_mut().read_to_string()?;
+        serde_json::from_str(&body).with_context(|| path.to_owned())
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Returns a client that asks without a proxy and returns replies of every status.
+pub(crate) fn agent() -> ureq::Agent {
+    let config = ureq::Agent::config_builder().proxy(None).http_status_as_error(false);
+    config.timeout_global(Some(TIMEOUT)).build().into()
+}
+
+/// Copies a whole store to an empty cache as a robot does.
+pub(crate) fn fetch_all(store: &Path, cache: &Path, profile: &str) -> Result<()> {
+    remove(cache)?;
+    let service = Service::start(&sibling("slag-encoder")?, "--store", store)?;
+    let mut fetch = Command::new(sibling("slag-edge")?);
+    fetch.args(["fetch", "--trust-first", "--json", "--quiet", "--at", "0,0,0", "--radius", "1e6"]);
+    fetch.args(["--from", &service.url, "--profile", profile, "--cache"]).arg(cache);
+    json_of(&mut fetch).map(|_| ())
+}
+
+/// A generated scene on a robot, in a folder: `scene`, `store` and `cache`.
+pub(crate) struct Prepared<'a> {
+    pub(crate) dir: &'a Path,
+    /// Kind of scene, as `generate scene` names it.
+    pub(crate) kind: &'a str,
+    pub(crate) seed: u64,
+    pub(crate) n_views: u32,
+    pub(crate) walk: Walk,
+    /// Further flags of `encode`; `SCENE` in them stands for the scene's folder.
+    pub(crate) encode_flags: &'a [&'a str],
+}
+
+impl Prepared<'_> {
+    /// Generates, encodes and fetches the scene, as far as that was not done before.
+    pub(crate) fn make(&self) -> Result<()> {
+        let [scene, store, cache] = ["scene", "store", "cache"].map(|name| self.dir.join(name));
+        let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));
+        if !poses.is_file() {
+            let (seed, n_views) = (self.seed.to_string(), self.n_views.to_string());
+            let mut command = Command::new(sibling("slag-lab")?);
+            command.args(["generate", "scene", "--kind", self.kind, "--seed", &seed, "--n-views", &n_views]);
+            finish(command.args(["--walk", &flag_value(&self.walk)?, "--out"]).arg(&scene))?;
+        }
+        if !store.join("manifest").is_file() {
+            let mut command = Command::new(sibling("slag-encoder")?);
+            command.args(["encode", "--metric", "--scene"]).arg(&splat).arg("--views").arg(&poses);
+            let folder = scene.to_string_lossy();
+            command.args(self.encode_flags.iter().map(|flag| flag.replace("SCENE", &folder)));
+            finish(command.arg("--store").arg(&store))?;
+        }
+        if !cache.join("current").is_file() {
+            fetch_all(&store, &cache, "compact")?;
+        }
+        Ok(())
+    }
+}
