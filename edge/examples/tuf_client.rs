@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use anyhow::{Context, anyhow};
-use slag_common::tuf::{Kept, Source, find_target, refresh};
+use slag_common::tuf::{Kept, Source, Trusted, refresh};
 
 /// Most bytes of a downloaded file.
 const MAX_FILE_BYTES: u64 = 16 << 20;
@@ -30,10 +30,10 @@ fn main() -> anyhow::Result<()> {
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
     match words[..] {
         ["init", root] => Ok(fs_err::write(dir.join("root.json"), fs_err::read(root)?)?),
-        ["refresh"] => update(&dir, flag("metadata-url")?, |_, _, _| Ok(())),
-        ["download"] => update(&dir, flag("metadata-url")?, |trusted, kept, source| {
+        ["refresh"] => update(&dir, flag("metadata-url")?, |_| Ok(())),
+        ["download"] => update(&dir, flag("metadata-url")?, |trusted| {
             for path in flags.get("target-name").into_iter().flatten() {
-                let target = find_target(trusted, kept, source, path)?.context("no role lists it")?;
+                let target = trusted.target(path).context("it is not listed")?;
                 let into = Path::new(flag("target-dir")?).join(encoded(path));
                 if fs_err::read(&into).is_ok_and(|held| target.check(path, &held).is_ok()) {
                     continue;
@@ -51,24 +51,23 @@ fn main() -> anyhow::Result<()> {
 }
 
 /// Loads the kept metadata, runs `work` on it, and saves the accepted metadata, also after an error.
-fn update(
-    dir: &Path,
-    url: &str,
-    work: impl FnOnce(&mut slag_common::tuf::Trusted, &mut Kept, &mut dyn Source) -> anyhow::Result<()>,
-) -> anyhow::Result<()> {
+fn update(dir: &Path, url: &str, work: impl FnOnce(&Trusted) -> anyhow::Result<()>) -> anyhow::Result<()> {
     let mut kept = Kept::from_root(&fs_err::read(dir.join("root.json"))?)?;
     let read = |name: &str| fs_err::read_to_string(dir.join(name)).ok();
     (kept.timestamp, kept.snapshot) = (read("timestamp.json"), read("snapshot.json"));
-    kept.targets.extend(read("targets.json").map(|text| ("targets".to_owned(), text)));
+    kept.targets = read("targets.json");
     let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH)?.as_secs();
     let mut source = Repository(url.to_owned());
-    let done = refresh(&mut kept, &mut source, now)
-        .map_err(anyhow::Error::from)
-        .and_then(|mut trusted| work(&mut trusted, &mut kept, &mut source));
-    let top = [("root", Some(kept.root)), ("timestamp", kept.timestamp), ("snapshot", kept.snapshot)];
-    let top = top.into_iter().map(|(role, text)| (role.to_owned(), text));
-    for (role, text) in top.chain(kept.targets.into_iter().map(|(role, text)| (role, Some(text)))) {
-        let path = dir.join(format!("{}.json", encoded(&role)));
+    let done =
+        refresh(&mut kept, &mut source, now).map_err(anyhow::Error::from).and_then(|trusted| work(&trusted));
+    let files = [
+        ("root", Some(kept.root)),
+        ("timestamp", kept.timestamp),
+        ("snapshot", kept.snapshot),
+        ("targets", kept.targets),
+    ];
+    for (role, text) in files {
+        let path = dir.join(format!("{role}.json"));
         match text {
             Some(text) => fs_err::write(path, text)?,
             None if path.exists() => fs_err::remove_file(path)?,

@@ -6,7 +6,6 @@ use serde_json::Value;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the number {found} is not a whole number of 64 bits, the only kind that canonical JSON has")]
 pub struct NotCanonical {
-    /// The number.
     pub found: String,
 }
 

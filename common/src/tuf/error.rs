@@ -5,76 +5,40 @@
 pub enum TufError {
     /// Not metadata of the role.
     #[error("{role} metadata: {what}; check that the address is that of a slag-encoder store")]
-    Format {
-        /// The role.
-        role: String,
-        /// The fault.
-        what: String,
-    },
+    Format { role: String, what: String },
     /// Too few keys of the role signed it.
     #[error(
-        "{role} metadata: {found} of its keys signed it, expected {threshold}: it was changed, or its keys are not those that the root names; if the store was made anew, add its root by hand"
+        "{role} metadata: {found} of its keys signed it, expected {threshold}: it was changed, or this is another store than the one that is trusted. If the store was made anew, trust its new root: `slag-edge trust add URL --sha256 HEX --replace`, with the SHA-256 that `slag-encoder keys status` prints there"
     )]
     Signatures {
-        /// The role.
         role: String,
         /// Keys with a valid signature.
         found: usize,
-        /// Keys needed.
         threshold: u32,
     },
     /// Older than what was seen before.
     #[error(
         "{role} metadata: version {offered} is offered after {seen}: an old state of the store is repeated; fetch again later, or from the store itself"
     )]
-    Rollback {
-        /// The role.
-        role: String,
-        /// Version seen before.
-        seen: u64,
-        /// Version offered.
-        offered: u64,
-    },
+    Rollback { role: String, seen: u64, offered: u64 },
     /// Not the version that another role states.
     #[error(
         "{role} metadata: version {found}, expected {expected}: files of different states are mixed; fetch again"
     )]
-    Version {
-        /// The role.
-        role: String,
-        /// Version stated.
-        expected: u64,
-        /// Version found.
-        found: u64,
-    },
+    Version { role: String, expected: u64, found: u64 },
     /// Expired.
-    #[error(
-        "{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder {}` there", if role == "root" { "keys renew" } else { "store refresh" }
-    )]
-    Expired {
-        /// The role.
-        role: String,
-        /// Time of expiry.
-        expired: String,
-        /// Reference time.
-        now: String,
-    },
+    #[error("{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder {}` there, and check its clock", if role == "root" { "keys renew" } else { "store refresh" })]
+    Expired { role: String, expired: String, now: String },
     /// Length or hash is not as stated.
     #[error("{what}: {fault}: it was changed, or files of different states are mixed; fetch again")]
     Content {
         /// The file or role.
         what: String,
-        /// The fault.
         fault: String,
     },
     /// Longer than allowed.
     #[error("{what} is longer than {max_bytes} bytes, the most that is read of it")]
-    TooLong {
-        /// The file.
-        what: String,
-        /// The limit.
-        max_bytes: u64,
-    },
+    TooLong { what: String, max_bytes: u64 },
     /// A file that must be there is missing.
     #[error("{what} is missing in the store; check the address, or publish the scene again")]
     Missing {
@@ -83,24 +47,15 @@ pub enum TufError {
     },
     /// The next step needs a role that is not there yet, or repeats one.
     #[error("{role} metadata came out of order")]
-    Order {
-        /// The role.
-        role: String,
-    },
-    /// More new roots or delegations than are read.
+    Order { role: String },
+    /// More new roots than are read.
     #[error("more than {limit} {what} in a row; expected fewer: fetch again to go on, or check the store")]
     TooMany {
         /// What there is too much of.
         what: &'static str,
-        /// The limit.
         limit: usize,
     },
     /// The store could not be read.
     #[error("{what}: {fault}")]
-    Source {
-        /// The file.
-        what: String,
-        /// The cause.
-        fault: String,
-    },
+    Source { what: String, fault: String },
 }

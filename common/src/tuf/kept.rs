@@ -1,7 +1,5 @@
 //! What a client remembers of a repository between updates.
 
-use std::collections::BTreeMap;
-
 use serde::{Deserialize, Serialize};
 
 use super::error::TufError;
@@ -13,16 +11,13 @@ use super::time::parse_utc;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Kept {
-    /// The newest root.
     pub root: String,
-    /// The newest timestamp.
     pub timestamp: Option<String>,
-    /// The newest snapshot.
     pub snapshot: Option<String>,
-    /// The newest targets metadata, by role: saves downloads, and need not outlive the process, because the snapshot
-    /// states its versions.
+    /// The newest targets metadata: saves a download, and need not outlive the process, because the snapshot states its
+    /// version.
     #[serde(skip)]
-    pub targets: BTreeMap<String, String>,
+    pub targets: Option<String>,
 }
 
 impl Kept {
@@ -32,7 +27,7 @@ impl Kept {
     /// [`TufError`] unless it is a root that its own keys signed.
     pub fn from_root(bytes: &[u8]) -> Result<Self, TufError> {
         parse_own_root(bytes)?;
-        Ok(Self { root: text(Root::TYPE, bytes)?, timestamp: None, snapshot: None, targets: BTreeMap::new() })
+        Ok(Self { root: text(Root::TYPE, bytes)?, timestamp: None, snapshot: None, targets: None })
     }
 
     /// Returns the version of the newest root.

@@ -14,9 +14,7 @@ const ED25519: &str = "ed25519";
 /// A public key as metadata lists it. Only Ed25519 keys can verify; others are kept and never count.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Key {
-    /// Kind of key.
     pub keytype: String,
-    /// Signature scheme.
     pub scheme: String,
     /// The key's values; `public` is the public key in hex.
     pub keyval: BTreeMap<String, Value>,
@@ -54,7 +52,6 @@ pub fn generate_key() -> SigningKey {
     SigningKey::generate(&mut rand_core::OsRng)
 }
 
-/// Returns whether a signature in hex is that of a message.
 pub(super) fn is_signed(key: &VerifyingKey, message: &[u8], signature_hex: &str) -> bool {
     let mut bytes = [0; 64];
     // Strict verification refuses small-order keys, which have several valid signatures (RFC 8032, 5.1.7).

@@ -52,7 +52,6 @@ impl RoleKeys {
 pub struct Root {
     /// Whether file names begin with version or hash; only such repositories are read.
     pub consistent_snapshot: bool,
-    /// Keys by id.
     pub keys: BTreeMap<String, Key>,
     /// `root`, `targets`, `snapshot` and `timestamp`.
     pub roles: BTreeMap<String, RoleKeys>,
@@ -77,7 +76,6 @@ impl Body for Root {
 /// Version of a metadata file, and its length and hashes where they are stated.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileMeta {
-    /// Version.
     pub version: u64,
     /// Length, bytes.
     #[serde(skip_serializing_if = "Option::is_none", default)]
@@ -182,71 +180,20 @@ impl TargetFile {
     }
 
     /// Checks a file's bytes.
-    ///
-    /// # Errors
-    /// [`TufError::Content`].
     pub fn check(&self, path: &str, bytes: &[u8]) -> Result<(), TufError> {
         check_content(path, bytes, Some(self.length), Some(&self.hashes))
     }
 }
 
-/// Targets: the files, or who signs for them.
+/// Targets: the files. Delegations to other roles are not followed.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Targets {
     /// Files by path.
     pub targets: BTreeMap<String, TargetFile>,
-    /// Roles that sign for some paths.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub delegations: Option<Delegations>,
 }
 
 impl Body for Targets {
     const TYPE: &'static str = "targets";
-
-    fn check(&self) -> Result<(), String> {
-        let roles = self.delegations.iter().flat_map(|delegations| &delegations.roles);
-        let mut names = std::collections::BTreeSet::new();
-        for role in roles {
-            role.keys.check(&role.name)?;
-            if ["root", "targets", "snapshot", "timestamp", ""].contains(&role.name.as_str()) {
-                return Err(format!("a delegated role is called {:?}", role.name));
-            }
-            if !names.insert(&role.name) {
-                return Err(format!("role {} is delegated to twice", role.name));
-            }
-            if role.paths.is_some() == role.path_hash_prefixes.is_some() {
-                return Err(format!("role {} has not one of paths and path_hash_prefixes", role.name));
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Roles that a targets role trusts for some paths.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Delegations {
-    /// Keys by id.
-    pub keys: BTreeMap<String, Key>,
-    /// In order of priority.
-    pub roles: Vec<DelegatedRole>,
-}
-
-/// A role that signs for some paths.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DelegatedRole {
-    /// Its name.
-    pub name: String,
-    /// Its keys.
-    #[serde(flatten)]
-    pub keys: RoleKeys,
-    /// Whether no later role is asked for its paths.
-    pub terminating: bool,
-    /// Patterns of paths.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub paths: Option<Vec<String>>,
-    /// Beginnings of the SHA-256 of paths, hex.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub path_hash_prefixes: Option<Vec<String>>,
 }
 
 /// Returns the SHA-256 of bytes, hex.

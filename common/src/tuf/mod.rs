@@ -12,7 +12,6 @@
 //! | timestamp | the version of the snapshot, for a short time | where a timer can sign |
 
 mod canonical;
-mod delegation;
 mod error;
 mod kept;
 mod key;
@@ -27,15 +26,12 @@ pub use canonical::{NotCanonical, canonical_json};
 pub use error::TufError;
 pub use kept::Kept;
 pub use key::{Key, generate_key};
-pub use metadata::{
-    Body, DelegatedRole, Delegations, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp,
-    sha256_hex,
-};
+pub use metadata::{Body, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, sha256_hex};
 pub use repository::one_key_repository;
 pub use signed::{Envelope, Head, MetadataSignature, SignedMetadata, add_signatures, sign};
 pub use time::{format_utc, parse_utc};
 pub use trusted::{Offered, Trusted};
-pub use update::{Source, find_target, refresh};
+pub use update::{Source, refresh};
 
 /// Version of the specification that is written.
 pub const SPEC_VERSION: &str = "1.0.31";
@@ -49,5 +45,3 @@ pub const MAX_SNAPSHOT_BYTES: u64 = 256 << 10;
 pub const MAX_TARGETS_BYTES: u64 = 5 << 20;
 /// Most new roots read in one update.
 pub const MAX_ROOTS: u32 = 256;
-/// Most delegated roles read for one target.
-pub const MAX_DELEGATIONS: usize = 32;

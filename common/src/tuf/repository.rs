@@ -22,7 +22,7 @@ pub fn one_key_repository(
     let keys = BTreeMap::from([(public.id(), public)]);
     let root = Root { consistent_snapshot: true, keys, roles: roles.into() };
     let targets = BTreeMap::from([(path.to_owned(), TargetFile::of(target))]);
-    let targets = sign(version, never, &Targets { targets, delegations: None }, &[key]);
+    let targets = sign(version, never, &Targets { targets }, &[key]);
     let meta = BTreeMap::from([("targets.json".to_owned(), FileMeta::of(version, &targets))]);
     let snapshot = sign(version, never, &Snapshot { meta }, &[key]);
     let meta = BTreeMap::from([("snapshot.json".to_owned(), FileMeta::of(version, &snapshot))]);

@@ -62,9 +62,6 @@ pub struct SignedMetadata<T> {
 
 impl<T: Body> SignedMetadata<T> {
     /// Parses metadata of a role; `role` is for messages.
-    ///
-    /// # Errors
-    /// [`TufError::Format`].
     pub fn parse(role: &str, bytes: &[u8]) -> Result<Self, TufError> {
         let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
         let Envelope { signatures, signed } =
@@ -92,9 +89,6 @@ impl<T: Body> SignedMetadata<T> {
     }
 
     /// Checks that enough different keys of a role signed it.
-    ///
-    /// # Errors
-    /// [`TufError::Signatures`].
     pub fn check_signatures(
         &self,
         role: &str,
@@ -123,9 +117,6 @@ impl<T: Body> SignedMetadata<T> {
     }
 
     /// Checks the expiry against a reference time, seconds since 1970.
-    ///
-    /// # Errors
-    /// [`TufError::Expired`].
     pub fn check_expiry(&self, role: &str, now_unix_secs: u64) -> Result<(), TufError> {
         match self.expires_unix_secs <= now_unix_secs {
             true => Err(TufError::Expired {
@@ -165,9 +156,6 @@ pub fn sign<T: Body>(version: u64, expires_unix_secs: u64, body: &T, keys: &[&Si
 }
 
 /// Adds the signatures of keys that have not signed metadata yet.
-///
-/// # Errors
-/// [`TufError::Format`].
 pub fn add_signatures(role: &str, bytes: &[u8], keys: &[SigningKey]) -> Result<Vec<u8>, TufError> {
     let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
     let Envelope { mut signatures, signed } =

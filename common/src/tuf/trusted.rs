@@ -3,13 +3,9 @@
 //! Steps come in the order of the specification: roots, timestamp, snapshot, targets. A step that fails leaves the rest
 //! as it was.
 
-use std::collections::BTreeMap;
-
 use super::error::TufError;
 use super::kept::{parse_own_root, signed_unix_secs};
-use super::metadata::{
-    Body, DelegatedRole, Delegations, FileMeta, RoleKeys, Root, Snapshot, Targets, Timestamp,
-};
+use super::metadata::{Body, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
 use super::signed::SignedMetadata;
 
 /// Whether an offered file is news.
@@ -27,7 +23,7 @@ pub struct Trusted {
     root: SignedMetadata<Root>,
     timestamp: Option<SignedMetadata<Timestamp>>,
     snapshot: Option<SignedMetadata<Snapshot>>,
-    targets: BTreeMap<String, SignedMetadata<Targets>>,
+    targets: Option<SignedMetadata<Targets>>,
     now_unix_secs: u64,
 }
 
@@ -38,10 +34,9 @@ impl Trusted {
     /// [`TufError`] unless it is a root that its own keys signed.
     pub fn new(root: &[u8], now_unix_secs: u64) -> Result<Self, TufError> {
         let root = parse_own_root(root)?;
-        Ok(Self { root, timestamp: None, snapshot: None, targets: BTreeMap::new(), now_unix_secs })
+        Ok(Self { root, timestamp: None, snapshot: None, targets: None, now_unix_secs })
     }
 
-    /// Returns the root.
     pub fn root(&self) -> &SignedMetadata<Root> {
         &self.root
     }
@@ -56,9 +51,14 @@ impl Trusted {
         self.snapshot.as_ref()
     }
 
-    /// Returns targets metadata of a role, once there is some.
-    pub fn targets(&self, role: &str) -> Option<&SignedMetadata<Targets>> {
-        self.targets.get(role)
+    /// Returns the targets metadata, once there is some.
+    pub fn targets(&self) -> Option<&SignedMetadata<Targets>> {
+        self.targets.as_ref()
+    }
+
+    /// Returns a file that the targets metadata lists.
+    pub fn target(&self, path: &str) -> Option<&TargetFile> {
+        self.targets.as_ref()?.body.targets.get(path)
     }
 
     /// Returns the reference time: the later of the clock and the newest signed time, seconds since 1970.
@@ -68,9 +68,6 @@ impl Trusted {
 
     /// Takes the next root (5.3.4 and 5.3.5): the version after the present one, signed by the present root's keys and
     /// by its own.
-    ///
-    /// # Errors
-    /// [`TufError`].
     pub fn add_root(&mut self, bytes: &[u8]) -> Result<(), TufError> {
         self.before_timestamp(Root::TYPE)?;
         let next = SignedMetadata::<Root>::parse(Root::TYPE, bytes)?;
@@ -98,9 +95,6 @@ impl Trusted {
     }
 
     /// Takes a timestamp (5.4): signed, not older than the one before, not expired.
-    ///
-    /// # Errors
-    /// [`TufError`].
     pub fn add_timestamp(&mut self, bytes: &[u8]) -> Result<Offered, TufError> {
         if self.snapshot.is_some() {
             return Err(TufError::Order { role: Timestamp::TYPE.into() });
@@ -118,21 +112,18 @@ impl Trusted {
             check_not_older(Snapshot::TYPE, seen, offered)?;
         }
         new.check_expiry(Timestamp::TYPE, self.now_unix_secs)?;
-        self.now_unix_secs = self.now_unix_secs.max(signed_unix_secs(&new).unwrap_or(0));
         // The newest signed time may be later than the clock by which the root was good.
-        self.root.check_expiry(Root::TYPE, self.now_unix_secs)?;
-        self.timestamp = Some(new);
+        let now_unix_secs = self.now_unix_secs.max(signed_unix_secs(&new).unwrap_or(0));
+        self.root.check_expiry(Root::TYPE, now_unix_secs)?;
+        (self.now_unix_secs, self.timestamp) = (now_unix_secs, Some(new));
         Ok(Offered::New)
     }
 
     /// Takes a snapshot (5.5): the one that the timestamp states, signed, not expired. `before`: the snapshot of an
     /// earlier update, whose targets metadata must all be there, none of them older.
-    ///
-    /// # Errors
-    /// [`TufError`].
     pub fn add_snapshot(&mut self, bytes: &[u8], before: Option<&[u8]>) -> Result<(), TufError> {
         let order = || TufError::Order { role: Snapshot::TYPE.into() };
-        let meta = self.timestamp.as_ref().filter(|_| self.targets.is_empty()).ok_or_else(order)?;
+        let meta = self.timestamp.as_ref().filter(|_| self.targets.is_none()).ok_or_else(order)?;
         let meta = meta.body.snapshot();
         meta.check(Snapshot::TYPE, bytes)?;
         let new = SignedMetadata::<Snapshot>::parse(Snapshot::TYPE, bytes)?;
@@ -152,41 +143,22 @@ impl Trusted {
         Ok(())
     }
 
-    /// Takes targets metadata (5.6): the one that the snapshot states, signed by the keys that the delegating role
-    /// names, not expired. `from`: the delegating role and what it says of this one; `None` for the top-level role.
-    ///
-    /// # Errors
-    /// [`TufError`].
-    pub fn add_targets(
-        &mut self,
-        bytes: &[u8],
-        from: Option<(&Delegations, &DelegatedRole)>,
-    ) -> Result<&SignedMetadata<Targets>, TufError> {
-        let role = from.map_or(Targets::TYPE, |(_, delegated)| &delegated.name);
-        let meta = self.targets_meta(role)?;
-        meta.check(role, bytes)?;
-        let new = SignedMetadata::<Targets>::parse(role, bytes)?;
-        match from {
-            Some((delegations, delegated)) => {
-                new.check_signatures(role, &delegations.keys, &delegated.keys)?;
-            }
-            None => self.check_signatures(role, &new)?,
-        }
-        check_version(role, meta, new.head.version)?;
-        new.check_expiry(role, self.now_unix_secs)?;
-        let role = role.to_owned();
-        Ok(self.targets.entry(role).insert_entry(new).into_mut())
+    /// Takes targets metadata (5.6): the one that the snapshot states, signed, not expired.
+    pub fn add_targets(&mut self, bytes: &[u8]) -> Result<(), TufError> {
+        let meta = self.targets_meta()?;
+        meta.check(Targets::TYPE, bytes)?;
+        let new = SignedMetadata::<Targets>::parse(Targets::TYPE, bytes)?;
+        self.check_signatures(Targets::TYPE, &new)?;
+        check_version(Targets::TYPE, meta, new.head.version)?;
+        new.check_expiry(Targets::TYPE, self.now_unix_secs)?;
+        self.targets = Some(new);
+        Ok(())
     }
 
-    /// Returns what the snapshot states of targets metadata.
-    ///
-    /// # Errors
-    /// [`TufError::Order`] without a snapshot, [`TufError::Missing`] if it does not list the role.
-    pub fn targets_meta(&self, role: &str) -> Result<&FileMeta, TufError> {
-        let order = || TufError::Order { role: role.to_owned() };
-        let snapshot = self.snapshot.as_ref().ok_or_else(order)?;
-        let name = format!("{role}.json");
-        snapshot.body.meta.get(&name).ok_or(TufError::Missing { what: name })
+    /// Returns what the snapshot states of the targets metadata.
+    pub(super) fn targets_meta(&self) -> Result<&FileMeta, TufError> {
+        let order = || TufError::Order { role: Targets::TYPE.into() };
+        Ok(&self.snapshot.as_ref().ok_or_else(order)?.body.meta["targets.json"])
     }
 
     fn check_signatures<T: Body>(&self, role: &str, metadata: &SignedMetadata<T>) -> Result<(), TufError> {

@@ -2,9 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use slag_common::tuf::{
-    FileMeta, Kept, Key, MAX_ROOT_BYTES, Snapshot, Targets, TufError, find_target, refresh, sign,
-};
+use slag_common::tuf::{FileMeta, Kept, Key, MAX_ROOT_BYTES, Snapshot, Targets, TufError, refresh, sign};
 
 use super::repo::*;
 
@@ -13,12 +11,12 @@ fn an_honest_repository_is_followed() {
     let mut repo = Repo::new();
     let mut kept = updated(&mut repo);
     repo.publish(b"two");
-    let mut trusted = update(&mut kept, &mut repo).expect("an honest repository");
-    let target = find_target(&mut trusted, &mut kept, &mut repo, PATH).expect("found").expect("listed");
+    let trusted = update(&mut kept, &mut repo).expect("an honest repository");
+    let target = trusted.target(PATH).expect("listed");
     target.check(PATH, b"two").expect("the file");
     assert!(matches!(target.check(PATH, b"owt"), Err(TufError::Content { .. })), "another file");
     assert!(matches!(target.check(PATH, b"two "), Err(TufError::Content { .. })), "a longer file");
-    assert_eq!(find_target(&mut trusted, &mut kept, &mut repo, "other").expect("read"), None);
+    assert_eq!(trusted.target("other"), None);
     // Nothing new: only the next root and the timestamp are asked for.
     repo.reads.clear();
     update(&mut kept, &mut repo).expect("the same again");
@@ -33,7 +31,7 @@ fn what_is_kept_goes_round_as_json() {
     let kept = updated(&mut repo);
     let text = serde_json::to_vec(&kept).expect("JSON");
     let mut read = serde_json::from_slice::<Kept>(&text).expect("JSON");
-    assert_eq!(read, Kept { targets: BTreeMap::new(), ..kept.clone() });
+    assert_eq!(read, Kept { targets: None, ..kept.clone() });
     update(&mut read, &mut repo).expect("honest");
     assert_eq!(read, kept);
 }
@@ -134,6 +132,11 @@ fn freeze_with_a_clock_that_was_set_back() {
     let error =
         refresh(&mut kept, &mut late, 0).expect_err("a root that had expired when the timestamp was signed");
     assert!(matches!(error, TufError::Expired { .. }) && role_of(&error) == "root", "{error}");
+    // A timestamp that is refused moves no clock: the same client goes on with the time that it had.
+    let mut trusted = slag_common::tuf::Trusted::new(repo.root(), NOW).expect("a root");
+    trusted.add_timestamp(&late.files["timestamp.json"]).expect_err("signed after the root's expiry");
+    assert_eq!(trusted.now_unix_secs(), NOW);
+    trusted.add_timestamp(&repo.files["timestamp.json"]).expect("the honest one");
     refresh(&mut kept, &mut repo, 0).expect("signed before it expired");
     assert_eq!(kept.signed_unix_secs(), Some(NOW));
 }
@@ -260,7 +263,7 @@ fn every_flipped_bit_is_refused() {
                 let body = |t: &slag_common::tuf::Trusted| {
                     let timestamp = t.timestamp().expect("there").body.clone();
                     let snapshot: Snapshot = t.snapshot().expect("there").body.clone();
-                    (timestamp, snapshot, t.targets("targets").expect("there").body.clone())
+                    (timestamp, snapshot, t.targets().expect("there").body.clone())
                 };
                 assert_eq!(body(&found), body(&honest), "{name}, bit {bit}");
             }

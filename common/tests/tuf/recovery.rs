@@ -88,7 +88,7 @@ fn fast_forward_is_made_good_by_a_new_root() {
         repo.rotate(next);
         repo.publish_again(b"two", 2, 2);
         let trusted = update(&mut kept, &mut repo).expect(taken);
-        assert_eq!(trusted.targets("targets").expect("there").head.version, 2, "{taken}");
+        assert_eq!(trusted.targets().expect("there").head.version, 2, "{taken}");
     }
 }
 

@@ -98,7 +98,7 @@ impl Repo {
     /// Publishes the next version of targets, snapshot and timestamp.
     pub fn publish(&mut self, content: &[u8]) {
         let targets = BTreeMap::from([(PATH.to_owned(), TargetFile::of(content))]);
-        self.publish_targets(self.version + 1, &Targets { targets, delegations: None });
+        self.publish_targets(self.version + 1, &Targets { targets });
     }
 
     pub fn publish_targets(&mut self, version: u64, targets: &Targets) {

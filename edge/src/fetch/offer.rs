@@ -1,8 +1,8 @@
 //! What a store offers: its metadata is brought up to date, and the manifest that it names is downloaded if it is news.
 
 use slag_common::Hash32;
-use slag_common::manifest::{self, Manifest, ManifestError};
-use slag_common::tuf::{Source, TargetFile, TufError, find_target, refresh};
+use slag_common::manifest::{self, Manifest, ManifestError, TextModelRecord};
+use slag_common::tuf::{Source, TargetFile, TufError, refresh};
 
 use super::download::Client;
 use super::error::FetchError;
@@ -24,6 +24,7 @@ impl Offer {
         let manifest_hash = old.manifest_hash;
         let bytes = cache.files().read(&cache.manifest_path(manifest_hash), manifest::MAX_BYTES).ok()?;
         let manifest = Manifest::parse(&bytes).ok()?;
+        let bytes = bytes.to_vec();
         (Hash32::of(&bytes) == manifest_hash).then_some(Self { bytes, manifest_hash, manifest })
     }
 
@@ -39,16 +40,15 @@ impl Offer {
         let no_trust = || FetchError::NoTrust { from: client.base().to_owned() };
         let mut kept = records.kept().ok_or_else(no_trust)?.clone();
         let mut source = StoreMetadata { client, failure: None };
-        let found = refresh(&mut kept, &mut source, now_unix_secs)
-            .and_then(|mut trusted| find_target(&mut trusted, &mut kept, &mut source, manifest::TARGET));
+        let trusted = refresh(&mut kept, &mut source, now_unix_secs);
         // Also what was accepted before a failure: a root that names new keys must not be forgotten.
         records.keep(cache, &kept)?;
-        let target = found.map_err(|e| source.failure.take().unwrap_or(e.into()))?;
+        let trusted = trusted.map_err(|e| source.failure.take().unwrap_or(e.into()))?;
         let missing = || TufError::Missing { what: format!("the target {}", manifest::TARGET) };
-        let target = target.ok_or_else(missing)?;
+        let target = trusted.target(manifest::TARGET).ok_or_else(missing)?;
         match on_board.filter(|offer| target.check(manifest::TARGET, &offer.bytes).is_ok()) {
             Some(offer) => Ok(offer.clone()),
-            None => Self::download(client, &target),
+            None => Self::download(client, target),
         }
     }
 
@@ -62,6 +62,12 @@ impl Offer {
         target.check(manifest::TARGET, &bytes)?;
         let manifest = Manifest::parse(&bytes)?;
         Ok(Self { manifest_hash: Hash32::of(&bytes), bytes, manifest })
+    }
+
+    /// Returns the files of the text model that the scene carries.
+    pub fn text_model(&self) -> impl Iterator<Item = Hash32> + '_ {
+        let models = self.manifest.encoder.text_model.iter();
+        models.flat_map(TextModelRecord::objects).map(|object| object.hash)
     }
 
     /// Refuses a manifest of another scene or encoder. `scene`: the one that the robot keeps to.

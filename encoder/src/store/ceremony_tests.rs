@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use slag_common::manifest::{self, Manifest};
-use slag_common::tuf::{Kept, Source, TufError, find_target, refresh};
+use slag_common::tuf::{Kept, Source, TufError, refresh};
 
 use super::ceremony::{Change, default_root_folder, sign_draft};
 use super::metadata::{Metadata, clock_unix_secs, read_published};
@@ -29,8 +29,8 @@ fn client(dir: &Path) -> Kept {
 
 /// A robot sees the manifest that is published.
 fn follows(kept: &mut Kept, dir: &Path) -> Result<(), TufError> {
-    let mut trusted = refresh(kept, &mut Folder(dir), clock_unix_secs())?;
-    let found = find_target(&mut trusted, kept, &mut Folder(dir), manifest::TARGET)?.expect("listed");
+    let trusted = refresh(kept, &mut Folder(dir), clock_unix_secs())?;
+    let found = trusted.target(manifest::TARGET).expect("listed");
     found.check(manifest::TARGET, &fs_err::read(dir.join("manifest")).expect("there"))
 }
 

@@ -175,7 +175,7 @@ impl Metadata {
         if self.published()?.is_some_and(|published| published.body.targets == targets) {
             return Ok(());
         }
-        self.sign_all(&Targets { targets, delegations: None }, now_unix_secs)
+        self.sign_all(&Targets { targets }, now_unix_secs)
     }
 
     /// Signs the timestamp anew, and the rest before half of its time is over. Needs the root's key never.

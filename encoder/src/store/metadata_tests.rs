@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use slag_common::manifest::{self, Manifest};
-use slag_common::tuf::{Kept, Source, TargetFile, Trusted, TufError, find_target, refresh};
+use slag_common::tuf::{Kept, Source, TargetFile, Trusted, TufError, refresh};
 
 use super::ceremony::{Change, default_root_folder};
 use super::metadata::{
@@ -34,9 +34,9 @@ fn client(dir: &Path) -> Kept {
 }
 
 fn update(kept: &mut Kept, dir: &Path, now: u64) -> Result<(Trusted, TargetFile), TufError> {
-    let mut trusted = refresh(kept, &mut Folder(dir), now)?;
-    let found = find_target(&mut trusted, kept, &mut Folder(dir), manifest::TARGET)?;
-    Ok((trusted, found.expect("listed")))
+    let trusted = refresh(kept, &mut Folder(dir), now)?;
+    let found = trusted.target(manifest::TARGET).expect("listed").clone();
+    Ok((trusted, found))
 }
 
 #[test]
