@@ -61,6 +61,7 @@ Description: offline text search in the Gaussian splats around a robot
  Fetches the shards around a robot from a store and answers questions such as
  "where is the chair" without a network.
 CONTROL
+# Debian's helpers (init-system-helpers is essential) remember whether an operator disabled or masked the unit.
 cat >"$root/DEBIAN/postinst" <<'SCRIPT'
 #!/bin/sh
 set -e
@@ -68,13 +69,16 @@ if [ "$1" = configure ]; then
     getent passwd slag >/dev/null ||
         useradd --system --user-group --home-dir /var/lib/slag --no-create-home --shell /usr/sbin/nologin slag
     install -d -o slag -g slag -m 755 /var/lib/slag
+    if deb-systemd-helper --quiet was-enabled slag-edge.service; then
+        deb-systemd-helper enable slag-edge.service >/dev/null
+    else
+        deb-systemd-helper update-state slag-edge.service >/dev/null
+    fi
     if [ -d /run/systemd/system ]; then
         systemctl daemon-reload
-        systemctl enable slag-edge.service
-        # The new program takes over.
-        systemctl restart slag-edge.service || echo "slag-edge does not start: journalctl -u slag-edge" >&2
-    elif command -v systemctl >/dev/null; then
-        systemctl enable slag-edge.service
+        # The new program takes over; what an operator disabled is left alone.
+        deb-systemd-invoke restart slag-edge.service ||
+            echo "slag-edge does not start: journalctl -u slag-edge" >&2
     fi
 fi
 SCRIPT
@@ -82,10 +86,7 @@ cat >"$root/DEBIAN/prerm" <<'SCRIPT'
 #!/bin/sh
 set -e
 if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
-    systemctl stop slag-edge.service
-fi
-if [ "$1" = remove ] && command -v systemctl >/dev/null; then
-    systemctl disable slag-edge.service
+    deb-systemd-invoke stop slag-edge.service
 fi
 SCRIPT
 # What was fetched and whom the robot trusts stay until the package is purged; the user stays for good, as
@@ -95,6 +96,7 @@ cat >"$root/DEBIAN/postrm" <<'SCRIPT'
 set -e
 [ ! -d /run/systemd/system ] || systemctl daemon-reload
 if [ "$1" = purge ]; then
+    deb-systemd-helper purge slag-edge.service >/dev/null
     rm -rf /var/lib/slag
 fi
 SCRIPT

@@ -54,9 +54,14 @@ kill "$service"
 wait "$service" || true
 service=
 
+wanted=$root/etc/systemd/system/multi-user.target.wants/slag-edge.service
+[ -L "$wanted" ] || fail "the unit is not enabled"
+# As `systemctl disable` does.
+rm "$wanted"
 echo '# kept' >>"$root/etc/slag/edge.toml"
 inside dpkg --force-confold --install /new.deb
 [ "$(tail -n 1 "$root/etc/slag/edge.toml")" = '# kept' ] || fail "the upgrade lost the configuration"
+[ ! -e "$wanted" ] && [ ! -L "$wanted" ] || fail "the upgrade enabled a unit that was disabled"
 inside dpkg-query --show slag-edge
 inside dpkg --remove slag-edge
 [ ! -e "$root/usr/bin/slag-edge" ] || fail "remove left the program"
