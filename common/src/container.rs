@@ -25,36 +25,20 @@ pub enum ContainerError {
     #[error(
         "the file has {found_bytes} bytes, expected {expected_bytes}: it is truncated; delete it, and it is made or fetched again"
     )]
-    Length {
-        /// Bytes expected.
-        expected_bytes: u64,
-        /// Bytes found.
-        found_bytes: u64,
-    },
+    Length { expected_bytes: u64, found_bytes: u64 },
     /// The file is of another kind.
     #[error(
         "byte 0: magic {found:02x?}, expected {expected:02x?}: this is another kind of file; check the path"
     )]
-    Magic {
-        /// Magic expected.
-        expected: [u8; 8],
-        /// Magic found.
-        found: [u8; 8],
-    },
+    Magic { expected: [u8; 8], found: [u8; 8] },
     /// The version is not supported.
     #[error(
         "byte 8: format version {found}, expected {expected}; use a program of the matching version, or encode again"
     )]
-    Version {
-        /// Version expected.
-        expected: u32,
-        /// Version found.
-        found: u32,
-    },
+    Version { expected: u32, found: u32 },
     /// A value is out of range or contradicts another.
     #[error("byte {offset_bytes}: {what}; the file is damaged: delete it, and it is made or fetched again")]
     Damaged {
-        /// The place.
         offset_bytes: u64,
         /// The value found and the value expected.
         what: String,
@@ -64,9 +48,7 @@ pub enum ContainerError {
         "section {id} at byte {offset_bytes}: checksum {found:#018x}, expected {expected:#018x}; the file is damaged: delete it, and it is made or fetched again"
     )]
     Checksum {
-        /// The section's id.
         id: u32,
-        /// Its offset.
         offset_bytes: u64,
         /// Checksum in the table.
         expected: u64,
@@ -77,12 +59,7 @@ pub enum ContainerError {
     #[error(
         "section {id} ({name}) is missing; the file was written by another version of this program: encode again"
     )]
-    Missing {
-        /// The section's id.
-        id: u32,
-        /// The section's name.
-        name: &'static str,
-    },
+    Missing { id: u32, name: &'static str },
 }
 
 /// Returns the first eight bytes of the BLAKE3 hash, little-endian.
@@ -96,9 +73,6 @@ fn align_up(n: usize) -> usize {
 }
 
 /// Writes a container: preamble, table, then each section padded with zeros to 64 bytes.
-///
-/// # Errors
-/// Those of the writer.
 pub fn write(mut out: impl Write, magic: [u8; 8], version: u32, sections: &[(u32, &[u8])]) -> io::Result<()> {
     let mut offset = align_up(PREAMBLE_BYTES + SECTION_ROW_BYTES * sections.len());
     let mut table = Vec::with_capacity(SECTION_ROW_BYTES * sections.len());
@@ -254,9 +228,6 @@ impl Layout {
     }
 
     /// Returns a copy of a section that holds one value.
-    ///
-    /// # Errors
-    /// As [`Layout::column`].
     pub fn value<T: AnyBitPattern>(
         &self,
         bytes: &[u8],
@@ -288,19 +259,19 @@ struct Block([u8; ALIGNMENT_BYTES]);
 
 impl AlignedBytes {
     /// Reads a whole file.
-    ///
-    /// # Errors
-    /// Those of the file system, with the path.
     pub fn read(path: &std::path::Path) -> io::Result<Self> {
-        use io::Read;
-        let mut file = fs_err::File::open(path)?;
+        let file = fs_err::File::open(path)?;
         let len = file.metadata()?.len() as usize;
+        Self::read_from(file, len)
+    }
+
+    /// Reads exactly `len` bytes.
+    pub fn read_from(mut reader: impl io::Read, len: usize) -> io::Result<Self> {
         let mut blocks = vec![Block([0; ALIGNMENT_BYTES]); len.div_ceil(ALIGNMENT_BYTES)];
-        file.read_exact(&mut bytemuck::cast_slice_mut::<Block, u8>(&mut blocks)[..len])?;
+        reader.read_exact(&mut bytemuck::cast_slice_mut::<Block, u8>(&mut blocks)[..len])?;
         Ok(Self { blocks, len })
     }
 
-    /// Copies bytes.
     pub fn copy_of(bytes: &[u8]) -> Self {
         let mut blocks = vec![Block([0; ALIGNMENT_BYTES]); bytes.len().div_ceil(ALIGNMENT_BYTES)];
         bytemuck::cast_slice_mut::<Block, u8>(&mut blocks)[..bytes.len()].copy_from_slice(bytes);

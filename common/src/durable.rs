@@ -18,9 +18,6 @@ pub enum Access {
 }
 
 /// Replaces a file through `PATH.part`: after a crash it has either its complete old content or its complete new one.
-///
-/// # Errors
-/// The file system's error, with the path.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
@@ -32,9 +29,6 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
 }
 
 /// Replaces the content of `path` by `bytes` through `part`, which must not exist and must be on the same file system.
-///
-/// # Errors
-/// The file system's error, with the path.
 pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Result<()> {
     let mut options = fs_err::OpenOptions::new();
     options.write(true).create_new(true);
@@ -50,18 +44,12 @@ pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Re
 }
 
 /// Renames a synced file, durably.
-///
-/// # Errors
-/// The file system's error, with the path.
 pub fn move_into_place(part: &Path, path: &Path) -> io::Result<()> {
     fs_err::rename(part, path)?;
     path.parent().map_or(Ok(()), sync_folder)
 }
 
 /// Makes the names in a folder durable.
-///
-/// # Errors
-/// The file system's error, with the path.
 pub fn sync_folder(path: &Path) -> io::Result<()> {
     // The folder of a name alone is the empty path, which cannot be opened.
     let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };

@@ -10,7 +10,6 @@ use std::time::Duration;
 pub struct Backoff {
     /// Pause after the first failure.
     pub first: Duration,
-    /// Longest pause.
     pub longest: Duration,
 }
 

@@ -19,7 +19,6 @@ mod text;
 mod trust;
 
 use std::ffi::OsString;
-use std::path::PathBuf;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
@@ -48,8 +47,9 @@ pub struct Cli {
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
     /// File of flags that the command line does not give [default: /etc/slag/edge.toml if it is there].
+    /// An empty name: no file.
     #[arg(long, global = true, value_name = "FILE")]
-    config: Option<PathBuf>,
+    config: Option<OsString>,
 }
 
 #[derive(Debug, Subcommand)]

@@ -2,7 +2,6 @@
 
 pub mod coded;
 
-use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
@@ -10,13 +9,13 @@ use std::sync::{Arc, Condvar, Mutex};
 use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
+use slag_common::frames::Aabb;
 use slag_common::hash::Hash32;
-use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
+use slag_common::manifest::{Calibration, Manifest};
 use slag_common::occupancy::BuiltOccupancy;
+use slag_common::shard::sample::{self, SampleObject, SampleObjects};
 use slag_common::shard::{
-    Additions, ExactColumns, IndexColumn, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout,
-    ShardView, quantise,
+    ExactColumns, IndexColumn, Positions, Profile, ShardHeader, ShardLayout, ShardView, quantise,
 };
 use slag_models::{InferenceError, TextEncoder};
 
@@ -76,55 +75,30 @@ impl BuiltShard {
         calibration: Calibration,
         places: Option<&BuiltOccupancy>,
     ) -> Self {
-        let shard = self.view();
-        let m = shard.header.n_components as usize;
-        let mut object_of = vec![NO_OBJECT; shard.header.n_gaussians as usize];
-        let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
-        for (number, object) in (0u16..).zip(objects) {
-            object.runs.iter().for_each(|run| object_of[run.start as usize..run.end as usize].fill(number));
-            let photo = format!("{}.jpg", object.id);
-            records.push(ObjectRecord {
+        let object = |object: &TestObject| {
+            let at = DVec3::X * object.id as f64;
+            SampleObject {
                 id: object.id,
-                position_in_world: [object.id as f64, 0.0, 0.0],
-                box_min: [object.id as f64 - 1.0, -1.0, -1.0],
-                box_max: [object.id as f64 + 1.0, 1.0, 1.0],
+                position_in_world: at,
+                bounds: Aabb { min: at - 1.0, max: at + 1.0 },
+                vectors: object.vectors.clone(),
+                runs: object.runs.clone(),
                 n_gaussians: object.n_gaussians,
-                n_gaussians_here: object.runs.iter().map(|run| run.len() as u32).sum(),
+                photo: format!("{}.jpg", object.id),
                 photo_box_px: [1, 2, 30, 40],
-                photo_start: photos.len() as u32,
-                photo_bytes: photo.len() as u32,
-            });
-            photos += &photo;
-            let (components, of_vectors) = quantise_vectors(&object.vectors, m, 3);
-            vectors.extend(components);
-            steps.extend(of_vectors);
-        }
-        let (run_ends, run_objects) = collect_runs(object_of);
-        let objects = Objects {
-            header: ObjectsHeader {
-                n_objects: records.len() as u32,
-                n_vectors: 3,
-                n_runs: run_ends.len() as u32,
-                photos_bytes: photos.len() as u32,
-                score_mean: calibration.score_mean,
-                score_spread: calibration.score_spread,
-                score_error_bound: 0.005,
-            },
-            records: &records,
-            vectors: &vectors,
-            steps: &steps,
-            run_ends: &run_ends,
-            run_objects: &run_objects,
-            photos: photos.as_bytes(),
+            }
         };
-        let mut bytes = Vec::new();
+        let Calibration { score_mean, score_spread } = calibration;
+        let objects = objects.iter().map(object).collect();
+        let objects = SampleObjects { objects, score_mean, score_spread, score_error_bound: 0.005 };
         let occupancy = places.map(BuiltOccupancy::view);
-        let additions =
-            Additions { objects: Some(&objects), occupancy: occupancy.as_ref(), ..Additions::default() };
-        shard.write_with(&mut bytes, additions).expect("writes to memory");
-        let bytes = AlignedBytes::copy_of(&bytes);
+        Self::read(&objects.add_to(&self.view(), occupancy.as_ref()), self.embeddings.clone())
+    }
+
+    fn read(bytes: &[u8], embeddings: Vec<Vec<f32>>) -> Self {
+        let bytes = AlignedBytes::copy_of(bytes);
         let layout = ShardLayout::check(&bytes).expect("a valid shard");
-        Self { bytes, layout, embeddings: self.embeddings.clone() }
+        Self { bytes, layout, embeddings }
     }
 
     pub fn view(&self) -> ShardView<'_> {
@@ -175,21 +149,13 @@ impl TestShard {
         let embeddings: Vec<f16> =
             members().flat_map(|m| m.embedding.iter().map(|v| f16::from_f32(*v))).collect();
         let input_indices: Vec<u32> = (0..positions.len() as u32).map(|i| i * 3 + 1).collect();
+        let bounds = Aabb { min: self.origin, max: self.origin + self.step * 65535.0 };
+        let (n, k) = (positions.len(), self.centroids.len());
         let header = ShardHeader {
-            cell_id: self.cell_id,
-            n_gaussians: positions.len() as u32,
-            n_centroids: self.centroids.len() as u32,
-            dim: dim as u32,
-            n_components: dim as u32,
-            n_subspaces: 0,
-            position_bits: [16, 16, 16, 0],
             centroid_step,
-            origin_in_world: self.origin.to_array(),
             position_step: self.step.to_array(),
-            box_min: self.origin.to_array(),
-            box_max: (self.origin + self.step * 65535.0).to_array(),
-            errors: ScoreErrors::default(),
             encoder_id: self.encoder_id.0,
+            ..sample::header(self.cell_id, n, k, dim, bounds)
         };
         let packed = IndexColumn::pack(&input_indices);
         let exact = exact.then_some(ExactColumns {
@@ -211,9 +177,7 @@ impl TestShard {
         }
         .write(&mut bytes)
         .expect("writes to memory");
-        let bytes = AlignedBytes::copy_of(&bytes);
-        let layout = ShardLayout::check(&bytes).expect("a valid shard");
-        BuiltShard { bytes, layout, embeddings: members().map(|m| m.embedding.clone()).collect() }
+        BuiltShard::read(&bytes, members().map(|m| m.embedding.clone()).collect())
     }
 }
 
@@ -307,44 +271,10 @@ pub fn axes_service(dim: usize, gate: Gate) -> (TextService, Arc<AtomicUsize>) {
 
 /// Returns the manifest of some shards, as an encoder of [`Axes`]' space would list them.
 pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
-    let cells = shards.iter().map(|shard| {
-        let view = shard.view();
-        let record = ShardRecord {
-            hash: Hash32::of(&shard.bytes),
-            len_bytes: shard.bytes.len() as u64,
-            n_centroids: view.header.n_centroids,
-            score_error_bound: view.radii.iter().fold(0.0, |a: f32, b| a.max(*b)),
-            score_errors: view.header.errors,
-            position_error: 0.01,
-        };
-        CellRecord {
-            cell_id: view.header.cell_id,
-            bounds: view.bounds(),
-            n_gaussians: view.header.n_gaussians,
-            shards: BTreeMap::from([(Profile::Compact, record)]),
-        }
-    });
-    let header = shards[0].view().header;
-    Manifest {
-        version: manifest::VERSION,
-        scene: "yard".into(),
-        generation,
-        created_unix_secs: 1_700_000_000,
-        metric: true,
-        geo_reference: None,
-        encoder: EncoderRecord {
-            name: "axes".into(),
-            id: Hash32(header.encoder_id),
-            dim: header.dim,
-            default_threshold: 0.5,
-            calibration: None,
-            text_model: None,
-        },
-        n_gaussians: shards.iter().map(|s| u64::from(s.view().header.n_gaussians)).sum(),
-        n_without_evidence: 0,
-        n_rejected: 0,
-        cells: cells.collect(),
-    }
+    let listed: Vec<_> = shards.iter().map(|shard| (Profile::Compact, &*shard.bytes)).collect();
+    let mut manifest = Manifest { generation, ..sample::manifest("yard", &listed) };
+    (manifest.encoder.name, manifest.encoder.default_threshold) = ("axes".into(), 0.5);
+    manifest
 }
 
 /// Writes a cache as a fetch leaves it, replacing `current` last.

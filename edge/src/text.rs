@@ -74,9 +74,6 @@ pub struct TextService {
 
 impl TextService {
     /// Opens the text encoder of a model folder.
-    ///
-    /// # Errors
-    /// [`TextOpenError`].
     pub fn open(models: &ModelDir, options: &SessionOptions) -> Result<Self, TextOpenError> {
         let encoder = models.text_encoder(options)?;
         let execution_provider = encoder.placement().map_or("none", |placement| placement.provider().name());
@@ -125,9 +122,6 @@ impl TextService {
     }
 
     /// Returns a text's vector, `[dim]`, unit length. Blocks while other texts are encoded.
-    ///
-    /// # Errors
-    /// [`TextError`].
     pub fn encode(&self, text: &str) -> Result<Arc<[f32]>, TextError> {
         let key = text.split_whitespace().collect::<Vec<_>>().join(" ");
         if let Some(vector) = self.cache().get(&key) {

@@ -1,6 +1,5 @@
 //! The real program over a real socket: fetch, status, query, serve, and exit codes.
 
-use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpListener;
 use std::path::Path;
@@ -11,8 +10,9 @@ use glam::DVec3;
 use serde_json::Value;
 use slag_common::Hash32;
 use slag_common::frames::Aabb;
-use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use slag_common::shard::{Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
+use slag_common::manifest::{self, Manifest};
+use slag_common::shard::sample::{self, SampleShard};
+use slag_common::shard::{Profile, ShardHeader, quantise};
 use slag_common::tuf::{generate_key, one_key_repository};
 use slag_edge::text::TextService;
 use slag_models::{ModelDir, SessionOptions};
@@ -27,71 +27,29 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
 
 /// Returns the manifest and the one shard of a scene whose first Gaussians are red and the others blue; positions in millimetres.
 fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
-    let n_gaussians = positions.len() as u32;
     let text =
         TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
     let vector = |word: &str| text.encode(word).expect("known").to_vec();
     let (centroids, centroid_step) = quantise(&[vector("red"), vector("blue")].concat());
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(10.0) };
-    let header = ShardHeader {
-        cell_id: 0,
-        n_gaussians,
-        n_centroids: 2,
-        dim: text.info().dim,
-        n_components: text.info().dim,
-        n_subspaces: 0,
-        position_bits: [16, 16, 16, 0],
-        centroid_step,
-        origin_in_world: [0.0; 3],
-        position_step: [1e-3; 3],
-        box_min: bounds.min.into(),
-        box_max: bounds.max.into(),
-        errors: ScoreErrors::default(),
-        encoder_id: text.info().id.0,
-    };
-    let mut shard = Vec::new();
-    ShardView {
-        header,
-        positions: Positions::Wide(positions),
-        centroid_starts: &[0, n_red, n_gaussians],
-        centroids: &centroids,
-        radii: &[0.05; 2],
-        basis: None,
-        residuals: None,
-        exact: None,
-        packed_indices: None,
-    }
-    .write(&mut shard)
-    .expect("writes to memory");
-    let record = ShardRecord {
-        hash: Hash32::of(&shard),
-        len_bytes: shard.len() as u64,
-        n_centroids: 2,
-        score_error_bound: 0.05,
-        score_errors: ScoreErrors::default(),
-        position_error: 5e-4,
-    };
-    let shards = BTreeMap::from([(Profile::Compact, record)]);
-    let manifest = Manifest {
-        version: manifest::VERSION,
-        scene: "paint".into(),
-        generation: 3,
-        created_unix_secs: 1_700_000_000,
-        metric: true,
-        geo_reference: None,
-        encoder: EncoderRecord {
-            name: text.info().name.clone(),
-            id: text.info().id,
-            dim: header.dim,
-            default_threshold: 0.8,
-            calibration: None,
-            text_model: None,
+    let n = positions.len();
+    let header = sample::header(0, n, 2, text.info().dim as usize, bounds);
+    let shard = SampleShard {
+        header: ShardHeader {
+            centroid_step,
+            position_step: [1e-3; 3],
+            encoder_id: text.info().id.0,
+            ..header
         },
-        n_gaussians: n_gaussians.into(),
-        n_without_evidence: 0,
-        n_rejected: 0,
-        cells: vec![CellRecord { cell_id: 0, bounds, n_gaussians, shards }],
+        positions: positions.to_vec(),
+        centroid_starts: vec![0, n_red, n as u32],
+        centroids,
+        radii: vec![0.05; 2],
+        embeddings: None,
     };
+    let shard = shard.to_bytes();
+    let mut manifest = Manifest { generation: 3, ..sample::manifest("paint", &[(Profile::Compact, &shard)]) };
+    (manifest.encoder.name, manifest.encoder.default_threshold) = (text.info().name.clone(), 0.8);
     (manifest.to_bytes(), shard)
 }
 
@@ -221,6 +179,32 @@ fn a_robot_fetches_asks_and_serves() {
     assert!(log.contains("stopping"), "{log}");
 }
 
+/// systemd hears when the service is ready, that it lives, and that it stops.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_supervisor_hears_of_start_life_and_stop() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let socket = std::os::unix::net::UnixDatagram::bind(dir.path().join("notify")).expect("binds");
+    let heard = || {
+        let mut bytes = [0; 64];
+        let n = socket.recv(&mut bytes).expect("a word");
+        String::from_utf8_lossy(&bytes[..n]).trim().to_owned()
+    };
+    let mut serving = slag_edge(dir.path(), &["serve", "--listen", "127.0.0.1:0"]);
+    serving.env("NOTIFY_SOCKET", dir.path().join("notify")).env("WATCHDOG_USEC", "30000");
+    let mut serving = serving.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("runs");
+    assert_eq!([heard(), heard()], ["READY=1", "WATCHDOG=1"]);
+    assert!(
+        Command::new("kill").args(["-TERM", &serving.id().to_string()]).status().expect("runs").success()
+    );
+    assert!(
+        std::iter::repeat_with(heard)
+            .find(|word| word != "WATCHDOG=1")
+            .is_some_and(|word| word == "STOPPING=1")
+    );
+    assert_eq!(serving.wait().expect("ends").code(), Some(0));
+}
+
 /// A store that never answers: ctrl-c ends the fetch with exit code 130.
 #[test]
 fn an_interrupted_fetch_says_so() {
@@ -323,8 +307,8 @@ fn a_robot_is_followed_by_its_service() {
     assert!(stop(serving).contains("fetched 1 shards of generation 3"));
 }
 
-/// A sector of flash that cannot be read, as a file that lost its pages while it was mapped: the program ends, its next start
-/// does not answer from that shard, and the next fetch brings it again.
+/// A page that was there when the shard was checked and mapped, and is not any more: the program ends once, its next start does
+/// not answer from that shard, and the next fetch brings it again.
 #[test]
 #[cfg(target_os = "linux")]
 fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
@@ -346,6 +330,26 @@ fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
     let (code, out, err) = run(dir.path(), &fetch);
     assert_eq!((code, &json(&out)["downloaded"]["n_shards"]), (Some(0), &1.into()), "{out}{err}");
     assert_eq!(run(dir.path(), &["query", "blue"]).0, Some(0));
+}
+
+/// A sector that gives EIO when the service starts: it listens, names the cell, and answers after the next fetch.
+#[slag_test_support::needs_loop_disk]
+#[test]
+fn a_service_starts_with_a_sector_that_cannot_be_read() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let disk = slag_test_support::LoopDisk::new(dir.path());
+    let (listed, shard) = painted(&[[5000; 3]; 4000], 2000);
+    let path = disk.path().join("shards").join(Hash32::of(&shard).to_string());
+    let from = store(listed, shard);
+    let fetch = ["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--json"];
+    assert_eq!(run(disk.path(), &fetch).0, Some(0));
+    disk.break_block(&path, 15);
+    let (serving, url) = serve(disk.path(), &[]);
+    assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
+    assert!(stop(serving).contains("cannot be read"));
+    let (code, out, err) = run(disk.path(), &fetch);
+    assert_eq!((code, &json(&out)["downloaded"]["n_shards"]), (Some(0), &1.into()), "{out}{err}");
+    assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
 }
 
 /// Far more queries than the service can answer: some are answered quickly, the others are refused, and memory stays.

@@ -20,6 +20,7 @@ mod crop;
 mod described;
 pub mod description;
 mod device_memory;
+pub mod download;
 mod encoder;
 pub mod encoder_id;
 mod error;

@@ -17,6 +17,7 @@ mod format;
 mod indices;
 mod layout;
 mod profile;
+pub mod sample;
 mod write;
 
 #[cfg(test)]

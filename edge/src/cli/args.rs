@@ -11,6 +11,7 @@ use crate::text::TextService;
 use anyhow::anyhow;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
+use slag_common::byte_size::{ByteSize, ByteSizeError};
 use slag_common::shard::Profile;
 use slag_models::commands::{self as model_commands, MODELS_HELP, RunArgs};
 use slag_models::hub::cache_folder;
@@ -42,7 +43,7 @@ impl CacheArgs {
 #[derive(Debug, Args)]
 pub struct DownloadArgs {
     /// Radius around the robot within which cells are kept, world units (metres in a metric scene).
-    #[arg(long, default_value_t = 50.0)]
+    #[arg(long, default_value_t = 50.0, value_parser = parse_radius, allow_negative_numbers = true)]
     pub radius: f64,
     /// Profile of the shards.
     #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
@@ -54,7 +55,7 @@ pub struct DownloadArgs {
     #[arg(long, value_name = "FILE")]
     pub ca: Option<PathBuf>,
     /// Most bytes kept on disk for shards and text models [default: twice the bytes of those within the radius].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
     pub max_bytes: Option<u64>,
 }
 
@@ -125,6 +126,16 @@ pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
 /// Reads an environment variable.
 pub fn variable(name: &str) -> Option<OsString> {
     std::env::var_os(name)
+}
+
+fn parse_radius(text: &str) -> Result<f64, String> {
+    let radius = text.parse::<f64>().ok().filter(|radius| *radius >= 0.0 && radius.is_finite());
+    radius.ok_or_else(|| "expected world units, 0 or more".to_owned())
+}
+
+/// Reads a number of bytes: 2GB, 2GiB or 2G.
+pub fn parse_bytes(text: &str) -> Result<u64, ByteSizeError> {
+    text.parse::<ByteSize>().map(|size| size.0)
 }
 
 /// Returns the parser of profiles, whose names the help text lists.

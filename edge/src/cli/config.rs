@@ -62,9 +62,9 @@ pub fn parse(
     // Without the checks of what is missing: the file may have it.
     let first = command.clone().ignore_errors(true).try_get_matches_from(line);
     let Ok(first) = first else { return Ok(command.try_get_matches_from(line)?) };
-    let named = first.try_get_one::<PathBuf>(FILE_FLAG).ok().flatten().cloned();
-    let mut settings = Settings { variable, file: read(named, variable)?, explicit: BTreeSet::new() };
-    settings.explicit = explicit(&first);
+    let named = first.try_get_one::<OsString>(FILE_FLAG).ok().flatten().map(PathBuf::from);
+    let file = read(named, variable)?;
+    let settings = Settings { variable, file, explicit: explicit(&first), root: command.clone() };
     let command = settings.apply(command, &[])?;
     settings.refuse_unknown(&command)?;
     Ok(command.try_get_matches_from(line)?)
@@ -127,6 +127,7 @@ struct Settings<'a> {
     variable: &'a dyn Fn(&str) -> Option<OsString>,
     file: Option<File>,
     explicit: BTreeSet<String>,
+    root: Command,
 }
 
 impl Settings<'_> {
@@ -144,7 +145,14 @@ impl Settings<'_> {
         for (id, values) in defaults {
             // clap keeps names and defaults for as long as the program runs.
             let values: Vec<&'static str> = values.into_iter().map(|value| &*value.leak()).collect();
-            command = command.mut_arg(id, |arg| arg.default_values(values).required(false));
+            command = command.mut_arg(id, |arg| match arg.get_action() {
+                // `--trust-first=false` switches off what a file switches on.
+                ArgAction::SetTrue => (arg.action(ArgAction::Set).num_args(0..=1).require_equals(true))
+                    .value_parser(clap::value_parser!(bool))
+                    .default_missing_value("true")
+                    .default_values(values),
+                _ => arg.default_values(values).required(false),
+            });
         }
         let below: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_owned()).collect();
         for name in below {
@@ -177,14 +185,11 @@ impl Settings<'_> {
         let whole = |words: &mut dyn Iterator<Item = &str>| {
             words.collect::<Vec<_>>().join("_").replace('-', "_").to_uppercase()
         };
-        let names = [
-            whole(&mut [PREFIX].into_iter().chain(path.iter().copied()).chain([long])),
-            whole(&mut [PREFIX, long].into_iter()),
-        ];
-        for name in names {
+        let own = whole(&mut [PREFIX].into_iter().chain(path.iter().copied()).chain([long]));
+        for (name, is_own) in [(own, !path.is_empty()), (whole(&mut [PREFIX, long].into_iter()), false)] {
             if let Some(text) = (self.variable)(&name) {
                 let text = text.into_string().map_err(|_| wrong(&name, "not text in UTF-8"))?;
-                return checked(arg, from_text(arg, &text), &name).map(Some);
+                return self.fitting(arg, is_own, &name, &|arg| Ok(from_text(arg, &text)));
             }
         }
         let Some(file) = &self.file else { return Ok(None) };
@@ -194,11 +199,36 @@ impl Settings<'_> {
                 .filter(|value| !value.is_table())
             {
                 let place = file.place(path, long);
-                let texts = from_value(arg, value).map_err(|what| wrong(&place, &what))?;
-                return checked(arg, texts, &place).map(Some);
+                return self.fitting(arg, !path.is_empty(), &place, &|arg| from_value(arg, value));
             }
         }
         Ok(None)
+    }
+
+    /// Checks a value. One for all commands need not fit each: `from` is an address to one and a number to another.
+    fn fitting(
+        &self,
+        arg: &Arg,
+        is_own: bool,
+        place: &str,
+        texts: &dyn Fn(&Arg) -> Result<Vec<String>, String>,
+    ) -> Result<Option<Vec<String>>, ConfigError> {
+        let check = |arg: &Arg| checked(arg, texts(arg).map_err(|what| wrong(place, &what))?, place);
+        let fits_another = || {
+            let mut waiting = vec![&self.root];
+            while let Some(command) = waiting.pop() {
+                let mut same = flags(command).filter(|other| other.get_long() == arg.get_long());
+                if same.any(|other| check(other).is_ok()) {
+                    return true;
+                }
+                waiting.extend(command.get_subcommands());
+            }
+            false
+        };
+        match check(arg) {
+            Err(_) if !is_own && fits_another() => Ok(None),
+            checked => checked.map(Some),
+        }
     }
 
     /// Refuses keys of the file that are no flag of any command.
@@ -240,17 +270,15 @@ impl File {
                 self.refuse_unknown(below, table, path)?;
                 path.pop();
             } else if !known.contains(key) {
-                let commands: Vec<&str> = command.get_subcommands().map(Command::get_name).collect();
-                let known = known.into_iter().collect::<Vec<_>>().join(", ");
-                let tables = if commands.is_empty() {
-                    String::new()
-                } else {
-                    format!("; tables: {}", commands.join(", "))
+                let tables: Vec<&str> = command.get_subcommands().map(Command::get_name).collect();
+                let near = |known: &String| strsim::jaro(known, key) > 0.75;
+                let near: Vec<String> = known.into_iter().filter(near).take(3).collect();
+                let hint = match (value.is_table(), near.is_empty()) {
+                    (true, _) if !tables.is_empty() => format!("; tables: {}", tables.join(", ")),
+                    (_, false) => format!("; perhaps {}", near.join(" or ")),
+                    _ => format!("; see `slag-edge {} --help`", path.join(" ")).replace("  ", " "),
                 };
-                return Err(wrong(
-                    &self.place(path, key),
-                    &format!("no flag of this name, expected one of {known}{tables}"),
-                ));
+                return Err(wrong(&self.place(path, key), &format!("no flag of this name{hint}")));
             }
         }
         Ok(())

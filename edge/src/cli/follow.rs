@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use crate::fetch::FetchRequest;
 use crate::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
+use crate::fetch::{FetchRequest, last_position};
 use crate::http::{App, RESTARTS, keep_following};
 use crate::store::EdgeCache;
 use anyhow::anyhow;
@@ -21,7 +21,7 @@ use super::progress::{Bar, print_line};
 /// Settings for following a robot.
 #[derive(Debug, Args)]
 pub struct FollowArgs {
-    /// When following: distance fetched beyond the radius, world units [default: a quarter of the radius].
+    /// When following: distance fetched beyond the radius, world units [default: a quarter of the radius, 1 if that is 0].
     #[arg(long, value_name = "D")]
     pub margin: Option<f64>,
     /// When following: least seconds between fetches.
@@ -35,7 +35,7 @@ pub struct FollowArgs {
 impl FollowArgs {
     /// Returns the settings for a radius.
     pub fn settings(&self, radius: f64) -> Result<FollowSettings, Failure> {
-        let margin = self.margin.unwrap_or(radius / 4.0);
+        let margin = self.margin.unwrap_or(if radius > 0.0 { radius / 4.0 } else { 1.0 });
         if !(margin > 0.0 && margin.is_finite()) {
             return Err(Failure::Usage(anyhow!("the margin is {margin}, it must be greater than 0")));
         }
@@ -119,15 +119,20 @@ pub fn follow_in_background(
 ) -> Result<Arc<AtomicBool>, Failure> {
     let cancel = Arc::new(AtomicBool::new(false));
     let stop = Arc::clone(&cancel);
+    // The robot is most likely where it was; the first position that is posted counts instead.
+    if let Some(at) = last_position(&cache) {
+        following.post(at);
+    }
     std::thread::Builder::new().name("follow".into()).spawn(move || {
         let followed = keep_following(&following, RESTARTS, &stop, || {
             let environment = FollowEnvironment {
                 fetch: &mut |request| fetch_once(&cache, request, ca.as_deref(), &stop, &()),
                 report: &mut |outcome| match outcome {
                     Ok(report) => {
+                        // Served before it is said.
+                        app.reload_now();
                         let (n, generation) = (report.downloaded.n_shards, report.generation);
                         tracing::info!("fetched {n} shards of generation {generation}");
-                        app.reload_now();
                     }
                     Err(error) => tracing::warn!("{}", crate::error_line(error)),
                 },

@@ -16,10 +16,10 @@ use slag_service::listen::{Listen, bind};
 use slag_service::stop::stop_signal;
 use slag_service::tls::TlsFiles;
 
-use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, variable};
+use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, parse_bytes};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
-use super::supervisor::Supervisor;
+use super::supervisor::{self, News};
 
 /// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
@@ -48,7 +48,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "FILE", requires = "tls_cert")]
     pub tls_key: Option<PathBuf>,
     /// Most memory that one query may use, bytes; all in progress together may use four times as many.
-    #[arg(long, value_name = "N", default_value_t = 256 << 20, value_parser = clap::value_parser!(u64).range(1 << 20..))]
+    #[arg(long, value_name = "SIZE", default_value = "256MiB", value_parser = parse_query_bytes)]
     pub max_query_bytes: u64,
     /// Most time that one query may take, seconds.
     #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=3600))]
@@ -125,15 +125,12 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
             None => None,
         };
         let scrub = scrub_in_background(&app, args.scrub_secs)?;
-        let supervisor = Supervisor::of(&variable).map(Arc::new);
-        if let Some(supervisor) = supervisor.clone() {
-            supervisor.ready();
-            let app = Arc::clone(&app);
-            tokio::spawn(async move { supervisor.pulse(|| http::is_alive(Arc::clone(&app))).await });
-        }
+        supervisor::tell(News::Ready);
+        let asked = Arc::clone(&app);
+        tokio::spawn(async move { supervisor::pulse(|| http::is_alive(Arc::clone(&asked))).await });
         let stop = async {
             stop.await;
-            supervisor.iter().for_each(|supervisor| supervisor.stopping());
+            supervisor::tell(News::Stopping);
         };
         let served = http::serve(app, listener, stop).await;
         // A fetch in progress need not be awaited: the next one resumes it.
@@ -143,6 +140,13 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     // A query that does not end must not keep the process alive.
     runtime.shutdown_timeout(drain);
     served
+}
+
+fn parse_query_bytes(text: &str) -> Result<u64, String> {
+    match parse_bytes(text).map_err(|e| e.to_string())? {
+        bytes if bytes < 1 << 20 => Err("expected 1MiB or more".into()),
+        bytes => Ok(bytes),
+    }
 }
 
 /// Scrubs on a thread of its own until the returned flag is set.

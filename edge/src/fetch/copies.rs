@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use slag_common::{Hash32, tuf};
 
-use crate::store::files::Files;
+use crate::store::files::{Files, is_bad_medium};
 
 /// A longer copy is damaged. It holds the longest metadata that a client keeps, with its quotes escaped.
 pub const MAX_COPY_BYTES: u64 =
@@ -32,7 +32,6 @@ pub enum Found {
 pub struct Version {
     /// Number of the version, from 1.
     pub sequence: u64,
-    /// The content.
     pub content: Vec<u8>,
     /// The copy that it was read from.
     index: usize,
@@ -40,7 +39,6 @@ pub struct Version {
     pub is_twice: bool,
 }
 
-/// One copy.
 enum Copy {
     Missing,
     Damaged(String),
@@ -65,6 +63,10 @@ impl Copies {
         &self.dir
     }
 
+    pub fn paths(&self) -> [PathBuf; 2] {
+        [0, 1].map(|index| self.path(index))
+    }
+
     fn path(&self, index: usize) -> PathBuf {
         self.dir.join(NAMES[index])
     }
@@ -77,7 +79,9 @@ impl Copies {
         let [first, second] = [0, 1].map(|index| match files.read(&self.path(index), MAX_COPY_BYTES) {
             Ok(bytes) => parse(&bytes),
             Err(e) if e.kind() == io::ErrorKind::NotFound => Copy::Missing,
-            Err(e) if e.kind() == io::ErrorKind::InvalidData => Copy::Damaged(e.to_string()),
+            Err(e) if e.kind() == io::ErrorKind::InvalidData || is_bad_medium(&e) => {
+                Copy::Damaged(e.to_string())
+            }
             Err(e) => Copy::Unreadable(e),
         });
         let version = |sequence, content, index, is_twice| {
@@ -97,9 +101,6 @@ impl Copies {
     }
 
     /// Makes a version that was read durable: a killed process may have left it unsynced.
-    ///
-    /// # Errors
-    /// The file system's.
     pub fn settle(&self, files: &dyn Files, version: &Version) -> io::Result<()> {
         files.sync(&self.path(version.index))?;
         files.sync_dir(&self.dir)
@@ -129,9 +130,17 @@ impl Copies {
     ) -> io::Result<Version> {
         let sequence = present.map_or(1, |present| present.sequence.saturating_add(1));
         let index = present.map_or(0, |present| 1 - present.index);
-        self.write_one(files, index, sequence, &content)?;
-        self.write_one(files, 1 - index, sequence, &content)?;
-        Ok(Version { sequence, content, index, is_twice: true })
+        let (mut written, mut broken) = (Vec::new(), None);
+        for index in [index, 1 - index] {
+            match self.write_one(files, index, sequence, &content) {
+                Ok(()) => written.push(index),
+                // Where one copy cannot be replaced, the other must do.
+                Err(e) if is_bad_medium(&e) => broken = Some(e),
+                Err(e) => return Err(e),
+            }
+        }
+        let Some(index) = written.first().copied() else { return Err(broken.expect("neither was written")) };
+        Ok(Version { sequence, content, index, is_twice: written.len() == 2 })
     }
 
     fn write_one(&self, files: &dyn Files, index: usize, sequence: u64, content: &[u8]) -> io::Result<()> {

@@ -1,12 +1,12 @@
-//! Errors of fetching and downloading.
+//! Errors of fetching.
 
 use std::io;
 use std::path::PathBuf;
-use std::time::Duration;
 
 use slag_common::Hash32;
 use slag_common::manifest::ManifestError;
 use slag_common::tuf::TufError;
+use slag_models::download::{DownloadError, DownloadFailure};
 
 use super::plan_error::PlanError;
 use super::records::RecordsError;
@@ -18,27 +18,16 @@ pub enum FetchError {
     /// A value is neither in the request nor recorded by an earlier fetch.
     #[error("no {what} is given, and no earlier fetch recorded one; {advice}")]
     NotGiven {
-        /// The missing value.
         what: &'static str,
         /// How to give it.
         advice: &'static str,
     },
     /// The address is invalid.
     #[error("{from:?} is not the address of a store: {what}; give one like http://host:port")]
-    Address {
-        /// The address.
-        from: String,
-        /// What is wrong.
-        what: String,
-    },
+    Address { from: String, what: String },
     /// The file of certificate authorities is of no use.
     #[error("{}: {what}, expected certificates of authorities in PEM; check --ca", path.display())]
-    Ca {
-        /// The file.
-        path: PathBuf,
-        /// The fault.
-        what: String,
-    },
+    Ca { path: PathBuf, what: String },
     /// The records cannot be used.
     #[error(transparent)]
     Records(#[from] RecordsError),
@@ -50,7 +39,6 @@ pub enum FetchError {
         "{url}: {failure} ({attempts} attempts); check the address and the connection, then fetch again: bytes received so far are kept"
     )]
     Download {
-        /// The URL requested.
         url: String,
         /// Attempts in a row.
         attempts: u32,
@@ -93,18 +81,12 @@ pub enum FetchError {
     #[error(
         "the store offers scene {offered:?}, this robot expects {expected:?}; check the address, or change the robot's scene once with `slag-edge fetch --scene NAME`"
     )]
-    Scene {
-        /// Scene expected.
-        expected: String,
-        /// Scene offered.
-        offered: String,
-    },
+    Scene { expected: String, offered: String },
     /// The scene uses another embedding space.
     #[error(
         "the scene was encoded with encoder {found}, expected {expected}; use that model, or have the scene encoded again"
     )]
     Encoder {
-        /// Encoder expected.
         expected: Hash32,
         /// Encoder of the manifest.
         found: Hash32,
@@ -113,19 +95,13 @@ pub enum FetchError {
     #[error(
         "shard {hash} matches its hash but is not a valid shard of this scene; have the scene published again"
     )]
-    Published {
-        /// The shard.
-        hash: Hash32,
-        /// What is wrong.
-        source: Box<StoreError>,
-    },
+    Published { hash: Hash32, source: Box<StoreError> },
     /// The fetch cannot be planned.
     #[error(transparent)]
     Plan(#[from] PlanError),
     /// Shards are missing, and the network may not be used.
     #[error("{n_shards} shards ({bytes} bytes) are not on board; fetch with network")]
     Offline {
-        /// Shards missing.
         n_shards: usize,
         /// Their bytes.
         bytes: u64,
@@ -135,11 +111,9 @@ pub enum FetchError {
         "{path}: {free_bytes} bytes are free, the fetch needs {needed_bytes}; free some space, or fetch a smaller radius", path = path.display()
     )]
     NoSpace {
-        /// The cache.
         path: PathBuf,
         /// Bytes that are still to be written.
         needed_bytes: u64,
-        /// Bytes free.
         free_bytes: u64,
     },
     /// The disk became full.
@@ -160,64 +134,23 @@ pub enum FetchError {
     Cancelled,
 }
 
-/// Reasons for a failed attempt.
-#[derive(Debug, thiserror::Error)]
-pub enum DownloadFailure {
-    /// The connection failed.
-    #[error("{0}")]
-    Transport(#[from] Box<ureq::Error>),
-    /// The server's certificate is refused, or TLS failed otherwise.
-    #[error("TLS failed: {0}; give the authority that vouches for the server with --ca FILE")]
-    Tls(String),
-    /// The body broke off.
-    #[error("the body ended at byte {found_bytes} of {expected_bytes}")]
-    Cut {
-        /// Length expected.
-        expected_bytes: u64,
-        /// Bytes received.
-        found_bytes: u64,
-    },
-    /// The server refuses.
-    #[error("the server answered with status {status}")]
-    Status {
-        /// HTTP status.
-        status: u16,
-        /// When to ask again (429 and 503, `Retry-After` in seconds).
-        retry_after: Option<Duration>,
-    },
-    /// The server redirects; shards and manifests are not fetched from elsewhere.
-    #[error("the server redirects to {location:?}; if that is the store, fetch from that address")]
-    Redirect {
-        /// The target (cut to 200 characters).
-        location: String,
-    },
-    /// The announced length differs from the manifest's.
-    #[error("the server announces {found:?}, expected {expected}")]
-    Length {
-        /// The length requested.
-        expected: String,
-        /// The header found.
-        found: String,
-    },
-    /// The content does not have the expected hash.
-    #[error("the content has hash {found}, expected {expected}")]
-    Hash {
-        /// Hash expected.
-        expected: Hash32,
-        /// Hash of the content.
-        found: Hash32,
-    },
-}
-
-impl DownloadFailure {
-    /// Returns whether another attempt may help.
-    pub(super) fn is_passing(&self) -> bool {
+impl FetchError {
+    /// Returns whether it may be gone once somebody has told the robot whom to trust.
+    pub(super) fn is_want_of_trust(&self) -> bool {
         match self {
-            // A certificate does not become another one by asking again.
-            Self::Redirect { .. } | Self::Tls(_) => false,
-            Self::Status { status, .. } => *status >= 500 || matches!(status, 408 | 416 | 429),
-            Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
-            Self::Cut { .. } | Self::Length { .. } | Self::Hash { .. } => true,
+            Self::NoTrust { .. } | Self::OtherRoot { .. } => true,
+            Self::Records(e) => matches!(e, RecordsError::Damaged { .. }),
+            Self::Tuf(e) => matches!(e, TufError::Signatures { .. } | TufError::Expired { .. }),
+            _ => false,
+        }
+    }
+
+    pub(super) fn of_download(url: String, error: DownloadError) -> Self {
+        match error {
+            DownloadError::Failed { attempts, failure } => Self::Download { url, attempts, failure },
+            DownloadError::Io(e) => Self::Io(e),
+            DownloadError::Cancelled => Self::Cancelled,
+            DownloadError::TooLong { max_bytes } => TufError::TooLong { what: url, max_bytes }.into(),
         }
     }
 }

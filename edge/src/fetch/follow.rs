@@ -18,6 +18,7 @@ use slag_common::retry::Backoff;
 
 use super::error::FetchError;
 use super::position::{MAX_TEXT_BYTES, NotAPosition, Position};
+use super::records;
 use super::report::FetchReport;
 use super::request::{DEFAULT_RADIUS, FetchRequest};
 use crate::store::EdgeCache;
@@ -119,6 +120,11 @@ impl Follower {
     pub fn fetched(&mut self, began: Duration, centre_in_world: DVec3) {
         (self.covered, self.attempted) = (Some((centre_in_world, began)), Some(began));
         (self.n_failures, self.retry_at) = (0, Duration::ZERO);
+    }
+
+    /// Lets the next fetch come at once, whatever failed before: its cause may be gone.
+    pub fn retry(&mut self) {
+        self.retry_at = Duration::ZERO;
     }
 
     /// Records a failed fetch, its start and its end; `random` is within 0..1.
@@ -265,6 +271,8 @@ pub fn follow(
     let started = Instant::now();
     let mut follower = Follower::new(settings);
     let mut manifest = None;
+    // What there was when a fetch failed for want of trust.
+    let mut distrusted = None;
     loop {
         if environment.cancel.load(Ordering::Relaxed) {
             return Err(FetchError::Cancelled);
@@ -275,6 +283,9 @@ pub fn follow(
         };
         if is_due {
             follower.forget();
+        }
+        if distrusted.as_ref().is_some_and(|before| *before != (n_seen, records::stamp(cache))) {
+            follower.retry();
         }
         let Some(position) = position else {
             if is_over {
@@ -308,12 +319,16 @@ pub fn follow(
         match outcome {
             Ok(report) => {
                 follower.fetched(now, report.centre_in_world);
+                distrusted = None;
                 // Needed for its geo-reference only; without it every geographic position fetches.
                 manifest = cache.read_manifest(report.manifest_hash).ok();
             }
             Err(FetchError::Cancelled) => return Err(FetchError::Cancelled),
             Err(error) if is_over => return Err(error),
-            Err(_) => follower.failed(now, started.elapsed(), (environment.random)()),
+            Err(error) => {
+                follower.failed(now, started.elapsed(), (environment.random)());
+                distrusted = error.is_want_of_trust().then(|| (n_seen, records::stamp(cache)));
+            }
         }
     }
 }

@@ -15,7 +15,6 @@ use crate::store::{self, BadCell, CellFault, Current, CurrentCell, EdgeCache, Ol
 pub struct Before<'a> {
     pub cache: &'a EdgeCache,
     pub current: Option<&'a Current>,
-    /// Its manifest.
     pub offer: Option<&'a Offer>,
 }
 
@@ -72,10 +71,6 @@ impl Before<'_> {
         let path = self.cache.shard_path(old.hash);
         let cell = CurrentCell { cell_id, hash: old.hash, len_bytes: old.len_bytes };
         store::can_stand_in(manifest, new, cell_id)
-            && self
-                .cache
-                .files()
-                .map(&path)
-                .is_ok_and(|bytes| store::check_shard(&path, &bytes, &cell, wanted.profile, manifest).is_ok())
+            && store::check_file(self.cache, &path, &cell, wanted.profile, manifest).is_ok()
     }
 }

@@ -13,13 +13,10 @@
 
 mod copies;
 mod download;
-mod environment;
 mod error;
 pub mod follow;
 mod generation;
 mod history;
-mod limits;
-mod lock;
 mod objects;
 mod offer;
 mod plan;
@@ -29,19 +26,17 @@ mod records;
 mod report;
 mod request;
 mod run;
-mod scrub;
 mod staging;
 mod trust;
 mod usage;
 
-pub use environment::{Environment, Progress};
-pub use error::{DownloadFailure, FetchError};
-pub use limits::NetworkLimits;
+pub use error::FetchError;
 pub use plan::{Held, Object, Plan, Wanted};
 pub use plan_error::PlanError;
 pub use position::{NotAPosition, Position, Spoken};
-pub use records::{Accepted, LastFetch, Records, RecordsError, accepted};
+pub use records::{Accepted, LastFetch, Records, RecordsError, accepted, last_position};
 pub use report::{FetchReport, Tally};
-pub use request::{DEFAULT_PARALLEL, DEFAULT_RADIUS, FetchRequest};
+pub use request::{Environment, FetchRequest, Progress};
 pub use run::fetch;
+pub use slag_models::download::{DownloadFailure, NetworkLimits};
 pub use trust::{AddedRoot, FirstRoot, add_root};

@@ -9,11 +9,14 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use slag_common::Hash32;
 use slag_common::manifest::{Manifest, TextModelRecord};
 use slag_common::shard::Profile;
+use slag_models::download::DownloadFailure;
 
 use super::download::Client;
-use super::error::{DownloadFailure, FetchError};
+use super::error::FetchError;
+use super::offer::Offer;
 use super::plan::Object;
 use super::staging::part_path;
+use crate::store::files::is_bad_medium;
 use crate::store::{self, CellFault, CurrentCell, EdgeCache, StoreError};
 
 /// Most connections at a time.
@@ -24,30 +27,37 @@ pub struct Check<'a> {
     pub manifest: &'a Manifest,
     pub profile: Profile,
     cells: BTreeMap<Hash32, &'a CurrentCell>,
-    /// Lengths of the files of the text model.
-    text_model: BTreeMap<Hash32, u64>,
+    text_model: BTreeSet<Hash32>,
 }
 
 impl<'a> Check<'a> {
     pub fn new(manifest: &'a Manifest, profile: Profile, cells: &'a [CurrentCell]) -> Self {
         let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
-        let text_model = text_model.map(|object| (object.hash, object.len_bytes)).collect();
+        let text_model = text_model.map(|object| object.hash).collect();
         Self { manifest, profile, cells: cells.iter().map(|cell| (cell.hash, cell)).collect(), text_model }
     }
 
     /// Returns whether an object belongs to the text model.
     pub fn is_of_text_model(&self, hash: Hash32) -> bool {
-        self.text_model.contains_key(&hash)
-    }
-
-    /// Returns the length of an object that the manifest lists.
-    pub fn len_bytes(&self, hash: Hash32) -> Option<u64> {
-        self.cell(hash).map(|cell| cell.len_bytes).or_else(|| self.text_model.get(&hash).copied())
+        self.text_model.contains(&hash)
     }
 
     /// Returns the cell of an object.
     pub fn cell(&self, hash: Hash32) -> Option<&'a CurrentCell> {
         self.cells.get(&hash).copied()
+    }
+
+    /// Returns whether an object on board is what the manifest describes. It is read only where the manifest by which it came
+    /// described it otherwise: readers find what rots, and mark it.
+    pub fn is_fit(&self, cache: &EdgeCache, on_board: Option<&Offer>, hash: Hash32) -> bool {
+        let Some(cell) = self.cell(hash) else { return true };
+        let described = |manifest: &Manifest| {
+            let listed = store::cell_of(manifest, cell.cell_id)?;
+            let shard = listed.shards.get(&self.profile)?;
+            Some((shard.hash, listed.n_gaussians, manifest.encoder.dim, manifest.encoder.id))
+        };
+        on_board.is_some_and(|before| described(&before.manifest) == described(self.manifest))
+            || store::check_file(cache, &cache.shard_path(hash), cell, self.profile, self.manifest).is_ok()
     }
 
     /// Checks that bytes are the shard, or the file of the text model, that the manifest describes.
@@ -74,6 +84,8 @@ pub struct Downloaded {
 fn fault_of(error: &FetchError) -> Option<CellFault> {
     match error {
         FetchError::Published { .. } => Some(CellFault::Invalid),
+        // Neither read, nor replaced.
+        FetchError::Io(e) if is_bad_medium(e) => Some(CellFault::Unreadable),
         FetchError::Download { failure, .. } => match failure {
             DownloadFailure::Hash { .. } | DownloadFailure::Length { .. } => Some(CellFault::Damaged),
             // 500: a store that cannot read the object.
@@ -142,7 +154,7 @@ fn download_one(
 ) -> Result<(), FetchError> {
     let part = part_path(cache, hash);
     client.object(cache.files(), hash, len_bytes, &part)?;
-    let bytes = cache.files().map(&part)?;
+    let bytes = cache.files().read(&part, len_bytes)?;
     if let Err(source) = check.object(&part, hash, &bytes) {
         // It would be the same the next time.
         cache.files().remove(&part)?;

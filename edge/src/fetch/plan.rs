@@ -8,6 +8,7 @@ use slag_common::manifest::{CellIndex, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::Profile;
 
 use super::plan_error::PlanError;
+use super::report::Tally;
 use crate::store::CurrentCell;
 
 /// A shard on board.
@@ -37,7 +38,6 @@ pub struct Wanted {
 pub struct Object {
     /// BLAKE3 of the content.
     pub hash: Hash32,
-    /// Its length.
     pub len_bytes: u64,
 }
 
@@ -58,9 +58,6 @@ pub struct Plan {
 
 impl Plan {
     /// Plans a fetch.
-    ///
-    /// # Errors
-    /// [`PlanError`].
     pub fn new(
         manifest: &Manifest,
         wanted: &Wanted,
@@ -111,6 +108,11 @@ impl Plan {
             };
         }
         Ok(plan)
+    }
+
+    /// Returns the number and total length of the objects to download.
+    pub(super) fn to_download(&self) -> Tally {
+        Tally::of(self.download.iter().map(|object| object.len_bytes))
     }
 }
 

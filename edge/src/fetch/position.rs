@@ -117,9 +117,6 @@ impl Position {
     /// A geographic position without a height gets the height of the nearest cell's centre, by horizontal
     /// distance to its box, then to its centre, then by id. A robot that knows only latitude and longitude
     /// thus gets the cells around it, wherever the scene's zero height lies.
-    ///
-    /// # Errors
-    /// [`PlanError::Number`], [`PlanError::NoGeoReference`].
     pub fn in_world(self, manifest: &Manifest) -> Result<DVec3, PlanError> {
         let number = |name, value: f64, limit: f64, expected| match value.abs() <= limit {
             true => Ok(()),

@@ -1,33 +1,35 @@
 //! What a robot believes: the metadata and the scene that it accepted. Two checksummed copies on the cache's own
 //! storage ([`Copies`]); the lock of the cache ensures one fetch at a time.
 
+use std::fs::{File, TryLockError};
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use slag_common::tuf::{Kept, sha256_hex};
 
 use super::copies::{Copies, Found, MAX_COPY_BYTES, Version};
-use super::lock::Lock;
 use super::position::Position;
 use crate::store::EdgeCache;
+use crate::store::files::Stat;
 
 /// Room for the first line of a copy.
 const MAX_CONTENT_BYTES: u64 = MAX_COPY_BYTES - 256;
+
+/// Wait for another fetch: a service's and a command's may meet.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(2);
+const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
 /// Reasons for which the records cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordsError {
     /// Another fetch holds the lock.
     #[error("another fetch uses {path}; wait for it or end it", path = path.display())]
-    Busy {
-        /// The cache.
-        path: PathBuf,
-    },
+    Busy { path: PathBuf },
     /// Both copies are damaged.
     #[error("{path}: both copies of the record of trust are damaged ({what}), so that no store is believed; what is on board keeps answering. Add the store's newest root by hand (`slag-edge trust add --root FILE`): the record is then written anew", path = path.display())]
     Damaged {
-        /// The copies' folder.
         path: PathBuf,
         /// The fault of one copy.
         what: String,
@@ -36,10 +38,7 @@ pub enum RecordsError {
     #[error(
         "the record of trust would take {len_bytes} bytes, the limit is {MAX_CONTENT_BYTES}; publish the scene under a shorter name"
     )]
-    TooLong {
-        /// Its length.
-        len_bytes: u64,
-    },
+    TooLong { len_bytes: u64 },
     /// The file system's error, with the path.
     #[error("{0}; check the cache's folder and its permissions")]
     Io(#[from] io::Error),
@@ -48,9 +47,7 @@ pub enum RecordsError {
 /// The request of the last fetch.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LastFetch {
-    /// The store's address.
     pub from: String,
-    /// The position.
     pub at: Position,
 }
 
@@ -61,7 +58,6 @@ pub struct Accepted {
     pub scene: Option<String>,
     /// SHA-256 of the newest root, hex.
     pub root_sha256: String,
-    /// Its version.
     pub root_version: u64,
     /// When the newest timestamp says it was signed, seconds since 1970.
     pub signed_unix_secs: Option<u64>,
@@ -94,9 +90,6 @@ pub struct Records {
 
 impl Records {
     /// Opens the records and mends a damaged copy; holds the lock until dropped.
-    ///
-    /// # Errors
-    /// [`RecordsError`], as for every operation here.
     pub fn open(cache: &EdgeCache) -> Result<Self, RecordsError> {
         let busy = || RecordsError::Busy { path: cache.dir().to_owned() };
         let lock = Lock::take(cache.dir())?.ok_or_else(busy)?;
@@ -200,6 +193,19 @@ pub fn accepted(cache: &EdgeCache) -> Option<Accepted> {
     }
 }
 
+/// Returns the position of the last fetch, without the lock.
+pub fn last_position(cache: &EdgeCache) -> Option<Position> {
+    match read(cache, &copies_of(cache)) {
+        Ok(Read::Record(_, record)) => record.last.map(|last| last.at),
+        _ => None,
+    }
+}
+
+/// Returns what changes whenever the records do.
+pub(super) fn stamp(cache: &EdgeCache) -> [Option<Stat>; 2] {
+    copies_of(cache).paths().map(|path| cache.files().stat(&path).ok().flatten())
+}
+
 fn copies_of(cache: &EdgeCache) -> Copies {
     Copies::new(cache.dir().join("trust"))
 }
@@ -222,10 +228,36 @@ fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Read> {
     })
 }
 
+/// The cache's lock, held until dropped.
+#[derive(Debug)]
+struct Lock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
+
+impl Lock {
+    /// Takes the lock of a cache folder; `None` if another fetch keeps it.
+    ///
+    /// # Errors
+    /// The file system's, with the path.
+    fn take(dir: &Path) -> io::Result<Option<Self>> {
+        let path = dir.join("lock");
+        fs_err::create_dir_all(dir)?;
+        let file = fs_err::OpenOptions::new().write(true).create(true).truncate(false).open(&path)?;
+        let file = file.into_parts().0;
+        let start = Instant::now();
+        loop {
+            match file.try_lock() {
+                Ok(()) => return Ok(Some(Self(file))),
+                Err(TryLockError::WouldBlock) if start.elapsed() > LOCK_TIMEOUT => return Ok(None),
+                Err(TryLockError::WouldBlock) => std::thread::sleep(LOCK_PAUSE),
+                Err(TryLockError::Error(e)) => {
+                    return Err(io::Error::new(e.kind(), format!("locking {}: {e}", path.display())));
+                }
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use slag_common::tuf::{MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TIMESTAMP_BYTES};
 
     use super::*;
@@ -238,7 +270,7 @@ mod tests {
             root: quotes(MAX_ROOT_BYTES),
             timestamp: Some(quotes(MAX_TIMESTAMP_BYTES)),
             snapshot: Some(quotes(MAX_SNAPSHOT_BYTES)),
-            targets: BTreeMap::new(),
+            targets: None,
         };
         let dir = tempfile::tempdir().expect("temporary folder");
         let cache = EdgeCache::open(dir.path());

@@ -10,9 +10,7 @@ use crate::store::BadCell;
 /// Number and length of some shards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Tally {
-    /// Shards.
     pub n_shards: usize,
-    /// Their total length.
     pub bytes: u64,
 }
 
@@ -34,12 +32,9 @@ pub struct TextModelTally {
     pub downloaded_bytes: u64,
 }
 
-/// Report of a fetch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FetchReport {
-    /// The scene.
     pub scene: String,
-    /// Its generation.
     pub generation: u64,
     /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
@@ -49,7 +44,6 @@ pub struct FetchReport {
     pub is_first_contact: bool,
     /// The encoder whose text model answers queries.
     pub encoder_id: Hash32,
-    /// Its name.
     pub encoder_name: String,
     /// The profile of the shards.
     pub profile: Profile,
@@ -61,13 +55,11 @@ pub struct FetchReport {
     pub n_cells: usize,
     /// Those whose shard could not be fetched.
     pub bad_cells: Vec<BadCell>,
-    /// Shards downloaded.
     pub downloaded: Tally,
     /// Needed shards that were on board already.
     pub kept: Tally,
     /// Shards on board that are not needed but fit the budget.
     pub spare: Tally,
-    /// Shards removed.
     pub freed: Tally,
     /// The text model, if the scene carries one; not counted among the shards.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -76,6 +68,5 @@ pub struct FetchReport {
     pub resumed_bytes: u64,
     /// Attempts beyond the first.
     pub retries: u64,
-    /// Duration.
     pub seconds: f64,
 }

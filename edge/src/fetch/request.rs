@@ -1,14 +1,17 @@
-//! Parameters of a fetch.
+//! What a fetch is asked for, and its surroundings: clock, cancel flag, random numbers, progress and network limits.
+
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 use slag_common::Hash32;
 use slag_common::shard::Profile;
+use slag_models::download::{DownloadFailure, NetworkLimits};
 
 use super::position::Position;
 
-/// Default radius, world units.
+/// World units.
 pub const DEFAULT_RADIUS: f64 = 50.0;
-/// Default number of parallel downloads.
-pub const DEFAULT_PARALLEL: usize = 4;
+const DEFAULT_PARALLEL: usize = 4;
 
 /// Parameters of a fetch.
 #[derive(Clone, Debug)]
@@ -19,7 +22,6 @@ pub struct FetchRequest {
     pub at: Option<Position>,
     /// Cells within this distance are fetched, world units.
     pub radius: f64,
-    /// Profile of the shards.
     pub profile: Profile,
     /// At the first contact, trust the root that the store offers.
     pub trust_first: bool,
@@ -30,7 +32,6 @@ pub struct FetchRequest {
     pub expected_encoder: Option<Hash32>,
     /// Byte budget for shards; absent: twice the length of the needed ones.
     pub max_bytes: Option<u64>,
-    /// Parallel downloads.
     pub parallel: usize,
     /// Use the manifest and shards on board only.
     pub offline: bool,
@@ -51,4 +52,29 @@ impl Default for FetchRequest {
             offline: false,
         }
     }
+}
+
+/// Receives the progress of a fetch, from any of its threads.
+pub trait Progress: Sync {
+    /// Called once with the number and total length of the shards to download.
+    fn planned(&self, _n_shards: usize, _bytes: u64) {}
+    /// Called with the number of bytes received since the last call.
+    fn received(&self, _bytes: u64) {}
+    /// Called when an attempt failed and another follows.
+    fn retried(&self, _url: &str, _failure: &DownloadFailure) {}
+}
+
+impl Progress for () {}
+
+/// The surroundings of a fetch.
+pub struct Environment<'a> {
+    pub now_unix_secs: u64,
+    /// Set to end the fetch; the next one resumes what arrived.
+    pub cancel: &'a AtomicBool,
+    pub progress: &'a dyn Progress,
+    /// Returns numbers within 0..1, to spread retries.
+    pub random: &'a (dyn Fn() -> f64 + Sync),
+    /// Certificates (PEM) of the authorities that may vouch for `https://` addresses; absent: those that browsers trust.
+    pub ca: Option<&'a Path>,
+    pub limits: NetworkLimits,
 }

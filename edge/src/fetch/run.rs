@@ -1,26 +1,23 @@
-//! A fetch, step by step.
+//! A fetch, phase by phase: each type is a state that only the phase before it can make.
 
 use std::collections::BTreeSet;
 use std::io;
 use std::time::Instant;
 
 use slag_common::Hash32;
-use slag_common::manifest::{Manifest, ObjectRecord, TextModelRecord};
 use slag_common::tuf::Kept;
 
 use super::download::Client;
-use super::environment::Environment;
 use super::error::FetchError;
 use super::generation::{Before, assemble};
 use super::history;
-use super::objects::{Check, download_all};
+use super::objects::{Check, Downloaded, download_all};
 use super::offer::Offer;
-use super::plan::{Object, Plan, Wanted};
+use super::plan::{Held, Object, Plan, Wanted};
 use super::records::{LastFetch, Records, RecordsError};
 use super::report::{FetchReport, Tally, TextModelTally};
-use super::request::FetchRequest;
-use super::scrub::{digests, scrub};
-use super::staging::{clear_manifests, clear_staging, held_shards, part_path, put, staging};
+use super::request::{Environment, FetchRequest};
+use super::staging::{clear_manifests, clear_staging, part_path, put, remove, staging};
 use super::trust::trust_first;
 use super::usage::Usage;
 use crate::store::{Current, EdgeCache, StoreError, damaged};
@@ -40,187 +37,292 @@ pub fn fetch(
     environment: &Environment<'_>,
 ) -> Result<FetchReport, FetchError> {
     let started = Instant::now();
-    let dirs =
-        [staging(cache), cache.dir().join("shards"), cache.dir().join("manifests"), cache.dir().into()];
-    for dir in dirs.iter().rev() {
-        cache.files().create_dir(dir)?;
-    }
-    let mut records = Records::open(cache)?;
-    let mut usage = Usage::open(cache.dir().join("db"));
-    // A killed fetch may have renamed files without syncing their folder.
-    for dir in &dirs {
-        cache.files().sync_dir(dir)?;
-    }
-    let last = records.last().cloned();
-    let (last_from, last_at) = last.map_or((None, None), |last| (Some(last.from), Some(last.at)));
-    let from = request
-        .from
-        .clone()
-        .or(last_from)
-        .ok_or(FetchError::NotGiven { what: "store address", advice: "give one with --from URL" })?;
-    let at = request.at.or(last_at).ok_or(FetchError::NotGiven {
-        what: "position",
-        advice: "give one with --at X,Y,Z or --at-geo LAT,LON",
-    })?;
-    let old = match cache.current() {
-        Err(e @ StoreError::Current { .. }) => {
-            tracing::warn!("{e}");
-            None
+    let locked = Locked::begin(cache, request, environment)?;
+    let mut report = locked.accept_offer()?.plan()?.download()?.clean_up()?;
+    report.seconds = started.elapsed().as_secs_f64();
+    Ok(report)
+}
+
+/// The cache is locked, and what is on board is known.
+struct Locked<'a> {
+    cache: &'a EdgeCache,
+    request: &'a FetchRequest,
+    environment: &'a Environment<'a>,
+    client: Client<'a>,
+    records: Records,
+    usage: Usage,
+    last: LastFetch,
+    /// The generation on board, and its manifest.
+    current: Option<Current>,
+    on_board: Option<Offer>,
+}
+
+impl<'a> Locked<'a> {
+    fn begin(
+        cache: &'a EdgeCache,
+        request: &'a FetchRequest,
+        environment: &'a Environment<'a>,
+    ) -> Result<Self, FetchError> {
+        let dirs =
+            [cache.dir().into(), cache.dir().join("manifests"), cache.dir().join("shards"), staging(cache)];
+        for dir in &dirs {
+            cache.files().create_dir(dir)?;
         }
-        other => other?,
-    };
-    let client = Client::new(&from, environment)?;
-    let on_board = old.as_ref().and_then(|old| Offer::on_board(cache, old));
-    let known_scene = records.scene().or(on_board.as_ref().map(|offer| offer.manifest.scene.as_str()));
-    let scene = request.scene.as_deref().or(known_scene).map(str::to_owned);
-    let mut is_first_contact = false;
-    let offer = match request.offline {
-        true => on_board
-            .clone()
-            .ok_or(FetchError::NotGiven { what: "manifest", advice: "fetch once with network" })?,
-        false => {
+        let records = Records::open(cache)?;
+        // A killed fetch may have renamed files without syncing their folder.
+        for dir in dirs.iter().rev() {
+            cache.files().sync_dir(dir)?;
+        }
+        let last = match (&request.from, request.at, records.last()) {
+            (from, at, Some(last)) => {
+                LastFetch { from: from.as_ref().unwrap_or(&last.from).clone(), at: at.unwrap_or(last.at) }
+            }
+            (Some(from), Some(at), None) => LastFetch { from: from.clone(), at },
+            (from, ..) => {
+                let (what, advice) = match from {
+                    None => ("store address", "give one with --from URL"),
+                    Some(_) => ("position", "give one with --at X,Y,Z or --at-geo LAT,LON"),
+                };
+                return Err(FetchError::NotGiven { what, advice });
+            }
+        };
+        let current = match cache.current() {
+            Err(e @ (StoreError::Current { .. } | StoreError::Unreadable(_))) => {
+                tracing::warn!("{e}");
+                None
+            }
+            other => other?,
+        };
+        Ok(Self {
+            client: Client::new(&last.from, environment)?,
+            usage: Usage::open(cache),
+            on_board: current.as_ref().and_then(|current| Offer::on_board(cache, current)),
+            cache,
+            request,
+            environment,
+            records,
+            last,
+            current,
+        })
+    }
+
+    /// Brings metadata up to date and takes the manifest that it names, if it is of the robot's scene and encoder.
+    fn accept_offer(mut self) -> Result<Offered<'a>, FetchError> {
+        let Self { cache, request, ref client, ref on_board, .. } = self;
+        let records = &mut self.records;
+        let mut is_first_contact = false;
+        let offer = if request.offline {
+            let advice = "fetch once with network";
+            on_board.clone().ok_or(FetchError::NotGiven { what: "manifest", advice })?
+        } else {
             if let Some(damage) = records.damage() {
                 return Err(damage.into());
             }
             if request.trust_first {
-                is_first_contact = trust_first(&client, cache, &mut records)?;
+                is_first_contact = trust_first(client, cache, records)?;
             }
-            let offer =
-                Offer::get(&client, cache, &mut records, environment.now_unix_secs, on_board.as_ref());
+            let now_unix_secs = self.environment.now_unix_secs;
+            let offer = Offer::get(client, cache, records, now_unix_secs, on_board.as_ref());
             offer.map_err(|e| disk_full(e, SPARE_BYTES))?
-        }
-    };
-    offer.check(scene.as_deref(), request)?;
+        };
+        let known = records.scene().or(on_board.as_ref().map(|offer| offer.manifest.scene.as_str()));
+        offer.check(request.scene.as_deref().or(known), request)?;
+        Ok(Offered { locked: self, offer, is_first_contact })
+    }
+}
 
-    let centre_in_world = at.in_world(&offer.manifest)?;
-    let mut held = held_shards(cache, &usage)?;
-    let FetchRequest { profile, radius, max_bytes, .. } = *request;
-    let wanted = Wanted { profile, centre_in_world, radius, max_bytes };
-    let mut plan = Plan::new(&offer.manifest, &wanted, &held)?;
-    let check = Check::new(&offer.manifest, profile, &plan.cells);
-    let marked = damaged::marked(cache);
-    let scrubbed = scrub(cache, &check, &plan.keep, &marked, &usage, environment.now_unix_secs);
-    if !scrubbed.unfit.is_empty() {
-        held.retain(|hash, _| !scrubbed.unfit.contains(hash));
-        plan = Plan::new(&offer.manifest, &wanted, &held)?;
-    }
-    let planned = Tally::of(plan.download.iter().map(|object| object.len_bytes));
-    if request.offline && planned.n_shards > 0 {
-        return Err(FetchError::Offline { n_shards: planned.n_shards, bytes: planned.bytes });
-    }
-    let accepted = records.accept(cache, &LastFetch { from, at }, &offer.manifest.scene);
-    accepted.map_err(|e| disk_full(e.into(), planned.bytes))?;
+/// The manifest that counts is known and accepted.
+struct Offered<'a> {
+    locked: Locked<'a>,
+    offer: Offer,
+    is_first_contact: bool,
+}
 
-    let text_of = |offer: &Offer| text_model(&offer.manifest).map(|object| object.hash).collect::<Vec<_>>();
-    let of_old = old.iter().flat_map(Current::shards).chain(on_board.iter().flat_map(text_of));
-    let in_use: BTreeSet<Hash32> = of_old.collect();
-    for hash in plan.free.difference(&in_use) {
-        cache.files().remove(&cache.shard_path(*hash))?;
-    }
-    if let (Some(old), Some(on_board)) = (&old, &on_board) {
-        history::note(cache, old, &on_board.manifest, offer.manifest_hash, &plan.cells);
-    }
-    clear_staging(cache, &plan.download)?;
-    environment.progress.planned(planned.n_shards, planned.bytes);
-    let before = Before { cache, current: old.as_ref(), offer: on_board.as_ref() };
-    let work = || {
-        let other_bytes = offer.bytes.len() as u64 + plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
-        if let Err(error) = check_space(cache, &plan.download, other_bytes) {
-            match history::forget(cache) {
-                true => check_space(cache, &plan.download, other_bytes)?,
-                false => return Err(error),
-            }
+impl<'a> Offered<'a> {
+    /// Decides what to download, keep and free. What readers marked as damaged is downloaded again, and so is what the manifest
+    /// describes otherwise than the one by which it came.
+    fn plan(self) -> Result<Planned<'a>, FetchError> {
+        let Locked { cache, request, usage, last, on_board, .. } = &self.locked;
+        let manifest = &self.offer.manifest;
+        let FetchRequest { profile, radius, max_bytes, offline, .. } = **request;
+        let wanted = Wanted { profile, centre_in_world: last.at.in_world(manifest)?, radius, max_bytes };
+        let mut held = usage.held_shards(cache)?;
+        let mut plan = Plan::new(manifest, &wanted, &held)?;
+        let marked = damaged::marked(cache);
+        let check = Check::new(manifest, profile, &plan.cells);
+        let is_unfit =
+            |hash: &Hash32| marked.contains(hash) || !check.is_fit(cache, on_board.as_ref(), *hash);
+        let unfit: BTreeSet<Hash32> = plan.keep.iter().copied().filter(is_unfit).collect();
+        if !unfit.is_empty() {
+            held.retain(|hash, _| !unfit.contains(hash));
+            plan = Plan::new(manifest, &wanted, &held)?;
         }
-        let check = Check::new(&offer.manifest, profile, &plan.cells);
-        let mut downloaded = download_all(cache, &client, &check, &plan.download, request.parallel)?;
-        damaged::unmark(cache, marked.intersection(&downloaded.good))?;
+        let planned = plan.to_download();
+        if offline && planned.n_shards > 0 {
+            return Err(FetchError::Offline { n_shards: planned.n_shards, bytes: planned.bytes });
+        }
+        Ok(Planned { offered: self, wanted, held, plan, marked })
+    }
+}
+
+/// What to do with each shard is decided; nothing was removed yet.
+struct Planned<'a> {
+    offered: Offered<'a>,
+    wanted: Wanted,
+    held: std::collections::BTreeMap<Hash32, Held>,
+    plan: Plan,
+    /// Shards that readers marked as damaged.
+    marked: BTreeSet<Hash32>,
+}
+
+impl<'a> Planned<'a> {
+    /// Makes room, downloads what is missing and switches to the new generation.
+    fn download(mut self) -> Result<Switched<'a>, FetchError> {
+        let needed_bytes = self.plan.to_download().bytes;
+        let switched = self.make_room().and_then(|()| self.bring());
+        let (current, downloaded) = switched.map_err(|e| disk_full(e, needed_bytes))?;
+        Ok(Switched { planned: self, current, downloaded })
+    }
+
+    /// Records the request, and removes what neither the old nor the new generation needs.
+    fn make_room(&mut self) -> Result<(), FetchError> {
+        let Offered { locked, offer, .. } = &mut self.offered;
+        let cache = locked.cache;
+        locked.records.accept(cache, &locked.last, &offer.manifest.scene)?;
+        let old_shards = locked.current.iter().flat_map(Current::shards);
+        let in_use: BTreeSet<Hash32> =
+            old_shards.chain(locked.on_board.iter().flat_map(Offer::text_model)).collect();
+        for hash in self.plan.free.difference(&in_use) {
+            remove(cache, &cache.shard_path(*hash))?;
+        }
+        if let (Some(old), Some(on_board)) = (&locked.current, &locked.on_board) {
+            history::note(cache, old, &on_board.manifest, offer.manifest_hash, &self.plan.cells);
+        }
+        clear_staging(cache, &self.plan.download)?;
+        let planned = self.plan.to_download();
+        locked.environment.progress.planned(planned.n_shards, planned.bytes);
+        let manifest_bytes = offer.bytes.len() as u64;
+        let other_bytes = manifest_bytes + self.plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
+        match check_space(cache, &self.plan.download, other_bytes) {
+            Err(_) if history::forget(cache) => check_space(cache, &self.plan.download, other_bytes),
+            checked => checked,
+        }
+    }
+
+    /// Downloads, and puts the pointer to the new generation in place. Cells that cannot be had are left out.
+    fn bring(&self) -> Result<(Current, Downloaded), FetchError> {
+        let Offered { locked, offer, .. } = &self.offered;
+        let cache = locked.cache;
+        let check = self.check();
+        let parallel = locked.request.parallel;
+        let mut downloaded = download_all(cache, &locked.client, &check, &self.plan.download, parallel)?;
+        damaged::unmark(cache, self.marked.intersection(&downloaded.good))?;
         // Without its text model the scene would not answer; the generation on board does.
         let of_text_model = downloaded.bad.keys().find(|hash| check.is_of_text_model(**hash)).copied();
         if let Some((_, error)) = of_text_model.and_then(|hash| downloaded.bad.remove(&hash)) {
             return Err(error);
         }
-        let current = assemble(before, &offer, &wanted, &plan, &downloaded.bad);
+        let before = Before { cache, current: locked.current.as_ref(), offer: locked.on_board.as_ref() };
+        let current = assemble(before, offer, &self.wanted, &self.plan, &downloaded.bad);
         for (hash, (_, error)) in &downloaded.bad {
             let cell_id = check.cell(*hash).map_or(0, |cell| cell.cell_id);
             tracing::warn!("cell {cell_id}: {}", crate::error_line(error));
         }
         if current.cells.is_empty() {
-            let first = plan.download.iter().find_map(|object| downloaded.bad.remove(&object.hash));
+            let first = self.plan.download.iter().find_map(|object| downloaded.bad.remove(&object.hash));
             if let Some((_, error)) = first {
                 return Err(error);
             }
         }
         // Readers open the generation again where a shard of it was replaced.
-        if old.as_ref() != Some(&current) || !downloaded.good.is_empty() {
+        if locked.current.as_ref() != Some(&current) || !downloaded.good.is_empty() {
             put(cache, &offer.bytes, &cache.manifest_path(offer.manifest_hash))?;
             let bytes = serde_json::to_vec(&current).map_err(io::Error::from)?;
             put(cache, &bytes, &cache.current_path())?;
         }
-        let sound = scrubbed.sound.iter().chain(&downloaded.good).copied();
-        Ok((digests(cache, &check, sound), downloaded.good, current))
-    };
-    let (digests, downloaded, current) = work().map_err(|e| disk_full(e, planned.bytes))?;
-
-    let in_use: BTreeSet<Hash32> = current.shards().chain(text_of(&offer)).collect();
-    plan.free.retain(|hash| !in_use.contains(hash));
-    for hash in &plan.free {
-        cache.files().remove(&cache.shard_path(*hash))?;
+        Ok((current, downloaded))
     }
-    let manifests = current.old_shards().map(|(_, old)| old.manifest_hash).chain([offer.manifest_hash]);
-    clear_manifests(cache, &manifests.collect())?;
-    clear_staging(cache, &[])?;
-    let on_board: BTreeSet<Hash32> = in_use.iter().chain(&plan.spare).copied().collect();
-    damaged::unmark(cache, marked.difference(&on_board))?;
-    usage.finish(&in_use, &digests, &on_board, environment.now_unix_secs);
-    let text: BTreeSet<Hash32> = text_of(&offer).into_iter().collect();
-    let tally =
-        |hashes: &BTreeSet<Hash32>| Tally::of(hashes.difference(&text).map(|hash| held[hash].len_bytes));
-    let is_downloaded = |object: &&Object| downloaded.contains(&object.hash) && !text.contains(&object.hash);
-    let text_model = offer.manifest.encoder.text_model.as_ref().map(|model| TextModelTally {
-        bytes: model.objects().map(|object| object.len_bytes).sum(),
-        downloaded_bytes: model
-            .objects()
-            .filter(|object| downloaded.contains(&object.hash))
-            .map(|object| object.len_bytes)
-            .sum(),
-    });
-    Ok(FetchReport {
-        text_model,
-        downloaded: Tally::of(plan.download.iter().filter(is_downloaded).map(|object| object.len_bytes)),
-        kept: tally(&plan.keep),
-        spare: tally(&plan.spare),
-        freed: tally(&plan.free),
-        scene: offer.manifest.scene,
-        generation: offer.manifest.generation,
-        manifest_hash: offer.manifest_hash,
-        root_version: records.kept().and_then(Kept::root_version),
-        is_first_contact,
-        encoder_id: offer.manifest.encoder.id,
-        encoder_name: offer.manifest.encoder.name,
-        profile,
-        centre_in_world,
-        radius,
-        n_cells: plan.cells.len(),
-        bad_cells: current.bad_cells,
-        resumed_bytes: client.resumed_bytes.into_inner(),
-        retries: client.retries.into_inner(),
-        seconds: started.elapsed().as_secs_f64(),
-    })
+
+    fn check(&self) -> Check<'_> {
+        Check::new(&self.offered.offer.manifest, self.wanted.profile, &self.plan.cells)
+    }
 }
 
-/// Returns the objects of the text model that a scene carries.
-fn text_model(manifest: &Manifest) -> impl Iterator<Item = ObjectRecord> + '_ {
-    manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects)
+/// The new generation is on board.
+struct Switched<'a> {
+    planned: Planned<'a>,
+    current: Current,
+    downloaded: Downloaded,
+}
+
+impl Switched<'_> {
+    /// Removes what only the old generation needed, and reports.
+    fn clean_up(mut self) -> Result<FetchReport, FetchError> {
+        let cache = self.planned.offered.locked.cache;
+        let offer = &self.planned.offered.offer;
+        let in_use: BTreeSet<Hash32> = self.current.shards().chain(offer.text_model()).collect();
+        self.planned.plan.free.retain(|hash| !in_use.contains(hash));
+        for hash in &self.planned.plan.free {
+            remove(cache, &cache.shard_path(*hash))?;
+        }
+        let old_manifests = self.current.old_shards().map(|(_, old)| old.manifest_hash);
+        clear_manifests(cache, &old_manifests.chain([offer.manifest_hash]).collect())?;
+        clear_staging(cache, &[])?;
+        let on_board = &in_use | &self.planned.plan.spare;
+        damaged::unmark(cache, self.planned.marked.difference(&on_board))?;
+        std::mem::take(&mut self.planned.offered.locked.usage).finish(cache, &in_use, &on_board);
+        Ok(self.report())
+    }
+
+    fn report(self) -> FetchReport {
+        let Self { planned: Planned { offered, wanted, held, plan, .. }, current, downloaded } = self;
+        let Offered { locked, offer, is_first_contact } = offered;
+        let text: BTreeSet<Hash32> = offer.text_model().collect();
+        let of_held =
+            |hashes: &BTreeSet<Hash32>| Tally::of(hashes.difference(&text).map(|hash| held[hash].len_bytes));
+        let new_bytes = |object: &Object| downloaded.good.contains(&object.hash).then_some(object.len_bytes);
+        let shards = plan.download.iter().filter(|object| !text.contains(&object.hash));
+        let text_model = offer.manifest.encoder.text_model.as_ref().map(|model| {
+            let objects = model.objects().map(|of| Object { hash: of.hash, len_bytes: of.len_bytes });
+            let (all, new) = objects.fold((0, 0), |(all, new), object| {
+                (all + object.len_bytes, new + new_bytes(&object).unwrap_or(0))
+            });
+            TextModelTally { bytes: all, downloaded_bytes: new }
+        });
+        let (resumed_bytes, retries) = locked.client.resumed_bytes_and_retries();
+        FetchReport {
+            text_model,
+            downloaded: Tally::of(shards.filter_map(new_bytes)),
+            kept: of_held(&plan.keep),
+            spare: of_held(&plan.spare),
+            freed: of_held(&plan.free),
+            generation: offer.manifest.generation,
+            manifest_hash: offer.manifest_hash,
+            root_version: locked.records.kept().and_then(Kept::root_version),
+            is_first_contact,
+            encoder_id: offer.manifest.encoder.id,
+            encoder_name: offer.manifest.encoder.name,
+            scene: offer.manifest.scene,
+            profile: wanted.profile,
+            centre_in_world: wanted.centre_in_world,
+            radius: wanted.radius,
+            n_cells: plan.cells.len(),
+            bad_cells: current.bad_cells,
+            resumed_bytes,
+            retries,
+            seconds: 0.0,
+        }
+    }
 }
 
 /// Refuses a download for which there is no space, before it begins. `other_bytes`: what is written besides.
 fn check_space(cache: &EdgeCache, download: &[Object], other_bytes: u64) -> Result<(), FetchError> {
     let Some(free_bytes) = cache.files().free_bytes(cache.dir())? else { return Ok(()) };
-    let mut needed_bytes = other_bytes;
-    for Object { hash, len_bytes } in download {
-        let staged_bytes = cache.files().stat(&part_path(cache, *hash))?.map_or(0, |stat| stat.len_bytes);
-        needed_bytes = needed_bytes.saturating_add(len_bytes.saturating_sub(staged_bytes));
-    }
+    let missing_bytes = |Object { hash, len_bytes }: &Object| {
+        let staged = cache.files().stat(&part_path(cache, *hash)).ok().flatten();
+        len_bytes.saturating_sub(staged.map_or(0, |stat| stat.len_bytes))
+    };
+    let needed_bytes = download.iter().map(missing_bytes).fold(other_bytes, u64::saturating_add);
     match !download.is_empty() && needed_bytes > free_bytes {
         true => Err(FetchError::NoSpace { path: cache.dir().to_owned(), needed_bytes, free_bytes }),
         false => Ok(()),

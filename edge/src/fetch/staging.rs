@@ -1,14 +1,15 @@
 //! The cache's folders: lists and clears them, and replaces files durably.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use slag_common::Hash32;
 
 use super::error::FetchError;
-use super::plan::{Held, Object};
-use super::usage::Usage;
+use super::plan::Object;
 use crate::store::EdgeCache;
+use crate::store::files::is_bad_medium;
 
 pub fn staging(cache: &EdgeCache) -> PathBuf {
     cache.dir().join("staging")
@@ -18,21 +19,15 @@ pub fn part_path(cache: &EdgeCache, hash: Hash32) -> PathBuf {
     staging(cache).join(format!("{hash}.part"))
 }
 
-/// Lists the shards on board and removes other files in their folder.
-pub fn held_shards(cache: &EdgeCache, usage: &Usage) -> Result<BTreeMap<Hash32, Held>, FetchError> {
-    let dir = cache.dir().join("shards");
-    let mut held = BTreeMap::new();
-    for name in cache.files().list(&dir)? {
-        let path = dir.join(&name);
-        match (name.parse::<Hash32>(), cache.files().stat(&path)?) {
-            (Ok(hash), Some(stat)) => {
-                let last_used = usage.last_used(hash);
-                held.insert(hash, Held { len_bytes: stat.len_bytes, last_used });
-            }
-            _ => cache.files().remove(&path)?,
+/// Removes a file. One whose inode cannot be read stays, and fails no fetch.
+pub fn remove(cache: &EdgeCache, path: &Path) -> io::Result<()> {
+    match cache.files().remove(path) {
+        Err(e) if is_bad_medium(&e) => {
+            tracing::warn!("{e}; the file system needs a check (fsck)");
+            Ok(())
         }
+        other => other,
     }
-    Ok(held)
 }
 
 /// Empties `staging/` except for partial downloads still wanted.
@@ -41,7 +36,7 @@ pub fn clear_staging(cache: &EdgeCache, wanted: &[Object]) -> Result<(), FetchEr
     for name in cache.files().list(&staging(cache))? {
         let path = staging(cache).join(name);
         if !wanted.contains(&path) {
-            cache.files().remove(&path)?;
+            remove(cache, &path)?;
         }
     }
     Ok(())
@@ -52,7 +47,7 @@ pub fn clear_manifests(cache: &EdgeCache, needed: &BTreeSet<Hash32>) -> Result<(
     let dir = cache.dir().join("manifests");
     for name in cache.files().list(&dir)? {
         if !name.parse().is_ok_and(|hash| needed.contains(&hash)) {
-            cache.files().remove(&dir.join(name))?;
+            remove(cache, &dir.join(name))?;
         }
     }
     Ok(())

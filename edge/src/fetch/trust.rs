@@ -4,9 +4,9 @@ use serde::Serialize;
 use slag_common::tuf::{Kept, MAX_ROOT_BYTES, MAX_ROOTS, TufError, sha256_hex};
 
 use super::download::Client;
-use super::environment::Environment;
 use super::error::FetchError;
 use super::records::Records;
+use super::request::Environment;
 use crate::store::EdgeCache;
 
 /// Where the first root comes from.
@@ -33,7 +33,6 @@ pub enum FirstRoot {
 pub struct AddedRoot {
     /// SHA-256, hex.
     pub sha256: String,
-    /// Version.
     pub version: u64,
     /// Whether it was trusted just now; otherwise the robot began with it, and nothing changed.
     pub is_new: bool,
@@ -41,9 +40,6 @@ pub struct AddedRoot {
 
 /// Trusts a root by hand. A root that the robot began with changes nothing, so that keys which were revoked since stay
 /// revoked. `replace`: trust it in place of another one.
-///
-/// # Errors
-/// [`FetchError`].
 pub fn add_root(
     cache: &EdgeCache,
     root: &FirstRoot,

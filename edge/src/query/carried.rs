@@ -6,7 +6,7 @@ use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 use slag_models::{ModelDir, SessionOptions};
 
-use crate::store::{EdgeCache, StoreError};
+use crate::store::{EdgeCache, StoreError, damaged};
 use crate::text::{TextOpenError, TextService};
 
 /// Longest description read; those of public models take two thousand bytes.
@@ -37,14 +37,27 @@ pub(super) fn open(
     let Some(record) = &manifest.encoder.text_model else { return Ok(None) };
     let expected = record.description.hash;
     let path = cache.shard_path(expected);
-    let bytes = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::Io)?;
+    // The next fetch downloads what is marked.
+    let mark = || record.objects().for_each(|object| damaged::mark(cache, object.hash));
+    let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
+    let bytes = read.inspect_err(|e| {
+        if e.is_damage() {
+            mark()
+        }
+    })?;
     let found = Hash32::of(&bytes);
     if found != expected {
+        mark();
         return Err(StoreError::Hash { path, expected, found }.into());
     }
     let folder = path.parent().unwrap_or(cache.dir());
     let opened = ModelDir::carried(&bytes, &path, folder)
         .map_err(TextOpenError::Model)
         .and_then(|models| TextService::open(&models, options));
-    opened.map(Some).map_err(|cause| CarriedError::Open { path, cause: Box::new(cause) })
+    opened.map(Some).map_err(|cause| {
+        if matches!(cause, TextOpenError::Model(_)) {
+            mark();
+        }
+        CarriedError::Open { path, cause: Box::new(cause) }
+    })
 }

@@ -14,10 +14,7 @@ pub enum OverBudget {
     #[error(
         "the query needs more than {bytes} bytes of memory, its budget; raise threshold, min_count or voxel, or ask for a smaller radius or box"
     )]
-    Bytes {
-        /// The budget.
-        bytes: u64,
-    },
+    Bytes { bytes: u64 },
     /// All requests together need too much memory.
     #[error(
         "the queries in progress need more than {bytes} bytes of memory, their budget together; ask again"
@@ -31,10 +28,7 @@ pub enum OverBudget {
         "the query took more than {} s, its budget; raise threshold, min_count or voxel, or ask for a smaller radius or box",
         time.as_secs_f64()
     )]
-    Time {
-        /// The budget.
-        time: Duration,
-    },
+    Time { time: Duration },
 }
 
 /// Bytes that all requests may use together.
@@ -114,9 +108,6 @@ impl Budget {
     }
 
     /// Returns what is spent, if anything is.
-    ///
-    /// # Errors
-    /// [`OverBudget`].
     pub fn check(&self) -> Result<(), OverBudget> {
         match self.0.as_ref().filter(|_| !self.goes_on()).and_then(|account| account.spent.get()) {
             Some(spent) => Err(spent.clone()),

@@ -38,7 +38,6 @@ pub(super) struct AskedQuestion<'a> {
     pub steepness: f32,
 }
 
-/// Scores in one shard.
 #[derive(Default)]
 pub(super) struct ShardScores {
     /// Whether the shard reaches into the region. If not, the other fields are left over from an earlier

@@ -6,13 +6,28 @@ use half::f16;
 use rayon::prelude::*;
 use slag_common::shard::{BLOCK, Residuals, ShardView};
 
-use super::bins::{BINS, bin_of};
 use super::cell::{Cell, Detail, Measured};
 use super::centroids::{AskedQuestion, combine};
 use super::dot::EmbeddingTimesVector;
 use super::matches::{Effort, Matches, Run};
 use super::region::Region;
 use super::simd::{BlockSums, FindSums, LastBlock, SomeRowsTimesVector};
+
+/// Number of bins; a score at a given rank is located by counting before anything is sorted.
+pub(super) const BINS: usize = 4096;
+
+/// Returns the bin of a score. It never falls as the score rises.
+pub(super) fn bin_of(score: f32) -> usize {
+    // Few scores lie outside -1..1; they share the first and the last bin.
+    ((score + 1.0) * (BINS as f32 / 2.0)).clamp(0.0, (BINS - 1) as f32) as usize
+}
+
+/// Returns a score that no score of a bin lies below.
+pub(super) fn edge_of(bin: usize) -> f32 {
+    // The first bin also holds all lower scores. Otherwise a little below the edge, because `bin_of` rounds.
+    let edge = bin as f32 / (BINS as f32 / 2.0) - 1.0;
+    if bin == 0 { f32::NEG_INFINITY } else { edge - 4.0 * f32::EPSILON }
+}
 
 /// Runs found so far, and buffers kept from one answer to the next.
 #[derive(Default)]
@@ -33,7 +48,6 @@ impl Gather {
 /// Bounds on the scores to gather.
 #[derive(Clone, Copy)]
 pub(super) struct Cut {
-    /// Lowest score wanted.
     pub score: f32,
     /// No score below this matches, even though `score` is an estimate.
     pub least: f32,

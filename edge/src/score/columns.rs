@@ -15,7 +15,6 @@ pub struct Columns {
     pub shard: Vec<u32>,
     /// Index in the shard.
     pub index: Vec<u32>,
-    /// Score.
     pub score: Vec<f32>,
     /// Mean, world units.
     pub x: Vec<f64>,

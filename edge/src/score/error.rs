@@ -17,7 +17,6 @@ pub enum ScoreError {
         "cell {cell_id} holds embeddings of {expected} components, but the query vector has {found}; use the models that the scene was encoded with"
     )]
     Dimension {
-        /// The cell.
         cell_id: u32,
         /// Components of the shard.
         expected: usize,
@@ -28,10 +27,7 @@ pub enum ScoreError {
     #[error(
         "the query vector has length {found}, expected 1; the text model is damaged or does not normalise its vectors"
     )]
-    NotUnit {
-        /// Its length.
-        found: f32,
-    },
+    NotUnit { found: f32 },
     /// A negative has another dimension than the question.
     #[error(
         "a negative has {found} components, but the query vector has {expected}; encode both with the same text model"
@@ -46,10 +42,5 @@ pub enum ScoreError {
     #[error(
         "cell {cell_id}: positions reach {found:e}, the limit is {MAX_COORDINATE:e} world units; encode the scene again around a nearer origin"
     )]
-    Extent {
-        /// The cell.
-        cell_id: u32,
-        /// Largest coordinate.
-        found: f64,
-    },
+    Extent { cell_id: u32, found: f64 },
 }

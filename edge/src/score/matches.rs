@@ -17,7 +17,6 @@ pub struct Hit {
 pub struct Run {
     /// Index of the shard in the searched slice.
     pub shard: u32,
-    /// First member.
     pub start: u32,
     /// One past the last member.
     pub end: u32,
@@ -34,7 +33,6 @@ pub struct Matches {
     pub n_gaussians: u64,
     /// Centroids that had to be decided member by member.
     pub n_centroids_undecided: u64,
-    /// Work done.
     pub effort: Effort,
     /// Shards without a centroid that can reach the threshold.
     pub n_shards_below: usize,
@@ -52,13 +50,10 @@ impl Matches {
 /// Work done beyond scoring centroids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {
-    /// Gaussians scored individually.
     pub n_rescored: u64,
     /// Blocks of residual codes read.
     pub n_blocks_read: u64,
-    /// Fine residuals read.
     pub n_fine_read: u64,
-    /// Exact embeddings read.
     pub n_embeddings_read: u64,
 }
 

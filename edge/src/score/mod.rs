@@ -15,7 +15,6 @@
 //!
 //! Scores of centroids and codes are integer sums, scaled once: they have the same bits on every processor.
 
-mod bins;
 mod budget;
 mod cell;
 mod centroids;

@@ -36,8 +36,6 @@ pub struct ObjectScores {
 ///
 /// Negatives that questions share are multiplied once. Scores are the same for any number of threads and on
 /// every processor.
-/// # Errors
-/// [`ScoreError`].
 pub fn score_objects(
     shards: &[ShardView<'_>],
     objects: &[Option<Objects<'_>>],

@@ -28,7 +28,6 @@ impl Polygon {
         Some(Self { corners, min, max })
     }
 
-    /// Returns the corners.
     pub fn corners(&self) -> &[DVec2] {
         &self.corners
     }

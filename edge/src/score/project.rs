@@ -60,7 +60,6 @@ pub struct Vector {
     pub exact: Vec<f64>,
     /// The same, quantised to 16 bits.
     pub rounded: Rounded,
-    /// Its length.
     pub length: f64,
 }
 
@@ -104,7 +103,6 @@ pub struct Projection {
     pub error_per_length: f32,
     /// Rounding error of a centroid's score that does not depend on that distance.
     pub error: f32,
-    /// Length of the mean.
     pub mean_length: f32,
     /// Tables of the residual code, in cells that have one.
     pub tables: Tables,
@@ -230,7 +228,6 @@ fn nearest(value: f64) -> i32 {
     (value + 0.5f64.copysign(value)) as i32
 }
 
-/// Returns the length of a vector.
 pub fn length(vector: &[f64]) -> f64 {
     vector.iter().map(|v| v * v).sum::<f64>().sqrt()
 }

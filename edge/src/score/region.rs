@@ -11,7 +11,6 @@ use super::polygon::Polygon;
 /// A ball in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ball {
-    /// Its centre.
     pub centre_in_world: DVec3,
     /// Its radius, world units.
     pub radius: f64,
@@ -27,7 +26,6 @@ impl Ball {
 /// box are included.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Region {
-    /// The ball.
     pub ball: Option<Ball>,
     /// The box, aligned with the world's axes.
     pub bounds: Option<Aabb>,

@@ -74,9 +74,6 @@ pub struct Search<'a> {
 
 impl<'a> Search<'a> {
     /// Scores the centroids of the shards that reach into the region: [`Search::batch`] for one question.
-    ///
-    /// # Errors
-    /// [`ScoreError`].
     pub fn new(
         shards: &'a [ShardView<'a>],
         question: &'a Question,
@@ -87,9 +84,6 @@ impl<'a> Search<'a> {
     }
 
     /// As [`Search::new`], in the buffers of an earlier search if that is over.
-    ///
-    /// # Errors
-    /// [`ScoreError`].
     pub fn reusing(
         scratch: &mut Scratch,
         shards: &'a [ShardView<'a>],
@@ -97,30 +91,14 @@ impl<'a> Search<'a> {
         region: Region,
         precision: Precision,
     ) -> Result<Self, ScoreError> {
-        let questions = std::slice::from_ref(question);
-        check(shards, questions)?;
-        scratch.take_scores(shards, questions)?;
-        let places = scratch.take().score(shards, questions, region.clone(), precision);
-        let places = places.into_iter().next().unwrap_or_default();
-        Ok(scratch.search(AskedQuestion {
-            shards,
-            question,
-            region,
-            precision,
-            scored: Arc::clone(&scratch.scored),
-            budget: scratch.budget.clone(),
-            places,
-            index: 0,
-            steepness: question.steepness(),
-        }))
+        let mut searches = Self::batch(scratch, shards, std::slice::from_ref(question), region, precision)?;
+        Ok(searches.swap_remove(0))
     }
 
     /// Scores the centroids for several questions in one pass; returns a search for each, in their order.
     ///
     /// Costs one product per centroid, component and distinct vector (negatives that questions share are
     /// multiplied once), in parallel by shard. Reuses the buffers of earlier searches if those are over.
-    /// # Errors
-    /// [`ScoreError`].
     pub fn batch(
         scratch: &mut Scratch,
         shards: &'a [ShardView<'a>],

@@ -3,10 +3,9 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::bins::{BINS, bin_of, edge_of};
 use super::cell::Cell;
 use super::centroids::AskedQuestion;
-use super::collect::{Cut, Gather, runs_inside};
+use super::collect::{BINS, Cut, Gather, bin_of, edge_of, runs_inside};
 use super::matches::{Effort, Hit, Run};
 
 /// Bits per pass of the radix sort: its counters stay in the L1 cache.

@@ -127,7 +127,6 @@ impl<K: Kernels> Work<K> for BlockSums<'_> {
 pub struct LastBlock {
     /// Index of the block.
     pub block: Option<usize>,
-    /// Its sums.
     pub sums: [u16; BLOCK],
 }
 
@@ -139,7 +138,6 @@ pub struct FindSums<'a> {
     pub low: &'a [Column],
     /// Values of the subspaces in the high halves.
     pub high: &'a [Column],
-    /// The Gaussians.
     pub members: std::ops::Range<usize>,
     /// The least sum wanted.
     pub least: u16,
@@ -187,7 +185,6 @@ pub struct SomeRowsTimesVector<'a> {
     pub vector: &'a [i16],
     /// The rows, ascending.
     pub which: &'a [u32],
-    /// Receives their products.
     pub products: &'a mut Vec<i32>,
 }
 

@@ -53,7 +53,6 @@ impl Current {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentCell {
-    /// The cell.
     pub cell_id: u32,
     /// BLAKE3 of its shard.
     pub hash: Hash32,
@@ -94,7 +93,6 @@ impl EdgeCache {
         self.dir.join("current")
     }
 
-    /// Returns the path of a shard.
     pub fn shard_path(&self, hash: Hash32) -> PathBuf {
         self.dir.join("shards").join(hash.to_string())
     }
@@ -104,15 +102,11 @@ impl EdgeCache {
         self.dir.join("damaged")
     }
 
-    /// Returns the path of a manifest.
     pub fn manifest_path(&self, hash: Hash32) -> PathBuf {
         self.dir.join("manifests").join(hash.to_string())
     }
 
     /// Returns the state of `current` without opening it; it changes whenever a fetch replaces the file.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`].
     pub fn current_stat(&self) -> Result<Option<Stat>, StoreError> {
         Ok(self.files.stat(&self.current_path())?)
     }
@@ -141,9 +135,6 @@ impl EdgeCache {
     }
 
     /// Reads a manifest of the cache and checks its hash.
-    ///
-    /// # Errors
-    /// [`StoreError::Missing`], [`StoreError::Hash`], [`StoreError::Manifest`].
     pub fn read_manifest(&self, hash: Hash32) -> Result<Manifest, StoreError> {
         let path = self.manifest_path(hash);
         let bytes = match self.files.read(&path, manifest::MAX_BYTES) {

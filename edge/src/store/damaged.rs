@@ -28,9 +28,6 @@ pub fn marked(cache: &EdgeCache) -> BTreeSet<Hash32> {
 }
 
 /// Removes marks: the shards are replaced, or no longer on board.
-///
-/// # Errors
-/// The file system's.
 pub fn unmark<'a>(cache: &EdgeCache, hashes: impl IntoIterator<Item = &'a Hash32>) -> std::io::Result<()> {
     let dir = cache.damaged_dir();
     hashes.into_iter().try_for_each(|hash| cache.files().remove(&dir.join(hash.to_string())))

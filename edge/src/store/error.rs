@@ -8,42 +8,32 @@ use slag_common::container::ContainerError;
 use slag_common::manifest::ManifestError;
 use slag_common::shard::Profile;
 
+use super::files::is_bad_medium;
+
 /// Reasons for which a cache cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The file system's error, with the path.
     #[error("{0}; check the cache's folder and its permissions")]
-    Io(#[from] io::Error),
+    Io(io::Error),
+    /// The medium does not give a file back.
+    #[error("{0}; fetch again, which replaces it")]
+    Unreadable(io::Error),
     /// Nothing was fetched yet.
     #[error("{path} holds no scene yet; fetch one first", path = path.display())]
-    Empty {
-        /// The cache.
-        path: PathBuf,
-    },
+    Empty { path: PathBuf },
     /// The generation pointer is damaged.
     #[error("{path}: {what}; fetch again, which writes it anew", path = path.display())]
-    Current {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        what: String,
-    },
+    Current { path: PathBuf, what: String },
     /// A file named by `current` is missing.
     #[error("{path} is missing, but `current` names it; fetch again", path = path.display())]
-    Missing {
-        /// The file.
-        path: PathBuf,
-    },
+    Missing { path: PathBuf },
     /// A shard was found damaged before, and not replaced since.
     #[error("{path} was found damaged; fetch again, which replaces it", path = path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-    },
+    Damaged { path: PathBuf },
     /// A file's content does not match its name.
     #[error("{path}: content has hash {found}, expected {expected}; fetch again, which replaces it", path = path.display())]
     Hash {
-        /// The file.
         path: PathBuf,
         /// Hash expected.
         expected: Hash32,
@@ -52,40 +42,41 @@ pub enum StoreError {
     },
     /// The manifest is invalid.
     #[error("{path}", path = path.display())]
-    Manifest {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: ManifestError,
-    },
+    Manifest { path: PathBuf, source: ManifestError },
     /// The shard is damaged.
     #[error("{path}", path = path.display())]
     Shard {
-        /// The file.
         path: PathBuf,
         /// The reason and place.
         source: ContainerError,
     },
     /// `current` names a cell or profile that the manifest does not list.
     #[error("{path}: the manifest lists no {profile} shard of cell {cell_id}; fetch again", path = path.display())]
-    Unlisted {
-        /// The file.
-        path: PathBuf,
-        /// The cell.
-        cell_id: u32,
-        /// The profile.
-        profile: Profile,
-    },
+    Unlisted { path: PathBuf, cell_id: u32, profile: Profile },
     /// The shard is intact but differs from the manifest's description.
     #[error("{path}: {field} is {found}, the manifest says {expected}; fetch again, which replaces it", path = path.display())]
     Mismatch {
-        /// The file.
         path: PathBuf,
         /// The field that differs.
         field: &'static str,
         /// Value in the manifest.
         expected: String,
-        /// Value found.
         found: String,
     },
+}
+
+impl From<io::Error> for StoreError {
+    fn from(e: io::Error) -> Self {
+        // `InvalidData`: the file is longer than it may be.
+        let is_damaged = is_bad_medium(&e) || e.kind() == io::ErrorKind::InvalidData;
+        if is_damaged { Self::Unreadable(e) } else { Self::Io(e) }
+    }
+}
+
+impl StoreError {
+    /// Returns whether a file is damaged, so that the next fetch must replace it.
+    pub fn is_damage(&self) -> bool {
+        use StoreError::{Hash, Mismatch, Shard, Unreadable};
+        matches!(self, Shard { .. } | Mismatch { .. } | Hash { .. } | Unreadable(_))
+    }
 }

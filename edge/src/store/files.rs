@@ -1,15 +1,50 @@
 //! The storage interface: every step that a power cut can separate is one call of [`Files`].
 
-use std::io::{self, Read, Seek, SeekFrom, Write};
-use std::path::Path;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use slag_common::container::AlignedBytes;
+
 use super::mmap::{self, FileBytes};
+
+/// The medium does not give a file back: a bad sector, a broken inode.
+#[derive(Debug, thiserror::Error)]
+#[error("{path} cannot be read: {source}", path = path.display())]
+struct BadMedium {
+    path: PathBuf,
+    source: io::Error,
+}
+
+/// Returns whether the medium failed: reading again does not help, and neither do other rights or more space.
+pub fn is_bad_medium(e: &io::Error) -> bool {
+    e.get_ref().is_some_and(|inner| inner.is::<BadMedium>())
+}
+
+/// Returns a function that adds a path to an error of the system.
+fn at(path: &Path) -> impl Fn(io::Error) -> io::Error {
+    // What file systems and block devices answer with. Linux: EIO, ENXIO, EBADE, ENODATA, ENOLINK, EBADMSG, EILSEQ,
+    // ETIMEDOUT, EUCLEAN (a broken inode), EREMOTEIO.
+    let codes: &[i32] = match (cfg!(target_os = "linux"), cfg!(unix)) {
+        (true, _) => &[5, 6, 52, 61, 67, 74, 84, 110, 117, 121],
+        (false, true) => &[5],
+        (false, false) => &[],
+    };
+    move |source| match source.raw_os_error().is_some_and(|code| codes.contains(&code)) {
+        true => bad_medium(path, source),
+        false => io::Error::new(source.kind(), format!("{}: {source}", path.display())),
+    }
+}
+
+/// Returns the error of a medium that does not give a file back.
+pub fn bad_medium(path: &Path, source: io::Error) -> io::Error {
+    io::Error::new(source.kind(), BadMedium { path: path.to_owned(), source })
+}
 
 /// File metadata.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stat {
-    /// Length.
     pub len_bytes: u64,
     /// Time of the last change, if the file system records it.
     pub modified: Option<SystemTime>,
@@ -38,8 +73,8 @@ pub trait Files: Send + Sync {
     /// Returns the names of the files in a folder, sorted; skips names that are not UTF-8.
     fn list(&self, dir: &Path) -> io::Result<Vec<String>>;
     /// Reads a file of at most `max_bytes`.
-    fn read(&self, path: &Path, max_bytes: u64) -> io::Result<Vec<u8>>;
-    /// Returns the bytes of an immutable file.
+    fn read(&self, path: &Path, max_bytes: u64) -> io::Result<AlignedBytes>;
+    /// Maps an immutable file. A page that cannot be read then ends the program: read the file before.
     fn map(&self, path: &Path) -> io::Result<FileBytes>;
     /// Returns a file's metadata; `None` if it does not exist.
     fn stat(&self, path: &Path) -> io::Result<Option<Stat>>;
@@ -54,7 +89,7 @@ pub struct DiskFiles;
 
 impl Files for DiskFiles {
     fn create_dir(&self, dir: &Path) -> io::Result<()> {
-        fs_err::create_dir_all(dir)?;
+        fs::create_dir_all(dir).map_err(at(dir))?;
         match dir.parent() {
             Some(parent) if !parent.as_os_str().is_empty() => self.sync_dir(parent),
             _ => Ok(()),
@@ -62,18 +97,21 @@ impl Files for DiskFiles {
     }
 
     fn write_from(&self, path: &Path, offset_bytes: u64, bytes: &[u8]) -> io::Result<()> {
-        let mut file = fs_err::OpenOptions::new().write(true).create(true).truncate(false).open(path)?;
-        file.set_len(offset_bytes)?;
-        file.seek(SeekFrom::Start(offset_bytes))?;
-        file.write_all(bytes)
+        let write = || {
+            let mut file = OpenOptions::new().write(true).create(true).truncate(false).open(path)?;
+            file.set_len(offset_bytes)?;
+            file.seek(SeekFrom::Start(offset_bytes))?;
+            file.write_all(bytes)
+        };
+        write().map_err(at(path))
     }
 
     fn sync(&self, path: &Path) -> io::Result<()> {
-        fs_err::OpenOptions::new().write(true).open(path)?.sync_all()
+        OpenOptions::new().write(true).open(path).and_then(|file| file.sync_all()).map_err(at(path))
     }
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
-        fs_err::rename(from, to)
+        fs::rename(from, to).map_err(at(to))
     }
 
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {
@@ -81,37 +119,38 @@ impl Files for DiskFiles {
     }
 
     fn remove(&self, path: &Path) -> io::Result<()> {
-        match fs_err::remove_file(path) {
+        match fs::remove_file(path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
-            other => other,
+            other => other.map_err(at(path)),
         }
     }
 
     fn list(&self, dir: &Path) -> io::Result<Vec<String>> {
         let mut names = Vec::new();
-        for entry in fs_err::read_dir(dir)? {
-            let entry = entry?;
-            if entry.file_type()?.is_file()
-                && let Ok(name) = entry.file_name().into_string()
-            {
-                names.push(name);
+        for entry in fs::read_dir(dir).map_err(at(dir))? {
+            let entry = entry.map_err(at(dir))?;
+            // An entry whose kind cannot be read is a file that cannot be read.
+            if entry.file_type().is_ok_and(|kind| !kind.is_file()) {
+                continue;
             }
+            names.extend(entry.file_name().into_string());
         }
         names.sort_unstable();
         Ok(names)
     }
 
-    fn read(&self, path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
-        let mut bytes = Vec::new();
-        fs_err::File::open(path)?.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
-        if bytes.len() as u64 > max_bytes {
+    fn read(&self, path: &Path, max_bytes: u64) -> io::Result<AlignedBytes> {
+        let file = File::open(path).map_err(at(path))?;
+        let len_bytes = file.metadata().map_err(at(path))?.len();
+        if len_bytes > max_bytes {
+            let path = path.display();
             let what = format!(
-                "{} is longer than {max_bytes} bytes, the limit for this kind of file; it is damaged",
-                path.display()
+                "{path} is longer than {max_bytes} bytes, the limit for this kind of file; it is damaged"
             );
             return Err(io::Error::new(io::ErrorKind::InvalidData, what));
         }
-        Ok(bytes)
+        // Whatever the code: the file is open, and it does not give its bytes.
+        AlignedBytes::read_from(file, len_bytes as usize).map_err(|e| bad_medium(path, e))
     }
 
     fn map(&self, path: &Path) -> io::Result<FileBytes> {
@@ -119,9 +158,9 @@ impl Files for DiskFiles {
     }
 
     fn stat(&self, path: &Path) -> io::Result<Option<Stat>> {
-        let metadata = match fs_err::metadata(path) {
+        let metadata = match fs::metadata(path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-            other => other?,
+            other => other.map_err(at(path))?,
         };
         #[cfg(unix)]
         let inode = std::os::unix::fs::MetadataExt::ino(&metadata);
@@ -132,8 +171,7 @@ impl Files for DiskFiles {
 
     #[cfg(unix)]
     fn free_bytes(&self, dir: &Path) -> io::Result<Option<u64>> {
-        let stat = rustix::fs::statvfs(dir)
-            .map_err(|e| io::Error::new(e.kind(), format!("free space of {}: {e}", dir.display())))?;
+        let stat = rustix::fs::statvfs(dir).map_err(|e| at(dir)(e.into()))?;
         Ok(Some(stat.f_bavail.saturating_mul(stat.f_frsize)))
     }
 

@@ -39,7 +39,6 @@ const STEPS: u32 = 3;
 pub struct Record {
     /// Name of the scene.
     pub scene: String,
-    /// The generation.
     pub generation: u64,
     /// When it was made, Unix seconds.
     pub created_unix_secs: u64,

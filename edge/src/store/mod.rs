@@ -9,7 +9,7 @@
 //! | `damaged/HASH` | marks of shards that were found damaged | readers: added; fetch: removed |
 //! | `history/GENERATION` | the objects of earlier generations; may be lost | fetch: replaced whole, removed |
 //! | `trust/` | accepted metadata and scene, in two copies | fetch |
-//! | `db/` | which shards were used and checked | fetch |
+//! | `usage.json` | when each shard was needed last; may be lost | fetch: replaced whole |
 //! | `lock` | locked by the one fetch | |
 //!
 //! Readers need no lock: they read `current` and the files it names, and start over if a fetch replaces it
@@ -31,6 +31,6 @@ pub use bad_cell::{BadCell, CellFault, OldShard, can_stand_in, cell_of};
 pub use cache::{Current, CurrentCell, EdgeCache};
 pub use error::StoreError;
 pub use scrubber::{Scrubbed, Scrubber};
-pub use shard::{OpenShard, check_shard};
+pub use shard::{OpenShard, check_file, check_shard};
 pub use snapshot::Snapshot;
 pub(crate) use snapshot::beside_queries;

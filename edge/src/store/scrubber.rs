@@ -19,7 +19,6 @@ pub struct Scrubber {
 /// A shard that was read.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scrubbed {
-    /// Its cell.
     pub cell_id: u32,
     /// Its part of all bytes on board, above 0 up to 1.
     pub share: f64,

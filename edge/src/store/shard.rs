@@ -83,10 +83,7 @@ impl OpenShard {
         is_listed && is_named && is_readable && is_unchanged
     }
 
-    /// Maps and checks a shard of the cache.
-    ///
-    /// # Errors
-    /// [`StoreError`].
+    /// Checks a shard of the cache with ordinary reads, then maps it.
     pub fn open(
         cache: &EdgeCache,
         manifest: &Manifest,
@@ -95,19 +92,33 @@ impl OpenShard {
     ) -> Result<Self, StoreError> {
         let path = cache.shard_path(at.hash);
         let stat = cache.files().stat(&path)?;
-        let bytes = match cache.files().map(&path) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
-            other => other?,
-        };
-        let (cell, layout) = check_shard(&path, &bytes, at, profile, manifest)?;
+        let (cell, layout) = check_file(cache, &path, at, profile, manifest)?;
+        let bytes = cache.files().map(&path)?;
+        if bytes.len() as u64 != at.len_bytes {
+            return Err(StoreError::Missing { path });
+        }
         Ok(Self { cell: cell.clone(), layout, bytes, profile, stat })
     }
 }
 
+/// Reads a file and checks it as [`check_shard`] does. Not through a map, where a page that cannot be read ends the program.
+pub fn check_file<'a>(
+    cache: &EdgeCache,
+    path: &Path,
+    at: &CurrentCell,
+    profile: Profile,
+    manifest: &'a Manifest,
+) -> Result<(&'a CellRecord, ShardLayout), StoreError> {
+    let bytes = match cache.files().read(path, at.len_bytes) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => {
+            return Err(StoreError::Missing { path: path.to_owned() });
+        }
+        other => other?,
+    };
+    check_shard(path, &bytes, at, profile, manifest)
+}
+
 /// Checks that bytes are an intact shard, and the one that a manifest lists for a cell.
-///
-/// # Errors
-/// [`StoreError::Shard`], [`StoreError::Mismatch`], [`StoreError::Unlisted`].
 pub fn check_shard<'a>(
     path: &Path,
     bytes: &[u8],

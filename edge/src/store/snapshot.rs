@@ -1,10 +1,12 @@
 //! An open generation: a manifest and its shards, mapped and checked.
 
+use std::collections::BTreeSet;
 use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 use slag_common::Hash32;
 use slag_common::manifest::Manifest;
+use slag_common::shard::Profile;
 
 use super::bad_cell::{BadCell, CellFault, can_stand_in};
 use super::cache::{Current, CurrentCell, EdgeCache};
@@ -24,7 +26,6 @@ pub struct Snapshot {
     pub current: Current,
     /// State of `current` just before it was read, for comparison with [`EdgeCache::current_stat`].
     pub current_stat: Option<Stat>,
-    /// The manifest.
     pub manifest: Manifest,
     /// The shards, by cell id, ascending; shared with snapshots of other generations that list them.
     pub shards: Vec<Arc<OpenShard>>,
@@ -32,7 +33,6 @@ pub struct Snapshot {
     pub bad_cells: Vec<BadCell>,
     /// Whether a shard could not be opened for a reason that may pass, such as too many open files.
     pub may_recover: bool,
-    /// Their objects.
     pub objects: ObjectIndex,
 }
 
@@ -48,9 +48,6 @@ impl Snapshot {
 
     /// Opens the current generation as [`Snapshot::open`] does, and takes over the shards that a snapshot of
     /// the same cache has open: they are neither mapped nor checked again.
-    ///
-    /// # Errors
-    /// As [`Snapshot::open`].
     pub fn open_after(cache: &EdgeCache, before: Option<&Self>) -> Result<Self, StoreError> {
         let mut seen = None;
         for _ in 0..MAX_RACES {
@@ -76,23 +73,10 @@ impl Snapshot {
         is_settled: bool,
     ) -> Result<Self, StoreError> {
         let manifest = cache.read_manifest(current.manifest_hash)?;
-        let profile = current.profile;
-        let marked = damaged::marked(cache);
-        let open = |manifest: &Manifest, cell: &CurrentCell| {
-            if marked.contains(&cell.hash) {
-                return Err(StoreError::Damaged { path: cache.shard_path(cell.hash) });
-            }
-            let held = before.map_or(&[][..], |before| &before.shards);
-            let held =
-                held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id).ok().map(|at| &held[at]);
-            match held.filter(|shard| shard.is(cache, manifest, profile, cell)) {
-                Some(shard) => Ok(Arc::clone(shard)),
-                None => OpenShard::open(cache, manifest, profile, cell).map(Arc::new),
-            }
-        };
+        let held = before.map_or(&[][..], |before| &before.shards);
+        let opener = Opener { cache, profile: current.profile, marked: damaged::marked(cache), held };
         let opened: Vec<Result<Arc<OpenShard>, StoreError>> =
-            beside_queries(|| current.cells.par_iter().map(|cell| open(&manifest, cell)).collect());
-        let mut bad_cells = current.bad_cells.clone();
+            beside_queries(|| current.cells.par_iter().map(|cell| opener.open(&manifest, cell)).collect());
         let (mut shards, mut failures) = (Vec::with_capacity(opened.len()), Vec::new());
         for (cell, opened) in current.cells.iter().zip(opened) {
             match opened {
@@ -104,25 +88,15 @@ impl Snapshot {
             }
         }
         let may_recover = failures.iter().any(|(_, e)| matches!(e, StoreError::Io(_)));
+        let mut bad_cells = current.bad_cells.clone();
         for bad in &mut bad_cells {
-            let Some(old) = bad.old else { continue };
-            let cell = CurrentCell { cell_id: bad.cell_id, hash: old.hash, len_bytes: old.len_bytes };
-            let of_old = cache.read_manifest(old.manifest_hash).and_then(|of_old| {
-                let may_stand_in = can_stand_in(&of_old, &manifest, bad.cell_id);
-                may_stand_in.then(|| open(&of_old, &cell)).transpose()
-            });
-            match of_old {
-                Ok(Some(shard)) => shards.push(shard),
-                Ok(None) => bad.old = None,
-                // Less to answer from; the next fetch tries the cell again.
-                Err(e) => {
-                    tracing::warn!("cell {} has no shard: {}", bad.cell_id, crate::error_line(&e));
-                    bad.old = None;
-                }
+            match opener.stand_in(&manifest, bad) {
+                Some(shard) => shards.push(shard),
+                None => bad.old = None,
             }
         }
         for (cell, e) in &failures {
-            if matches!(e, StoreError::Shard { .. } | StoreError::Mismatch { .. }) {
+            if e.is_damage() {
                 damaged::mark(cache, cell.hash);
             }
             tracing::warn!("cell {} does not answer: {}", cell.cell_id, crate::error_line(e));
@@ -146,6 +120,46 @@ impl Snapshot {
             let at = self.current.cells.binary_search_by_key(&bad.cell_id, |cell| cell.cell_id).ok()?;
             Some(self.current.cells[at].hash)
         })
+    }
+}
+
+/// Opens the shards of a generation.
+struct Opener<'a> {
+    cache: &'a EdgeCache,
+    profile: Profile,
+    /// Shards that were found damaged.
+    marked: BTreeSet<Hash32>,
+    /// Shards that an earlier snapshot has open, by cell.
+    held: &'a [Arc<OpenShard>],
+}
+
+impl Opener<'_> {
+    fn open(&self, manifest: &Manifest, cell: &CurrentCell) -> Result<Arc<OpenShard>, StoreError> {
+        let Self { cache, profile, .. } = *self;
+        if self.marked.contains(&cell.hash) {
+            return Err(StoreError::Damaged { path: cache.shard_path(cell.hash) });
+        }
+        let held = self.held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id);
+        let held = held.ok().map(|at| &self.held[at]);
+        match held.filter(|shard| shard.is(cache, manifest, profile, cell)) {
+            Some(shard) => Ok(Arc::clone(shard)),
+            None => OpenShard::open(cache, manifest, profile, cell).map(Arc::new),
+        }
+    }
+
+    /// Opens the shard of an earlier generation that answers for a bad cell.
+    fn stand_in(&self, manifest: &Manifest, bad: &BadCell) -> Option<Arc<OpenShard>> {
+        let old = bad.old?;
+        let cell = CurrentCell { cell_id: bad.cell_id, hash: old.hash, len_bytes: old.len_bytes };
+        let opened = self.cache.read_manifest(old.manifest_hash).and_then(|of_old| {
+            let may_stand_in = can_stand_in(&of_old, manifest, bad.cell_id);
+            may_stand_in.then(|| self.open(&of_old, &cell)).transpose()
+        });
+        // Less to answer from; the next fetch tries the cell again.
+        let warn = |e: &StoreError| {
+            tracing::warn!("cell {} has no shard: {}", bad.cell_id, crate::error_line(e));
+        };
+        opened.inspect_err(warn).ok().flatten()
     }
 }
 

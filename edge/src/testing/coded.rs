@@ -2,10 +2,10 @@
 
 use glam::DVec3;
 use half::f16;
-use slag_common::container::AlignedBytes;
+use slag_common::frames::Aabb;
 use slag_common::shard::{
-    BLOCK, Basis, CODEWORDS, ExactColumns, Fine, Positions, Residuals, ScoreErrors, ShardHeader, ShardLayout,
-    ShardView, quantise,
+    BLOCK, Basis, CODEWORDS, ExactColumns, Fine, Positions, Residuals, ScoreErrors, ShardHeader, ShardView,
+    quantise, sample,
 };
 
 use super::{BuiltShard, normalised};
@@ -59,22 +59,13 @@ impl CodedShard {
         let codes: Vec<u8> =
             (0..n.div_ceil(BLOCK) * BLOCK * self.n_subspaces / 2).map(|_| random.bits() as u8).collect();
         let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.bits() as u16)).collect();
-        let step = 10.0 / 65536.0;
+        let bounds = Aabb { min: self.origin, max: self.origin + 10.0 };
         let header = ShardHeader {
-            cell_id: self.cell_id,
-            n_gaussians: n as u32,
-            n_centroids: k as u32,
-            dim: dim as u32,
             n_components: m as u32,
             n_subspaces: self.n_subspaces as u32,
-            position_bits: [16, 16, 16, 0],
             centroid_step,
-            origin_in_world: self.origin.to_array(),
-            position_step: [step; 3],
-            box_min: self.origin.to_array(),
-            box_max: (self.origin + 10.0).to_array(),
             errors: ScoreErrors { mean: CODE_ERROR, ..ScoreErrors::default() },
-            encoder_id: [7; 32],
+            ..sample::header(self.cell_id, n, k, dim, bounds)
         };
         let fine_steps: Vec<f32> = (0..m).map(|_| 1.0 + 0.5 * random.signed()).collect();
         let fine_scales: Vec<f32> = (0..k).map(|_| 2e-4 * (1.5 + random.signed())).collect();
@@ -129,8 +120,6 @@ impl CodedShard {
         let exact = ExactColumns { input_indices: &input_indices, embeddings: &halves, fine: Some(fine) };
         let exact = self.is_exact.then_some(exact);
         ShardView { exact, ..view(&radii, &reaches) }.write(&mut bytes).expect("writes to memory");
-        let bytes = AlignedBytes::copy_of(&bytes);
-        let layout = ShardLayout::check(&bytes).expect("a valid shard");
-        BuiltShard { bytes, layout, embeddings }
+        BuiltShard::read(&bytes, embeddings)
     }
 }

@@ -1,5 +1,5 @@
 //! Storage and network fail together, in a thousand trials (`SLAG_TRIALS=10000`: more). After each, the old or the new
-//! generation answers a real query, whole. Storage includes the two copies of the trust state, and the records in sled.
+//! generation answers a real query, whole. Storage includes the two copies of the trust state, and the records of use.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -16,7 +16,7 @@ use slag_edge::store::{BadCell, EdgeCache};
 use slag_edge::text::{EncoderInfo, TextService};
 use slag_models::{InferenceError, TextEncoder};
 
-use super::crash::{copy_dir, rot_one_copy};
+use super::crash::rot_one_copy;
 use super::scene::{DIM, ENCODER, FIRST, Published, RootKeys};
 use super::server::{Fault, Seen, Server};
 use super::sim::SimFiles;
@@ -102,20 +102,6 @@ struct Stage {
     is_key_change: bool,
 }
 
-/// Flips bits of a file, or cuts it.
-fn rot(path: &Path, random: &mut Random) {
-    let mut bytes = fs_err::read(path).expect("there");
-    match random.below(3) {
-        0 => bytes.truncate(random.below(bytes.len() as u64 + 1) as usize),
-        _ if bytes.is_empty() => {}
-        _ => (0..1 + random.below(40)).for_each(|_| {
-            let at = random.below(bytes.len() as u64) as usize;
-            bytes[at] ^= 1 << random.below(8);
-        }),
-    }
-    fs_err::write(path, bytes).expect("written");
-}
-
 /// Counts of outcomes: a harness in which fetches never fail, or always do, tests nothing.
 #[derive(Debug, Default)]
 struct Outcomes {
@@ -141,7 +127,6 @@ impl Stage {
         let files = Arc::new(SimFiles::default());
         Robot::on_sim(dir.path(), files.clone(), &server.url()).fetch().expect("works");
         server.publish(new.clone());
-        copy_dir(&dir.path().join("cache/db"), &dir.path().join("db-before"));
         Self { dir, server, stale, old, new, before: files.fork(None, 0), is_key_change }
     }
 
@@ -165,25 +150,6 @@ impl Stage {
         robot.request.radius = 15.0;
         robot.request.max_bytes = Some(self.new.bytes(1..5));
         robot
-    }
-
-    /// Restores the records of use of before the trial (1), deletes them (2), damages them (3), or leaves them (0).
-    fn settle_records(&self, fate: u64, random: &mut Random) {
-        let db = self.dir.path().join("cache/db");
-        if (1..3).contains(&fate) && db.exists() {
-            fs_err::remove_dir_all(&db).expect("there");
-        }
-        if fate == 1 {
-            copy_dir(&self.dir.path().join("db-before"), &db);
-        }
-        if fate == 3 && db.exists() {
-            for entry in fs_err::read_dir(&db).expect("there") {
-                let path = entry.expect("readable").path();
-                if path.is_file() && random.below(2) == 0 {
-                    rot(&path, random);
-                }
-            }
-        }
     }
 
     /// Chooses what happens to each request.
@@ -244,10 +210,6 @@ impl Stage {
 
     fn trial(&self, seed: u64, outcomes: &Outcomes) {
         let mut random = Random::new(seed);
-        self.settle_records(1, &mut random);
-        if seed % 8 == 5 {
-            self.settle_records(3, &mut random);
-        }
         self.server.faults(self.network(seed));
         // A fetch without faults takes about 50 steps.
         let (storage, step) = (random.below(4), 1 + random.below(55));
@@ -259,6 +221,9 @@ impl Stage {
             _ => {}
         }
         let mut robot = self.robot(&files);
+        if seed % 8 == 5 {
+            files.flip(&robot.cache.dir().join("usage.json"), &mut random);
+        }
         robot.request.parallel = 1 + random.below(3) as usize;
         robot.limits.attempts = 4;
         robot.limits.read_timeout = SILENCE;
@@ -267,7 +232,6 @@ impl Stage {
 
         // The power fails now, unless it failed before: unsynced data may be lost, torn or reordered.
         let context = format!("seed {seed}, storage {storage} at step {step}: {result:?}");
-        self.settle_records(random.below(4), &mut random);
         let files = match random.below(3) {
             0 if storage != 1 => Arc::new(files.fork(None, seed)),
             _ => Arc::new(files.after_power_cut(seed)),

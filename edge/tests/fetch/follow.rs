@@ -7,11 +7,11 @@ use glam::DVec3;
 use slag_common::shard::Profile;
 use slag_common::tuf::TufError;
 use slag_edge::fetch::follow::{Decision, FollowEnvironment, FollowSettings, Follower, Following, follow};
-use slag_edge::fetch::{FetchError, Position};
+use slag_edge::fetch::{FetchError, FetchReport, FetchRequest, FirstRoot, Position, last_position};
 
 use super::scene::{Published, bounds};
 use super::server::{Fault, Server};
-use super::{Robot, assert_holds};
+use super::{Robot, assert_holds, at};
 
 const N_CELLS: usize = 30;
 
@@ -39,9 +39,8 @@ fn settings() -> FollowSettings {
 
 #[test]
 fn going_to_and_fro_over_an_edge_costs_one_fetch() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let server = Server::start(Published::new(1, &[0; N_CELLS], 20));
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let mut robot = Robot::of(&server);
     // Cells end at multiples of ten. For the first fetch the critical edge is also at 100 + 18 = 118: there
     // every step changes the set of cells in reach.
     for edge in [100.0, 102.0] {
@@ -59,10 +58,9 @@ fn going_to_and_fro_over_an_edge_costs_one_fetch() {
 /// Oracle: the cells' boxes, by brute force, at every position.
 #[test]
 fn a_drive_always_has_what_is_around() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; N_CELLS], 20);
     let server = Server::start(scene.clone());
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let mut robot = Robot::of(&server);
     // Room for six cells: 12 + 6 to either side reach five or six at most.
     let budget_bytes = scene.bytes(0..6);
     robot.request.max_bytes = Some(budget_bytes);
@@ -94,29 +92,12 @@ fn a_drive_always_has_what_is_around() {
     assert_eq!(objects.len(), (0..N_CELLS as u32).filter(|id| bounds(*id).min.x <= 254.5 + 18.0).count());
 }
 
-/// Within the budget the least recently used shards go first, so the way back costs only what was freed.
-#[test]
-fn the_way_back_uses_what_is_still_on_board() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let scene = Published::new(1, &[0; N_CELLS], 20);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
-    robot.request.max_bytes = Some(scene.bytes(0..12));
-    let mut follower = Follower::new(settings());
-    drive(&mut robot, &mut follower, 0, (0..40).map(|i| 105.0 + f64::from(i)));
-    server.take_seen();
-    let back = drive(&mut robot, &mut follower, 40, (0..40).map(|i| 140.0 - f64::from(i)));
-    assert!(back.len() > 5, "{back:?}");
-    assert_eq!(server.take_objects().len(), 0, "twelve cells hold the whole way");
-}
-
 /// The loop over real sockets: network faults, no network, a new generation, and the end.
 #[test]
 fn following_survives_the_loss_of_the_network() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; N_CELLS], 20);
     let server = Server::start(scene.clone());
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let mut robot = Robot::of(&server);
     robot.limits.attempts = 1;
     let settings = FollowSettings {
         radius: 4.0,
@@ -182,12 +163,47 @@ fn following_survives_the_loss_of_the_network() {
     assert_eq!(scene.hash(6, Profile::Compact), robot.snapshot().current.cells[0].hash);
 }
 
+/// A follower that was not told whom to trust tries again when the robot moves, and when somebody tells it: the pause after a
+/// failure would be an hour.
+#[test]
+fn a_follower_waits_for_trust_and_not_for_time() {
+    let scene = Published::new(1, &[0; 3], 20);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::of(&server);
+    robot.request.trust_first = false;
+    let pause = Duration::from_secs(3600);
+    let settings = FollowSettings {
+        min_interval: Duration::ZERO,
+        first_backoff: pause,
+        longest_backoff: pause,
+        ..FollowSettings::default()
+    };
+    let following = Following::default();
+    following.post(at(5.0));
+    let mut n_outcomes = 0;
+    let mut report = |outcome: &Result<FetchReport, FetchError>| {
+        n_outcomes += 1;
+        match (n_outcomes, outcome) {
+            (1, Err(FetchError::NoTrust { .. })) => following.post(at(6.0)),
+            (2, Err(FetchError::NoTrust { .. })) => {
+                let root = FirstRoot::Bytes(scene.first_root());
+                assert!(robot.add_root(&root, false).expect("added").is_new);
+            }
+            (3, Ok(_)) => following.close(),
+            (n, outcome) => panic!("{n}: {:?}", outcome.as_ref().err()),
+        }
+    };
+    let (fetch, cancel) = (&mut |_: &FetchRequest| robot.fetch(), &AtomicBool::new(false));
+    let environment = FollowEnvironment { fetch, report: &mut report, random: &|| 0.5, cancel };
+    follow(&robot.cache, &robot.request, settings, &following, environment).expect("served");
+    assert_eq!(last_position(&robot.cache), Some(at(5.0)), "where it begins when it is started again");
+}
+
 /// Positions end while a fetch is due and fails: the error is returned.
 #[test]
 fn the_end_tells_whether_the_last_position_was_served() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let server = Server::start(Published::new(1, &[0; 3], 20));
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let mut robot = Robot::of(&server);
     robot.limits.attempts = 1;
     server.faults(|_| Fault::Status(404));
     let (following, cancel) = (Following::default(), AtomicBool::new(false));

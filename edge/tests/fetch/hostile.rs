@@ -33,10 +33,9 @@ impl Progress for Count {
 /// After each refusal the previous generation still answers.
 #[test]
 fn refused_manifests_leave_the_old_generation() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let second = Published::new(2, &[0; 4], 50);
     let server = Server::start(second.clone());
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let mut robot = Robot::of(&server);
     robot.fetch().expect("works");
     let third = Published::new(3, &[1; 4], 50);
     let refused = |robot: &Robot, published: Published| {
@@ -81,10 +80,9 @@ fn refused_manifests_leave_the_old_generation() {
 /// An intact shard of the right cell and length under another shard's hash: only the hash reveals it.
 #[test]
 fn other_content_under_a_hash_is_refused() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let (scene, other) = (Published::new(1, &[0; 1], 50), Published::new(1, &[1; 1], 50));
     let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     let instead = other.objects[&other.hash(0, Profile::Compact)].clone();
     assert_eq!(instead.len() as u64, scene.bytes(0..1));
     server.faults(objects(Fault::Instead(instead)));
@@ -98,10 +96,9 @@ fn other_content_under_a_hash_is_refused() {
 
 #[test]
 fn endless_bodies_are_cut_off() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; 1], 50);
     let server = Server::start(scene.clone());
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let mut robot = Robot::of(&server);
     // The right content, followed by more: only the manifest's length is read.
     server.faults(objects(Fault::Endless));
     let count = Count::default();
@@ -128,8 +125,7 @@ fn redirects_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
     let (server, elsewhere) = (Server::start(scene.clone()), Server::start(scene));
     for part in ["timestamp", "/targets/", "objects"] {
-        let dir = tempfile::tempdir().expect("temporary folder");
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let robot = Robot::of(&server);
         let location = elsewhere.url();
         server.faults(move |seen| match seen.path.contains(part) {
             true => Fault::Redirect(format!("{location}{}", seen.path)),
@@ -156,9 +152,8 @@ fn lasting_faults_are_given_up_and_told() {
         (Fault::Cut(100), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
     ];
     for (fault, expected_attempts, is_expected) in cases {
-        let dir = tempfile::tempdir().expect("temporary folder");
         let server = Server::start(scene.clone());
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let robot = Robot::of(&server);
         server.faults(objects(fault.clone()));
         let count = Count::default();
         match robot.fetch_watched(&count, &AtomicBool::new(false)).expect_err("lasting") {
@@ -269,10 +264,9 @@ fn addresses_that_are_none_are_refused() {
 /// An announced length above the limit is believed at once.
 #[test]
 fn a_manifest_of_a_gigabyte_is_refused_unread() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; 1], 50);
     let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     robot.fetch().expect("works");
     server.publish(Published::new(2, &[1; 1], 50));
     server.take_seen();
@@ -297,12 +291,11 @@ fn names_that_are_paths_are_refused() {
     let name = scene.hash(0, Profile::Compact).to_string();
     let upper = name.to_uppercase();
     for path in ["../../../etc/passwd", "/etc/passwd", "", ".", "..\\\\x", "a/b", &name[1..], &upper] {
-        let dir = tempfile::tempdir().expect("temporary folder");
         let mut hostile = scene.clone();
         hostile.listed = json.replace(&name, path).into_bytes();
         let hostile = hostile.signed_by(&[FIRST], 1);
         let server = Server::start(hostile);
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let robot = Robot::of(&server);
         let error = robot.fetch().expect_err("refused");
         assert!(matches!(error, FetchError::Manifest(ManifestError::Content { .. })), "{path}: {error}");
 
@@ -316,7 +309,7 @@ fn names_that_are_paths_are_refused() {
     }
 }
 
-/// Shards with false sizes, sections, counts and offsets under valid checksums, hashes and signatures.
+/// Shards with false sizes and counts under valid checksums, hashes and signatures; the format's own tests have more lies.
 #[test]
 fn shards_that_lie_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
@@ -329,30 +322,9 @@ fn shards_that_lie_are_refused() {
     let get = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("8 bytes"));
     let header = get(&sound, row(0) + 8) as usize;
     type Lie<'a> = (&'a str, Box<dyn Fn(&mut Vec<u8>) + 'a>);
-    let lies: Vec<Lie<'_>> = vec![
-        (
-            "overlap",
-            Box::new(|b| {
-                let at = get(b, row(0) + 8);
-                set(b, row(1) + 8, at)
-            }),
-        ),
-        ("offset that wraps", Box::new(|b| set(b, row(1) + 8, u64::MAX - 63))),
-        ("length that wraps", Box::new(|b| set(b, row(1) + 16, u64::MAX))),
-        (
-            "length beyond the end",
-            Box::new(|b| {
-                let len = get(b, row(1) + 16);
-                set(b, row(1) + 16, len + (1 << 40))
-            }),
-        ),
-        ("length that is short", Box::new(|b| set(b, row(1) + 16, 6))),
-        ("two sections of one id", Box::new(|b| b[row(1)] = b[row(0)])),
-        ("file length", Box::new(|b| set(b, 16, 1 << 50))),
-        ("number of sections", Box::new(|b| b[12..16].copy_from_slice(&u32::MAX.to_le_bytes()))),
+    let lies: [Lie<'_>; 3] = [
+        ("a length that wraps", Box::new(|b| set(b, row(1) + 16, u64::MAX))),
         ("n_gaussians", Box::new(|b| b[header + 4..header + 8].copy_from_slice(&u32::MAX.to_le_bytes()))),
-        ("huge K", Box::new(|b| b[header + 8..header + 12].copy_from_slice(&u32::MAX.to_le_bytes()))),
-        ("huge dim", Box::new(|b| b[header + 12..header + 16].copy_from_slice(&u32::MAX.to_le_bytes()))),
         ("K and N together", Box::new(|b| b[header + 4..header + 12].copy_from_slice(&[0xff; 8]))),
     ];
     for (name, lie) in &lies {
@@ -369,7 +341,6 @@ fn shards_that_lie_are_refused() {
         let head = [&bytes[..24], &bytes[32..row(n_sections)]].concat();
         bytes[24..32].copy_from_slice(&Hash32::of(&head).0[..8]);
 
-        let dir = tempfile::tempdir().expect("temporary folder");
         let mut hostile = scene.clone();
         let (hash, len_bytes) = (Hash32::of(&bytes), bytes.len() as u64);
         hostile.objects.insert(hash, bytes);
@@ -378,7 +349,7 @@ fn shards_that_lie_are_refused() {
             (record.hash, record.len_bytes) = (hash, len_bytes);
         });
         let server = Server::start(hostile);
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let robot = Robot::of(&server);
         let error = robot.fetch().expect_err(name);
         let FetchError::Published { source, .. } = &error else { panic!("{name}: {error}") };
         let StoreError::Shard { source, .. } = &**source else { panic!("{name}: {source}") };

@@ -17,19 +17,17 @@ fn of(generation: u64, roots: &[RootKeys], version: u64) -> Published {
 }
 
 struct Trial {
-    _dir: tempfile::TempDir,
     server: Server,
     robot: Robot,
 }
 
 impl Trial {
     fn new(first: Published) -> Self {
-        let dir = tempfile::tempdir().expect("temporary folder");
         let server = Server::start(first.clone());
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let robot = Robot::of(&server);
         assert!(robot.fetch().expect("first contact").is_first_contact);
         assert_holds(&robot.snapshot(), &first, 0..3);
-        Self { _dir: dir, server, robot }
+        Self { server, robot }
     }
 
     fn accepts(&self, published: Published) -> FetchReport {

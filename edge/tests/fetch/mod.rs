@@ -6,6 +6,7 @@ mod follow;
 mod history;
 mod hostile;
 mod keys;
+mod medium;
 mod partial;
 mod rot;
 mod scene;
@@ -29,11 +30,14 @@ use slag_edge::fetch::{
 use slag_edge::store::{EdgeCache, Snapshot};
 
 use scene::{NOW, Published};
+use server::Server;
 use sim::SimFiles;
 
 /// Fetches with short timeouts and few retries.
 #[derive(Clone)]
 struct Robot {
+    /// Its own, where it has one.
+    _dir: Option<Arc<tempfile::TempDir>>,
     cache: EdgeCache,
     request: FetchRequest,
     now_unix_secs: u64,
@@ -48,6 +52,7 @@ impl Robot {
             longest_backoff: Duration::from_millis(4),
             read_timeout: Duration::from_secs(5),
             chunk_bytes: 512,
+            progress_bytes: 512,
             ..NetworkLimits::default()
         };
         let request = FetchRequest {
@@ -58,7 +63,14 @@ impl Robot {
             trust_first: true,
             ..FetchRequest::default()
         };
-        Self { cache, request, now_unix_secs: NOW, limits }
+        Self { _dir: None, cache, request, now_unix_secs: NOW, limits }
+    }
+
+    /// Makes a robot in a folder of its own.
+    fn of(server: &Server) -> Self {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let robot = Self::on_disk(dir.path(), &server.url());
+        Self { _dir: Some(Arc::new(dir)), ..robot }
     }
 
     fn on_disk(dir: &Path, from: &str) -> Self {

@@ -33,9 +33,8 @@ pub fn answering(snapshot: &Snapshot) -> Vec<(u32, Hash32)> {
 
 /// Oracle: the same of whole scenes that were fetched without faults.
 fn whole(scene: &Published) -> Vec<(u32, Hash32)> {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     robot.fetch().expect("works");
     answering(&robot.snapshot())
 }
@@ -116,10 +115,9 @@ fn an_old_copy_answers_only_where_it_belongs() {
         ("the frame on the earth", |manifest| manifest.geo_reference = None),
     ];
     for (name, edit) in edits {
-        let dir = tempfile::tempdir().expect("temporary folder");
         let first = Published::new(1, &[0; 3], 40);
         let server = Server::start(first.clone());
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let robot = Robot::of(&server);
         robot.fetch().expect("works");
         let second = Published::new(2, &[0, 7, 0], 40).edited(edit);
         server.publish(second.clone());
@@ -134,10 +132,9 @@ fn an_old_copy_answers_only_where_it_belongs() {
 /// A network that fails is not a cell that is bad: the old generation stays, and what arrived is kept.
 #[test]
 fn a_network_that_fails_publishes_nothing() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let (first, second) = (Published::new(1, &[0; 3], 40), Published::new(2, &[7; 3], 40));
     let server = Server::start(first.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     robot.fetch().expect("works");
     let before = answering(&robot.snapshot());
     server.publish(second.clone());
@@ -161,10 +158,9 @@ fn a_network_that_fails_publishes_nothing() {
 /// The pointer to the generation on board is read strictly.
 #[test]
 fn a_cell_is_either_on_board_or_bad() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; 3], 40);
     let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     server.faults(at_cells(&scene, &[1], &Fault::Status(404)));
     robot.fetch().expect("the others are good");
     let path = robot.cache.current_path();

@@ -35,14 +35,10 @@ fn cells(snapshot: &Snapshot) -> Vec<u32> {
 
 #[test]
 fn a_rotten_shard_costs_its_cell_only() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; 3], 40);
     let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     robot.fetch().expect("works");
-    // Older than the grain of file times, so that fetches do not read the files again.
-    std::thread::sleep(std::time::Duration::from_millis(150));
-    robot.fetch().expect("nothing new");
     let path = robot.cache.shard_path(scene.hash(1, Profile::Compact));
     let faults: [(&str, &dyn Fn()); 3] = [
         ("a flipped bit", &|| flip_unseen(&path)),
@@ -69,8 +65,6 @@ fn a_rotten_shard_costs_its_cell_only() {
         assert_holds(&snapshot, &scene, 0..3);
         assert_eq!(snapshot.bad_cells, [], "{name}");
         assert_eq!(robot.fetch().expect("nothing new").downloaded.n_shards, 0, "{name}");
-        std::thread::sleep(std::time::Duration::from_millis(150));
-        robot.fetch().expect("nothing new");
     }
 }
 
@@ -116,13 +110,10 @@ fn any_rot_costs_its_cells_only() {
 /// All shards are read in turn, the one that rotted is marked, and no snapshot takes it over.
 #[test]
 fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; 3], 40);
     let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     robot.fetch().expect("works");
-    std::thread::sleep(Duration::from_millis(150));
-    robot.fetch().expect("nothing new");
     let (snapshot, mut scrubber) = (robot.snapshot(), Scrubber::default());
     let mut steps = |n: usize| -> Vec<(u32, bool)> {
         let step = |_| scrubber.step(&robot.cache, &snapshot).map(|step| (step.cell_id, step.is_sound));
@@ -140,10 +131,9 @@ fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
 /// A robot in service finds rot by itself and fetches the shard, although nothing else makes a fetch due.
 #[test]
 fn a_robot_in_service_heals_rot() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; 3], 40);
     let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
+    let robot = Robot::of(&server);
     let (following, cancel) = (Arc::<Following>::default(), AtomicBool::new(false));
     let engine = Engine::new(robot.cache.clone(), text_service());
     let app = App::following(engine, Settings::default(), Some(Arc::clone(&following)));

@@ -7,12 +7,10 @@ use glam::DVec3;
 use half::f16;
 use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
-use slag_common::frames::{Aabb, GeoReference};
-use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
-use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
-use slag_common::shard::{
-    Additions, ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
-};
+use slag_common::frames::{Aabb, GeoReference, Geographic};
+use slag_common::manifest::{self, Manifest};
+use slag_common::shard::sample::{self, SampleObject, SampleObjects, SampleShard};
+use slag_common::shard::{Profile, ShardHeader, ShardLayout, quantise};
 use slag_common::tuf::{
     FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, format_utc, sign,
 };
@@ -63,42 +61,18 @@ pub fn bounds(cell_id: u32) -> Aabb {
 
 pub fn shard(spec: &ShardSpec) -> Vec<u8> {
     let mut random = Random::new(spec.content ^ u64::from(spec.cell_id) << 32);
-    let (n, box_) = (spec.n_gaussians, bounds(spec.cell_id));
+    let n = spec.n_gaussians as usize;
     let (centroids, centroid_step) = quantise(&[0.5; DIM as usize]);
-    let header = ShardHeader {
-        cell_id: spec.cell_id,
-        n_gaussians: n,
-        n_centroids: 1,
-        dim: DIM,
-        n_components: DIM,
-        n_subspaces: 0,
-        position_bits: [16, 16, 16, 0],
-        centroid_step,
-        origin_in_world: box_.min.into(),
-        position_step: [1e-4; 3],
-        box_min: box_.min.into(),
-        box_max: box_.max.into(),
-        errors: ScoreErrors::default(),
-        encoder_id: spec.encoder.0,
+    let header = sample::header(spec.cell_id, n, 1, DIM as usize, bounds(spec.cell_id));
+    let shard = SampleShard {
+        header: ShardHeader { centroid_step, encoder_id: spec.encoder.0, ..header },
+        positions: (0..n).map(|_| [(); 3].map(|()| random.bits() as u16)).collect(),
+        centroid_starts: vec![0, spec.n_gaussians],
+        centroids,
+        radii: vec![0.1],
+        embeddings: spec.is_exact.then(|| vec![f16::from_f32(0.5); n * DIM as usize]),
     };
-    let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.bits() as u16)).collect();
-    let indices: Vec<u32> = (0..n).collect();
-    let embeddings = vec![f16::from_f32(0.5); (n * DIM) as usize];
-    let mut out = Vec::new();
-    let exact = ExactColumns { input_indices: &indices, embeddings: &embeddings, fine: None };
-    let parts = ShardView {
-        header,
-        positions: Positions::Wide(&positions),
-        centroid_starts: &[0, n],
-        centroids: &centroids,
-        radii: &[0.1],
-        basis: None,
-        residuals: None,
-        exact: spec.is_exact.then_some(exact),
-        packed_indices: None,
-    };
-    parts.write(&mut out).expect("writes to memory");
-    out
+    shard.to_bytes()
 }
 
 /// A thing of a scene: an object of one Gaussian.
@@ -116,53 +90,22 @@ pub struct TestThing {
 fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
     let bytes = AlignedBytes::copy_of(bytes);
     let layout = ShardLayout::check(&bytes).expect("sound");
-    let shard = layout.view(&bytes);
-    let mut objects = vec![NO_OBJECT; shard.header.n_gaussians as usize];
-    let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
-    for (at, thing) in things.iter().enumerate() {
-        objects[at] = at as u16;
+    let object = |(at, thing): (u32, &TestThing)| {
         let middle = DVec3::new(thing.x, 0.0, 105.0);
-        let photo = format!("{}.png", thing.id);
-        records.push(ObjectRecord {
+        SampleObject {
             id: thing.id,
-            position_in_world: middle.into(),
-            box_min: (middle - 0.5).into(),
-            box_max: (middle + 0.5).into(),
+            position_in_world: middle,
+            bounds: Aabb { min: middle - 0.5, max: middle + 0.5 },
+            vectors: (0..DIM as usize).map(|axis| f32::from(axis == thing.axis)).collect(),
+            runs: std::iter::once(at..at + 1).collect(),
             n_gaussians: 1,
-            n_gaussians_here: 1,
+            photo: format!("{}.png", thing.id),
             photo_box_px: [0, 0, 1, 1],
-            photo_start: photos.len() as u32,
-            photo_bytes: photo.len() as u32,
-        });
-        photos += &photo;
-        let vector: Vec<f32> = (0..DIM as usize).map(|axis| f32::from(axis == thing.axis)).collect();
-        let (components, of_vectors) = quantise_vectors(&vector, DIM as usize, 2);
-        vectors.extend(components);
-        steps.extend(of_vectors);
-    }
-    let (run_ends, run_objects) = collect_runs(objects);
-    let header = ObjectsHeader {
-        n_objects: records.len() as u32,
-        n_vectors: 2,
-        n_runs: run_ends.len() as u32,
-        photos_bytes: photos.len() as u32,
-        score_mean: 0.0,
-        score_spread: 0.1,
-        score_error_bound: 0.01,
+        }
     };
-    let objects = Objects {
-        header,
-        records: &records,
-        vectors: &vectors,
-        steps: &steps,
-        run_ends: &run_ends,
-        run_objects: &run_objects,
-        photos: photos.as_bytes(),
-    };
-    let mut out = Vec::new();
-    let additions = Additions { objects: Some(&objects), ..Additions::default() };
-    shard.write_with(&mut out, additions).expect("writes to memory");
-    out
+    let objects = (0..).zip(things).map(object).collect();
+    let objects = SampleObjects { objects, score_mean: 0.0, score_spread: 0.1, score_error_bound: 0.01 };
+    objects.add_to(&layout.view(&bytes), None)
 }
 
 impl Published {
@@ -185,52 +128,24 @@ impl Published {
 
     /// Publishes cells `0..contents.len()` in both profiles; equal content numbers give equal shards.
     pub fn new(generation: u64, contents: &[u64], n_gaussians: u32) -> Self {
-        let mut objects = BTreeMap::new();
-        let cells = (0u32..).zip(contents).map(|(cell_id, content)| {
-            let shards = [Profile::Compact, Profile::Exact].map(|profile| {
-                let is_exact = profile == Profile::Exact;
-                let spec = ShardSpec { cell_id, content: *content, n_gaussians, encoder: ENCODER, is_exact };
-                let bytes = shard(&spec);
-                let (hash, len_bytes) = (Hash32::of(&bytes), bytes.len() as u64);
-                objects.insert(hash, bytes);
-                let record = ShardRecord {
-                    hash,
-                    len_bytes,
-                    n_centroids: 1,
-                    score_error_bound: 0.1,
-                    score_errors: ScoreErrors::default(),
-                    position_error: 5e-5,
-                };
-                (profile, record)
-            });
-            CellRecord { cell_id, bounds: bounds(cell_id), n_gaussians, shards: BTreeMap::from(shards) }
-        });
+        let mut shards = Vec::new();
+        for (cell_id, content) in (0u32..).zip(contents) {
+            for profile in [Profile::Compact, Profile::Exact] {
+                let (content, is_exact) = (*content, profile == Profile::Exact);
+                let spec = ShardSpec { cell_id, content, n_gaussians, encoder: ENCODER, is_exact };
+                shards.push((profile, shard(&spec)));
+            }
+        }
+        let listed: Vec<(Profile, &[u8])> =
+            shards.iter().map(|(profile, bytes)| (*profile, &bytes[..])).collect();
+        let origin = Geographic { latitude_deg: 46.8, longitude_deg: -91.9, height_m: 150.0 };
         let manifest = Manifest {
-            version: VERSION,
-            scene: "yard".into(),
             generation,
             created_unix_secs: NOW - 1000,
-            metric: true,
-            geo_reference: Some(GeoReference {
-                origin: slag_common::frames::Geographic {
-                    latitude_deg: 46.8,
-                    longitude_deg: -91.9,
-                    height_m: 150.0,
-                },
-            }),
-            encoder: EncoderRecord {
-                name: "e".into(),
-                id: ENCODER,
-                dim: DIM,
-                default_threshold: 0.1,
-                calibration: None,
-                text_model: None,
-            },
-            n_gaussians: u64::from(n_gaussians) * contents.len() as u64,
-            n_without_evidence: 0,
-            n_rejected: 0,
-            cells: cells.collect(),
+            geo_reference: Some(GeoReference { origin }),
+            ..sample::manifest("yard", &listed)
         };
+        let objects = shards.into_iter().map(|(_, bytes)| (Hash32::of(&bytes), bytes)).collect();
         let (listed, metadata) = (Vec::new(), BTreeMap::new());
         Self { manifest, listed, metadata, objects }.edited(|_| ())
     }
@@ -274,7 +189,7 @@ pub fn metadata(roots: &[RootKeys], version: u64, expires: u64, target: &[u8]) -
     }
     let online = key(roots[roots.len() - 1].online);
     let targets = BTreeMap::from([(manifest::TARGET.to_owned(), TargetFile::of(target))]);
-    let targets = sign(version, lasting, &Targets { targets, delegations: None }, &[&online]);
+    let targets = sign(version, lasting, &Targets { targets }, &[&online]);
     let meta = BTreeMap::from([("targets.json".to_owned(), FileMeta::of(version, &targets))]);
     let snapshot = sign(version, lasting, &Snapshot { meta }, &[&online]);
     let meta = BTreeMap::from([("snapshot.json".to_owned(), FileMeta::of(version, &snapshot))]);

@@ -36,6 +36,8 @@ pub enum Fault {
     Length(i64),
     /// Answers with the range that begins so many bytes later.
     ShiftedRange(usize),
+    /// Answers a range as if it were the whole file, with status 200.
+    Slice,
     /// Sends other bytes.
     Instead(Vec<u8>),
     /// Sends nothing until the client goes away.
@@ -186,6 +188,11 @@ fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
             304
         }
         (Fault::IgnoreRange, _) | (_, None) => 200,
+        (Fault::Slice, Some(start)) if start < body.len() => {
+            head += &format!("Content-Range: bytes {start}-{}/{}\r\n", body.len() - 1, body.len());
+            body.drain(..start);
+            200
+        }
         (_, Some(_)) if if_range.as_ref() != Some(&etag) => 200,
         (_, Some(start)) if start >= body.len() => {
             body.clear();

@@ -301,13 +301,13 @@ impl Files for SimFiles {
         })
     }
 
-    fn read(&self, path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
+    fn read(&self, path: &Path, max_bytes: u64) -> io::Result<AlignedBytes> {
         self.look(|state| {
             let bytes = &state.inodes[state.inode(path)?].live;
             if bytes.len() as u64 > max_bytes {
                 return Err(io::Error::new(io::ErrorKind::InvalidData, "the file is too long"));
             }
-            Ok(bytes.clone())
+            Ok(AlignedBytes::copy_of(bytes))
         })
     }
 

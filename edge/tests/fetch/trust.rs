@@ -1,11 +1,10 @@
 //! First trust, and attacks on what a robot remembers: damaged and lost records, other roots, other scenes.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use slag_common::tuf::{TufError, sha256_hex};
 use slag_edge::fetch::{FetchError, FirstRoot, RecordsError, accepted};
 
-use super::crash::copy_dir;
 use super::scene::{FIRST, Published, RootKeys};
 use super::server::Server;
 use super::{Robot, assert_holds};
@@ -21,27 +20,24 @@ fn of(generation: u64, roots: &[RootKeys]) -> Published {
 
 /// A robot that has followed from the first root to the second; generation 2 is on board.
 struct Rotated {
-    dir: tempfile::TempDir,
     server: Server,
     robot: Robot,
 }
 
 impl Rotated {
     fn new() -> Self {
-        let dir = tempfile::tempdir().expect("temporary folder");
         let server = Server::start(of(1, &[FIRST]));
-        let mut robot = Robot::on_disk(dir.path(), &server.url());
+        let mut robot = Robot::of(&server);
         robot.fetch().expect("first contact");
         robot.request.trust_first = false;
         server.publish(of(2, &[FIRST, SECOND]));
         assert_eq!(robot.fetch().expect("accepted").root_version, Some(2));
-        Self { dir, server, robot }
+        Self { server, robot }
     }
 
-    /// Returns the folders of records.
-    fn records(&self) -> Vec<PathBuf> {
-        let folders = ["db", "trust"].map(|name| self.robot.cache.dir().join(name));
-        folders.into_iter().filter(|folder| folder.is_dir()).collect()
+    /// Returns the files of records.
+    fn records(&self) -> [PathBuf; 3] {
+        ["trust/0", "trust/1", "usage.json"].map(|name| self.robot.cache.dir().join(name))
     }
 
     fn refuses_the_old_keys(&self, context: &str) {
@@ -67,39 +63,18 @@ impl Rotated {
     }
 }
 
-fn files_below(dir: &Path, found: &mut Vec<PathBuf>) {
-    for entry in fs_err::read_dir(dir).expect("there") {
-        let path = entry.expect("readable").path();
-        match path.is_dir() {
-            true => files_below(&path, found),
-            false => found.push(path),
-        }
-    }
-}
-
 /// A flipped bit in any file of records neither stops a robot nor brings old keys back.
 #[test]
 fn a_flipped_bit_in_the_records_costs_nothing() {
     let rotated = Rotated::new();
-    let mut files = Vec::new();
-    for folder in rotated.records() {
-        copy_dir(&folder, &rotated.dir.path().join("saved").join(folder.file_name().expect("a name")));
-        files_below(&folder, &mut files);
-    }
+    let saved = rotated.records().map(|file| (fs_err::read(&file).expect("there"), file));
     let mut n_trials = 0;
-    for file in files {
-        let bytes = fs_err::read(&file).expect("there");
-        // Most of a database is zeros.
-        let places: Vec<usize> = (0..bytes.len()).filter(|at| bytes[*at] != 0).collect();
-        for at in places.iter().step_by(places.len().div_ceil(N_FLIPS).max(1)) {
-            for folder in rotated.records() {
-                let saved = rotated.dir.path().join("saved").join(folder.file_name().expect("a name"));
-                fs_err::remove_dir_all(&folder).expect("there");
-                copy_dir(&saved, &folder);
-            }
+    for (bytes, file) in &saved {
+        for at in (0..bytes.len()).step_by(bytes.len().div_ceil(N_FLIPS)) {
+            saved.iter().for_each(|(bytes, file)| fs_err::write(file, bytes).expect("written"));
             let mut flipped = bytes.clone();
-            flipped[*at] ^= 1 << (at % 8);
-            fs_err::write(&file, flipped).expect("written");
+            flipped[at] ^= 1 << (at % 8);
+            fs_err::write(file, flipped).expect("written");
             let context = format!("bit {} of byte {at} of {}", at % 8, file.display());
             rotated.refuses_the_old_keys(&context);
             rotated.accepts_the_new_keys(&context);
@@ -133,10 +108,9 @@ fn adding_the_first_root_again_does_not_bring_its_keys_back() {
 /// Without a step that says so, nobody is trusted.
 #[test]
 fn first_trust_is_a_step_of_its_own() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let published = of(2, &[FIRST, SECOND]);
     let server = Server::start(published.clone());
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let mut robot = Robot::of(&server);
     robot.request.trust_first = false;
     let error = robot.fetch().expect_err("nothing is trusted");
     assert!(matches!(error, FetchError::NoTrust { .. }), "{error}");
@@ -188,8 +162,8 @@ fn without_a_whole_copy_no_store_is_believed() {
 #[test]
 fn a_robot_without_records_asks_for_a_root() {
     let rotated = Rotated::new();
-    for folder in rotated.records() {
-        fs_err::remove_dir_all(folder).expect("there");
+    for file in rotated.records() {
+        fs_err::remove_file(file).expect("there");
     }
     assert!(matches!(rotated.robot.fetch(), Err(FetchError::NoTrust { .. })));
     assert_holds(&rotated.robot.snapshot(), &of(2, &[FIRST, SECOND]), 0..3);

@@ -5,13 +5,15 @@
 //! test as ignored; in CI it runs and fails.
 
 mod damage;
+mod loop_disk;
 mod memory;
 
 use std::path::{Path, PathBuf};
 
 pub use damage::damaged;
+pub use loop_disk::{BLOCK_BYTES, LoopDisk};
 pub use memory::{CountingAllocator, Taken, memory_of};
-pub use slag_test_needs::needs_shared;
+pub use slag_test_needs::{needs_loop_disk, needs_shared};
 
 /// Returns the root of the workspace.
 pub fn workspace_root() -> PathBuf {

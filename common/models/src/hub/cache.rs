@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use slag_common::durable;
 
-use super::download::Client;
+use super::download::client;
 use super::error::HubError;
 use super::lock::Lock;
 use super::options::HubOptions;
@@ -112,7 +112,7 @@ impl Hub {
         // Another pull may have changed it meanwhile.
         lock = Lock::read(root)?;
         lock.entry(name).licence.clone_from(&entry.licence);
-        let client = Client::new(&self.options)?;
+        let client = client(&self.options)?;
         let mut pull = Pull {
             table: &self.table,
             options: &self.options,

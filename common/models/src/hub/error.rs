@@ -3,9 +3,9 @@
 use std::io;
 use std::path::PathBuf;
 
-use super::download::Failure;
 use super::source::Source;
 use crate::description::{DescriptionError, Sha256};
+use crate::download::{DownloadError, DownloadFailure};
 use crate::error::ModelError;
 
 /// Error of pulling, finding or verifying a model.
@@ -63,7 +63,7 @@ pub enum HubError {
         /// The requested address.
         url: String,
         /// The cause.
-        failure: Box<Failure>,
+        failure: Box<DownloadError>,
         /// The model's missing files.
         wanted: Vec<Wanted>,
     },
@@ -80,7 +80,7 @@ pub enum HubError {
     NoFolder,
     /// The proxy cannot be used.
     #[error("the proxy in HTTPS_PROXY: {0}; correct or unset it")]
-    Proxy(#[from] Failure),
+    Proxy(#[from] DownloadFailure),
     /// A file's hash is not the expected one.
     #[error("{}: SHA-256 is {found}, expected {expected} ({}); {advice}", path.display(), source_of(*by))]
     Hash {

@@ -14,7 +14,7 @@ mod source;
 mod table;
 
 pub use cache::{Here, Hub};
-pub use download::{Failure, MAX_FILE_BYTES};
+pub use download::MAX_FILE_BYTES;
 pub use error::{HubError, Wanted};
 pub use lock::{Accepted, Lock, LockedFile};
 pub use options::{HubOptions, cache_folder, models_folder};

@@ -5,13 +5,14 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use slag_common::durable;
 
-use super::download::{Advertised, Client, Failure, discard};
+use super::download::{Advertised, PartialFile, ask};
 use super::error::{HubError, Wanted};
 use super::lock::{Lock, LockedFile};
 use super::options::HubOptions;
 use super::source::Source;
 use super::table::{Entry, Table};
 use crate::description::Sha256;
+use crate::download::{Client, DownloadError, Part};
 use crate::model_dir::hash_file;
 
 /// The files of a model to pull.
@@ -44,7 +45,7 @@ pub(super) struct Pull<'a> {
     pub(super) folder: PathBuf,
     pub(super) entry: &'a Entry,
     pub(super) side: Side,
-    pub(super) client: Client,
+    pub(super) client: Client<'static>,
     pub(super) lock: Lock,
 }
 
@@ -69,8 +70,8 @@ impl Pull<'_> {
         self.lock.write(&self.options.root)
     }
 
-    fn unreachable(&self, url: &str, failure: Failure) -> HubError {
-        if let Failure::Io(error) = failure {
+    fn unreachable(&self, url: &str, failure: DownloadError) -> HubError {
+        if let DownloadError::Io(error) = failure {
             return HubError::Io(error);
         }
         let folder = &self.folder;
@@ -85,7 +86,7 @@ impl Pull<'_> {
 
     /// Requests a file's metadata from the hub; it must belong to the pulled commit.
     fn ask(&mut self, url: &str) -> Result<Advertised, HubError> {
-        let advertised = self.client.ask(url).map_err(|failure| self.unreachable(url, failure))?;
+        let advertised = ask(&self.client, url).map_err(|failure| self.unreachable(url, failure))?;
         if let Some(found) = advertised.revision.clone() {
             let accepted = self.lock.entry(&self.entry.name);
             match self.entry.revision.clone().or(accepted.revision.clone()) {
@@ -123,7 +124,7 @@ impl Pull<'_> {
         let expected = match self.expected(path) {
             Some(expected) => expected,
             // Placed by hand, with no expected hash in the table or the lock.
-            None => match self.client.ask(&self.url(path)).ok().and_then(|advertised| advertised.sha256) {
+            None => match ask(&self.client, &self.url(path)).ok().and_then(|advertised| advertised.sha256) {
                 Some(sha256) => LockedFile { sha256, hash_source: Source::Hub },
                 None => LockedFile { sha256: found, hash_source: Source::PlacedByHand },
             },
@@ -149,22 +150,22 @@ impl Pull<'_> {
         }
         let hub = advertised.sha256.map(|sha256| LockedFile { sha256, hash_source: Source::Hub });
         let stated = expected.or(hub);
-        let part = target.with_added_extension("part");
+        let part = PartialFile(target.with_added_extension("part"));
         fs_err::create_dir_all(target.parent().unwrap_or(&self.options.root))?;
         let len_bytes = self.entry.known.get(path).map(|known| known.len_bytes).or(advertised.len_bytes);
         tracing::info!("pulling {url}");
         loop {
-            let received = self.client.receive(&url, &part, len_bytes);
+            let received = part.receive(&self.client, &url, len_bytes);
             let was_begun = received.map_err(|failure| self.unreachable(&url, failure))?;
-            let found = Sha256(hash_file(&part)?);
+            let found = Sha256(hash_file(&part.0)?);
             let first = LockedFile { sha256: found, hash_source: Source::FirstPull };
             let expected = stated.clone().unwrap_or(first);
             if expected.sha256 == found {
-                durable::move_into_place(&part, target)?;
-                discard(&part)?;
+                durable::move_into_place(&part.0, target)?;
+                part.discard()?;
                 return Ok(expected);
             }
-            discard(&part)?;
+            part.discard()?;
             // The existing part may belong to another version of the file: try once more from the start.
             if !was_begun {
                 let advice = "the download was discarded: pull again, or give another --hub";

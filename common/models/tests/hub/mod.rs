@@ -226,8 +226,8 @@ fn without_the_hub_the_error_lists_the_files_to_place() {
     let (server, root, _) = setting();
     let table = pinned(&server);
     for (url, status, part) in [
-        (server.url.as_str(), Some(404), "the server answers 404"),
-        (server.url.as_str(), Some(503), "the server answers 503"),
+        (server.url.as_str(), Some(404), "the server answered with status 404"),
+        (server.url.as_str(), Some(503), "the server answered with status 503"),
         // Nothing listens on port 1.
         ("http://127.0.0.1:1", None, "refused"),
     ] {

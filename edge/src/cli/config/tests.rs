@@ -51,6 +51,12 @@ fn the_line_comes_before_the_environment_and_that_before_the_file() {
         // A value of the file does not stand beside another of the line that excludes it.
         ("slag-edge fetch", &environment, "at", &["1,2,3"]),
         ("slag-edge fetch --at-geo 4,5", &environment, "at", &[]),
+        // One name for all commands that have different values there; what the file switches on is switched off.
+        ("slag-edge fetch", &[("SLAG_EDGE_FROM", "http://a:1")], "from", &["http://a:1"]),
+        ("slag-edge changes", &[("SLAG_EDGE_FROM", "http://a:1")], "from", &[]),
+        ("slag-edge changes", &[("SLAG_EDGE_FROM", "7")], "from", &["7"]),
+        ("slag-edge serve --trust-first=false", &[], "trust_first", &["false"]),
+        ("slag-edge serve --trust-first", &[("SLAG_EDGE_TRUST_FIRST", "false")], "trust_first", &["true"]),
     ] {
         let matches = parsed(line, environment, SERVE).unwrap_or_else(|e| panic!("{line}: {e}"));
         assert_eq!(values(&matches, id), expected, "{line}: {id}");
@@ -90,6 +96,11 @@ fn errors_name_the_file_and_the_key() {
     let error = parsed("slag-edge --config nowhere.toml status", &[], "").expect_err("no file").to_string();
     assert!(error.contains("nowhere.toml cannot be read"), "{error}");
     assert!(parsed("slag-edge status", &[("SLAG_EDGE_CONFIG", "")], "[no").is_ok(), "no file is read");
+    let line = ["slag-edge", "--config", "", "status"].map(OsString::from);
+    let named = |name: &str| (name == "SLAG_EDGE_CONFIG").then(|| "nowhere.toml".into());
+    assert!(parse(Cli::command(), &line, &named).is_ok(), "no file is read");
+    let error = parsed("slag-edge status", &[("SLAG_EDGE_FROM", "x y")], "nothing = 1").expect_err("no flag");
+    assert!(error.to_string().len() < 120, "a hint, not all flags: {error}");
 }
 
 /// Returns the keys of all flags that a file may set, as `serve.listen`.
@@ -139,6 +150,6 @@ fn the_unit_has_room_for_all_queries() {
         unit.lines().find_map(|line| line.strip_prefix("MemoryMax=")?.strip_suffix('G')).expect("a limit");
     let limit_bytes = limit.parse::<u64>().expect("gigabytes") << 30;
     let query_bytes = &values(&parsed("slag-edge serve", &[], "").expect("parses"), "max_query_bytes")[0];
-    let query_bytes: u64 = query_bytes.parse().expect("bytes");
+    let query_bytes = query_bytes.parse::<slag_common::ByteSize>().expect("bytes").0;
     assert!(limit_bytes >= 4 * query_bytes * 3 / 2 + (256 << 20), "{limit_bytes} for {query_bytes} a query");
 }
