@@ -313,6 +313,7 @@ pub fn follow(
             }
         }
         let request = FetchRequest { at: Some(position), radius: follower.fetch_radius(), ..request.clone() };
+        let before = (n_seen, records::stamp(cache));
         let outcome = (environment.fetch)(&request);
         following.note(&outcome);
         (environment.report)(&outcome);
@@ -327,7 +328,7 @@ pub fn follow(
             Err(error) if is_over => return Err(error),
             Err(error) => {
                 follower.failed(now, started.elapsed(), (environment.random)());
-                distrusted = error.is_want_of_trust().then(|| (n_seen, records::stamp(cache)));
+                distrusted = error.is_want_of_trust().then_some(before);
             }
         }
     }

@@ -25,7 +25,7 @@ fn rot_is_found_within_a_day() {
         match &open {
             Some(snapshot) => {
                 let mut scrubber = Scrubber::default();
-                let sound = (0..3).filter_map(|_| Some(scrubber.step(&robot.cache, snapshot)?.is_sound));
+                let sound = (0..2).filter_map(|_| Some(scrubber.step(&robot.cache, snapshot)?.is_sound));
                 assert_eq!(sound.filter(|is_sound| !is_sound).count(), 1);
             }
             None => assert_eq!(robot.snapshot().bad_cells.len(), 1),
