@@ -70,7 +70,7 @@ fn errors_name_the_file_and_the_key() {
     for (file, key, what) in [
         ("[serve]\nlisten = 'nowhere'", "serve.listen", "IP:PORT or unix:PATH"),
         ("[serve]\nlisten = 7734", "serve.listen", "IP:PORT or unix:PATH"),
-        ("[fetch]\nradius = 'far'", "fetch.radius", "invalid float"),
+        ("[fetch]\nradius = 'far'", "fetch.radius", "0 or more"),
         ("[fetch]\nradius = [1, 2]", "fetch.radius", "expected one value"),
         ("[fetch]\nradius = 1979-05-27", "fetch.radius", "expected a text or a number"),
         ("[fetch]\nwatch = 'yes'", "fetch.watch", "expected true or false"),
