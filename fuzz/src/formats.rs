@@ -9,6 +9,7 @@ use slag_common::manifest::{CellIndex, Manifest};
 use slag_common::shard::{self, ShardLayout};
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Hash32, poses};
+use slag_edge::query::relations::{self, Phrase};
 use slag_edge::store::EdgeCache;
 use slag_encoder::ingest::read_geo_reference;
 use slag_encoder::lift::{CellField, ContributionFile, RegionTable};
@@ -305,6 +306,18 @@ pub fn geo(data: &[u8]) -> bool {
 pub fn query(data: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(data) else { return false };
     slag_edge::http::parse_query(text).is_ok_and(|request| request.check().is_ok())
+}
+
+/// A text that may name relations, and a phrase as JSON, on a thread with the stack of the service's threads.
+pub fn grammar(data: &[u8]) -> bool {
+    let text = String::from_utf8_lossy(data).into_owned();
+    let read = std::thread::Builder::new().stack_size(2 << 20).spawn(move || {
+        let understood = relations::understand(&text);
+        let phrase = serde_json::from_str::<Phrase>(&text).ok().filter(|phrase| phrase.check().is_ok());
+        let phrases = [understood, phrase].into_iter().flatten();
+        phrases.inspect(|phrase| assert!(phrase.things().len() <= relations::MAX_THINGS)).count() > 0
+    });
+    read.expect("a thread").join().expect("no panic")
 }
 
 /// Lines with positions of the robot.

@@ -28,8 +28,9 @@ macro_rules! targets {
 
 targets! {
     formats: container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
-    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, geo, query, position;
-    services: http_request, tuf;
+    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, geo, query, position,
+    grammar;
+    services: http_request, v1, tuf;
 }
 
 /// Runs a target by name.

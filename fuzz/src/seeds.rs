@@ -17,9 +17,13 @@ use slag_common::shard::{
     ShardHeader, ShardView,
 };
 use slag_common::{Distortion, Hash32, Intrinsics, View, container};
+use slag_edge::store::EdgeCache;
 
 /// Longest shared file used: in longer ones mutations rarely hit anything that matters.
 const MAX_SHARED_BYTES: usize = 100_000;
+
+/// The embedding space of the scene.
+pub const ENCODER: Hash32 = Hash32([9; 32]);
 
 /// Requests of all kinds, and one whose body is no JSON.
 const HTTP_REQUESTS: &[&str] = &[
@@ -30,6 +34,51 @@ const HTTP_REQUESTS: &[&str] = &[
     "GET /v1/objects?limit=3&prompt_id=0 HTTP/1.1\r\nHost: localhost\r\nSec-Fetch-Site: same-origin\r\nAuthorization: Bearer abcdefghijklmnop\r\n\r\nHEAD /status HTTP/1.0\r\n\r\n",
     "GET /metrics HTTP/1.1\r\nHost: [::1]:7734\r\nExpect: 100-continue\r\n\r\n",
 ];
+
+/// Bodies of `POST /v1/query` with every member.
+const V1_BODIES: &[&str] = &[
+    r#"{"texts":["a on the b","nearest a","c"],"near":[0,0,0],"heading_rad":1.5,"limit":5,"offset":1}"#,
+    r#"{"vectors":[[1,0,0.5]],"kind":"gaussians","min_score":-1,"precision":"centroids","time_budget_ms":500}"#,
+    r#"{"phrases":[{"thing":"a","relation":{"is":"near","of":{"thing":"b"}}}],"relations":false,"min_count":1}"#,
+    r#"{"texts":["a"],"kind":"clusters","voxel":0.5,"negatives":["b","c"],"region":{"ball":{"centre":[1,2,3],"radius":9},"box":{"from":[0,0,0],"to":[9,9,9]},"polygon":[[0,0],[9,0],[9,9]]}}"#,
+];
+
+/// Writes the cache of a robot with a scene of one cell with objects, in the space of [`ENCODER`] and of three components.
+pub fn write_scene(folder: &Path) {
+    let bytes = shard(true);
+    let mut manifest = Manifest::parse(&manifest()).expect("a manifest");
+    let record = ShardRecord {
+        hash: Hash32::of(&bytes),
+        len_bytes: bytes.len() as u64,
+        n_centroids: 2,
+        score_error_bound: 0.1,
+        score_errors: ScoreErrors::default(),
+        position_error: 1e-3,
+    };
+    manifest.encoder.id = ENCODER;
+    manifest.encoder.dim = 3;
+    manifest.cells = vec![CellRecord {
+        cell_id: 5,
+        bounds: Aabb { min: DVec3::new(0.0, -3.0, 2.0), max: DVec3::new(66.0, 130.0, 4.0) },
+        n_gaussians: 6,
+        shards: BTreeMap::from([(Profile::Compact, record)]),
+    }];
+    let bytes_of_manifest = manifest.to_bytes();
+    let (hash, of_manifest) = (Hash32::of(&bytes), Hash32::of(&bytes_of_manifest));
+    let current = format!(
+        r#"{{"manifest_hash":"{of_manifest}","profile":"compact","centre_in_world":[0.0,0.0,0.0],"radius":50.0,"cells":[{{"cell_id":5,"hash":"{hash}","len_bytes":{}}}]}}"#,
+        bytes.len()
+    );
+    let cache = EdgeCache::open(folder);
+    for (path, bytes) in [
+        (cache.shard_path(hash), &bytes),
+        (cache.manifest_path(of_manifest), &bytes_of_manifest),
+        (cache.current_path(), &current.into_bytes()),
+    ] {
+        fs_err::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+        fs_err::write(path, bytes).expect("a file");
+    }
+}
 
 /// Returns the seeds of a target; `shared` is the folder of shared test data, if it exists.
 pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
@@ -75,6 +124,15 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "query" => text(
             "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&kind=gaussians&voxel=0.2&min_count=3",
         ),
+        "grammar" => [
+            "where is the second largest red mug on a table near the window?",
+            "chair between the sofa and the lamp in front of me",
+            "third pallet from the gate",
+            r#"{"thing":"mug","pick":{"by":"nearest","n":2,"from":{"thing":"gate"}},"relation":{"is":"on","of":{"thing":"me"}}}"#,
+        ]
+        .map(|text| text.as_bytes().to_vec())
+        .into(),
+        "v1" => V1_BODIES.iter().map(|body| body.as_bytes().to_vec()).collect(),
         "tuf" => super::services::tuf_seeds(),
         "http_request" => HTTP_REQUESTS.iter().map(|request| request.as_bytes().to_vec()).collect(),
         "position" => text("1 2 3\n46.8,-91.9,150\n{\"x\":1,\"y\":2,\"z\":3}\n{\"lat\":1,\"lon\":2}\n"),
@@ -124,7 +182,7 @@ fn shard(is_exact: bool) -> Vec<u8> {
         box_min: [0.0, -3.0, 2.0],
         box_max: [66.0, 130.0, 4.0],
         errors: ScoreErrors::default(),
-        encoder_id: [9; 32],
+        encoder_id: ENCODER.0,
     };
     let embeddings = [f16::from_f32(0.5); 15];
     let mut out = Vec::new();

@@ -15,24 +15,48 @@ use slag_common::tuf::{
 use slag_edge::http::{self, App, Settings};
 use slag_edge::query::Engine;
 use slag_edge::store::EdgeCache;
-use slag_edge::text::TextService;
-use slag_models::{ModelDir, SessionOptions};
+use slag_edge::text::{EncoderInfo, TextService};
+use slag_models::{InferenceError, TextEncoder};
 use slag_service::listen::{Listen, bind};
+
+use super::seeds;
 
 /// Asks for little, and ends the connection; what comes before may be whole or not.
 const LAST: &[u8] = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
 /// Most bytes of an answer that are read.
 const MAX_ANSWER_BYTES: u64 = 1 << 20;
 
-/// Starts the robot's service without a scene, once; returns its socket.
+/// Knows any text that begins with a letter.
+struct Letters;
+
+impl TextEncoder for Letters {
+    fn name(&self) -> &str {
+        "letters"
+    }
+
+    fn dim(&self) -> usize {
+        3
+    }
+
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
+        let first = text.bytes().next().filter(u8::is_ascii_alphabetic).ok_or(InferenceError::EmptyText)?;
+        Ok((0..3).map(|axis| f32::from(axis == first % 3)).collect())
+    }
+}
+
+/// Starts the robot's service with a small scene, once; returns its socket.
 fn service() -> &'static PathBuf {
     static SOCKET: OnceLock<PathBuf> = OnceLock::new();
     SOCKET.get_or_init(|| {
         let folder = std::env::temp_dir().join(format!("slag-fuzz-{}", std::process::id()));
         fs_err::create_dir_all(&folder).expect("a folder");
-        let options = SessionOptions::new("not-needed".into());
-        let text = TextService::open(&ModelDir::colours(), &options).expect("built in");
-        let app = App::new(Engine::new(EdgeCache::open(folder.join("cache")), text), Settings::default());
+        let info =
+            EncoderInfo { name: "letters".into(), id: seeds::ENCODER, dim: 3, execution_provider: "none" };
+        let text = TextService::start(info, Box::new(Letters)).expect("a thread");
+        seeds::write_scene(&folder.join("cache"));
+        let engine = Engine::new(EdgeCache::open(folder.join("cache")), text);
+        engine.reload().expect("a scene");
+        let app = App::new(engine, Settings::default());
         let socket = folder.join("socket");
         let listen = Listen::Unix(socket.clone());
         let (ready, is_ready) = std::sync::mpsc::channel();
@@ -47,6 +71,15 @@ fn service() -> &'static PathBuf {
         is_ready.recv().expect("listens");
         socket
     })
+}
+
+/// A body of `POST /v1/query` to a service with a scene.
+pub fn v1(data: &[u8]) -> bool {
+    let head = format!(
+        "POST /v1/query HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {}\r\n\r\n",
+        data.len()
+    );
+    http_request(&[head.as_bytes(), data].concat())
 }
 
 /// The bytes of a connection to the robot's service: whatever they are, no handler panics, and the service answers on.

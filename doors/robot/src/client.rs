@@ -6,7 +6,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use crate::changes::Changes;
-use crate::error::RobotError;
+use crate::error::{MAX_TEXT_BYTES, RobotError};
 use crate::floor::Floor;
 use crate::goal::Goals;
 use crate::place::Place;
@@ -42,6 +42,7 @@ impl Robot {
     /// # Errors
     /// [`RobotError`].
     pub fn ask(&self, request: &Value) -> Result<Reply, RobotError> {
+        check_texts(texts_of(request))?;
         self.post("/v1/query", request)
     }
 
@@ -52,6 +53,7 @@ impl Robot {
     pub fn ask_points(&self, request: &Value) -> Result<Reply<PointAnswer>, RobotError> {
         let mut request = request.clone();
         request["kind"] = json!("gaussians");
+        check_texts(texts_of(&request))?;
         self.post("/v1/query", &request)
     }
 
@@ -79,9 +81,7 @@ impl Robot {
     /// # Errors
     /// [`RobotError`].
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<Goals, RobotError> {
-        let path = "/v1/goal";
-        let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
-        self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
+        self.get_with("/v1/goal", parameters)
     }
 
     /// Returns what changed between two generations, by the parameters of `GET /v1/changes`.
@@ -89,9 +89,7 @@ impl Robot {
     /// # Errors
     /// [`RobotError`].
     pub fn changes(&self, parameters: &[(&str, String)]) -> Result<Changes, RobotError> {
-        let path = "/v1/changes";
-        let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
-        self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
+        self.get_with("/v1/changes", parameters)
     }
 
     /// Returns the ground around the robot, by the parameters of `GET /v1/floor`.
@@ -99,9 +97,7 @@ impl Robot {
     /// # Errors
     /// [`RobotError`].
     pub fn floor(&self, parameters: &[(&str, String)]) -> Result<Floor, RobotError> {
-        let path = "/v1/floor";
-        let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
-        self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
+        self.get_with("/v1/floor", parameters)
     }
 
     /// Says where the robot is, as `POST /position` takes it; a robot that follows then fetches what is around it.
@@ -114,6 +110,16 @@ impl Robot {
 
     fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, RobotError> {
         self.read(path, self.agent.get(self.address(path)).call())
+    }
+
+    fn get_with<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        parameters: &[(&str, String)],
+    ) -> Result<T, RobotError> {
+        let pairs = || parameters.iter().map(|(name, value)| (*name, value.as_str()));
+        check_texts(pairs().filter_map(|(name, value)| (name == "text").then_some(value)))?;
+        self.read(path, self.agent.get(self.address(path)).query_pairs(pairs()).call())
     }
 
     fn post<T: DeserializeOwned>(&self, path: &str, body: &Value) -> Result<T, RobotError> {
@@ -145,5 +151,38 @@ impl Robot {
 
     fn foreign(&self, path: &str, cause: impl ToString) -> RobotError {
         RobotError::Foreign { url: self.address(path), cause: cause.to_string() }
+    }
+}
+
+fn texts_of(request: &Value) -> impl Iterator<Item = &str> {
+    request["texts"].as_array().into_iter().flatten().filter_map(Value::as_str)
+}
+
+/// Refuses texts that are too long here already: doors ask with their own token, and on behalf of anybody.
+fn check_texts<'a>(mut texts: impl Iterator<Item = &'a str>) -> Result<(), RobotError> {
+    match texts.find(|text| text.len() > MAX_TEXT_BYTES) {
+        Some(text) => Err(RobotError::TooLong { n_bytes: text.len() }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Nobody listens: a text that is too long is refused before anything is sent.
+    #[test]
+    fn long_texts_are_not_sent() {
+        let robot = Robot::new("http://127.0.0.1:9", None);
+        let long = "a on ".repeat(9_000);
+        let refused = [
+            robot.ask(&json!({"texts": ["chair", long]})).map(drop),
+            robot.ask_points(&json!({"texts": [long]})).map(drop),
+            robot.goal(&[("text", long.clone())]).map(drop),
+            robot.changes(&[("text", long)]).map(drop),
+        ];
+        for refused in refused {
+            assert!(matches!(refused, Err(RobotError::TooLong { n_bytes: 45_000 })), "{refused:?}");
+        }
     }
 }

@@ -2,6 +2,9 @@
 
 use serde_json::Value;
 
+/// Longest text that a robot takes.
+pub(crate) const MAX_TEXT_BYTES: usize = 512;
+
 /// Why the robot gave no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {
@@ -22,6 +25,12 @@ pub enum RobotError {
         status: u16,
         /// What the program says: what was found and what it expects.
         detail: String,
+    },
+    /// A text that no robot takes.
+    #[error("a text has {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}; name the thing in a few words")]
+    TooLong {
+        /// Its length.
+        n_bytes: usize,
     },
     /// The answer is none of `slag-edge`.
     #[error(

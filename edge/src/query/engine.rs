@@ -13,7 +13,7 @@ use slag_models::{InferenceError, SessionOptions};
 use super::answer::answer;
 use super::carried;
 use super::reply::Reply;
-use super::request::{QueryRequest, RequestError};
+use super::request::{QueryRequest, RequestError, check_text};
 use super::scene::Scene;
 use crate::score::{Budget, OverBudget, Question, ScoreError, Scratch};
 use crate::store::files::Stat;
@@ -247,7 +247,11 @@ impl Engine {
     }
 
     /// Returns the vector of a text.
+    ///
+    /// # Errors
+    /// It is longer than a text may be, or unknown to the model.
     pub(super) fn encode_text(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
+        check_text("text", text)?;
         Ok(self.text().encode(text)?)
     }
 

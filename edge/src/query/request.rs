@@ -157,6 +157,24 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
     }
 }
 
+/// Checks a text that the text model is to encode. `parameter`: its name, for the error.
+///
+/// # Errors
+/// It is too long, has no words, or control characters.
+pub fn check_text(parameter: &str, text: &str) -> Result<(), RequestError> {
+    if text.len() > MAX_TEXT_BYTES {
+        let found = format!("{} bytes", text.len());
+        return Err(RequestError::new(parameter, &found, format!("at most {MAX_TEXT_BYTES} bytes")));
+    }
+    if text.trim().is_empty() {
+        return Err(RequestError::new(parameter, text, "words to look for"));
+    }
+    if text.chars().any(|c| c.is_control() && !c.is_whitespace()) {
+        return Err(RequestError::new(parameter, text, "no control characters"));
+    }
+    Ok(())
+}
+
 /// One or several questions of the same kind.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueryRequest {
@@ -234,16 +252,7 @@ impl QueryRequest {
         }
         let texts = self.texts.iter().map(|text| ("text", text.as_str()));
         for (parameter, text) in texts.chain(negatives.iter().map(|text| ("negatives", *text))) {
-            if text.len() > MAX_TEXT_BYTES {
-                let found = format!("{} bytes", text.len());
-                return refuse(parameter, &found, format!("at most {MAX_TEXT_BYTES} bytes"));
-            }
-            if text.trim().is_empty() {
-                return refuse(parameter, &text, "words to look for".into());
-            }
-            if text.chars().any(|c| c.is_control() && !c.is_whitespace()) {
-                return refuse(parameter, &text, "no control characters".into());
-            }
+            check_text(parameter, text)?;
         }
         let most = match self.kind {
             Some(AnswerKind::Gaussians) => MAX_GAUSSIANS,

@@ -7,7 +7,7 @@ use super::v1::room_with;
 use super::*;
 
 /// The places of the room with two mugs and a table: a floor from -1 to 5 m along x and to 4 m along y, and their boxes.
-fn places() -> BuiltOccupancy {
+pub(super) fn places() -> BuiltOccupancy {
     let voxel = 0.1;
     let inside = |p: glam::DVec3, low: [f64; 3], high: [f64; 3]| {
         p.cmpge(low.into()).all() && p.cmplt(high.into()).all()

@@ -52,11 +52,15 @@ pub(super) fn room_with(places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
 }
 
 async fn post(service: &Service, body: &Value) -> (StatusCode, HeaderMap, Value) {
+    post_bytes(service, body.to_string()).await
+}
+
+async fn post_bytes(service: &Service, body: String) -> (StatusCode, HeaderMap, Value) {
     let request = Request::builder()
         .method("POST")
         .uri("/v1/query")
         .header("content-type", "application/json")
-        .body(Body::from(body.to_string()))
+        .body(Body::from(body))
         .expect("a request");
     let router = router(Arc::clone(&service.app));
     soon(async { read(router.oneshot(request).await.expect("infallible")).await }).await
@@ -242,6 +246,38 @@ async fn wrong_requests_are_refused_by_name() {
     assert_eq!(reply["results"][0]["negatives"], json!(["1 red, 2 blue"]), "{reply}");
     let empty = Service::new(None, Settings::default());
     assert_eq!(post(&empty, &json!({"texts": ["0"]})).await.0, StatusCode::SERVICE_UNAVAILABLE);
+}
+
+/// One text of 45 kB, or a phrase as deep, must end neither a thread nor the process.
+#[tokio::test]
+async fn long_and_deep_questions_are_refused() {
+    let service = Service::new(Some(&room_with(Some(&super::goal::places()))), Settings::default());
+    let long = format!("a {}", "on a ".repeat(9_000));
+    let deep = |n: usize| {
+        let levels = r#"{"thing":"a","relation":{"is":"on","of":"#.repeat(n);
+        format!(r#"{{"phrases":[{levels}{{"thing":"a"}}{}]}}"#, "}}".repeat(n))
+    };
+    let bodies = [
+        (json!({"texts": [long]}).to_string(), "text"),
+        (json!({"phrases": [{"thing": long}]}).to_string(), "phrases"),
+        (json!({"texts": ["0"], "negatives": [long]}).to_string(), "negatives"),
+        (deep(8), "phrases"),
+        (deep(60), "phrases"),
+        (deep(9_000), "body"),
+    ];
+    for (body, parameter) in bodies {
+        let (status, _, reply) = post_bytes(&service, body).await;
+        assert_eq!((status, &reply["parameter"]), (StatusCode::BAD_REQUEST, &json!(parameter)), "{reply}");
+    }
+    let long = long.replace(' ', "+");
+    for path in ["/query", "/v1/query", "/v1/goal", "/v1/changes", "/v1/view/scores"] {
+        let (status, _, reply) = service.get(&format!("{path}?text={long}")).await;
+        assert_eq!(
+            (status, &reply["parameter"]),
+            (StatusCode::BAD_REQUEST, &json!("text")),
+            "{path}: {reply}"
+        );
+    }
 }
 
 #[tokio::test]

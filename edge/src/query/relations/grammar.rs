@@ -7,9 +7,11 @@
 //! ```
 //!
 //! Articles count for nothing. The leftmost relation divides a phrase, so relations nest to the right: "mug on the
-//! table near the window" is a mug on (a table near the window).
+//! table near the window" is a mug on (a table near the window). A text of more than [`MAX_TEXT_BYTES`] or with more than
+//! [`MAX_THINGS`] things is no phrase: this bounds time and recursion for every caller.
 
-use super::phrase::{By, Phrase, Pick, Place, Relation};
+use super::phrase::{By, MAX_THINGS, Phrase, Pick, Place, Relation};
+use crate::text::MAX_TEXT_BYTES;
 
 /// The words of each relation; where several begin at a word, the longest counts.
 const RELATIONS: [(&str, Relation); 31] = [
@@ -72,14 +74,18 @@ const OPENINGS: [&str; 10] = [
     "take me to",
 ];
 
-/// Returns the meaning of a text, or `None` if it names no relation and no pick: it is one thing then, for the text model.
+/// Returns the meaning of a text, or `None` if it names no relation and no pick, or more than the limits allow: it is one
+/// thing then, for the text model.
 pub fn understand(text: &str) -> Option<Phrase> {
+    if text.len() > MAX_TEXT_BYTES {
+        return None;
+    }
     let lower = text.to_lowercase();
     let words: Vec<&str> =
         lower.split_whitespace().map(|word| word.trim_matches(['.', ',', '?', '!', '"'])).collect();
     let words: Vec<&str> = words.into_iter().filter(|word| !word.is_empty()).collect();
     let opening = OPENINGS.iter().filter_map(|opening| starts(&words, opening)).max().unwrap_or(0);
-    let phrase = phrase(&words[opening..])?;
+    let phrase = phrase(&words[opening..], &mut { MAX_THINGS })?;
     (!phrase.is_asker() && (phrase.pick.is_some() || phrase.relation.is_some())).then_some(phrase)
 }
 
@@ -96,14 +102,13 @@ fn relation(words: &[&str]) -> Option<(Relation, usize)> {
 }
 
 fn without_article<'a, 'b>(words: &'a [&'b str]) -> &'a [&'b str] {
-    match words.split_first() {
-        Some((first, rest)) if ARTICLES.contains(first) => without_article(rest),
-        _ => words,
-    }
+    let n_articles = words.iter().take_while(|word| ARTICLES.contains(word)).count();
+    &words[n_articles..]
 }
 
-/// Reads a phrase; `None` if it is none.
-fn phrase(words: &[&str]) -> Option<Phrase> {
+/// Reads a phrase; `None` if it is none, or has more than `n_left` things. Each level of recursion names a thing.
+fn phrase(words: &[&str], n_left: &mut usize) -> Option<Phrase> {
+    *n_left = n_left.checked_sub(1)?;
     let words = without_article(words);
     let (nth, rest) = nth(words);
     let by = rest.first().and_then(|word| PICKS.iter().find(|(name, _)| name == word)).map(|(_, by)| *by);
@@ -124,7 +129,7 @@ fn phrase(words: &[&str]) -> Option<Phrase> {
         return Some(Phrase { pick: pick(None), ..thing(named)? });
     };
     if is_from(at) {
-        let from = phrase(&head[at + 1..])?;
+        let from = phrase(&head[at + 1..], n_left)?;
         return Some(Phrase { pick: pick(Some(from)), ..thing(&head[..at])? });
     }
     let (is, n) = relation(&head[at..])?;
@@ -132,9 +137,9 @@ fn phrase(words: &[&str]) -> Option<Phrase> {
     let named = if by.is_some() { &head[..at] } else { &words[..words.len() - head.len() + at] };
     let place = if is == Relation::Between {
         let and = after.iter().position(|word| *word == "and")?;
-        Place { is, of: phrase(&after[..and])?, and: Some(phrase(&after[and + 1..])?) }
+        Place { is, of: phrase(&after[..and], n_left)?, and: Some(phrase(&after[and + 1..], n_left)?) }
     } else {
-        Place { is, of: phrase(after)?, and: None }
+        Place { is, of: phrase(after, n_left)?, and: None }
     };
     Some(Phrase { pick: pick(None), relation: Some(Box::new(place)), ..thing(named)? })
 }
@@ -221,6 +226,28 @@ mod tests {
         ] {
             let found = understand(text);
             assert!(found.is_none(), "{text}: {found:?}");
+        }
+    }
+
+    /// On a thread with the stack of the service's threads, which one relation a level overflowed.
+    #[test]
+    fn long_texts_are_no_phrases() {
+        let read = |text: String| {
+            let read = std::thread::Builder::new().stack_size(2 << 20).spawn(move || understand(&text));
+            read.expect("a thread").join().expect("no overflow")
+        };
+        let relations = |n: usize| format!("a {}", "on a ".repeat(n));
+        assert_eq!(read(relations(7)).map(|phrase| phrase.check()), Some(Ok(())));
+        let long = [
+            relations(8),
+            relations(9_000),
+            "a between ".repeat(9_000) + &"and b ".repeat(9_000),
+            "the ".repeat(12_000) + "mug on the table",
+            "nearest a from ".repeat(9_000) + "b",
+        ];
+        for text in long {
+            let shown: String = text.chars().take(40).collect();
+            assert_eq!(read(text), None, "{shown}");
         }
     }
 
