@@ -55,17 +55,8 @@ impl ViewWork<'_> {
             sink: self,
         };
         let stages = ViewStages::new(tools, context);
-        // Never waits for the bucket: the pipeline asks for views with its lock held.
-        let source = std::iter::from_fn(|| {
-            while !context.is_cancelled() {
-                let number = self.dispatcher.take()?;
-                match prepared.views.get(number) {
-                    Some(view) => return Some((true, view)),
-                    None => self.dispatcher.done(number),
-                }
-            }
-            None
-        });
+        let source = views_to_do(self.dispatcher, &prepared.views, || context.is_cancelled());
+        let source = source.map(|view| (true, view));
         let reports = work_off(&stages, self.n_threads, source, context, |view, error| {
             tracing::warn!("view {} fails: {error}", view.name);
             Ok(self.fail(view, &error.to_string())?)
@@ -128,4 +119,24 @@ impl ViewSink for ViewWork<'_> {
         self.finish(view);
         Ok(())
     }
+}
+
+/// Yields the views that are to be had at present. The pipeline asks for them with its lock held, so nothing here waits for the
+/// bucket: whether another worker did a view meanwhile is found where its photo is fetched.
+fn views_to_do<'a>(
+    dispatcher: &'a dyn Dispatcher,
+    views: &'a [View],
+    is_cancelled: impl Fn() -> bool,
+) -> impl Iterator<Item = &'a View> {
+    std::iter::from_fn(move || {
+        while !is_cancelled() {
+            let number = dispatcher.take()?;
+            match views.get(number) {
+                Some(view) => return Some(view),
+                // Of a message that this program did not write.
+                None => dispatcher.done(number),
+            }
+        }
+        None
+    })
 }
