@@ -18,8 +18,8 @@ fn robots_fetch_from_static_files() {
         || run_json(&mut encoder(&["store", "export", "--store", text(&store), "--out", text(&site)]));
     encode(&[]);
     let n_shards = content(&store).into_iter().map(|(_, hash)| hash).collect::<BTreeSet<_>>().len();
-    assert_eq!(export()["n_objects"], n_shards);
-    assert_eq!(export()["n_objects"], 0, "a second export has nothing to write");
+    assert_eq!(export()["n_files"], n_shards);
+    assert_eq!(export()["n_files"], 0, "a second export has nothing to write");
 
     let mut python = Command::new("python3");
     python.args(["-u", "-m", "http.server", "0", "--bind", "127.0.0.1", "--directory", text(&site)]);

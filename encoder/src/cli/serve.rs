@@ -12,7 +12,7 @@ use super::Exit;
 use super::common::{ModelArgs, runtime, stopped, warn_of_expiry};
 use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
-use crate::view::{self, Shown, Viewer};
+use crate::view::{self, Viewed, Viewer};
 
 /// Time between two looks whether metadata expires soon.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(86_400);
@@ -57,7 +57,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
         let limits = serve::Limits::default();
         let open_text = open_text(args.models.clone());
         let shown =
-            Shown { store: Some(args.store.clone()), splat: None, views: Vec::new(), up: None, open_text };
+            Viewed { store: Some(args.store.clone()), splat: None, views: Vec::new(), up: None, open_text };
         let page = view::router(Viewer::new(shown));
         let router = serve::router_with(&args.store, limits, access, page)?;
         let store = args.store.clone();

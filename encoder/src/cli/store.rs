@@ -84,7 +84,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
         StoreCommand::Verify(at) => {
             let reader = StoreReader::open(&at.store)?;
             let listing = reader.listing();
-            progress.begin("verify", "object", listing.n_objects() as u64, 0);
+            progress.begin("verify", "file", listing.n_files() as u64, 0);
             let verified = listing.verify(|| progress.advance(1));
             progress.end();
             warn_of_expiry(&at.store);
@@ -95,15 +95,14 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             // A mistyped path must not create a store.
             StoreReader::open(&at.store)?;
             let pruned = Store::create_or_open(&at.store)?.prune()?;
-            let lines = format!("{} objects removed, {}\n", pruned.n_objects, ByteSize(pruned.len_bytes));
+            let lines = format!("{} files removed, {}\n", pruned.n_files, ByteSize(pruned.len_bytes));
             print(json, &pruned, lines)?;
             Ok(Exit::Done)
         }
         StoreCommand::Export { at, out } => {
             let exported = export(&at.store, out)?;
-            let Exported { n_objects, len_bytes, n_removed } = exported;
-            let lines =
-                format!("{n_objects} objects written, {}; {n_removed} removed\n", ByteSize(len_bytes));
+            let Exported { n_files, len_bytes, n_removed } = exported;
+            let lines = format!("{n_files} files written, {}; {n_removed} removed\n", ByteSize(len_bytes));
             print(json, &exported, lines)?;
             Ok(Exit::Done)
         }
@@ -139,7 +138,7 @@ struct Generation {
     encoder: String,
     n_cells: usize,
     n_gaussians: u64,
-    n_objects: usize,
+    n_files: usize,
     shard_bytes: u64,
 }
 
@@ -155,7 +154,7 @@ impl Generation {
             encoder: manifest.encoder.name.clone(),
             n_cells: manifest.cells.len(),
             n_gaussians: manifest.cells.iter().map(|cell| u64::from(cell.n_gaussians)).sum(),
-            n_objects: shards.len() + published.extras.len(),
+            n_files: shards.len() + published.extras.len(),
             shard_bytes: shards.values().sum(),
         }
     }
@@ -164,13 +163,12 @@ impl Generation {
 impl fmt::Display for Listed {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for generation in std::iter::once(&self.current).chain(&self.previous) {
-            let Generation {
-                scene, generation, encoder, n_cells, n_gaussians, n_objects, shard_bytes, ..
-            } = generation;
+            let Generation { scene, generation, encoder, n_cells, n_gaussians, n_files, shard_bytes, .. } =
+                generation;
             let bytes = ByteSize(*shard_bytes);
             writeln!(
                 f,
-                "generation {generation} of {scene}: {n_gaussians} Gaussians in {n_cells} cells by {encoder}, {n_objects} objects, {bytes} of shards"
+                "generation {generation} of {scene}: {n_gaussians} Gaussians in {n_cells} cells by {encoder}, {n_files} files, {bytes} of shards"
             )?;
         }
         if let (Some(first), n @ 3..) = (self.history.first(), self.history.len()) {
@@ -191,7 +189,7 @@ struct Lines<'a>(&'a Verified);
 
 impl fmt::Display for Lines<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Verified { n_objects, len_bytes, bad } = self.0;
+        let Verified { n_files, len_bytes, bad } = self.0;
         for object in bad {
             let fault = match &object.fault {
                 Fault::Missing => "missing",
@@ -200,7 +198,7 @@ impl fmt::Display for Lines<'_> {
             };
             writeln!(f, "{}: {fault} ({})", object.path.display(), object.holds.join("; "))?;
         }
-        write!(f, "{n_objects} objects, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
+        write!(f, "{n_files} files, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
         writeln!(
             f,
             "{}",

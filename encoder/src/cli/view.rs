@@ -15,7 +15,7 @@ use super::Exit;
 use super::common::{ModelArgs, parse_frame, runtime, stopped, text_encoder_of};
 use crate::ingest::{self, FrameChoice};
 use crate::publish::serve::{self, Access};
-use crate::view::{OpenText, Shown, Splat, Viewer, router, up_of};
+use crate::view::{OpenText, Splat, Viewed, Viewer, router, up_of};
 
 /// `view`.
 #[derive(Debug, Args)]
@@ -99,7 +99,7 @@ fn check_page() -> Result<()> {
 }
 
 /// Reads what is shown.
-fn shown(args: &ViewArgs) -> Result<Shown> {
+fn shown(args: &ViewArgs) -> Result<Viewed> {
     let set = args.views.as_deref().map(|path| poses::read(path, args.images.as_deref())).transpose()?;
     let splat = match &args.scene {
         None => None,
@@ -118,7 +118,7 @@ fn shown(args: &ViewArgs) -> Result<Shown> {
     let views: Vec<View> = set.map(|set| set.views).unwrap_or_default();
     let up = args.up.or_else(|| up_of(&views));
     let open_text = open_text(args.models.clone());
-    Ok(Shown { store: args.store.clone(), splat, views, up, open_text })
+    Ok(Viewed { store: args.store.clone(), splat, views, up, open_text })
 }
 
 /// Returns the link that opens the page with a question.

@@ -22,7 +22,7 @@ use super::reader::{Published, StoreReader};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Exported {
     /// Objects that were not there.
-    pub(crate) n_objects: usize,
+    pub(crate) n_files: usize,
     /// Their bytes.
     pub(crate) len_bytes: u64,
     /// Objects removed that neither generation needs.
@@ -79,7 +79,7 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
         }
     }
     let len_bytes = fresh.iter().map(|(_, len_bytes)| **len_bytes).sum();
-    Ok(Exported { n_objects: fresh.len(), len_bytes, n_removed })
+    Ok(Exported { n_files: fresh.len(), len_bytes, n_removed })
 }
 
 /// Returns the files of metadata by name, the timestamp last: roots, targets and snapshots are there before it names them.

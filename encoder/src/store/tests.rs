@@ -193,7 +193,7 @@ fn prune_keeps_two_generations_with_their_extras() {
     }
     assert_eq!(object_names(&store).len(), 7);
     let pruned = store.prune().expect("readable");
-    assert_eq!(pruned.n_objects, 3);
+    assert_eq!(pruned.n_files, 3);
     let kept: BTreeSet<String> = [1, 2, 4, 5].map(|i: usize| all[i].0.to_string()).into();
     assert_eq!(object_names(&store), kept);
     let extras_records = fs_err::read_dir(dir.path().join("extras")).expect("folder").count();
@@ -356,7 +356,7 @@ fn verification_reads_every_byte_and_names_what_is_bad() {
         let verified = reader.listing().verify(|| {
             n_read.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         });
-        assert_eq!((verified.n_objects, n_read.into_inner()), (3, 3));
+        assert_eq!((verified.n_files, n_read.into_inner()), (3, 3));
         verified
     };
     let sound = verify();

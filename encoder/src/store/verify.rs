@@ -41,7 +41,7 @@ pub(crate) struct BadObject {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Verified {
     /// Objects that the current generation and the one before it list.
-    pub(crate) n_objects: usize,
+    pub(crate) n_files: usize,
     /// Bytes read.
     pub(crate) len_bytes: u64,
     /// Bad ones, by hash.
@@ -70,7 +70,7 @@ impl StoreReader {
 }
 
 impl Listing<'_> {
-    pub(crate) fn n_objects(&self) -> usize {
+    pub(crate) fn n_files(&self) -> usize {
         self.holds.len()
     }
 
@@ -92,7 +92,7 @@ impl Listing<'_> {
             fault.map(|fault| BadObject { hash: *hash, path, fault, holds: holds.clone() })
         };
         let bad = self.holds.par_iter().filter_map(check).collect();
-        Verified { n_objects: self.n_objects(), len_bytes: bytes_read.into_inner(), bad }
+        Verified { n_files: self.n_files(), len_bytes: bytes_read.into_inner(), bad }
     }
 }
 

@@ -24,7 +24,7 @@ const LOCK_PATIENCE: Duration = Duration::from_secs(2);
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Pruned {
     /// Objects removed.
-    pub n_objects: u64,
+    pub n_files: u64,
     /// Their length together.
     pub len_bytes: u64,
 }
@@ -214,7 +214,7 @@ impl Store {
             for (path, len_bytes) in files_in(&folder?.path())? {
                 if !named_in(&path, &objects) {
                     fs_err::remove_file(&path)?;
-                    pruned.n_objects += 1;
+                    pruned.n_files += 1;
                     pruned.len_bytes += len_bytes;
                 }
             }

@@ -16,4 +16,4 @@ mod viewer;
 pub(crate) use photos::up_of;
 pub(crate) use routes::router;
 pub(crate) use splat::Splat;
-pub(crate) use viewer::{OpenText, Shown, Viewer};
+pub(crate) use viewer::{OpenText, Viewed, Viewer};

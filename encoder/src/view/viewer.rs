@@ -19,7 +19,7 @@ use crate::store::StoreReader;
 /// Opens the text encoder of a store; the error says what to do.
 pub(crate) type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
 
-pub(crate) struct Shown {
+pub(crate) struct Viewed {
     pub(crate) store: Option<PathBuf>,
     /// The splat; of the store, if there is one.
     pub(crate) splat: Option<Splat>,
@@ -54,7 +54,7 @@ impl OpenedText {
 
 /// Answers the page.
 pub(crate) struct Viewer {
-    shown: Shown,
+    shown: Viewed,
     /// Locked while another generation is opened, so that one request opens it.
     generation: Mutex<Option<Arc<Generation>>>,
     /// Locked while a question is scored: one at a time bounds memory.
@@ -63,7 +63,7 @@ pub(crate) struct Viewer {
 
 impl Viewer {
     /// Makes a viewer; nothing is opened yet.
-    pub(crate) fn new(shown: Shown) -> Self {
+    pub(crate) fn new(shown: Viewed) -> Self {
         Self { shown, generation: Mutex::default(), text: Mutex::default() }
     }
 
