@@ -23,7 +23,6 @@ const N_THREADS: usize = 2;
 const PATIENCE: Duration = Duration::from_secs(60);
 const RETRY_PAUSE: Duration = Duration::from_millis(300);
 
-/// A bucket cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum BlobError {
     #[error(
@@ -87,7 +86,6 @@ impl Bucket {
         Ok(Self { store: Arc::from(store), prefix, url, is_local: false, runtime })
     }
 
-    /// Returns the address.
     pub(crate) fn url(&self) -> &str {
         &self.url
     }
@@ -132,7 +130,6 @@ impl Bucket {
         }
     }
 
-    /// Returns an object that must be there.
     pub(crate) fn require(&self, key: &str) -> Result<Bytes, BlobError> {
         let missing = || BlobError::Missing { url: self.url.clone(), key: key.to_owned() };
         self.get(key)?.ok_or_else(missing)

@@ -24,7 +24,6 @@ td.n{text-align:right;white-space:nowrap}thead th{position:sticky;top:0;backgrou
 figure{margin:12px 0;display:inline-block;vertical-align:top}figcaption{font-size:13px}\
 img,svg{max-width:100%;height:auto}svg{background:#fff;color:#111}";
 
-/// A page in the making.
 pub struct Page {
     title: String,
     body: String,
@@ -46,7 +45,6 @@ pub fn escaped(text: &str) -> String {
 }
 
 impl Page {
-    /// Begins a page.
     pub fn new(title: &str) -> Self {
         Self { title: escaped(title), body: String::new() }
     }
@@ -56,12 +54,10 @@ impl Page {
         self.body.write_fmt(what).unwrap_or_default();
     }
 
-    /// Adds a heading.
     pub fn heading(&mut self, text: &str) {
         self.add(format_args!("<h2>{}</h2>\n", escaped(text)));
     }
 
-    /// Adds a paragraph.
     pub fn paragraph(&mut self, text: &str) {
         self.add(format_args!("<p>{}</p>\n", escaped(text)));
     }
@@ -76,7 +72,6 @@ impl Page {
         self.add(format_args!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escaped(caption)));
     }
 
-    /// Adds a picture, JPEG.
     pub fn picture(&mut self, jpeg: &[u8], caption: &str) {
         let (data, caption) = (STANDARD.encode(jpeg), escaped(caption));
         self.add(format_args!(
@@ -145,7 +140,6 @@ impl Page {
         self.table(&names.clone(), &rows);
     }
 
-    /// Ends the page.
     pub fn finish(self) -> String {
         let Self { title, body } = self;
         format!(

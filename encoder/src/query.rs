@@ -29,7 +29,6 @@ pub struct Scores {
     pub total_weights: Vec<f32>,
 }
 
-/// Scores cannot be computed.
 #[derive(Debug, thiserror::Error)]
 pub enum QueryError {
     #[error(transparent)]

@@ -10,7 +10,6 @@ use crate::blobs::Bucket;
 use crate::cells::CellLimits;
 use crate::encode::ViewSettings;
 
-/// Version of the documents and objects.
 const FORMAT: u32 = 4;
 
 /// Returns the version of this program, as documents state it.
@@ -31,7 +30,6 @@ pub(super) struct InputFile {
     pub(super) ending: String,
 }
 
-/// A view of a run.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct PlannedView {
     pub(super) name: String,

@@ -3,7 +3,6 @@
 use crate::blobs::BlobError;
 use crate::encode::EncodeError;
 
-/// Why a coordinator or worker ends.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum FleetError {
     #[error(transparent)]
@@ -41,7 +40,6 @@ pub(crate) enum FleetError {
 }
 
 impl FleetError {
-    /// Makes the error of a damaged object.
     pub(super) fn damaged(bucket: &crate::blobs::Bucket, key: &str, problem: impl ToString) -> Self {
         Self::Damaged { url: bucket.url().to_owned(), key: key.to_owned(), problem: problem.to_string() }
     }

@@ -13,7 +13,6 @@ use crate::blobs::Bucket;
 /// Time between two beats, and between two looks at them.
 const BEAT: Duration = Duration::from_secs(10);
 
-/// Beats until it is dropped.
 pub(super) struct Heartbeat {
     _stop: Sender<()>,
 }
@@ -37,7 +36,6 @@ impl Heartbeat {
     }
 }
 
-/// A worker's view of a coordinator's heartbeat.
 pub(super) struct HeartbeatWatch {
     run: Run,
     /// Time without a new beat after which the coordinator counts as gone.

@@ -83,7 +83,6 @@ pub(super) fn engines_text(models: impl ToString, segmenter: &str) -> String {
     format!("{} and {segmenter}", models.to_string())
 }
 
-/// The files of views on a worker.
 pub(super) struct ViewFiles {
     bucket: Arc<Bucket>,
     folder: PathBuf,
@@ -135,7 +134,6 @@ impl ViewFiles {
         self.views.iter().find(|planned| planned.name == view.name)
     }
 
-    /// Removes a view's files: it is done.
     pub(super) fn remove(&self, view: &View) {
         let Some(planned) = self.planned(view) else { return };
         for path in std::iter::once(self.photo_path(planned)).chain(self.mask_path(planned)) {
@@ -168,7 +166,6 @@ pub(super) fn fetch_input(bucket: &Bucket, hash: Hash32) -> Result<axum::body::B
     }
 }
 
-/// Brings an input into a file.
 pub(super) fn fetch_file(bucket: &Bucket, file: &InputFile, path: &Path) -> Result<(), FleetError> {
     let bytes = fetch_input(bucket, file.hash)?;
     if let Some(folder) = path.parent() {

@@ -25,7 +25,6 @@ pub(super) fn pack_view(
     Ok(bytes)
 }
 
-/// The parts of a view's object.
 pub(super) struct ViewObject {
     bytes: AlignedBytes,
     pub(super) record: ViewRecord,
@@ -34,7 +33,6 @@ pub(super) struct ViewObject {
 }
 
 impl ViewObject {
-    /// Reads and checks an object.
     pub(super) fn read(bytes: &[u8]) -> Result<Self, ContainerError> {
         let bytes = AlignedBytes::copy_of(bytes);
         let layout = Layout::check(&bytes, VIEW_MAGIC, VERSION)?;
@@ -72,7 +70,6 @@ pub(super) fn pack_scene(scene: &Gaussians) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads the object of a scene.
 pub(super) fn unpack_scene(bytes: &[u8]) -> Result<Gaussians, ContainerError> {
     let bytes = AlignedBytes::copy_of(bytes);
     let layout = Layout::check(&bytes, SCENE_MAGIC, VERSION)?;

@@ -19,7 +19,6 @@ use crate::memory::{MemoryPlan, Phase};
 use crate::raster::project::Prepared as PreparedScene;
 use crate::segment::Segmenter;
 
-/// A run on a worker.
 pub(super) struct Prepared {
     pub(super) run: Run,
     pub(super) plan: RunPlan,

@@ -73,7 +73,6 @@ fn stream_name(run: Run, of_scene: Hash32) -> String {
     format!("SLAG-{}-{}", &of_scene.to_string()[..16], run.0)
 }
 
-/// Fills the queue of a run.
 pub(super) struct Enqueuer {
     runtime: Arc<Runtime>,
     context: Context,

@@ -10,7 +10,6 @@ use crate::blobs::Bucket;
 const END: &str = "end.json";
 const DONE: &str = "done";
 
-/// A run of an encode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Run(pub(super) u64);
 
@@ -88,7 +87,6 @@ impl Run {
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }
 
-    /// Returns whether workers have views to do.
     pub(super) fn is_open(self, bucket: &Bucket) -> Result<bool, FleetError> {
         Ok(!self.has_ended(bucket)? && bucket.len_of(&self.key(DONE))?.is_none())
     }

@@ -13,7 +13,6 @@ const PREFIX: &str = "slag-worker-";
 /// The file in each folder that its worker holds locked.
 const LOCK: &str = "lock";
 
-/// A folder that goes with the run.
 pub(super) struct RunFolder {
     path: PathBuf,
     _lock: File,

@@ -64,7 +64,6 @@ impl ViewWork<'_> {
         reports.map(drop).map_err(of_encode)
     }
 
-    /// Records that a view cannot be done.
     fn fail(&self, view: &View, reason: &str) -> Result<(), FleetError> {
         let number = self.prepared.number_of[&view.name];
         let document = documents::to_bytes(&FailedView { reason: reason.to_owned() })?;

@@ -25,32 +25,25 @@ use crate::progress::Progress;
 /// Pause between two looks at the state of a run: in a folder, and over a network.
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(1)];
 
-/// Which views a worker takes.
 #[derive(Clone, Debug)]
 pub(crate) enum Dispatch {
     /// Every `of`-th, from `index` on; after `help_after` without work, what others left.
     Share {
         /// Number of this worker, from 0.
         index: usize,
-        /// Number of workers.
         of: usize,
         /// Time to wait for the others.
         help_after: Duration,
     },
-    /// What a queue hands out.
     Queue(QueueSettings),
 }
 
-/// How a worker works.
 #[derive(Clone, Debug)]
 pub(crate) struct WorkerSettings {
-    /// Which views it takes.
     pub(crate) dispatch: Dispatch,
     /// Threads, and views worked on at a time.
     pub(crate) n_threads: usize,
-    /// GPUs for the models.
     pub(crate) gpus: Vec<u32>,
-    /// Working memory.
     pub(crate) memory_bytes: u64,
     /// Folder for photos in work; it need not outlast the worker.
     pub(crate) folder: PathBuf,
@@ -62,10 +55,8 @@ pub(crate) struct WorkerSettings {
     pub(crate) stays: bool,
 }
 
-/// What a worker did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct WorkReport {
-    /// Runs that it took part in.
     pub(crate) n_runs: usize,
     /// Views that it was the first to finish.
     pub(crate) n_views: usize,

@@ -16,10 +16,8 @@ use crate::store::StoreReader;
 /// Largest f32 rounding of a coordinate, relative to it: splat files keep means in f32.
 const F32_ROUNDING: f64 = 1e-7;
 
-/// A Gaussian that answers a query.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Hit {
-    /// Index in the input file.
     pub index: u32,
     /// Cosine with the query.
     pub cosine: f32,

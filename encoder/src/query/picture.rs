@@ -6,7 +6,6 @@ use slag_common::gaussians::SH_C0;
 
 use crate::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 
-/// Colour where the scene is transparent.
 const BACKGROUND: [f32; 3] = [0.9; 3];
 
 /// Draws a scene with the Gaussians of `cosines` (`[N]`) at or above the threshold lit, at the view's own size.

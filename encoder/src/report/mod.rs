@@ -102,7 +102,6 @@ pub(crate) fn of_encode(
     Ok(page.finish())
 }
 
-/// Returns the row of a thing.
 fn row_of(object: &FoundObject) -> Vec<String> {
     let numbers = |of: DVec3| of.to_array().map(|axis| format!("{axis:.2}")).join(", ");
     let FoundObject { id, position_m, bounds, n_gaussians, n_masks, photo } = object;

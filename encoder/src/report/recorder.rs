@@ -15,13 +15,11 @@ use crate::progress::{FoundObject, Progress};
 const N_PICTURES: usize = 12;
 const JPEG_QUALITY: u8 = 80;
 
-/// A view of the encode.
 pub(super) struct RecordedView {
     pub(super) name: String,
     pub(super) position_in_world: DVec3,
     /// Masks, once they are found.
     pub(super) n_masks: Option<usize>,
-    /// Why it is left out.
     pub(super) reason: Option<String>,
     /// Its masks drawn over the photo, JPEG.
     pub(super) picture: Option<Vec<u8>>,

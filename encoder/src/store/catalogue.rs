@@ -23,12 +23,9 @@ const CACHE_BYTES: u64 = 16 << 20;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 const GENERATIONS: &str = "generations";
 
-/// What the catalogue says of a generation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct GenerationRecord {
-    /// Name of the scene.
     pub(crate) scene: String,
-    /// Its number.
     pub(crate) generation: u64,
     pub(crate) manifest_hash: Hash32,
     /// When it was made, seconds since 1970.
@@ -51,7 +48,6 @@ impl GenerationRecord {
     }
 }
 
-/// Why a database cannot be used.
 enum Fault {
     /// Another process holds it.
     Held,
@@ -86,7 +82,6 @@ fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, Fault> {
     serde_json::from_slice(bytes).map_err(|e| Fault::Damaged(e.to_string()))
 }
 
-/// The open catalogue.
 #[derive(Debug)]
 pub(crate) struct Catalogue {
     path: PathBuf,
@@ -168,7 +163,6 @@ impl Catalogue {
         self.history().map_err(|fault| self.error(fault))
     }
 
-    /// Returns the highest generation published.
     pub(crate) fn last_generation(&self) -> Result<Option<u64>, StoreError> {
         let last = self.generations.last().map_err(|e| self.error(e.into()))?;
         Ok(last.and_then(|(key, _)| Some(u64::from_be_bytes(key.as_ref().try_into().ok()?))))

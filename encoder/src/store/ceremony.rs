@@ -25,13 +25,11 @@ pub(crate) enum Change {
     Key(String),
 }
 
-/// A root that was made.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Changed {
     pub(crate) root_version: u64,
     /// SHA-256 of the root, hex; absent while it is a draft.
     pub root_sha256: Option<String>,
-    /// The draft, if it lacks signatures.
     pub(crate) draft: Option<PathBuf>,
 }
 
@@ -47,7 +45,6 @@ pub(crate) struct KeyStatus {
 /// The keys of a store, and until when they count.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct KeysStatus {
-    /// Version of the newest root.
     pub(crate) root_version: u64,
     /// Its SHA-256, hex.
     pub root_sha256: String,

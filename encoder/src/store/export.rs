@@ -18,12 +18,10 @@ use super::error::StoreError;
 use super::metadata::{self, TIMESTAMP_FILE};
 use super::reader::{Published, StoreReader};
 
-/// What an export wrote.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Exported {
     /// Objects that were not there.
     pub(crate) n_files: usize,
-    /// Their bytes.
     pub(crate) len_bytes: u64,
     /// Objects removed that neither generation needs.
     pub(crate) n_removed: usize,

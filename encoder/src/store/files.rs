@@ -61,7 +61,6 @@ pub(super) fn ensure_folder_unsynced(path: &Path) -> io::Result<()> {
     }
 }
 
-/// The current manifest.
 pub(super) const MANIFEST: &str = "manifest";
 /// The one before it, which fetches in progress may still need.
 pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";

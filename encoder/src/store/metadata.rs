@@ -26,7 +26,6 @@ use slag_common::tuf::{
 use super::error::StoreError;
 use super::{files, roles};
 
-/// The newest timestamp.
 pub(crate) const TIMESTAMP_FILE: &str = "timestamp.json";
 /// Days for which a timestamp counts, unless a refresh says otherwise.
 pub(crate) const TIMESTAMP_DAYS: u32 = 30;
@@ -47,7 +46,6 @@ pub(crate) struct Refreshed {
     pub(crate) expires_unix_secs: u64,
 }
 
-/// A root, parsed, and its bytes.
 pub(super) struct RootFile {
     pub(crate) root: SignedMetadata<Root>,
     pub(crate) bytes: Vec<u8>,

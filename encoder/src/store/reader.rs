@@ -16,7 +16,6 @@ use super::models::ModelsRecord;
 /// Objects by name that belong to a generation but are not sent to robots.
 pub type Extras = BTreeMap<String, Hash32>;
 
-/// A published generation.
 #[derive(Clone, Debug)]
 pub struct Published {
     pub manifest: Manifest,
@@ -132,12 +131,10 @@ impl StoreReader {
         Ok(record.filter(|record| record.encoder == self.manifest().encoder.id))
     }
 
-    /// Returns the store's folder.
     pub fn dir(&self) -> &Path {
         &self.dir
     }
 
-    /// Returns the current generation.
     pub fn current(&self) -> &Published {
         &self.current
     }
@@ -147,7 +144,6 @@ impl StoreReader {
         self.previous.as_ref()
     }
 
-    /// Returns the current manifest.
     pub fn manifest(&self) -> &Manifest {
         &self.current.manifest
     }
@@ -177,7 +173,6 @@ pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
     dir.join("extras").join(manifest_hash.to_string())
 }
 
-/// Reads a manifest; returns its bytes too.
 pub(super) fn read_manifest(path: &Path) -> Result<(Manifest, Vec<u8>), StoreError> {
     let Some(bytes) = files::read_manifest_bytes(path)? else {
         return Err(StoreError::NotPublished { path: path.to_owned() });

@@ -13,11 +13,9 @@ use slag_common::manifest::TextModelRecord;
 use super::files;
 use super::reader::{Published, StoreReader};
 
-/// What is wrong with an object.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Fault {
-    /// It is not there.
     Missing,
     /// Its content has another hash or length than the manifest lists.
     Damaged,
@@ -29,9 +27,7 @@ pub(crate) enum Fault {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct BadObject {
     pub(crate) hash: Hash32,
-    /// Its file.
     pub(crate) path: PathBuf,
-    /// What is wrong.
     pub(crate) fault: Fault,
     /// What it holds, such as `cell 3, balanced, generation 2`.
     pub(crate) holds: Vec<String>,
@@ -48,7 +44,6 @@ pub(crate) struct Verified {
     pub(crate) bad: Vec<BadObject>,
 }
 
-/// The objects that a store publishes.
 pub(crate) struct Listing<'a> {
     reader: &'a StoreReader,
     /// What each holds, by hash and length if a manifest states it.

@@ -20,12 +20,9 @@ use super::reader::{self, Extras, Published, StoreReader};
 /// Time to wait for the lock: sled releases the lock of a writer that has just ended on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);
 
-/// The result of [`Store::prune`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Pruned {
-    /// Objects removed.
     pub n_files: u64,
-    /// Their length together.
     pub len_bytes: u64,
 }
 
@@ -65,7 +62,6 @@ impl Store {
         Ok(store)
     }
 
-    /// Returns the store's folder.
     pub fn dir(&self) -> &Path {
         &self.dir
     }
@@ -87,7 +83,6 @@ impl Store {
         self.catalogue.db()
     }
 
-    /// Returns a reader of what is published.
     pub fn reader(&self) -> Result<StoreReader, StoreError> {
         StoreReader::open(&self.dir)
     }
@@ -118,7 +113,6 @@ impl Store {
         Ok(placed?)
     }
 
-    /// Writes an object; as [`Store::put_object`].
     pub fn put_bytes(&self, bytes: &[u8]) -> Result<(Hash32, u64), StoreError> {
         self.put_object(|out| out.write_all(bytes))
     }

@@ -19,7 +19,6 @@ pub(super) struct Things {
     /// Shards, and which of their objects are scored there.
     shards: Vec<(Shard, Vec<usize>)>,
     calibration: Option<Calibration>,
-    /// Ids of the objects.
     ids: BTreeSet<u64>,
 }
 

@@ -9,7 +9,6 @@ use crate::diff::DiffError;
 use crate::lift::published::ReadFieldError;
 use crate::store::StoreError;
 
-/// Why the page gets no answer.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ViewError {
     #[error("only a splat is shown, which cannot be asked; encode it, and give its store with --store")]

@@ -13,7 +13,6 @@ use crate::lift::published::{read_field, read_regions};
 use crate::lift::{CellField, RegionTable};
 use crate::store::StoreReader;
 
-/// An opened generation.
 pub(super) struct Generation {
     pub(super) reader: StoreReader,
     pub(super) things: Things,
@@ -83,7 +82,6 @@ impl Generation {
         }
     }
 
-    /// Returns the message of a cell's Gaussians.
     pub(super) fn cell(
         &self,
         cell_id: u32,

@@ -28,7 +28,6 @@ const BINARY: [(header::HeaderName, &str); 1] = [(header::CONTENT_TYPE, "applica
 type AppState = State<Arc<Viewer>>;
 type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
 
-/// Returns the page and its routes.
 pub(crate) fn router(viewer: Viewer) -> Router {
     Router::new()
         .route("/v1/changes", axum::routing::get(changes))
@@ -42,7 +41,6 @@ pub(crate) fn router(viewer: Viewer) -> Router {
         .with_state(Arc::new(viewer))
 }
 
-/// Runs work off the asynchronous threads.
 async fn blocking<T: Send + 'static>(
     viewer: Arc<Viewer>,
     work: impl FnOnce(&Viewer) -> Result<T, ViewError> + Send + 'static,
@@ -134,7 +132,6 @@ fn number<T: std::str::FromStr>(name: &str, value: &str) -> Result<T, Problem> {
     value.parse().map_err(|_| bad(format!("{name} is {:?}, expected a whole number", shown())))
 }
 
-/// Returns a question and its negatives.
 fn question(pairs: &[(String, String)]) -> Result<(String, Vec<String>), Problem> {
     let of = |wanted: &'static str| {
         pairs.iter().filter(move |(name, _)| name == wanted).map(|(_, value)| value.clone())

@@ -10,14 +10,12 @@ use slag_view::Photo;
 use super::error::ViewError;
 use crate::store::StoreReader;
 
-/// A cell's smallest shard.
 pub(super) struct Shard {
     pub(super) bytes: AlignedBytes,
     pub(super) layout: ShardLayout,
 }
 
 impl Shard {
-    /// Returns the photos whose poses it has.
     pub(super) fn photos(&self) -> Vec<Photo> {
         let origin = DVec3::from(self.layout.header.origin_in_world);
         let photos = self.layout.photo_poses(&self.bytes);
@@ -49,7 +47,6 @@ pub(super) fn combined(mut of_vectors: Vec<Vec<f32>>) -> Vec<f32> {
     own
 }
 
-/// Reads the smallest shard of a cell.
 pub(super) fn smallest_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<Shard>, ViewError> {
     let Some(record) = cell.shards.values().next() else { return Ok(None) };
     let bytes = reader.read_object(record.hash)?;

@@ -8,7 +8,6 @@ use slag_view::{Cell, CellState, Description, Step, cell_message};
 use super::error::ViewError;
 use crate::cells::{self, CellLimits, CellSplit};
 
-/// The program's name in a description.
 pub(super) const PROGRAM: &str = "slag-encoder";
 /// Gaussians of a cell where a splat is shown alone: the first cell is small enough for a first picture within a second.
 const MAX_GAUSSIANS: usize = 65_536;

@@ -31,7 +31,6 @@ pub(crate) struct Viewed {
     pub(crate) open_text: OpenText,
 }
 
-/// A text encoder.
 struct OpenedText {
     /// Id of its space.
     id: Hash32,
@@ -52,7 +51,6 @@ impl OpenedText {
     }
 }
 
-/// Answers the page.
 pub(crate) struct Viewer {
     shown: Viewed,
     /// Locked while another generation is opened, so that one request opens it.
@@ -62,7 +60,6 @@ pub(crate) struct Viewer {
 }
 
 impl Viewer {
-    /// Makes a viewer; nothing is opened yet.
     pub(crate) fn new(shown: Viewed) -> Self {
         Self { shown, generation: Mutex::default(), text: Mutex::default() }
     }
@@ -87,7 +84,6 @@ impl Viewer {
         }
     }
 
-    /// Describes what there is to draw.
     pub(super) fn describe(&self) -> Result<Description, ViewError> {
         let mut description = match (&self.shown.store, &self.shown.splat) {
             (None, Some(splat)) => splat.describe(),
@@ -112,7 +108,6 @@ impl Viewer {
         Ok(diff::diff(of(before), of(reader.current()))?)
     }
 
-    /// Returns the message of a cell's Gaussians.
     pub(super) fn cell(
         &self,
         cell_id: u32,

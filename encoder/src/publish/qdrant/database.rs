@@ -17,10 +17,8 @@ use super::points::generation;
 use super::settings::vectors_of;
 use super::{IndexSettings, PushError, PushOptions, Snapshot};
 
-/// Longest pause between two attempts.
 const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 
-/// The client of a database.
 pub(super) struct Database<'a> {
     client: Qdrant,
     /// For requests that take as long as their collection is large.
@@ -57,7 +55,6 @@ impl<'a> Database<'a> {
         Ok(listed.collections.into_iter().map(|collection| collection.name).collect())
     }
 
-    /// Returns the number of repeated attempts.
     pub(super) fn n_retries(&self) -> u64 {
         self.n_retries.load(Ordering::Relaxed)
     }
@@ -171,7 +168,6 @@ impl Collection<'_> {
         }
     }
 
-    /// Returns the collection's settings and payload indexes.
     pub(super) async fn describe(&self) -> Result<CollectionInfo, PushError> {
         let describe = || self.database.client.collection_info(self.name.as_str());
         let info = self.database.attempt("describe the collection", describe).await?;
@@ -229,7 +225,6 @@ impl Collection<'_> {
         self.database.attempt("delete points of earlier generations", delete).await.map(drop)
     }
 
-    /// Counts the points of other scenes.
     pub(super) async fn count_others(&self) -> Result<u64, PushError> {
         self.count(Filter::must_not([Condition::matches("scene", self.manifest.scene.clone())])).await
     }

@@ -41,10 +41,8 @@ pub enum Layout {
     Cells,
 }
 
-/// Target and pace of a push.
 #[derive(Clone)]
 pub(crate) struct PushOptions {
-    /// gRPC address of the database.
     pub(crate) url: String,
     /// The collection, or the beginning of the names of one a cell; created if absent.
     pub(crate) collection: String,
@@ -108,9 +106,7 @@ pub(crate) struct PushReport {
     pub(crate) n_sent: u64,
     /// Gaussians without an embedding, left out.
     pub(crate) n_without_evidence: u64,
-    /// Repeated attempts.
     pub(crate) n_retries: u64,
-    /// Collections of this generation.
     pub(crate) n_collections: usize,
     /// How many of them this run created.
     pub(crate) n_created_collections: usize,
@@ -125,7 +121,6 @@ pub(crate) struct PushReport {
     pub(crate) snapshots: Vec<Snapshot>,
 }
 
-/// Why a push ended early.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum PushError {
     #[error(

@@ -9,7 +9,6 @@ use slag_common::shard::{Profile, ShardLayout};
 use super::PushError;
 use crate::store::StoreReader;
 
-/// The exact shard of a cell.
 pub(super) struct CellShard {
     bytes: AlignedBytes,
     layout: ShardLayout,
@@ -17,7 +16,6 @@ pub(super) struct CellShard {
 }
 
 impl CellShard {
-    /// Reads and checks a cell's shard.
     pub(super) fn load(reader: &StoreReader, cell: &CellRecord) -> Result<Self, PushError> {
         let cell_id = cell.cell_id;
         let record = cell.shards.get(&Profile::Exact).ok_or(PushError::NoShard { cell_id })?;

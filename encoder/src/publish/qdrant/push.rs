@@ -113,7 +113,6 @@ struct Push<'a> {
 struct Target<'a> {
     collection: Collection<'a>,
     cells: &'a [CellRecord],
-    /// The collection as it was found.
     existing: Option<CollectionInfo>,
 }
 

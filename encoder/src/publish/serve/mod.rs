@@ -20,10 +20,8 @@ use crate::store::StoreError;
 pub use router::{bounded, router, router_with};
 pub use slag_service::access::{Access, AccessSettings};
 
-/// Bounds of the service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Bounds of the connections.
     pub connections: ConnectionLimits,
     /// Requests in progress; further ones get 503.
     pub n_requests: usize,
@@ -45,7 +43,6 @@ impl Default for Limits {
     }
 }
 
-/// Why the service does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     #[error(transparent)]
@@ -73,7 +70,6 @@ pub async fn serve(
     serve_router(router(dir, limits, access)?, listen, limits, tls, on_listening, shutdown).await
 }
 
-/// Serves routes as [`serve`] does.
 pub async fn serve_router(
     router: axum::Router,
     listen: impl Into<Listen>,

@@ -22,7 +22,6 @@ use crate::store::{Stamp, StoreError, StoreReader};
 /// itself (no file descriptors left), so the manifest's own change is not the only sign.
 const RETRY_PAUSE: Duration = Duration::from_secs(10);
 
-/// One generation, as it is served.
 pub(super) struct Snapshot {
     pub(super) reader: StoreReader,
     pub(super) manifest: Bytes,
@@ -62,7 +61,6 @@ struct Failed {
     at: Instant,
 }
 
-/// The service's state.
 pub(super) struct Service {
     dir: PathBuf,
     snapshot: RwLock<Arc<Snapshot>>,
@@ -79,7 +77,6 @@ pub(super) struct Service {
 pub(super) type AppState = State<Arc<Service>>;
 
 impl Service {
-    /// Opens the current generation.
     pub(super) fn open(dir: &Path, limits: &Limits) -> Result<Self, StoreError> {
         Ok(Self {
             snapshot: RwLock::new(Arc::new(Snapshot::open(dir)?)),
@@ -152,7 +149,6 @@ impl Service {
     }
 }
 
-/// Answers `GET /metrics`.
 pub(super) async fn metrics(State(service): AppState) -> Result<Exposition, Problem> {
     let generation = service.with_current(|snapshot| Ok(snapshot.world().generation)).await?;
     let mut text = Exposition::new("slag_store");
