@@ -1,11 +1,50 @@
 //! Workers with shares, and a folder as bucket.
 
+use std::process::Command;
+
+use super::conformance::{Kind, conforms};
 use super::support::*;
 use slag_tests::*;
 
-/// The first of two workers is killed at its second view, so the other does what is left of its share.
+/// A folder as bucket, and shares.
+struct Shares {
+    scene: Scene,
+    bucket: String,
+}
+
+impl Kind for Shares {
+    fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    fn coordinator(&self, store: &str) -> Command {
+        let mut command = self.scene.encode(store);
+        command.args(["--blobs", &self.bucket]);
+        command
+    }
+
+    fn worker(&self, number: usize) -> Command {
+        let mut command = worker(&self.bucket);
+        command.args(["--index", &number.to_string(), "--of", "2", "--help-after", "0.2", "--threads", "1"]);
+        command
+    }
+
+    fn n_views(&self) -> usize {
+        n_objects(&self.scene.path("bucket/views"))
+    }
+}
+
 #[test]
-fn a_folder_and_two_workers_of_which_one_is_killed_give_the_same_bytes() {
+fn a_folder_and_shares_conform() {
+    let scene = Scene::new();
+    let bucket = text(&scene.path("bucket")).to_owned();
+    conforms(&Shares { scene, bucket });
+}
+
+/// Folders for photos in work go with their workers, or when the next one begins; workers of other models and versions are
+/// refused.
+#[test]
+fn workers_leave_nothing_and_do_not_mix() {
     let scene = Scene::new();
     let (bucket, scratch) = (scene.path("bucket"), scene.path("scratch"));
     let share = |index: &str| {
@@ -47,10 +86,6 @@ fn a_folder_and_two_workers_of_which_one_is_killed_give_the_same_bytes() {
     assert_eq!(report["n_views"], N_VIEWS - n_before, "{report}");
     scene.assert_same("store");
 
-    // What the bucket has is not done again, whoever asks for it: there is no worker.
-    Running::start(scene.encode("again").args(["--blobs", text(&bucket)])).json();
-    scene.assert_same("again");
-
     // A program of another version does not touch a run.
     let plan = bucket.join("jobs/00000009/plan.json");
     fs_err::create_dir_all(plan.parent().expect("a folder")).expect("made");
@@ -60,7 +95,7 @@ fn a_folder_and_two_workers_of_which_one_is_killed_give_the_same_bytes() {
 }
 
 /// Returns what a worker that must fail prints.
-fn worker_output(command: &mut std::process::Command) -> String {
+fn worker_output(command: &mut Command) -> String {
     let output = command.output().expect("starts");
     assert_eq!(output.status.code(), Some(1), "{command:?}");
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()

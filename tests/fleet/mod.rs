@@ -1,5 +1,6 @@
 //! Fleets of real workers against the bytes that one process makes.
 
+mod conformance;
 mod faults;
 mod folder;
 mod hosts;

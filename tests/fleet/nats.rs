@@ -1,5 +1,8 @@
 //! Workers that a queue hands work to: a real nats-server with JetStream.
 
+use std::process::Command;
+
+use super::conformance::{Kind, conforms};
 use super::network::Network;
 use super::support::*;
 use slag_tests::*;
@@ -74,6 +77,34 @@ impl Fleet {
     fn n_views_done(&self) -> usize {
         n_objects(&self.scene.path("bucket/views"))
     }
+}
+
+impl Kind for Fleet {
+    fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    fn coordinator(&self, store: &str) -> Command {
+        let mut command = self.scene.encode(store);
+        command.args(["--blobs", &self.bucket, "--fleet", &url(self.port), "--ack-wait", "1"]);
+        command
+    }
+
+    fn worker(&self, _number: usize) -> Command {
+        let mut command = worker(&self.bucket);
+        command.args(["--fleet", &url(self.port), "--threads", "1", "--ack-wait", "1"]);
+        command
+    }
+
+    fn n_views(&self) -> usize {
+        self.n_views_done()
+    }
+}
+
+#[test]
+fn a_folder_and_a_queue_conform() {
+    let (fleet, _server) = Fleet::new(free_port());
+    conforms(&fleet);
 }
 
 /// One worker is killed, one stands still for longer than the queue waits for it and goes on; the server is killed in the
