@@ -24,9 +24,7 @@ impl Kind for Shares {
     }
 
     fn worker(&self, number: usize) -> Command {
-        let mut command = worker(&self.bucket);
-        command.args(["--index", &number.to_string(), "--of", "2", "--help-after", "0.2", "--threads", "1"]);
-        command
+        with_share(worker(&self.bucket), number)
     }
 
     fn n_views(&self) -> usize {
@@ -47,14 +45,13 @@ fn a_folder_and_shares_conform() {
 fn workers_leave_nothing_and_do_not_mix() {
     let scene = Scene::new();
     let (bucket, scratch) = (scene.path("bucket"), scene.path("scratch"));
-    let share = |index: &str| {
-        let mut worker = worker(text(&bucket));
+    let share = |number: usize| {
+        let mut worker = with_share(worker(text(&bucket)), number);
         worker.args(["--scratch", text(&scratch)]);
-        worker.args(["--index", index, "--of", "2", "--help-after", "0.2", "--threads", "1"]);
         worker
     };
     let coordinator = Running::start(scene.encode("store").args(["--blobs", text(&bucket)]));
-    let killed = Running::start(&mut share("0"));
+    let killed = Running::start(&mut share(0));
     wait_until("a first view", || n_objects(&bucket.join("views")) > 0);
     killed.kill();
     let n_of_killed = n_objects(&bucket.join("views"));
@@ -67,7 +64,7 @@ fn workers_leave_nothing_and_do_not_mix() {
     let refused = worker_output(&mut other);
     assert!(refused.contains("colours") && refused.contains("--models"), "{refused}");
 
-    let mut interrupted = Running::start(&mut share("1"));
+    let mut interrupted = Running::start(&mut share(1));
     let own = format!("slag-worker-{}-", interrupted.id());
     wait_until("a folder of the next worker alone, without that of the killed one", || {
         let folders = std::fs::read_dir(&scratch).expect("there").flatten();
@@ -79,7 +76,7 @@ fn workers_leave_nothing_and_do_not_mix() {
     assert_eq!(n_objects(&scratch), 0, "a worker that is interrupted takes its folder with it");
 
     let n_before = n_objects(&bucket.join("views"));
-    let report = Running::start(&mut share("1")).json();
+    let report = Running::start(&mut share(1)).json();
     let summary = coordinator.json();
     assert_eq!(n_objects(&scratch), 0);
     assert_eq!(summary["n_views"], N_VIEWS);
@@ -90,7 +87,7 @@ fn workers_leave_nothing_and_do_not_mix() {
     let plan = bucket.join("jobs/00000009/plan.json");
     fs_err::create_dir_all(plan.parent().expect("a folder")).expect("made");
     fs_err::write(plan, r#"{"program": "7.0.0"}"#).expect("written");
-    let refused = worker_output(&mut share("0"));
+    let refused = worker_output(&mut share(0));
     assert!(refused.contains("7.0.0") && refused.contains("install the same program"), "{refused}");
 }
 

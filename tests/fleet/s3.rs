@@ -137,9 +137,7 @@ impl Kind for Shares<'_> {
     }
 
     fn worker(&self, number: usize) -> Command {
-        let mut command = self.s3.known_to(worker("s3://scenes/room"));
-        command.args(["--index", &number.to_string(), "--of", "2", "--help-after", "0.5", "--threads", "1"]);
-        command
+        with_share(self.s3.known_to(worker("s3://scenes/room")), number)
     }
 
     fn n_views(&self) -> usize {

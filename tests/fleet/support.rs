@@ -76,6 +76,12 @@ pub fn worker(bucket: &str) -> Command {
     command
 }
 
+/// Gives a worker one of two shares.
+pub fn with_share(mut worker: Command, number: usize) -> Command {
+    worker.args(["--index", &number.to_string(), "--of", "2", "--help-after", "0.3", "--threads", "1"]);
+    worker
+}
+
 /// A program in the background, killed when dropped.
 pub struct Running {
     child: Option<Child>,
