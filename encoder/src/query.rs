@@ -1,6 +1,5 @@
 //! Full-precision scores of a published field, for evaluation and trust.
 
-mod by_level;
 mod hits;
 mod picture;
 
@@ -12,10 +11,8 @@ use slag_common::objects::object_score;
 use slag_common::shard::{Profile, ShardLayout};
 
 use crate::lift::published::{ReadFieldError, read_field, read_regions};
-use crate::lift::{CellField, RegionTable};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader};
-pub use by_level::ByLevel;
 pub use hits::{Hit, SceneMismatch, check_scene, located, points_ply};
 pub use picture::{draw_lit, luma};
 use slag_math::dot;
@@ -59,34 +56,15 @@ fn with_exact(profile: Profile) -> String {
 
 /// Scores every Gaussian against a unit query vector.
 pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError> {
+    check_dim(reader, query)?;
     let table = read_regions(reader)?;
-    check_dim(reader, &table, query)?;
     let region_scores = table.scores(query);
-    scores_of_cells(reader, table.len(), |_, field| field.cosines(&region_scores))
-}
-
-fn check_dim(reader: &StoreReader, table: &RegionTable, query: &[f32]) -> Result<(), QueryError> {
-    let (expected, found) = (table.dim(), query.len());
-    let encoder = || reader.manifest().encoder.name.clone();
-    (found == expected).then_some(()).ok_or_else(|| QueryError::Dimension {
-        expected,
-        found,
-        encoder: encoder(),
-    })
-}
-
-/// Scores the Gaussians of all cells, in the order of the input. `cosines`: of a field, and which cell it is.
-fn scores_of_cells(
-    reader: &StoreReader,
-    n_regions: usize,
-    cosines: impl Fn(usize, &CellField) -> Vec<f32>,
-) -> Result<Scores, QueryError> {
     let manifest = reader.manifest();
     let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
     let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
-    for (at, cell) in manifest.cells.iter().enumerate() {
-        let field = read_field(reader, cell.cell_id, cell.n_gaussians, n_regions)?;
-        let cosines = cosines(at, &field);
+    for cell in &manifest.cells {
+        let field = read_field(reader, cell.cell_id, cell.n_gaussians, table.len())?;
+        let cosines = field.cosines(&region_scores);
         for (k, index) in field.input_indices.iter().enumerate() {
             if *index as usize >= n {
                 return Err(QueryError::Index { cell_id: cell.cell_id, index: *index, n });
@@ -98,16 +76,21 @@ fn scores_of_cells(
     Ok(scores)
 }
 
+fn check_dim(reader: &StoreReader, query: &[f32]) -> Result<(), QueryError> {
+    let encoder = &reader.manifest().encoder;
+    let (expected, found) = (encoder.dim as usize, query.len());
+    match found == expected {
+        true => Ok(()),
+        false => Err(QueryError::Dimension { expected, found, encoder: encoder.name.clone() }),
+    }
+}
+
 /// Scores every Gaussian as a profile's shards decode it: what a robot that holds them knows.
 ///
 /// Total weights are left at zero: shards do not keep them.
 pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -> Result<Scores, QueryError> {
+    check_dim(reader, query)?;
     let manifest = reader.manifest();
-    let dim = manifest.encoder.dim as usize;
-    if query.len() != dim {
-        let encoder = manifest.encoder.name.clone();
-        return Err(QueryError::Dimension { expected: dim, found: query.len(), encoder });
-    }
     let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
     let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
     for cell in &manifest.cells {

@@ -11,7 +11,7 @@ use slag_common::{Gaussians, npy, poses};
 
 use super::Exit;
 use super::common::{ModelArgs, print, profile_parser, text_encoder_of};
-use crate::query::{self, ByLevel, Hit, Scores};
+use crate::query::{self, Hit, Scores};
 use crate::raster::RasterView;
 use crate::store::StoreReader;
 
@@ -38,9 +38,6 @@ pub struct QueryArgs {
     /// Scores as a robot with shards of this profile does [default: the field in full precision].
     #[arg(long, value_name = "NAME", value_parser = profile_parser())]
     pub profile: Option<Profile>,
-    /// Scores coarse and fine masks separately and takes the best score, instead of their mean.
-    #[arg(long, conflicts_with = "profile")]
-    pub by_mask_level: bool,
     /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).
     #[arg(long, value_name = "FILE")]
     pub scores: Option<PathBuf>,
@@ -73,7 +70,6 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let vector = encoder.encode(&args.text)?;
     let scores = match args.profile {
         Some(profile) => query::scores_of_shards(&reader, &vector, profile)?,
-        None if args.by_mask_level => ByLevel::read(&reader)?.scores(&vector)?,
         None => query::scores(&reader, &vector)?,
     };
     if let Some(path) = &args.scores {
