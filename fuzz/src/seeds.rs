@@ -1,7 +1,6 @@
 //! Valid inputs to start from.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::Path;
 
 use glam::{DAffine3, DVec3};
@@ -400,8 +399,4 @@ fn cell_field() -> Vec<u8> {
         f32s(&[0.9, 0.8]),
     ];
     sections(b"SLAGFELD", 1, &columns)
-}
-
-fn u16s(values: &[u16]) -> Vec<u8> {
-    values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
