@@ -172,8 +172,8 @@ fn commands(text: &str) -> Vec<Vec<String>> {
         .collect()
 }
 
-/// Returns the flags in a document's sentences, without those of other programs and scripts.
-fn flags_in_sentences(text: &str) -> Vec<&str> {
+/// Returns the code in a document's sentences that begins as commands and flags of our programs do.
+fn code_in_sentences(text: &str) -> Vec<&str> {
     const OURS: [&str; 12] = [
         "encode", "check", "query", "serve", "fetch", "worker", "goal", "store", "keys", "trust", "push",
         "bench",
@@ -183,13 +183,14 @@ fn flags_in_sentences(text: &str) -> Vec<&str> {
         is_fenced ^= line.trim_start().starts_with("```");
         !is_fenced && !line.starts_with("    ")
     });
-    let code = sentences.flat_map(|line| line.split('`').skip(1).step_by(2)).filter(|code| {
+    let code = sentences.flat_map(|line| line.split('`').skip(1).step_by(2));
+    code.filter(|code| {
         let mut words = code.split(' ').filter(|word| !word.contains('='));
         words
             .next()
             .is_some_and(|word| word.starts_with("--") || word.starts_with("slag-") || OURS.contains(&word))
-    });
-    flags(code.flat_map(|code| code.split([' ', '\\', '|', '"'])))
+    })
+    .collect()
 }
 
 fn flags<'a>(words: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
@@ -213,7 +214,9 @@ fn flags_that_the_documents_name_exist() {
     check(|_, text| {
         let commands = commands(text);
         let of_commands = flags(commands.iter().flatten().map(String::as_str));
-        let named = flags_in_sentences(text).into_iter().chain(of_commands);
+        let code = code_in_sentences(text);
+        let of_sentences = flags(code.into_iter().flat_map(|code| code.split([' ', '\\', '|', '"'])));
+        let named = of_sentences.into_iter().chain(of_commands);
         let missing = named.filter(|flag| !known.0.contains(*flag) && !OTHER_FLAGS.contains(flag));
         missing.map(|flag| format!("no program has {flag}")).collect()
     });
@@ -242,8 +245,25 @@ fn documented_commands_are_understood() {
                 faults.push(format!("`{}`: {}", words.join(" "), message.lines().next().unwrap_or_default()));
             }
         }
+        for code in code_in_sentences(text) {
+            let words: Vec<&str> = code.split([' ', '|']).collect();
+            let Some((_, program)) = programs.iter().find(|(name, _)| *name == words[0]) else { continue };
+            if !has_command(&program(), &words[1..]) {
+                faults.push(format!("`{code}` is no command"));
+            }
+        }
         faults
     });
+}
+
+/// Returns whether the words before the first flag are commands, as far as the program has some.
+fn has_command(program: &clap::Command, words: &[&str]) -> bool {
+    match words {
+        [word, rest @ ..] if program.has_subcommands() && !word.starts_with('-') => {
+            program.find_subcommand(word).is_some_and(|command| has_command(command, rest))
+        }
+        _ => true,
+    }
 }
 
 /// Collects the functions of all Rust files: `function` and `file::function`.
