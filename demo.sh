@@ -1,8 +1,9 @@
 #!/bin/sh
 # Sets everything up, builds, and shows the whole system at work on a house and yard that it generates.
 # usage: demo.sh [flags of `slag-lab demo`]
-# The page at /view is part of it where Node.js is here or can be downloaded.
-# The build leaves out evaluation and benchmarks, the GPU rasteriser, Qdrant and Arrow, which the demo does not use: `cargo build --release` has them.
+# The page at /view is part of it where Node.js is here or can be downloaded. The build leaves out evaluation
+# and benchmarks, the GPU rasteriser, Qdrant and Arrow, which the demo does not use: `cargo build --release` has
+# them.
 set -eu
 cd "$(dirname "$0")"
 sh scripts/setup.sh demo

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Sets everything up, builds all programs with the page, and puts them under a prefix: programs, ONNX Runtime, manual pages and
-# shell completions. Needs Rust; Debian packages that are missing are installed (with sudo where you are not root).
+# Sets everything up, builds all programs with the page, and puts them under a prefix: programs, ONNX Runtime,
+# manual pages and shell completions. Needs Rust; Debian packages that are missing are installed (with sudo
+# where you are not root).
 # usage: install.sh [--prefix DIR] [--uninstall]      [default prefix: ~/.local]
 set -eu
 prefix=$HOME/.local uninstall=

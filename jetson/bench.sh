@@ -1,10 +1,12 @@
 #!/bin/sh
-# Fills the paper's table of query times on this machine, an Orin or any other: OUT/robot.md and OUT/robot.json bear its name.
+# Fills the paper's table of query times on this machine, an Orin or any other: OUT/robot.md and OUT/robot.json
+# bear its name.
 #
 #     jetson/bench.sh OUT [FLAGS OF slag-lab bench robot]
 #
-# The first run builds the programs and the other engine with cargo, which takes an hour on an Orin. Graphs of more than a
-# million vectors take hours more: --engines compact,balanced,dense,qdrant-scan,qdrant-hnsw=1000000 leaves them out.
+# The first run builds the programs and the other engine with cargo, which takes an hour on an Orin. Graphs of
+# more than a million vectors take hours more: --engines compact,balanced,dense,qdrant-scan,qdrant-hnsw=1000000
+# leaves them out.
 set -eu
 cd "$(dirname "$0")/.."
 if [ $# -lt 1 ]; then

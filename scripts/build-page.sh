@@ -1,8 +1,8 @@
 #!/bin/sh
 # Builds the page from common/view/web into common/view/dist, which the programs embed, and states its size.
 # usage: build-page.sh [--if-possible]
-# Node.js comes from scripts/get-node.sh. With --if-possible a page that is newer than its source stays as it is, and where it
-# does not build (no network), a line says so: the programs work without it.
+# Node.js comes from scripts/get-node.sh. With --if-possible a page that is newer than its source stays as it
+# is, and where it does not build (no network), a line says so: the programs work without it.
 set -eu
 cd "$(dirname "$0")/../common/view/web"
 

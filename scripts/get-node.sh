@@ -1,6 +1,6 @@
 #!/bin/sh
-# Prints a folder with `node` and `npm`: this machine's where Node.js is 18 or newer, else a pinned one that is put into
-# target/node. Node.js builds the page; the programs do not need it.
+# Prints a folder with `node` and `npm`: this machine's where Node.js is 18 or newer, else a pinned one that is
+# put into target/node. Node.js builds the page; the programs do not need it.
 # usage: get-node.sh
 set -eu
 

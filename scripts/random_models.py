@@ -1,5 +1,5 @@
-"""Makes CLIP ViT-B/32 (image side) or Segment Anything ViT-B at full size with random weights, as ONNX: for measurements of
-time alone. Names are those of the public exports.
+"""Makes CLIP ViT-B/32 (image side) or Segment Anything ViT-B at full size with random weights, as ONNX: for
+measurements of time alone. Names are those of the public exports.
 
 usage: random_models.py FOLDER clip|sam
 needs: torch, transformers (5), onnx

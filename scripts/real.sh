@@ -6,10 +6,10 @@
 #   LERF     lerf_ovs: NAME/{images,sparse/0,point_cloud.ply} for each scene, label/NAME/frame_*.json; or -
 #   SCANNET  scans/NAME as published, and NAME/{images,transforms.json,point_cloud.ply} for each; or -
 #
-# Rules of the comparison: a scene's threshold is the paper's 0.28, or one that other scenes chose, never the scene's own
-# labels; frames are matched with cameras by name; every labelled word is reported.
-# Environment: OUT (default real-results), PRESET (default paper), ACCEPT_LICENCE (a licence that restricts use),
-# THRESHOLDS, DEVICE and PROVIDER. Encodes that are done already are not repeated.
+# Rules of the comparison: a scene's threshold is the paper's 0.28, or one that other scenes chose, never the
+# scene's own labels; frames are matched with cameras by name; every labelled word is reported. Environment: OUT
+# (default real-results), PRESET (default paper), ACCEPT_LICENCE (a licence that restricts use), THRESHOLDS,
+# DEVICE and PROVIDER. Encodes that are done already are not repeated.
 set -eu
 [ $# -eq 3 ] || { sed -n 2,12p "$0" >&2; exit 2; }
 models=${1%%,*}

@@ -2,9 +2,10 @@
 # Workers of a fleet as a Slurm array, without a queue: task I of N does every N-th view, then what others left.
 # usage: sbatch --array=0-15 encoder/deploy/slurm.sh BUCKET [flags of `slag-encoder worker`]
 #   BUCKET: a folder that all nodes see, or s3://BUCKET/PREFIX with credentials in the environment.
-# Start `slag-encoder encode ... --blobs BUCKET` where the photos are, before or after, and `scancel --name slag-worker` once it has
-# ended; tasks that Slurm starts again (--requeue) find finished work in the bucket. Where fewer tasks run at a time than the array
-# has, give `--help-after 5`: those that run do the others' shares then, instead of waiting for them.
+# Start `slag-encoder encode ... --blobs BUCKET` where the photos are, before or after, and `scancel --name
+# slag-worker` once it has ended; tasks that Slurm starts again (--requeue) find finished work in the bucket.
+# Where fewer tasks run at a time than the array has, give `--help-after 5`: those that run do the others'
+# shares then, instead of waiting for them.
 #SBATCH --job-name=slag-worker
 #SBATCH --cpus-per-task=2
 #SBATCH --requeue

@@ -52,7 +52,8 @@ test("slag-encoder encode: --report has the encode in one file; the bytes are th
     const column = (heading, at) => rowsUnder(heading).evaluateAll((rows, k) => rows.map((row) => row.children[k].innerText), at);
     const sum = (numbers) => numbers.reduce((a, b) => a + Number(b), 0);
     assert.equal(await rowsUnder("Cells").count(), summary.n_cells);
-    // The map has each camera where its pose is, x to the right and y up, and the one that was left out is the broken photo's.
+    // The map has each camera where its pose is, x to the right and y up, and the one that was left out is the
+    // broken photo's.
     const circles = await page.locator("h2:text-is('Map') ~ figure circle").evaluateAll((all) => all.map((c) => ({
       isLeftOut: c.textContent.includes("left out"), x: Number(c.getAttribute("cx")), y: -Number(c.getAttribute("cy")),
     })));

@@ -175,8 +175,8 @@ fn class_of(tile: u32) -> u32 {
     return N_CLASSES - 1u - (exponent * 4u + ((n >> (exponent - 2u)) & 3u) - 4u);
 }
 
-// Orders the tiles by their number of pairs, the fullest first: the last ones to be blended are then soon done. One
-// workgroup orders all tiles.
+// Orders the tiles by their number of pairs, the fullest first: the last ones to be blended are then soon done.
+// One workgroup orders all tiles.
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn order_tiles(@builtin(local_invocation_index) thread: u32) {
     let n_tiles = view.tile_columns * (view.end_tile_row - view.first_tile_row);

@@ -97,7 +97,8 @@ fn project(index: u32) -> Projected {
         return result;
     }
 
-    // Rows of the axes of the Gaussian in the camera frame, times scales; then their products with the Jacobian's rows.
+    // Rows of the axes of the Gaussian in the camera frame, times scales; then their products with the
+    // Jacobian's rows.
     let q = real4(
         real(g.rotation_wxyz.x),
         real(g.rotation_wxyz.y),

@@ -6,7 +6,8 @@
 struct SortPass {
     // Counter with the number of items.
     items: u32,
-    // The upper word of item i is `keys[i * stride + offset] - least`; the lower word, the next one, has `low_bits` bits.
+    // The upper word of item i is `keys[i * stride + offset] - least`; the lower word, the next one, has
+    // `low_bits` bits.
     stride: u32,
     offset: u32,
     least: u32,

@@ -1,4 +1,5 @@
-// Ties the three modules together: state.ts (what a link holds), network.ts (what is asked), drawing/ (what is seen).
+// Ties the three modules together: state.ts (what a link holds), network.ts (what is asked), drawing/ (what is
+// seen).
 
 import "./style.css";
 import { ChangesPanel } from "./changes";
