@@ -95,6 +95,17 @@ impl Gaussians {
             && self.sh_dc[index].iter().all(|c| c.is_finite())
     }
 
+    /// Undoes the decoding of values that a file had decoded already: scales instead of logarithms, opacities instead of logits.
+    pub fn deactivate(&mut self, scales: bool, opacities: bool) {
+        if scales {
+            self.scales.iter_mut().flatten().for_each(|scale| *scale = scale.ln().max(0.0));
+        }
+        if opacities {
+            let logit = |opacity: f32| (opacity / (1.0 - opacity)).ln();
+            self.opacities.iter_mut().for_each(|opacity| *opacity = logit(*opacity).clamp(0.0, 1.0));
+        }
+    }
+
     /// Returns the decoded size of `count` Gaussians of degree `sh_degree`, bytes.
     pub fn decoded_bytes(count: usize, sh_degree: u8) -> usize {
         count * (24 + 16 + 12 + 4 + 12 + 12 * Self::sh_rest_per_channel(sh_degree))

@@ -184,12 +184,11 @@ fn colmap_errors_have_place_and_fault() {
 
     let (_, what) = problem(read_text(CAMERA, "1 1.1 0 0 0 0 0 0 1 a.jpg\n\n"));
     assert!(matches!(what, PoseProblem::NotARotation { image, .. } if image == "a.jpg"));
-    let (_, what) = problem(read_text(CAMERA, "1 NaN 0 0 0 0 0 0 1 a.jpg\n\n"));
-    assert!(matches!(what, PoseProblem::NotARotation { .. }));
-
-    // Without the lines of features, the second image must not be skipped silently.
-    let (place, _) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 1 a.jpg\n2 1 0 0 0 0 0 0 1 b.jpg\n"));
+    let (place, what) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 three\n"));
     assert_eq!(place, Place::Line(2));
+    assert!(what.to_string().contains("three"), "{what}");
+    let (_, what) = problem(read_text("1 OPENCV 64 48 50 50 32 24 0.1 0.2\n", IMAGE));
+    assert!(what.to_string().contains("OPENCV has 8 parameters, found 6"), "{what}");
 
     let (_, what) = problem(read_text(CAMERA, &IMAGE.repeat(2)));
     assert_eq!(what, PoseProblem::DuplicateImage { image: "a.jpg".into() });
@@ -207,6 +206,89 @@ fn colmap_errors_have_place_and_fault() {
     assert_eq!(problem(read_text(CAMERA, "# nothing\n")).1, PoseProblem::NoViews);
     assert_eq!(problem(read_text(&CAMERA.repeat(2), IMAGE)).1, PoseProblem::DuplicateCamera { camera_id: 1 });
     assert!(matches!(read_files(&[("cameras.txt", b"")]), Err(PoseError::NotFound { .. })));
+}
+
+/// Lines of features may be missing, and names may have any number of words; images without a pose are left out and named.
+#[test]
+fn every_image_of_a_model_is_read_or_named() {
+    const CAMERA: &str = "\u{feff}1 PINHOLE 64 48 50 50 32 24\r\n";
+    for name in ["a.jpg", "IMG 1 (2).jpg", "a b.jpg"] {
+        for features in ["", "\n", "775.2 1029.3 8574 1183 971 -1\n"] {
+            let line = |id: u32| format!("{id} 1 0 0 0 0 0 0 1 {id}{name}\n{features}");
+            let set = read_text(CAMERA, &(1..=5).map(line).collect::<String>()).unwrap();
+            assert_eq!(set.views.len(), 5, "{name} {features:?}");
+            assert_eq!(set.views[4].name, format!("5{name}"));
+        }
+    }
+    let lost = "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 0 0 0 0 0 0 0 1 b.jpg\n\n3 NaN 0 0 0 0 0 0 1 c.jpg\n\n";
+    let set = read_text(CAMERA, lost).unwrap();
+    assert_eq!((set.views.len(), set.damaged.len()), (1, 2));
+    assert!(set.left_out().is_some_and(|text| text.contains("2 of 3") && text.contains("b.jpg")));
+}
+
+/// Photos under other paths, endings or letters; several models; a second form of the model.
+#[test]
+fn photos_and_models_are_found_and_choices_are_said() {
+    let dir = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| {
+        let path = dir.path().join(name);
+        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
+        fs_err::write(path, text).unwrap();
+    };
+    let image = |id: u32| format!("{id} 1 0 0 0 0 0 0 1 {id}.JPG\n");
+    for (model, ids) in [("sparse/0", 1..3), ("sparse/1", 3..9)] {
+        write(&format!("{model}/cameras.txt"), "1 PINHOLE 64 48 50 50 32 24\n");
+        write(&format!("{model}/images.txt"), &ids.map(image).collect::<String>());
+    }
+    for name in ["3.jpg", "4.png", "5.JPG"] {
+        write(&format!("images/{name}"), "");
+    }
+    for path in ["", "sparse", "sparse/1"] {
+        let set = poses::read(&dir.path().join(path), None).unwrap();
+        assert_eq!(set.views.len(), 6, "{path}");
+        let found: Vec<bool> = set.views.iter().map(|view| view.image_path.is_file()).collect();
+        assert_eq!(found, [true, true, true, false, false, false]);
+        assert!(
+            set.notes.iter().any(|note| note.starts_with("2 photos have other names")),
+            "{:?}",
+            set.notes
+        );
+    }
+    let small = poses::read(&dir.path().join("sparse/0"), None).unwrap();
+    assert!(small.notes.iter().any(|note| note.contains("several models")), "{:?}", small.notes);
+    write("sparse/1/images.bin", "");
+    let text = poses::read(&dir.path().join("sparse/1/images.txt"), None).unwrap();
+    assert!(
+        text.notes.iter().any(|note| note.contains("images.bin, which is newer, is ignored")),
+        "{:?}",
+        text.notes
+    );
+}
+
+/// NaN is no JSON, a byte order mark neither; paths of another machine are found by their endings.
+#[test]
+fn transforms_of_other_programs_are_read() {
+    let dir = tempfile::tempdir().unwrap();
+    fs_err::create_dir(dir.path().join("images")).unwrap();
+    fs_err::write(dir.path().join("images/a.jpg"), "").unwrap();
+    let matrix = "[[1,0,0,1],[0,1,0,2],[0,0,1,3],[0,0,0,1]]";
+    let frame = |path: &str, matrix: &str| {
+        format!(r#"{{"file_path": "{path}", "sharpness":NaN, "transform_matrix": {matrix}}}"#)
+    };
+    let frames = [
+        frame("C:\\\\Users\\\\anna\\\\a.jpg", matrix),
+        frame("/home/NaN/b.jpg", &matrix.replace('3', "-Infinity")),
+    ];
+    let json = format!("\u{feff}{{\"fl_x\": 60, \"w\": 64, \"h\": 48, \"frames\": [{}]}}", frames.join(","));
+    fs_err::write(dir.path().join("transforms.json"), json).unwrap();
+    for images in [None, Some(dir.path().join("images"))] {
+        let set = poses::read(dir.path(), images.as_deref()).unwrap();
+        assert_eq!((set.views.len(), set.views[0].name.as_str()), (1, "a.jpg"));
+        assert!(set.views[0].image_path.is_file());
+        assert_eq!(set.damaged[0].0, "/home/NaN/b.jpg");
+    }
+    let cameras = read_files(&[("transforms.json", b"[{\"id\": 0}]")]).unwrap_err().to_string();
+    assert!(cameras.contains("cameras.json"), "{cameras}");
 }
 
 /// Counts of 2D features that exceed the file, by one record and by overflow.
@@ -311,7 +393,10 @@ fn transforms_errors_have_place_and_fault() {
         bad["transform_matrix"][row][column] = value.into();
         let (place, what) = with("frames", serde_json::json!([frame("a.jpg"), bad]));
         assert_eq!(place, Place::Frame(1));
-        let names_it = matches!(&what, PoseProblem::NotARotation { image, .. } if image == "b.jpg");
+        let names_it = matches!(
+            &what,
+            PoseProblem::NotARotation { image, .. } | PoseProblem::Mirrored { image } if image == "b.jpg"
+        );
         assert!(names_it || row == 3, "{row} {column} {value}: {what}");
     }
     let twice = serde_json::json!([frame("images/a.jpg"), frame("images_2/a.jpg")]);

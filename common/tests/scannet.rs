@@ -90,7 +90,7 @@ fn damaged_scene_folders_are_named() {
     write(path, "pose/7.txt", "1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n");
     assert!(matches!(problem(path), PoseProblem::Expected { expected: "4 rows of 4 numbers", .. }));
     write(path, "pose/7.txt", "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n");
-    assert!(matches!(problem(path), PoseProblem::NotARotation { .. }), "a reflection");
+    assert!(matches!(problem(path), PoseProblem::Mirrored { .. }), "a reflection");
     write(path, "pose/7.txt", " ".repeat(1 << 20));
     assert!(matches!(problem(path), PoseProblem::TooLarge { bytes: 1_048_576, .. }));
     write(path, "pose/7.txt", [0xFF; 64]);

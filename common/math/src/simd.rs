@@ -89,7 +89,6 @@ impl InstructionSet {
         Self::available().last().copied().unwrap_or(Self::Portable)
     }
 
-    /// Returns the name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Portable => "portable",

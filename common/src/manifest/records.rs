@@ -91,7 +91,6 @@ impl TextModelRecord {
 pub struct ObjectRecord {
     /// BLAKE3 of the file.
     pub hash: Hash32,
-    /// Length of the file.
     pub len_bytes: u64,
 }
 
@@ -112,11 +111,9 @@ pub struct Calibration {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CellRecord {
-    /// The cell.
     pub cell_id: u32,
     /// Box around the extents of its Gaussians, world frame.
     pub bounds: Aabb,
-    /// Gaussians.
     pub n_gaussians: u32,
     /// Its shards, one per profile.
     #[schemars(extend("propertyNames" = serde_json::json!({ "enum": Profile::ALL.map(Profile::name) })))]
@@ -129,7 +126,6 @@ pub struct CellRecord {
 pub struct ShardRecord {
     /// BLAKE3 of the file.
     pub hash: Hash32,
-    /// Length of the file.
     pub len_bytes: u64,
     /// Centroids of the codebook.
     pub n_centroids: u32,

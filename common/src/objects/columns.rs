@@ -83,7 +83,6 @@ impl ObjectRecord {
         Aabb { min: self.box_min.into(), max: self.box_max.into() }
     }
 
-    /// Returns the position.
     pub fn position(&self) -> DVec3 {
         self.position_in_world.into()
     }
@@ -92,7 +91,6 @@ impl ObjectRecord {
 /// The objects' columns, borrowed from a shard's bytes or from the data to be written.
 #[derive(Clone, Copy, Debug)]
 pub struct Objects<'a> {
-    /// The header.
     pub header: ObjectsHeader,
     /// `[n]`.
     pub records: &'a [ObjectRecord],

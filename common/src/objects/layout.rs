@@ -123,7 +123,6 @@ impl ObjectsLayout {
     }
 }
 
-/// Returns the fault of a record, if it has one.
 fn fault(record: &ObjectRecord, n_here: u32, photos: &str) -> Option<&'static str> {
     let bounds = record.bounds();
     let is_finite = [record.position(), bounds.min, bounds.max].iter().all(|v| v.is_finite());

@@ -15,7 +15,6 @@ pub struct Thing {
     /// Derived from the indices of its Gaussians in the splat: equal while these are the same.
     #[serde(serialize_with = "as_hex", deserialize_with = "from_hex")]
     pub id: u64,
-    /// Its Gaussians.
     pub n_gaussians: u32,
     /// Mean of its Gaussians inside the box.
     pub position_in_world: DVec3,

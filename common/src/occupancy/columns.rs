@@ -94,7 +94,6 @@ impl StoredRun {
 pub struct BlockRun<'a> {
     /// Indices of the blocks, see [`StoredRun::start`].
     pub blocks: Range<u32>,
-    /// Their kind.
     pub kind: RunKind,
     /// `[blocks.len()]`, if the blocks are mixed: occupied and free voxels.
     pub masks: &'a [[u64; 2]],
@@ -114,7 +113,6 @@ impl BlockRun<'_> {
 /// The occupancy's columns, borrowed from a shard's bytes or from the data to be written.
 #[derive(Clone, Copy, Debug)]
 pub struct Occupancy<'a> {
-    /// The header.
     pub header: OccupancyHeader,
     /// `[n_runs]`, ascending.
     pub runs: &'a [StoredRun],

@@ -85,11 +85,12 @@ fn affine_from_matrix(image: &str, rotation: DMat3, translation: [f64; 3]) -> Re
     let gram = rotation.transpose() * rotation - DMat3::IDENTITY;
     let largest =
         gram.to_cols_array().iter().fold(0.0_f64, |m, v| if v.is_nan() { *v } else { m.max(v.abs()) });
+    if largest.is_nan() || largest > ROTATION_TOLERANCE {
+        return Err(PoseProblem::NotARotation { image: image.to_owned(), deviation: largest });
+    }
     // A reflection is orthonormal too, with determinant -1 instead of 1.
-    let deviation =
-        if largest <= ROTATION_TOLERANCE { (rotation.determinant() - 1.0).abs() } else { largest };
-    if deviation.is_nan() || deviation > 2.0 * ROTATION_TOLERANCE {
-        return Err(PoseProblem::NotARotation { image: image.to_owned(), deviation });
+    if rotation.determinant() < 0.0 {
+        return Err(PoseProblem::Mirrored { image: image.to_owned() });
     }
     let translation = check_translation(translation)?;
     Ok(DAffine3::from_rotation_translation(DQuat::from_mat3(&rotation).normalize(), translation))

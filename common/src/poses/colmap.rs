@@ -11,7 +11,7 @@ use fs_err::File;
 
 use super::checks::{affine_from_wxyz, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
-use super::paths::parent;
+use super::paths::{PhotoFinder, parent};
 use super::view_set::{PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 
@@ -30,6 +30,9 @@ const MODELS: [(i32, &str, usize); 6] = [
     (5, "OPENCV_FISHEYE", 8),
 ];
 
+/// Windows' editors begin a text with it.
+const BYTE_ORDER_MARK: char = '\u{feff}';
+
 type Cameras = BTreeMap<u32, Intrinsics>;
 
 pub(super) fn read(
@@ -44,13 +47,66 @@ pub(super) fn read(
     let extension = if source == PoseSource::ColmapBinary { "bin" } else { "txt" };
     let [cameras_path, images_path] =
         ["cameras", "images"].map(|stem| model_dir.join(stem).with_extension(extension));
-    let views = match source {
+    let images = match source {
         PoseSource::ColmapBinary => {
             images_from_binary(&images_path, &cameras_from_binary(&cameras_path)?, &images_dir)?
         }
         _ => images_from_text(&images_path, &cameras_from_text(&cameras_path)?, &images_dir)?,
     };
-    view_set(&images_path, views, source)
+    let mut set = view_set(&images_path, images.views, source)?;
+    set.damaged = images.damaged;
+    set.notes = notes(model_dir, extension, set.views.len());
+    set.notes.extend(PhotoFinder::new(images_dir).find_missing(&mut set.views));
+    Ok(set)
+}
+
+/// Returns what else could have been read: the other form of the model, and larger models beside it.
+fn notes(model_dir: &Path, extension: &str, n_views: usize) -> Vec<String> {
+    let mut notes = Vec::new();
+    let other = if extension == "bin" { "txt" } else { "bin" };
+    let [own, other] = [extension, other].map(|extension| model_dir.join(format!("images.{extension}")));
+    if other.is_file() {
+        let changed = |path: &Path| fs_err::metadata(path).and_then(|metadata| metadata.modified()).ok();
+        let newer = if changed(&other) > changed(&own) { ", which is newer," } else { "" };
+        notes.push(format!(
+            "read {}; {}{newer} is ignored: name the file to read it",
+            own.display(),
+            other.display()
+        ));
+    }
+    let beside = model_dir.parent().and_then(largest_model);
+    if let Some((larger, n)) = beside.filter(|(larger, n)| larger != model_dir && *n > n_views as u64) {
+        notes.push(format!(
+            "{} has {n_views} images; {} beside it has {n}: COLMAP made several models, one is read",
+            model_dir.display(),
+            larger.display()
+        ));
+    }
+    notes
+}
+
+/// Returns the numbered COLMAP model (`0`, `1` ...) with most images in a folder, and their number.
+pub(super) fn largest_model(folder: &Path) -> Option<(PathBuf, u64)> {
+    let number = |path: &PathBuf| path.file_name()?.to_str()?.parse::<u32>().ok();
+    let entries = fs_err::read_dir(folder).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    let mut models: Vec<(u32, PathBuf)> = entries.filter_map(|path| Some((number(&path)?, path))).collect();
+    models.sort();
+    let counted = models.into_iter().filter_map(|(_, path)| Some((n_images(&path)?, path)));
+    let largest = counted.reduce(|best, model| if model.0 > best.0 { model } else { best });
+    largest.map(|(n, path)| (path, n))
+}
+
+/// Returns the number of images that a model states, or that its lines suggest; `None` without a model.
+fn n_images(model_dir: &Path) -> Option<u64> {
+    if let Ok(mut file) = Binary::open(&model_dir.join("images.bin")) {
+        return file.u64("the number of images").ok();
+    }
+    let mut lines = Lines::open(&model_dir.join("images.txt")).ok()?;
+    let mut n = 0;
+    while lines.advance_to_record().ok()? {
+        n += u64::from(!is_features(&lines.line));
+    }
+    Some(n)
 }
 
 /// Returns the first of these folders that exists, or else the first: `images/` beside a parent folder `sparse`, beside
@@ -78,13 +134,41 @@ fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsi
             ([fx, fy], [cx, cy], Distortion::Fisheye { k: [k1, k2, k3, k4] })
         }
         _ => {
-            return Err(PoseProblem::Expected {
-                expected: "as many parameters as the lens model has",
-                found: format!("{} for {model}", params.len()),
+            let expected = MODELS.iter().find(|(_, name, _)| *name == model).map_or(0, |(.., n)| *n);
+            return Err(PoseProblem::LensParameters {
+                model: model.to_owned(),
+                expected,
+                found: params.len(),
             });
         }
     };
     check_intrinsics(size_px, focal, centre, distortion)
+}
+
+/// The images of a model.
+#[derive(Default)]
+struct Images {
+    views: Vec<View>,
+    /// Names of images without a pose, with the reason.
+    damaged: Vec<(String, String)>,
+}
+
+impl Images {
+    /// Adds an image record; one without a pose (zeros, NaN), as some exporters write it for photos that they could not
+    /// place, is left out.
+    fn push(
+        &mut self,
+        name: &str,
+        wxyz: [f64; 4],
+        view: Result<View, PoseProblem>,
+    ) -> Result<(), PoseProblem> {
+        if wxyz == [0.0; 4] || wxyz.iter().any(|q| q.is_nan()) {
+            self.damaged.push((name.trim().to_owned(), format!("its quaternion is {wxyz:?}")));
+            return Ok(());
+        }
+        self.views.push(view?);
+        Ok(())
+    }
 }
 
 /// Returns the view of an image record.
@@ -97,6 +181,7 @@ fn view(
     translation: [f64; 3],
 ) -> Result<View, PoseProblem> {
     let name = name.replace('\\', "/");
+    let name = name.strip_prefix("./").unwrap_or(&name).to_owned();
     let relative = Path::new(&name);
     if name.is_empty()
         || name.contains('\0')
@@ -149,6 +234,9 @@ impl Lines {
         self.line = String::from_utf8(bytes).map_err(|_| {
             self.fail(PoseProblem::Expected { expected: "UTF-8 text", found: "other bytes".to_owned() })
         })?;
+        if self.number == 1 && self.line.starts_with(BYTE_ORDER_MARK) {
+            self.line.remove(0);
+        }
         Ok(n > 0)
     }
 
@@ -210,33 +298,43 @@ fn camera_from_line(line: &str) -> Result<(u32, Intrinsics), PoseProblem> {
     Ok((camera_id, intrinsics(&model, size_px, &params)?))
 }
 
-fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Vec<View>, PoseError> {
-    let mut views = Vec::new();
+fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Images, PoseError> {
+    let mut images = Images::default();
     let mut lines = Lines::open(path)?;
-    while lines.advance_to_record()? {
-        let view =
-            image_from_line(&lines.line, cameras, images_dir).map_err(|problem| lines.fail(problem))?;
-        views.push(view);
-        // A line of features follows each image, empty or not. In a file without these lines every second image
-        // would silently be taken for one, so the number of words is checked.
-        if lines.advance()? && lines.line.split_ascii_whitespace().count() % 3 != 0 {
-            let found = excerpt(&lines.line);
-            return Err(lines.fail(PoseProblem::Expected {
-                expected: "the image's 2D features (X Y POINT3D_ID ...) or an empty line",
-                found,
-            }));
+    let mut has_record = lines.advance_to_record()?;
+    while has_record {
+        add_image_line(&lines.line, cameras, images_dir, &mut images)
+            .map_err(|problem| lines.fail(problem))?;
+        // A line of features follows each image, perhaps an empty one; some exporters leave it out.
+        has_record = lines.advance()?;
+        if has_record && is_features(&lines.line) {
+            has_record = lines.advance_to_record()?;
         }
     }
-    Ok(views)
+    Ok(images)
 }
 
-fn image_from_line(line: &str, cameras: &Cameras, images_dir: &Path) -> Result<View, PoseProblem> {
+/// Returns whether a line has the 2D features of an image, `X Y POINT3D_ID` each, or is empty or a comment.
+fn is_features(line: &str) -> bool {
+    let is_number = |word: &str| word.parse::<f64>().is_ok();
+    line.starts_with('#')
+        || line.split_whitespace().count() % 3 == 0 && line.split_whitespace().all(is_number)
+}
+
+fn add_image_line(
+    line: &str,
+    cameras: &Cameras,
+    images_dir: &Path,
+    images: &mut Images,
+) -> Result<(), PoseProblem> {
     let mut rest = line;
-    let _image_id: u32 = take(&mut rest, "an image id")?;
+    let _image_id: u32 =
+        take(&mut rest, "an image id, or the 2D features (X Y POINT3D_ID ...) of the image before")?;
     let wxyz = take_numbers(&mut rest, "a quaternion QW QX QY QZ")?;
     let translation = take_numbers(&mut rest, "a translation TX TY TZ")?;
     let camera_id = take(&mut rest, "a camera id")?;
-    view(cameras, images_dir, rest.trim(), camera_id, wxyz, translation)
+    let name = rest.trim();
+    images.push(name, wxyz, view(cameras, images_dir, name, camera_id, wxyz, translation))
 }
 
 /// A binary file that is read front to back; counts are checked against its length.
@@ -349,8 +447,8 @@ fn cameras_from_binary(path: &Path) -> Result<Cameras, PoseError> {
     Ok(cameras)
 }
 
-fn images_from_binary(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Vec<View>, PoseError> {
-    let mut views = Vec::new();
+fn images_from_binary(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Images, PoseError> {
+    let mut images = Images::default();
     let mut file = Binary::open(path)?;
     for _ in 0..file.u64("the number of images")? {
         let _image_id = file.u32("an image id")?;
@@ -359,10 +457,10 @@ fn images_from_binary(path: &Path, cameras: &Cameras, images_dir: &Path) -> Resu
         let camera_id = file.u32("a camera id")?;
         let name = file.name()?;
         let view = view(cameras, images_dir, &name, camera_id, wxyz, translation);
-        views.push(view.map_err(|problem| file.fail(problem))?);
+        images.push(&name, wxyz, view).map_err(|problem| file.fail(problem))?;
         let n_features = file.u64("the number of 2D features")?;
         file.skip(n_features, FEATURE_BYTES, "the image's 2D features")?;
     }
     file.expect_end()?;
-    Ok(views)
+    Ok(images)
 }

@@ -20,7 +20,8 @@ pub use view_set::{AppliedTransform, PoseSource, ViewSet};
 
 /// Reads the posed views at `path`.
 ///
-/// `path` is the folder of a COLMAP model (or one of its files, or a folder with `sparse/0` or `sparse`), or a nerfstudio
+/// `path` is the folder of a COLMAP model (or one of its files, or a folder with `sparse/0`, `0` or `sparse`; of several
+/// numbered models the one with most images), or a nerfstudio
 /// `transforms.json` (or its folder), or a scene folder as ScanNet's SensReader exports it (`color/`, `pose/`,
 /// `intrinsic/`). COLMAP takes precedence over `transforms.json`, that over ScanNet, and binary over text, which is
 /// rounded.
@@ -40,7 +41,10 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
             _ => Err(PoseError::NotFound { path: path.to_owned() }),
         };
     }
-    for model_dir in [path.to_owned(), path.join("sparse/0"), path.join("sparse")] {
+    let numbered = |folder: &Path| colmap::largest_model(folder).map(|(model, _)| model);
+    let model_dirs =
+        [Some(path.to_owned()), numbered(&path.join("sparse")), numbered(path), Some(path.join("sparse"))];
+    for model_dir in model_dirs.into_iter().flatten() {
         for (source, extension) in [(PoseSource::ColmapBinary, "bin"), (PoseSource::ColmapText, "txt")] {
             let has = |stem: &str| model_dir.join(stem).with_extension(extension).is_file();
             if has("cameras") && has("images") {

@@ -1,7 +1,10 @@
-//! Paths of pose files.
+//! Paths of pose files, and of photos that are not where the poses say.
 
+use std::collections::{BTreeMap, HashMap};
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
+
+use crate::camera::View;
 
 /// Returns the parent folder of `path`, also for paths such as `.` that do not name it.
 pub(super) fn parent(path: &Path) -> io::Result<PathBuf> {
@@ -9,4 +12,72 @@ pub(super) fn parent(path: &Path) -> io::Result<PathBuf> {
         Some(parent) if path.file_name().is_some() && parent != Path::new("") => Ok(parent.to_owned()),
         _ => Ok(fs_err::canonicalize(path)?.parent().map_or_else(|| PathBuf::from("/"), Path::to_owned)),
     }
+}
+
+/// Endings of photos, in small letters.
+const PHOTO_ENDINGS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
+
+/// Finds photos whose path or ending differs from what the poses say.
+pub(super) struct PhotoFinder {
+    /// The folder of the photos.
+    dir: PathBuf,
+    /// By folder: files by their name in small letters without its ending; `None` where two have the same.
+    listed: HashMap<PathBuf, BTreeMap<String, Option<PathBuf>>>,
+}
+
+impl PhotoFinder {
+    pub(super) fn new(dir: PathBuf) -> Self {
+        Self { dir, listed: HashMap::new() }
+    }
+
+    /// Returns the photo at the longest ending of `path` that exists in the folder, with the stated file name or else in
+    /// other letters or with the ending of another photo format; and that ending.
+    pub(super) fn find(&mut self, path: &str) -> Option<(PathBuf, String)> {
+        let parts: Vec<&str> = Path::new(path)
+            .components()
+            .filter_map(|part| match part {
+                Component::Normal(part) => part.to_str(),
+                _ => None,
+            })
+            .collect();
+        let endings = || (0..parts.len()).map(|start| parts[start..].join("/"));
+        let exact = endings().find(|ending| self.dir.join(ending).is_file());
+        let found = exact.map(|ending| (self.dir.join(&ending), ending));
+        found.or_else(|| endings().find_map(|ending| Some((self.similar(&self.dir.join(&ending))?, ending))))
+    }
+
+    fn similar(&mut self, path: &Path) -> Option<PathBuf> {
+        let folder = path.parent()?;
+        let files = self.listed.entry(folder.to_owned()).or_insert_with(|| {
+            let mut files = BTreeMap::new();
+            let entries = fs_err::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+            for file in entries.map(|entry| entry.path()) {
+                let ending = file.extension().and_then(|ending| ending.to_str()).map(str::to_lowercase);
+                if let (Some(stem), true) =
+                    (stem_of(&file), ending.is_some_and(|ending| PHOTO_ENDINGS.contains(&&*ending)))
+                {
+                    files.entry(stem).and_modify(|one| *one = None).or_insert(Some(file));
+                }
+            }
+            files
+        });
+        files.get(&stem_of(path)?)?.clone()
+    }
+
+    /// Finds the photos of the views whose file does not exist; returns a sentence on them, if there are any.
+    pub(super) fn find_missing(&mut self, views: &mut [View]) -> Option<String> {
+        let mut moved = Vec::new();
+        for view in views.iter_mut().filter(|view| !view.image_path.is_file()) {
+            if let Some((path, _)) = self.find(&view.name) {
+                moved.push(format!("{} for {}", path.display(), view.name));
+                view.image_path = path;
+            }
+        }
+        let first = moved.first()?;
+        Some(format!("{} photos have other names than the poses say, such as {first}", moved.len()))
+    }
+}
+
+fn stem_of(path: &Path) -> Option<String> {
+    Some(path.file_stem()?.to_str()?.to_lowercase())
 }

@@ -11,7 +11,7 @@ use serde::Deserialize;
 
 use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
-use super::paths::parent;
+use super::paths::{PhotoFinder, parent};
 use super::view_set::{AppliedTransform, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 
@@ -43,7 +43,8 @@ struct Camera {
 #[derive(Deserialize)]
 struct FrameEntry {
     file_path: String,
-    transform_matrix: Vec<Vec<f64>>,
+    /// NaN, which is no JSON, was replaced by null.
+    transform_matrix: Vec<Vec<Option<f64>>>,
     #[serde(flatten)]
     camera: Camera,
 }
@@ -58,24 +59,97 @@ struct Transforms {
 }
 
 pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
-    let bytes = fs_err::read(path)?;
+    let bytes = null_for_nan(&fs_err::read(path)?);
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+    if text.trim_ascii_start().starts_with(b"[") {
+        let what = "this is a list, as the cameras.json of a training run, not a transforms.json";
+        return Err(PoseProblem::OtherKind { what }.at(path, Place::File));
+    }
     let transforms: Transforms =
-        serde_json::from_slice(&bytes).map_err(|cause| PoseError::Json { path: path.to_owned(), cause })?;
+        serde_json::from_slice(text).map_err(|cause| PoseError::Json { path: path.to_owned(), cause })?;
     let folder = parent(path)?;
-    let file_paths: Vec<String> =
-        transforms.frames.iter().map(|frame| frame.file_path.replace('\\', "/")).collect();
-    let names = names_of(&file_paths);
-    let mut views = Vec::new();
-    for (index, ((frame, file_path), name)) in
-        transforms.frames.iter().zip(&file_paths).zip(names).enumerate()
-    {
-        let view = name
-            .ok_or_else(|| PoseProblem::UnsafeName { image: file_path.clone() })
-            .and_then(|name| view(frame, file_path, name, &transforms.camera, &folder, images_dir));
-        views.push(view.map_err(|problem| problem.at(path, Place::Frame(index)))?);
+    let mut frames = Frames {
+        paths: transforms.frames.iter().map(|frame| frame.file_path.replace('\\', "/")).collect(),
+        images_dir,
+        folder: &folder,
+        finders: match images_dir {
+            Some(dir) => vec![PhotoFinder::new(dir.to_owned())],
+            None => vec![PhotoFinder::new(folder.clone()), PhotoFinder::new(folder.join("images"))],
+        },
+        moved: Vec::new(),
+    };
+    let names = names_of(&frames.paths);
+    let (mut views, mut damaged) = (Vec::new(), Vec::new());
+    for (index, (frame, name)) in transforms.frames.iter().zip(names).enumerate() {
+        let at = |problem: PoseProblem| problem.at(path, Place::Frame(index));
+        let image = frames.paths[index].clone();
+        let Some(rows) = finite(&frame.transform_matrix) else {
+            damaged.push((image, "a value of its transform_matrix is not a number".to_owned()));
+            continue;
+        };
+        let (image_path, name) =
+            frames.photo(index, name).ok_or_else(|| at(PoseProblem::UnsafeName { image }))?;
+        let camera = frame.camera.clone().or(&transforms.camera);
+        views.push(view(&rows, name, image_path, &camera).map_err(at)?);
     }
     let applied = applied(&transforms, &folder).map_err(|problem| problem.at(path, Place::File))?;
-    Ok(ViewSet { applied, ..view_set(path, views, PoseSource::Transforms)? })
+    let first = frames.moved.first();
+    let notes = first
+        .map(|first| format!("{} photos are not where the file says; found {first}", frames.moved.len()))
+        .into_iter()
+        .collect();
+    Ok(ViewSet { applied, damaged, notes, ..view_set(path, views, PoseSource::Transforms)? })
+}
+
+/// Replaces NaN and infinities, which some writers put into JSON, by null.
+fn null_for_nan(json: &[u8]) -> Vec<u8> {
+    let (mut out, mut rest, mut is_text) = (Vec::with_capacity(json.len() + 16), json, false);
+    while let [byte, after @ ..] = rest {
+        let word = [&b"-Infinity"[..], b"Infinity", b"NaN"].into_iter().find(|word| rest.starts_with(word));
+        if let (false, Some(word)) = (is_text, word) {
+            out.extend_from_slice(b"null");
+            rest = &rest[word.len()..];
+            continue;
+        }
+        is_text ^= *byte == b'"';
+        let n = if is_text && *byte == b'\\' { rest.len().min(2) } else { 1 };
+        out.extend_from_slice(&rest[..n]);
+        rest = if n == 1 { after } else { &rest[n..] };
+    }
+    out
+}
+
+fn finite(rows: &[Vec<Option<f64>>]) -> Option<Vec<Vec<f64>>> {
+    rows.iter().map(|row| row.iter().copied().collect()).collect()
+}
+
+/// Where the photos of the frames are.
+struct Frames<'a> {
+    paths: Vec<String>,
+    images_dir: Option<&'a Path>,
+    folder: &'a Path,
+    finders: Vec<PhotoFinder>,
+    /// Photos that were not where the file says.
+    moved: Vec<String>,
+}
+
+impl Frames<'_> {
+    /// Returns the path of a frame's photo and its name: where the file says, or else at the longest ending of that path
+    /// that exists. `name`: by the file, perhaps without an ending.
+    fn photo(&mut self, index: usize, name: Option<String>) -> Option<(PathBuf, String)> {
+        let (name, file_path) = (name?, &self.paths[index]);
+        let (image_path, ending) = match self.images_dir {
+            Some(dir) => existing(&dir.join(&name)),
+            None => existing(&self.folder.join(file_path)),
+        };
+        if !image_path.is_file()
+            && let Some((found, name)) = self.finders.iter_mut().find_map(|finder| finder.find(file_path))
+        {
+            self.moved.push(format!("{} for {file_path}", found.display()));
+            return Some((found, name));
+        }
+        Some((image_path, name + &ending))
+    }
 }
 
 /// Returns the earlier change of the world frame. Files of old versions of nerfstudio do not record it; it assumes
@@ -99,23 +173,14 @@ fn applied(transforms: &Transforms, folder: &Path) -> Result<Option<AppliedTrans
 pub(super) const COLMAP_AXES: DMat3 =
     DMat3::from_cols(DVec3::new(0.0, 1.0, 0.0), DVec3::new(1.0, 0.0, 0.0), DVec3::new(0.0, 0.0, -1.0));
 
-/// Returns the view of a frame; `name` may lack the extension, as its `file_path` may.
 fn view(
-    frame: &FrameEntry,
-    file_path: &str,
+    matrix: &[Vec<f64>],
     name: String,
-    shared: &Camera,
-    folder: &Path,
-    images_dir: Option<&Path>,
+    image_path: PathBuf,
+    camera: &Camera,
 ) -> Result<View, PoseProblem> {
-    let (image_path, extension) = match images_dir {
-        Some(dir) => existing(&dir.join(&name)),
-        None => existing(&folder.join(file_path)),
-    };
-    let name = name + &extension;
     let opencv_axes_in_opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-    let world_from_camera = affine_from_rows(&name, &frame.transform_matrix, opencv_axes_in_opengl)?;
-    let camera = frame.camera.clone().or(shared);
+    let world_from_camera = affine_from_rows(&name, matrix, opencv_axes_in_opengl)?;
     let intrinsics = camera.intrinsics(&name, &image_path)?;
     Ok(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() })
 }

@@ -16,6 +16,10 @@ pub struct ViewSet {
     pub source: PoseSource,
     /// Names of frames that are listed without a pose (ScanNet's `-inf`), sorted; they are not in `views`.
     pub without_pose: Vec<String>,
+    /// Frames that are left out because their pose is no rotation and translation, with the reason.
+    pub damaged: Vec<(String, String)>,
+    /// What was guessed or chosen while reading, a sentence each.
+    pub notes: Vec<String>,
     /// The transform that `transforms.json` states was applied to its poses already.
     pub applied: Option<AppliedTransform>,
 }
@@ -42,6 +46,17 @@ pub enum PoseSource {
     Scannet,
 }
 
+impl ViewSet {
+    /// Returns a sentence on the frames that are left out, if there are any.
+    pub fn left_out(&self) -> Option<String> {
+        let (lost, damaged) = (self.without_pose.len(), self.damaged.len());
+        let of = self.views.len() + lost + damaged;
+        let first = self.damaged.first().map(|(name, reason)| format!("{name} ({reason})"));
+        let first = first.or_else(|| self.without_pose.first().cloned())?;
+        Some(format!("{} of {of} frames have no pose and are left out, the first is {first}", lost + damaged))
+    }
+}
+
 /// Sorts views by name; an empty set or two equal names are errors.
 pub(super) fn view_set(path: &Path, mut views: Vec<View>, source: PoseSource) -> Result<ViewSet, PoseError> {
     if views.is_empty() {
@@ -51,5 +66,6 @@ pub(super) fn view_set(path: &Path, mut views: Vec<View>, source: PoseSource) ->
     if let Some(pair) = views.windows(2).find(|pair| pair[0].name == pair[1].name) {
         return Err(PoseProblem::DuplicateImage { image: pair[0].name.clone() }.at(path, Place::File));
     }
-    Ok(ViewSet { views, source, without_pose: Vec::new(), applied: None })
+    let (without_pose, damaged, notes) = Default::default();
+    Ok(ViewSet { views, source, without_pose, damaged, notes, applied: None })
 }

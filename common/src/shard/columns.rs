@@ -106,7 +106,6 @@ pub struct Fine<'a> {
 /// A shard's columns, borrowed from its bytes or from the data to be written.
 #[derive(Clone, Copy, Debug)]
 pub struct ShardView<'a> {
-    /// The header.
     pub header: ShardHeader,
     /// `[N]`; decode with [`ShardView::position_in_world`].
     pub positions: Positions<'a>,
@@ -153,7 +152,6 @@ impl ShardView<'_> {
         Aabb { min, max: min + size }
     }
 
-    /// Returns the members of a centroid.
     pub fn members(&self, centroid: usize) -> Range<usize> {
         self.centroid_starts[centroid] as usize..self.centroid_starts[centroid + 1] as usize
     }

@@ -91,7 +91,6 @@ pub struct ScoreErrors {
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ShardHeader {
-    /// The cell.
     pub cell_id: u32,
     /// Gaussians, N.
     pub n_gaussians: u32,

@@ -10,7 +10,6 @@
 //! A residual code splits the components into subspaces and names one of 16 codewords for each:
 //! `E ~ P[r] + scale[r] * sum over g of sum over c in subspace g of codewords[g][code][c] * basis_steps[c] * basis[c]`.
 
-mod check;
 mod columns;
 mod decode;
 mod format;

@@ -8,48 +8,14 @@ use std::path::{Path, PathBuf};
 /// Why a splat file could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum SplatError {
-    /// A file cannot be opened, read or written.
     #[error("{cause}; check the path and its permissions")]
-    Io {
-        /// The failed call, with the path. The message quotes it, so it is not a `source` as well.
-        cause: io::Error,
-    },
-    /// The content violates the format.
+    Io { cause: io::Error },
     #[error("{}: {place}: expected {expected}, found {found}; {advice}", path.display())]
-    Malformed {
-        /// The file.
-        path: PathBuf,
-        /// The place in the file.
-        place: Place,
-        /// The content expected.
-        expected: String,
-        /// The content found.
-        found: String,
-        /// The remedy.
-        advice: &'static str,
-    },
-    /// Compressed content cannot be decompressed.
+    Malformed { path: PathBuf, place: Place, expected: String, found: String, advice: &'static str },
     #[error("{}: {place}: {what} cannot be decompressed: {cause}; copy or export the file again", path.display())]
-    Undecodable {
-        /// The file.
-        path: PathBuf,
-        /// The place in the file.
-        place: Place,
-        /// The compressed part.
-        what: &'static str,
-        /// The decompressor's error. The message quotes it, so it is not a `source` as well.
-        cause: Box<dyn Error + Send + Sync>,
-    },
-    /// The format or feature is known but not supported.
+    Undecodable { path: PathBuf, place: Place, what: &'static str, cause: Box<dyn Error + Send + Sync> },
     #[error("{}: {format} is not supported; {advice}", path.display())]
-    Unsupported {
-        /// The file.
-        path: PathBuf,
-        /// The format or feature.
-        format: String,
-        /// The remedy.
-        advice: &'static str,
-    },
+    Unsupported { path: PathBuf, format: String, advice: &'static str },
 }
 
 /// A place in a splat file.

@@ -17,7 +17,6 @@ pub(super) struct Input {
 }
 
 impl Input {
-    /// Opens a file.
     pub fn open(path: &Path) -> Result<Self, SplatError> {
         let file = fs_err::File::open(path)?;
         let len_bytes = file.metadata()?.len();

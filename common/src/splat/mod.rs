@@ -49,6 +49,16 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Gaussians, SplatError>
         (b"PK\x03\x04", _) => sog::read_bundle(path, *options),
         (_, "splat") => dot_splat::read(input),
         (_, "json") | ([b'{', ..], _) => sog::read_folder(path, *options),
+        (b"vers", _) => Err(SplatError::Unsupported {
+            path: path.into(),
+            format: "a pointer of Git LFS".into(),
+            advice: "bring the file itself with `git lfs pull`",
+        }),
+        ([b'<', ..], _) => Err(SplatError::Unsupported {
+            path: path.into(),
+            format: "a web page".into(),
+            advice: "the download was refused or needs a login: download the file itself",
+        }),
         (_, "ksplat") => Err(SplatError::Unsupported {
             path: path.into(),
             format: ".ksplat".into(),

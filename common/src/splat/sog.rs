@@ -145,6 +145,13 @@ pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians
     let len_bytes = file.metadata()?.len();
     let archive = ZipArchive::new(BufReader::new(file))
         .map_err(|source| SplatError::undecodable(path, Place::Byte(0), "the ZIP directory", source))?;
+    if archive.index_for_name("meta.json").is_none() {
+        return Err(SplatError::Unsupported {
+            path: path.into(),
+            format: "a ZIP file without the meta.json of SOG".into(),
+            advice: "unpack it and give the splat inside",
+        });
+    }
     let mut sog = Sog { path: path.into(), parts: Parts::Bundle(Box::new(archive)), len_bytes };
     let meta = sog.meta("meta.json")?;
     sog.decode(&meta, options)

@@ -61,6 +61,13 @@ impl Header {
             fractional_bits: raw[13],
             flags: raw[14],
         };
+        if raw.starts_with(b"ply") {
+            return Err(SplatError::Unsupported {
+                path: path.into(),
+                format: "a PLY in gzip".into(),
+                advice: "unpack it with `gunzip`",
+            });
+        }
         if !raw.starts_with(MAGIC) {
             return malformed(0, "the magic \"NGSP\" of SPZ", format!("{:02x?}", &raw[..4]));
         }

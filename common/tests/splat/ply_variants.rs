@@ -249,3 +249,51 @@ fn what_is_written_is_read_back() {
         assert_near(rows[5][10 + 3 * per_channel].into(), f64::from(written.scales[5][0]).ln(), 1e-6, "log");
     }
 }
+
+/// An ASCII PLY of one Gaussian with these properties, each with its value.
+fn one_row(properties: &[(&str, &str, f64)]) -> Vec<u8> {
+    let header: String =
+        properties.iter().map(|(kind, name, _)| format!("property {kind} {name}\n")).collect();
+    let row: Vec<String> = properties.iter().map(|(.., value)| value.to_string()).collect();
+    format!("ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n{}\n", row.join(" ")).into_bytes()
+}
+
+/// Flat Gaussians of 2DGS, colours as numbers of 0 to 1, harmonics of degree 4; and files that are no splats are named.
+#[test]
+fn files_of_other_kinds_are_read_or_named() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let path = dir.path().join("a.ply");
+    let geometry = |float: &'static str| -> Vec<(&'static str, &'static str, f64)> {
+        let names = ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "opacity"];
+        names.into_iter().map(|name| (float, name, if name == "rot_0" { 1.0 } else { 0.0 })).collect()
+    };
+    let read_back = |properties: &[(&str, &str, f64)]| {
+        std::fs::write(&path, one_row(properties)).expect("writes");
+        read_all(&path)
+    };
+    let colours = [("float", "red", 1.0), ("float", "green", 0.5), ("float", "blue", 0.0)];
+    let flat = read_back(&[&geometry("float")[..], &colours].concat()).expect("2DGS");
+    assert_eq!(flat.scales[0], [1.0, 1.0, 0.0]);
+    for (found, expected) in flat.rgb_dc(0).into_iter().zip([1.0, 0.5, 0.0]) {
+        assert_near(found.into(), expected, 1e-6, "colour");
+    }
+    let rest: Vec<String> = (0..72).map(|i| format!("f_rest_{i}")).collect();
+    let mut fourth = [&geometry("float")[..], &[("float", "scale_2", 0.0)]].concat();
+    fourth.extend((0..3).map(|i| ("float", ["f_dc_0", "f_dc_1", "f_dc_2"][i], 0.25)));
+    fourth.extend(rest.iter().enumerate().map(|(i, name)| ("float", name.as_str(), i as f64)));
+    let fourth = read_back(&fourth).expect("degree 4");
+    assert_eq!((fourth.sh_degree, fourth.sh_rest.len()), (3, 45));
+    // Channel by channel in the file, 24 each, of which 15 are kept.
+    assert_eq!((fourth.sh_rest[..4].to_vec(), fourth.sh_rest[44]), (vec![0.0, 24.0, 48.0, 1.0], 62.0));
+
+    let refused = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).expect("writes");
+        read_all(&path).expect_err("no splat").to_string()
+    };
+    assert!(refused(b"version https://git-lfs.github.com/spec/v1\n").contains("git lfs pull"));
+    assert!(refused(b"<!DOCTYPE html>").contains("web page"));
+    assert!(refused(&one_row(&geometry("float")[..3])).contains("point cloud"));
+    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut gzip, &one_row(&geometry("float"))).expect("memory");
+    assert!(refused(&gzip.finish().expect("memory")).contains("gunzip"));
+}

@@ -4,7 +4,7 @@
 use glam::DVec3;
 
 use super::container::Ply;
-use super::harmonics::sh_rest_properties;
+use super::sh_rest_properties;
 use crate::Gaussians;
 use crate::splat::columns::{ReadOptions, columns};
 use crate::splat::error::SplatError;
@@ -63,27 +63,13 @@ fn unpack_rotation(word: u32) -> [f64; 4] {
 
 /// Reads the rows of a file with its header already read.
 pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
-    let Some(chunk) = ply.element("chunk") else {
-        return Err(SplatError::malformed(
-            ply.input.path(),
-            ply.input.place(),
-            "a header with an element \"chunk\"",
-            "none",
-        ));
-    };
-    let mut chunk_properties = Vec::new();
-    for name in RANGES {
-        chunk_properties.push(ply.property(chunk, name, EXPORT_AGAIN)?);
-    }
+    let chunk = ply.require_element("chunk", EXPORT_AGAIN)?;
+    let mut chunk_properties = ply.properties(chunk, &RANGES, EXPORT_AGAIN)?;
     // Files of the first version have no colour ranges; colours span 0..=1.
-    let has_colour_ranges = ply.elements[chunk].property(COLOUR_RANGES[0]).is_some();
-    for name in COLOUR_RANGES.into_iter().filter(|_| has_colour_ranges) {
-        chunk_properties.push(ply.property(chunk, name, EXPORT_AGAIN)?);
+    if ply.elements[chunk].property(COLOUR_RANGES[0]).is_some() {
+        chunk_properties.extend(ply.properties(chunk, &COLOUR_RANGES, EXPORT_AGAIN)?);
     }
-    let mut packed = Vec::new();
-    for name in PACKED {
-        packed.push(ply.property(vertex, name, EXPORT_AGAIN)?);
-    }
+    let packed = ply.properties(vertex, &PACKED, EXPORT_AGAIN)?;
 
     ply.seek_element(chunk)?;
     let mut chunks = Vec::with_capacity(ply.checked_count(chunk)?);

@@ -104,6 +104,11 @@ impl Element {
         self.properties.iter().position(|p| p.name == name)
     }
 
+    /// Returns whether a property is a number with a fraction.
+    pub fn is_float(&self, index: usize) -> bool {
+        matches!(self.properties[index].kind, Kind::Scalar(Scalar::F32 | Scalar::F64))
+    }
+
     /// Returns the length of a binary row, or `None` if the element has lists.
     fn row_bytes(&self) -> Option<usize> {
         self.properties
@@ -168,16 +173,38 @@ impl Ply {
         self.elements.iter().position(|e| e.name == name)
     }
 
-    /// Returns the index of a property of an element, or an error if it is missing.
-    pub fn property(&self, element: usize, name: &str, advice: &'static str) -> Result<usize, SplatError> {
+    /// Returns the index of an element, or an error if it is missing.
+    pub fn require_element(&self, name: &str, advice: &'static str) -> Result<usize, SplatError> {
+        let missing = || self.missing(format!("a header with an element {name:?}"), advice);
+        self.element(name).ok_or_else(missing)
+    }
+
+    /// Returns the indices of properties of an element, or an error if one is missing.
+    pub fn properties(
+        &self,
+        element: usize,
+        names: &[&str],
+        advice: &'static str,
+    ) -> Result<Vec<usize>, SplatError> {
         let element = &self.elements[element];
-        element.property(name).ok_or_else(|| SplatError::Malformed {
+        let index = |name: &&str| {
+            let missing = || {
+                self.missing(format!("a header with property {name:?} of element {:?}", element.name), advice)
+            };
+            element.property(name).ok_or_else(missing)
+        };
+        names.iter().map(index).collect()
+    }
+
+    fn missing(&self, expected: String, advice: &'static str) -> SplatError {
+        let place = Place::Line(self.line);
+        SplatError::Malformed {
             path: self.input.path().into(),
-            place: Place::Line(self.line),
-            expected: format!("a header with property {name:?} of element {:?}", element.name),
+            place,
+            expected,
             found: "none".into(),
             advice,
-        })
+        }
     }
 
     /// Returns the number of rows of the next element after checking that they fit into the rest of the file.

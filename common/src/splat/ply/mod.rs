@@ -7,36 +7,118 @@
 
 mod compressed;
 mod container;
-mod harmonics;
-mod plain;
 mod points;
-mod vertices;
 mod write;
 
+use std::path::Path;
+
+use glam::DVec3;
+
 pub use points::{Point, PointProperties};
-pub use vertices::read_vertices;
 pub use write::{write, write_header, write_rows, write_to};
 
-use super::columns::ReadOptions;
-use super::error::SplatError;
+use super::columns::{MAX_SH_DEGREE, ReadOptions, columns};
+use super::error::{Place, SplatError};
 use super::input::Input;
+use super::values::{dc_of_colour, sigmoid, unit_rotation};
 use crate::Gaussians;
 use container::Ply;
+
+/// Advice for a PLY without the properties of a splat.
+const NOT_A_SPLAT: &str =
+    "this is not a trained splat but perhaps a point cloud or mesh: give the PLY of the splat";
+/// The name of the Gaussians' element.
+const VERTEX: &str = "vertex";
+const GEOMETRY: [&str; 10] =
+    ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0", "scale_1"];
+/// The third scale, which the flat Gaussians of 2DGS lack.
+const THIRD_SCALE: &str = "scale_2";
+/// A higher degree that some trainers write; it is cut to [`MAX_SH_DEGREE`].
+const HIGHER_SH_DEGREE: u8 = MAX_SH_DEGREE + 1;
 
 /// Reads a PLY file, plain or compressed.
 pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let ply = Ply::open(input)?;
-    let Some(vertex) = ply.element("vertex") else {
+    let vertex = ply.require_element(VERTEX, NOT_A_SPLAT)?;
+    match ply.elements[vertex].property("packed_position") {
+        Some(_) => compressed::read(ply, vertex, options),
+        None => read_plain(ply, vertex, options),
+    }
+}
+
+/// Reads the rows of a file with a property for each number.
+fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
+    let mut wanted = ply.properties(vertex, &GEOMETRY, NOT_A_SPLAT)?;
+    let third_scale = ply.elements[vertex].property(THIRD_SCALE);
+    // A flat Gaussian's third axis is read as some other number and set to 0.
+    wanted.push(third_scale.unwrap_or(wanted[9]));
+    let rgb_names = ["red", "green", "blue"];
+    let rgb: Option<Vec<usize>> = rgb_names.iter().map(|name| ply.elements[vertex].property(name)).collect();
+    // nerfstudio exports plain colours on request ("rgb"), others as numbers of 0 to 1.
+    let white = match (&rgb, ply.elements[vertex].property("f_dc_0")) {
+        (Some(rgb), None) => Some(if ply.elements[vertex].is_float(rgb[0]) { 1.0 } else { 255.0 }),
+        _ => None,
+    };
+    match (rgb, white) {
+        (Some(rgb), Some(_)) => wanted.extend(rgb),
+        _ => wanted.extend(ply.properties(vertex, &["f_dc_0", "f_dc_1", "f_dc_2"], NOT_A_SPLAT)?),
+    }
+    let (degree, rest) = sh_rest_properties(&ply, vertex)?;
+    let degree = options.kept_degree(degree);
+    if degree > 0 {
+        wanted.extend(rest);
+    }
+
+    ply.seek_element(vertex)?;
+    let mut out = columns(ply.checked_count(vertex)?, degree);
+    ply.rows(&wanted, |row| {
+        let [x, y, z, w, i, j, k, logit, s0, s1, s2, r, g, b, rest @ ..] = row else {
+            unreachable!("every row has the 14 values requested");
+        };
+        out.means_in_world.push(DVec3::new(*x, *y, *z));
+        out.rotations_wxyz.push(unit_rotation([*w, *i, *j, *k]));
+        let [s0, s1, s2] = [s0, s1, s2].map(|s| s.exp() as f32);
+        out.scales.push([s0, s1, if third_scale.is_some() { s2 } else { 0.0 }]);
+        out.opacities.push(sigmoid(*logit));
+        out.sh_dc.push([r, g, b].map(|c| white.map_or(*c as f32, |white| dc_of_colour(c / white))));
+        out.sh_rest.extend(rest.iter().map(|c| *c as f32));
+    })?;
+    Ok(out)
+}
+
+/// Reads properties of the vertices of a mesh or point cloud: a row per vertex, in the order of `names`.
+///
+/// # Errors
+/// [`SplatError`] if the file is not a PLY, is truncated, or lacks a property.
+pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Vec<[f64; N]>, SplatError> {
+    const NO_VERTICES: &str = "give a PLY with this property";
+    let mut ply = Ply::open(Input::open(path)?)?;
+    let vertex = ply.require_element(VERTEX, NO_VERTICES)?;
+    let wanted = ply.properties(vertex, &names, NO_VERTICES)?;
+    ply.seek_element(vertex)?;
+    let mut rows = Vec::with_capacity(ply.checked_count(vertex)?);
+    ply.rows(&wanted, |row| rows.push(std::array::from_fn(|i| row[i])))?;
+    Ok(rows)
+}
+
+/// Returns the degree of the spherical harmonics in the `f_rest_*` of an element, and the properties in the order of
+/// [`Gaussians::sh_rest`]; the file stores them channel by channel.
+fn sh_rest_properties(ply: &Ply, element: usize) -> Result<(u8, Vec<usize>), SplatError> {
+    let property = |i: usize| ply.elements[element].property(&format!("f_rest_{i}"));
+    let in_file: Vec<_> = (0..).map_while(property).collect();
+    let per_channel = in_file.len() / 3;
+    let of_degree = |degree: &u8| 3 * Gaussians::sh_rest_per_channel(*degree) == in_file.len();
+    let Some(degree) = (0..=HIGHER_SH_DEGREE).find(of_degree) else {
         return Err(SplatError::Malformed {
             path: ply.input.path().into(),
-            place: ply.input.place(),
-            expected: "a header with an element \"vertex\"".into(),
-            found: "none".into(),
-            advice: plain::NOT_A_SPLAT,
+            place: Place::Byte(0),
+            expected: "0, 9, 24, 45 or 72 properties f_rest_*".into(),
+            found: in_file.len().to_string(),
+            advice: "export with spherical harmonics of degree 0 to 3",
         });
     };
-    if ply.elements[vertex].property("packed_position").is_some() {
-        return compressed::read(ply, vertex, options);
-    }
-    plain::read(ply, vertex, options)
+    let degree = degree.min(MAX_SH_DEGREE);
+    let kept = 0..Gaussians::sh_rest_per_channel(degree);
+    let order = kept.flat_map(|i| (0..3).map(move |channel| channel * per_channel + i));
+    Ok((degree, order.map(|i| in_file[i]).collect()))
 }

@@ -16,15 +16,12 @@ use glam::DVec3;
 /// Which of the optional properties the points have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PointProperties {
-    /// `question`.
     pub question: bool,
     /// `cell` and `index`.
     pub shard_index: bool,
-    /// `input_index`.
     pub input_index: bool,
 }
 
-/// A point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
     /// Index of the text.
@@ -33,7 +30,6 @@ pub struct Point {
     pub answer: u32,
     /// Mean, world frame.
     pub position_in_world: DVec3,
-    /// Score.
     pub score: f32,
     /// Cell, and index in its shard.
     pub shard_index: (u32, u32),
@@ -61,7 +57,6 @@ impl PointProperties {
         header + "end_header\n"
     }
 
-    /// Returns the bytes of a point.
     pub fn point_bytes(self) -> usize {
         4 * (usize::from(self.question)
             + 2
