@@ -258,3 +258,74 @@ fn geo_reference() {
         (46.842657, -91.994008, 158.509)
     );
 }
+
+/// Oracle: the derivative by differences. Strong tangential terms fold the image over; such pixels have no image, and the
+/// lenses of real cameras do not fold.
+#[test]
+fn pixels_where_a_lens_folds_have_no_image() {
+    for (p, folds) in [([0.4, -0.3], true), ([0.003, -0.002], false)] {
+        let distortion = Distortion::Brown { k: [0.0; 3], p };
+        let lens = camera(distortion);
+        let photo = RgbImage::from_pixel(lens.width_px, lens.height_px, Rgb([9; 3]));
+        let (_, valid) = Undistorter::new(lens).image(&photo);
+        let mut n_folded = 0;
+        for (at, valid) in valid.into_iter().enumerate() {
+            let pixel = [at % lens.width_px as usize, at / lens.width_px as usize].map(|c| c as f64 + 0.5);
+            let [x, y] = lens.distorted_from_pixel(pixel);
+            let h = 1e-6;
+            let at = |dx: f64, dy: f64| distortion.distort([x + dx, y + dy]);
+            let slope = |a: [f64; 2], b: [f64; 2]| [0, 1].map(|i| (a[i] - b[i]) / (2.0 * h));
+            let ([a, b], [c, d]) = (slope(at(h, 0.0), at(-h, 0.0)), slope(at(0.0, h), at(0.0, -h)));
+            let is_folded = a * d - b * c <= 0.0;
+            n_folded += usize::from(is_folded);
+            assert!(!(is_folded && valid), "{pixel:?}");
+        }
+        assert_eq!(n_folded > 100, folds, "{n_folded}");
+    }
+}
+
+/// An EXIF orientation is applied where only the turned photo fits its camera; transparent pixels are outside of the photo.
+#[test]
+fn turned_and_transparent_photos() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.png");
+    let camera = camera(Distortion::None);
+    let mut photo = image::RgbaImage::from_pixel(160, 120, image::Rgba([10, 20, 30, 255]));
+    photo.put_pixel(7, 3, image::Rgba([200, 200, 200, 0]));
+    photo.save(&path).unwrap();
+    let loaded = load_image(&view(&path, camera)).unwrap();
+    let valid = loaded.valid.expect("some are hidden");
+    assert_eq!(valid.iter().position(|valid| !valid), Some(3 * 160 + 7));
+    assert_eq!((valid.iter().filter(|valid| !**valid).count(), loaded.image.get_pixel(7, 3).0), (1, [0; 3]));
+
+    // Stored upright, with the orientation 6: a quarter turn clockwise brings its right column to the bottom.
+    let upright = RgbImage::from_fn(120, 160, |x, _| Rgb([if x == 119 { 250 } else { 5 }; 3]));
+    let mut jpeg = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95).encode_image(&upright).unwrap();
+    let exif: [u8; 36] = [
+        0xff, 0xe1, 0, 34, b'E', b'x', b'i', b'f', 0, 0, b'M', b'M', 0, 42, 0, 0, 0, 8, 0, 1, 1, 0x12, 0, 3,
+        0, 0, 0, 1, 0, 6, 0, 0, 0, 0, 0, 0,
+    ];
+    let path = dir.path().join("b.jpg");
+    fs_err::write(&path, [&jpeg[..2], &exif, &jpeg[2..]].concat()).unwrap();
+    let loaded = load_image(&view(&path, camera)).unwrap();
+    assert_eq!(loaded.image.dimensions(), (160, 120));
+    assert!(loaded.image.get_pixel(80, 119)[0] > 150 && loaded.image.get_pixel(80, 60)[0] < 60);
+    fs_err::write(&path, b"\0\0\0\x24ftypheic\0\0\0\0mif1heic").unwrap();
+    assert!(matches!(load_image(&view(&path, camera)), Err(IngestError::Heif { .. })));
+}
+
+/// Arrays have no names: GeoJSON's order is not ours.
+#[test]
+fn a_geo_reference_in_an_array_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("geo.json");
+    for text in [
+        r#"{"origin": [8.54, 47.37, 400]}"#,
+        r#"[{"lat": 1, "lon": 2, "alt": 3}]"#,
+        r#"{"origin": {"lat": 1}}"#,
+    ] {
+        fs_err::write(&path, text).unwrap();
+        assert!(matches!(read_geo_reference(&path), Err(GeoError::Json { .. })), "{text}");
+    }
+}

@@ -9,7 +9,7 @@ use slag_common::{Gaussians, Hash32};
 use slag_encoder::cells::{self, Cell, CellLimits, PositionError};
 use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
 use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable, ViewContributions};
-use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
+use slag_encoder::shard::{CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
 use slag_math::matrix::Rows;
 use slag_math::random::Random;
 
@@ -226,8 +226,13 @@ fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (
         appearance: false,
     };
     let score_context = ScoreMetricContext { metric, bank, spread };
-    let (id, extras) = (Hash32([0; 32]), CellExtras::default());
-    let built = shard::build(scene, 0, cell, embeddings, id, &score_context, &settings, &extras);
+    let builder = ShardBuilder {
+        scene,
+        encoder_id: Hash32([0; 32]),
+        score_context: &score_context,
+        settings: &settings,
+    };
+    let built = builder.build(0, cell, embeddings, CellExtras::default());
     (AlignedBytes::copy_of(&built.shards[0].bytes), built.position_error)
 }
 

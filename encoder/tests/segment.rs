@@ -465,3 +465,64 @@ fn a_loaded_photo_makes_the_input() {
     };
     assert_eq!(by_box(again), by_box(masks));
 }
+
+/// Masks that match no photo are refused by name; folders of `amg.py` and entries with other folders are found.
+#[test]
+fn masks_are_matched_with_their_photos() {
+    let dir = folder();
+    let views = [view("a.jpg", 4, 3), view("b.jpg", 4, 3)];
+    let check = |path: &Path, strict| {
+        GivenMasks::open(path, Vec::new()).unwrap().check_views(&views, strict).map_err(|e| e.to_string())
+    };
+    let refused = check(dir.path(), false).unwrap_err();
+    assert!(refused.contains("\"a.jpg\"") && refused.contains("found nothing"), "{refused}");
+    fs_err::write(dir.path().join("a_s.npy"), "").unwrap();
+    assert!(check(dir.path(), false).unwrap_err().contains("LangSplat"));
+    let amg = dir.path().join("a");
+    fs_err::create_dir(&amg).unwrap();
+    let white = |at: usize| (0..12).map(|i| if i == at { 255 } else { 0 }).collect::<Vec<u8>>();
+    for number in [0, 1, 10] {
+        let path = amg.join(format!("{number}.png"));
+        write_png_sized(&path, 4, 3, &white(number));
+    }
+    assert!(
+        check(dir.path(), false)
+            .unwrap()
+            .is_some_and(|text| text.contains("1 of 2") && text.contains("b.jpg"))
+    );
+    assert!(check(dir.path(), true).unwrap_err().contains("--strict"));
+    let image = RgbImage::new(4, 3);
+    let input = SegmentInput {
+        view: &views[0],
+        image: &image,
+        valid: None,
+        undistorter: None,
+        depth: None,
+        pool: None,
+    };
+    let masks = GivenMasks::open(dir.path(), vec![255]).unwrap().load(&input).unwrap().expect("masks");
+    assert_eq!(
+        masks.iter().map(|mask| (mask.box_px.x0, mask.box_px.y0)).collect::<Vec<_>>(),
+        [(0, 0), (1, 0), (2, 2)]
+    );
+
+    let path = dir.path().join("coco.json");
+    for (names, covered) in [
+        (["images/a.jpg", "images/b.jpg"], true),
+        (["a_jpg.rf.1f.jpg", "b_jpg.rf.2e.jpg"], true),
+        (["x.jpg", "y.jpg"], false),
+        (["left/a.jpg", "right/a.jpg"], false),
+    ] {
+        let images: Vec<String> = names
+            .iter()
+            .enumerate()
+            .map(|(id, name)| format!(r#"{{"id": {id}, "file_name": "{name}"}}"#))
+            .collect();
+        fs_err::write(&path, format!(r#"{{"images": [{}], "annotations": []}}"#, images.join(","))).unwrap();
+        assert_eq!(check(&path, true).is_ok(), covered, "{names:?}");
+    }
+}
+
+fn write_png_sized(path: &Path, width: u32, height: u32, pixels: &[u8]) {
+    GrayImage::from_raw(width, height, pixels.to_vec()).expect("the size").save(path).unwrap();
+}

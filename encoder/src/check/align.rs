@@ -27,16 +27,11 @@ pub struct Alignment {
 /// Reason why two sets of poses cannot be aligned.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AlignError {
-    /// Too few photos are in both sets.
     #[error(
         "{n} photos are in both sets of poses, at least {MIN_CAMERAS} are needed; give poses of the same photos, with \
          the same file names"
     )]
-    Few {
-        /// Their number.
-        n: usize,
-    },
-    /// The centres do not determine a rotation.
+    Few { n: usize },
     #[error(
         "the cameras of one set of poses stand on a line or in one point, which leaves the rotation undetermined; \
          give poses of more photos"

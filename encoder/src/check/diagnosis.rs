@@ -1,30 +1,50 @@
 //! Finds the mistake that explains why drawings and photos differ.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use serde::Serialize;
 use slag_common::{Gaussians, Similarity};
-use slag_math::stats::{Rank, quantile};
 
-use super::error::CheckError;
-use super::frames::FrameCandidate;
-use super::mistake::Mistake;
-use super::search::Search;
-use super::trial::Trial;
-use super::view::{CheckView, at_width, draw, flat_psnr_db, mean, psnr_db};
-use crate::raster::Rasterizer;
+use super::mistake::{FrameCandidate, FrameCause, Mistake};
+use super::report::CheckReport;
+use super::suspicion::{at_per_mille, camera_spread, scene_diagonal};
+use super::view::{CheckView, at_width, mean};
+use super::{CheckError, CheckOptions};
+use crate::raster::{LoadedScene, Rasterizer};
+
+/// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain colour, dB.
+pub(super) const CLEAR_GAIN_DB: f64 = 3.0;
+/// Gain that counts where the data themselves suggest a mistake, dB.
+const SUSPECTED_GAIN_DB: f64 = 0.5;
+/// Factor between neighbouring scales of the sweep, and the largest scale; the smallest is its inverse.
+const SWEEP_STEP: f64 = 1.06;
+const SWEEP_LIMIT: f64 = 64.0;
+/// First step of the refinement: rotation in radians, scale in its logarithm, translation in scene diagonals.
+const FIRST_STEP: f64 = 0.02;
+/// Number of times that the step is halved.
+const HALVINGS: u32 = 6;
+/// Gain below which the refinement fits noise of the few small samples, dB: the frame stays as computed.
+const REFINED_GAIN_DB: f64 = 1.0;
+
+/// Trials that a diagnosis lists.
+const LISTED_TRIALS: usize = 10;
+
+/// A correction that was tried, and the mean PSNR it leads to.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Trial {
+    pub mistake: Mistake,
+    pub psnr_db: f64,
+}
 
 /// Result of the search for a mistake.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Diagnosis {
-    /// PSNR of the sampled views with the poses as given, dB.
+    /// PSNR of the sampled views with the inputs as given, dB.
     pub given_psnr_db: f64,
     /// The mistake whose correction explains the photos, if any does.
     pub mistake: Option<Mistake>,
-    /// A second mistake, corrected after the first.
-    pub and: Option<Mistake>,
-    /// The similarity from the world of the poses to that of the splat, where the mistake is one and nothing else.
+    /// The similarity from the world of the poses to that of the splat, where the mistake is one.
     pub splat_from_poses: Option<Similarity>,
-    /// All corrections tried, best first.
+    /// The best corrections that were tried, best first.
     pub tried: Vec<Trial>,
     /// Diagonal of the box around the middle 90 % of the Gaussians along each axis, world units.
     pub scene_diagonal: f64,
@@ -32,20 +52,6 @@ pub struct Diagnosis {
     pub camera_spread: f64,
     /// The findings as sentences.
     pub advice: Vec<String>,
-}
-
-/// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain colour, dB.
-pub(super) const CLEAR_GAIN_DB: f64 = 3.0;
-
-/// Means over all views of a check.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Means {
-    /// PSNR of the drawings, dB.
-    pub(super) psnr_db: f64,
-    /// PSNR of a plane of each photo's mean colour, dB.
-    pub(super) flat_psnr_db: f64,
-    /// Share of the images that the scene covers.
-    pub(super) covered_share: f64,
 }
 
 /// Small copies of some views, and the positions of all cameras.
@@ -62,86 +68,191 @@ impl Samples {
     pub(super) fn new(n_views: usize, n_samples: usize, width_px: u32) -> Self {
         let n = n_samples.clamp(1, n_views);
         let indices = (0..n).map(|i| i * n_views / n).collect();
-        Self {
-            indices,
-            width_px,
-            views: Vec::with_capacity(n),
-            camera_positions: Vec::with_capacity(n_views),
-        }
+        Self { indices, width_px, views: Vec::new(), camera_positions: Vec::new() }
     }
 
-    /// Adds the view with this index; its photo is copied only if the view is a sample.
+    /// Adds the view with this index; its photo is copied only if the view is a sample, or the first of all.
     pub(super) fn add(&mut self, index: usize, view: &CheckView) -> Result<(), CheckError> {
         self.camera_positions.push(view.view.camera_from_world.inverse().translation);
-        if self.indices.binary_search(&index).is_ok() {
+        if self.views.is_empty() || self.indices.binary_search(&index).is_ok() {
             self.views.push(at_width(view, self.width_px)?);
         }
         Ok(())
     }
 
-    /// Searches for the correction with which the samples match; `frames` are tried beside common mistakes.
+    /// Searches for the correction with which the samples match.
     pub(super) fn diagnose(
         &self,
         scene: &Gaussians,
+        loaded: &dyn LoadedScene,
         rasterizer: &dyn Rasterizer,
-        means: Means,
-        frames: &[FrameCandidate],
+        report: &CheckReport,
+        options: &CheckOptions,
     ) -> Result<Diagnosis, CheckError> {
-        let psnr_with = |corrections: &[Mistake]| -> Result<f64, CheckError> {
-            let mut sum = 0.0;
-            for sample in &self.views {
-                let view = corrections.iter().fold(sample.view, |view, mistake| mistake.corrected(&view));
-                let drawing = draw(scene, &CheckView { view, ..sample.clone() }, rasterizer)?;
-                sum += psnr_db(&sample.image, |pixel, c| drawing.rgb[pixel * 3 + c]);
-            }
-            Ok(sum / self.views.len() as f64)
+        let search = Search {
+            samples: &self.views,
+            scene,
+            loaded,
+            rasterizer,
+            flat_psnr_db: mean(self.views.iter().map(CheckView::flat_psnr_db)),
+            given_psnr_db: self.psnr_db(loaded, None)?,
+            suspected: options.suspicions.iter().filter_map(|suspicion| suspicion.mistake).collect(),
         };
-        let given_psnr_db = psnr_with(&[])?;
-        // A correction that merely turns black into some colour gains too, but never exceeds the mean colour.
-        let flat_db = mean(self.views.iter().map(|sample| flat_psnr_db(&sample.image)));
-        let enough_db = (given_psnr_db + CLEAR_GAIN_DB).max(flat_db);
-        let scene_diagonal = scene_diagonal(scene);
-        let centre = scene_middle(scene);
-        let tried = Search { psnr_db: &psnr_with, frames, enough_db, centre, scene_diagonal }.run()?;
-        let best = tried.first().filter(|best| best.psnr_db > enough_db);
+        let tried = search.run(&options.frames)?;
+        let best = tried.first().filter(|best| search.explains(best));
         let mut diagnosis = Diagnosis {
-            given_psnr_db,
+            given_psnr_db: search.given_psnr_db,
             mistake: best.map(|best| best.mistake),
-            and: best.and_then(|best| best.and),
-            splat_from_poses: best
-                .filter(|best| best.and.is_none())
-                .and_then(|best| best.mistake.splat_from_poses()),
+            splat_from_poses: best.and_then(|best| best.mistake.splat_from_poses()),
             tried,
-            scene_diagonal,
-            camera_spread: spread(&self.camera_positions),
+            scene_diagonal: scene_diagonal(scene),
+            camera_spread: camera_spread(&self.camera_positions),
             advice: Vec::new(),
         };
-        diagnosis.advice = advice(&diagnosis, means);
+        diagnosis.advice = advice(&diagnosis, report);
         Ok(diagnosis)
+    }
+
+    fn psnr_db(&self, scene: &dyn LoadedScene, mistake: Option<Mistake>) -> Result<f64, CheckError> {
+        mean_psnr_db(&self.views, scene, mistake)
     }
 }
 
-fn advice(diagnosis: &Diagnosis, means: Means) -> Vec<String> {
-    let mut advice = Vec::new();
-    match diagnosis.mistake {
-        Some(mistake) => {
-            let and = diagnosis.and.map_or(String::new(), |and| format!("; and {and}"));
-            advice.push(format!(
-                "{mistake}{and} (PSNR {:.1} dB instead of {:.1} dB)",
-                diagnosis.tried[0].psnr_db, diagnosis.given_psnr_db
-            ));
-        }
-        None => advice.push(format!(
-            "the drawings match the photos hardly better than a plain colour (PSNR {:.1} dB, plain colour {:.1} dB), \
-             and no common mistake explains it; check that photos, poses and scene come from the same reconstruction",
-            means.psnr_db, means.flat_psnr_db
-        )),
+fn mean_psnr_db(
+    samples: &[CheckView],
+    scene: &dyn LoadedScene,
+    mistake: Option<Mistake>,
+) -> Result<f64, CheckError> {
+    let mut sum = 0.0;
+    for sample in samples {
+        let view = mistake.map_or(sample.view, |mistake| mistake.corrected(&sample.view));
+        let drawing = CheckView { view, ..sample.clone() }.draw(scene)?;
+        sum += sample.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
     }
-    if diagnosis.mistake.is_none() && means.covered_share < 0.5 {
-        advice.push(format!(
-            "the scene covers {:.0} % of the images; the cameras look away from it or are far from it",
-            means.covered_share * 100.0
-        ));
+    Ok(sum / samples.len() as f64)
+}
+
+/// The search for the correction with which drawings match photos best.
+struct Search<'a> {
+    samples: &'a [CheckView],
+    scene: &'a Gaussians,
+    loaded: &'a dyn LoadedScene,
+    rasterizer: &'a dyn Rasterizer,
+    flat_psnr_db: f64,
+    given_psnr_db: f64,
+    /// Mistakes that the data suggest.
+    suspected: Vec<Mistake>,
+}
+
+impl Search<'_> {
+    /// Tries what is suspected, then common mistakes and frames, then a sweep of scales, until one explains the photos.
+    /// Returns all trials, best first; a frame of nerfstudio's defaults or a scale among the best is refined.
+    fn run(&self, frames: &[FrameCandidate]) -> Result<Vec<Trial>, CheckError> {
+        let mut tried = Vec::new();
+        for mistake in &self.suspected {
+            tried.push(self.trial(*mistake)?);
+        }
+        if !tried.iter().any(|trial| self.explains(trial)) {
+            let frames = frames.iter().map(|frame| Mistake::Frame(*frame));
+            for mistake in Mistake::common().into_iter().chain(frames) {
+                tried.push(self.trial(mistake)?);
+            }
+        }
+        if !tried.iter().any(|trial| self.explains(trial)) {
+            let n = (SWEEP_LIMIT.ln() / SWEEP_STEP.ln()).floor() as i32;
+            for power in (-n..=n).filter(|power| *power != 0) {
+                tried.push(self.trial(Mistake::SceneScale(SWEEP_STEP.powi(power)))?);
+            }
+        }
+        tried.sort_by(|a, b| b.psnr_db.total_cmp(&a.psnr_db));
+        if let Some(first) = tried.first_mut() {
+            *first = self.refined(*first)?;
+        }
+        tried.truncate(LISTED_TRIALS);
+        Ok(tried)
+    }
+
+    fn trial(&self, mistake: Mistake) -> Result<Trial, CheckError> {
+        let psnr_db = match mistake.corrected_splat(self.scene) {
+            Some(scene) => mean_psnr_db(self.samples, &*self.rasterizer.load(&scene)?, None)?,
+            None => mean_psnr_db(self.samples, self.loaded, Some(mistake))?,
+        };
+        Ok(Trial { mistake, psnr_db })
+    }
+
+    /// Returns whether a correction is clearly better than the inputs as given, and its drawings fit by themselves: one that
+    /// merely turns black into some colour gains, too.
+    fn explains(&self, trial: &Trial) -> bool {
+        let gain_db = if self.suspected.contains(&trial.mistake) { SUSPECTED_GAIN_DB } else { CLEAR_GAIN_DB };
+        trial.psnr_db > (self.given_psnr_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
+    }
+
+    /// Moves a similarity that is computed from other data than the trainer's, or swept, to where the drawings match best
+    /// (pattern search, Hooke and Jeeves 1961). Others are exact.
+    fn refined(&self, best: Trial) -> Result<Trial, CheckError> {
+        // Directions of the search: scale, three rotations and three translations, up and down.
+        let (directions, least_gain_db) = match best.mistake {
+            Mistake::Frame(FrameCandidate { cause: FrameCause::NerfstudioDefaults, .. }) => {
+                (14, REFINED_GAIN_DB)
+            }
+            Mistake::SceneScale(_) => (2, 0.0),
+            _ => return Ok(best),
+        };
+        let with = |similarity: Similarity| match best.mistake {
+            Mistake::Frame(frame) => Mistake::Frame(FrameCandidate { splat_from_poses: similarity, ..frame }),
+            _ => Mistake::SceneScale(similarity.scale),
+        };
+        let (centre, diagonal) = (at_per_mille(self.scene, 500), scene_diagonal(self.scene));
+        let mut found = best;
+        let mut step = FIRST_STEP;
+        for _ in 0..=HALVINGS + 2 {
+            for direction in 0..directions {
+                let Some(similarity) = found.mistake.splat_from_poses() else { break };
+                let moved = self.trial(with(moved(similarity, direction, step, centre, diagonal)))?;
+                if moved.psnr_db > found.psnr_db {
+                    found = moved;
+                }
+            }
+            step *= 0.5;
+        }
+        Ok(if found.psnr_db > best.psnr_db + least_gain_db { found } else { best })
+    }
+}
+
+/// Returns a similarity moved a step in a direction, about the centre of the scene.
+fn moved(similarity: Similarity, direction: usize, step: f64, centre: DVec3, diagonal: f64) -> Similarity {
+    let step = if direction.is_multiple_of(2) { step } else { -step };
+    let axis = |at: usize| DVec3::from_array(std::array::from_fn(|i| if i == at { 1.0 } else { 0.0 }));
+    let mut change = Similarity::IDENTITY;
+    match direction / 2 {
+        0 => change.scale = step.exp(),
+        at @ 1..=3 => change.rotation = DQuat::from_axis_angle(axis(at - 1), step),
+        at => change.translation = axis(at - 4) * (step * diagonal),
+    }
+    change.translation += centre - change.rotation * centre * change.scale;
+    change.after(&similarity)
+}
+
+fn advice(diagnosis: &Diagnosis, report: &CheckReport) -> Vec<String> {
+    let mut advice = Vec::new();
+    match (diagnosis.mistake, diagnosis.tried.first()) {
+        (Some(mistake), Some(best)) => advice.push(format!(
+            "likely mistake: {mistake} ({:.2} dB with the correction, {:.2} dB without)",
+            best.psnr_db, diagnosis.given_psnr_db
+        )),
+        _ => {
+            advice.push(format!(
+                "no common mistake explains it (PSNR {:.1} dB, plain colour {:.1} dB); check that photos, poses and scene \
+                 come from the same reconstruction, in one frame",
+                report.mean_psnr_db, report.mean_flat_psnr_db
+            ));
+            if report.mean_covered_share < 0.5 {
+                advice.push(format!(
+                    "the scene covers {:.0} % of the images; the cameras look away from it or are far from it",
+                    report.mean_covered_share * 100.0
+                ));
+            }
+        }
     }
     let Diagnosis { scene_diagonal, camera_spread, .. } = *diagnosis;
     if camera_spread > 0.0 && !(0.05..=200.0).contains(&(scene_diagonal / camera_spread)) {
@@ -150,30 +261,19 @@ fn advice(diagnosis: &Diagnosis, means: Means) -> Vec<String> {
              check that both have the same unit"
         ));
     }
+    if let Some(Similarity { scale, rotation, translation }) = diagnosis.splat_from_poses {
+        let (axis, angle_rad) = rotation.to_axis_angle();
+        advice.push(format!(
+            "the splat's world is that of the poses times {scale:.6}, rotated by {:.3} degrees about ({:.4}, {:.4}, {:.4}), \
+             then moved by ({:.6}, {:.6}, {:.6}); write it with --write-frame FILE and encode with --splat-frame FILE",
+            angle_rad.to_degrees(),
+            axis.x,
+            axis.y,
+            axis.z,
+            translation.x,
+            translation.y,
+            translation.z
+        ));
+    }
     advice
-}
-
-/// Returns the diagonal of the box around the middle 90 % of the means along each axis.
-fn scene_diagonal(scene: &Gaussians) -> f64 {
-    (at_per_mille(scene, 950) - at_per_mille(scene, 50)).length()
-}
-
-/// Returns the medians of the means along the axes.
-fn scene_middle(scene: &Gaussians) -> DVec3 {
-    at_per_mille(scene, 500)
-}
-
-fn at_per_mille(scene: &Gaussians, per_mille: usize) -> DVec3 {
-    let along = |axis: usize| {
-        let finite = |p: &DVec3| Some(p[axis]).filter(|v| v.is_finite());
-        let mut values: Vec<f64> = scene.means_in_world.iter().filter_map(finite).collect();
-        quantile(&mut values, per_mille, Rank::Between).unwrap_or_default()
-    };
-    DVec3::new(along(0), along(1), along(2))
-}
-
-/// Returns the largest distance of a position from the mean of all positions.
-fn spread(positions: &[DVec3]) -> f64 {
-    let centre = positions.iter().sum::<DVec3>() / positions.len() as f64;
-    positions.iter().map(|p| p.distance(centre)).fold(0.0, f64::max)
 }

@@ -1,15 +1,14 @@
-//! Common mistakes in poses and intrinsics, and their corrections.
+//! Common mistakes in poses, intrinsics and splats, and their corrections.
 
 use std::fmt;
 
-use glam::{DAffine3, DMat3, DVec3};
+use glam::{DAffine3, DMat3, DQuat, DVec3};
 use serde::Serialize;
-use slag_common::Similarity;
+use slag_common::{Gaussians, Similarity, View};
 
-use super::frames::{FrameCandidate, from_axes, right_angles, write_axes};
 use crate::raster::RasterView;
 
-/// A common mistake in poses or intrinsics.
+/// A common mistake in poses, intrinsics or splat.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mistake {
@@ -19,62 +18,137 @@ pub enum Mistake {
     WorldFromCamera,
     /// Both, as in a NeRF `transforms.json`.
     WorldFromOpenGlCamera,
-    /// The scene is larger than the cameras' world by this factor.
-    SceneScale(f64),
+    /// The photos are turned by 180 degrees against their cameras.
+    UpsideDown,
     /// The focal lengths must be multiplied by this factor.
     FocalScale(f64),
+    /// Focal lengths and centre are those of photos this many times as large.
+    IntrinsicsOfSize(f64),
+    /// The principal point is at 0 instead of the middle.
+    CentreAtZero,
+    /// The scene is larger than the cameras' world by this factor.
+    SceneScale(f64),
     /// The worlds differ by right angles: axis i of the splat's is this axis of the cameras', counted from 1, with its
     /// sign.
     WorldAxes([i8; 3]),
     /// The worlds differ by a similarity.
     Frame(FrameCandidate),
+    /// The splat is mirrored along this axis, 0 to 2.
+    Mirrored(usize),
+    /// The splat has scales instead of their logarithms, or opacities instead of logits.
+    Activated { scales: bool, opacities: bool },
 }
 
-/// The wrong conventions of cameras.
-pub(super) const CAMERA_CONVENTIONS: [Mistake; 3] =
-    [Mistake::OpenGlAxes, Mistake::WorldFromCamera, Mistake::WorldFromOpenGlCamera];
-
-/// Returns all mistakes that are tried by themselves, beside frames.
-pub(super) fn single_mistakes() -> Vec<Mistake> {
-    let scales = [0.01, 0.1, 10.0, 100.0].map(Mistake::SceneScale);
-    let focals = [0.5, 2.0].map(Mistake::FocalScale);
-    let axes = right_angles().into_iter().map(Mistake::WorldAxes);
-    CAMERA_CONVENTIONS.into_iter().chain(scales).chain(focals).chain(axes).collect()
+/// A similarity between the world of the poses and that of the splat, and why it may hold.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct FrameCandidate {
+    pub cause: FrameCause,
+    pub splat_from_poses: Similarity,
 }
+
+/// Why a splat's world may differ from that of its poses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FrameCause {
+    /// The splat is in the world of a second set of poses.
+    OtherPoses,
+    /// The splat is an export of nerfstudio in its trained frame, and the file that states it is missing.
+    NerfstudioDefaults,
+    /// The stated frame is not that of the splat, which is in the world of the poses.
+    FrameFileNotMeant,
+    /// An offset, such as that of UTM coordinates, is part of one world only.
+    Shifted,
+}
+
+/// Nerfstudio's world axes from COLMAP's: x and y swapped, z negated.
+const COLMAP_AXES: [i8; 3] = [2, 1, -3];
 
 impl Mistake {
-    /// Returns the similarity from the world of the poses to that of the splat; `None` for mistakes of cameras.
+    /// Returns the mistakes that are tried whatever the data say, beside frames.
+    pub(super) fn common() -> Vec<Self> {
+        let cameras =
+            [Self::OpenGlAxes, Self::WorldFromCamera, Self::WorldFromOpenGlCamera, Self::UpsideDown];
+        let focals = [0.5, 2.0].map(Self::FocalScale);
+        let scales = [0.01, 0.1, 10.0, 100.0].map(Self::SceneScale);
+        let axes = right_angles().into_iter().map(Self::WorldAxes);
+        let mirrored = (0..3).map(Self::Mirrored);
+        cameras.into_iter().chain(focals).chain(scales).chain(axes).chain(mirrored).collect()
+    }
+
+    /// Returns the similarity from the world of the poses to that of the splat; `None` for other mistakes.
     pub fn splat_from_poses(self) -> Option<Similarity> {
         match self {
             Self::SceneScale(factor) => Some(Similarity::from_scale(factor)),
             Self::WorldAxes(axes) => Some(from_axes(axes)),
             Self::Frame(frame) => Some(frame.splat_from_poses),
-            Self::OpenGlAxes | Self::WorldFromCamera | Self::WorldFromOpenGlCamera | Self::FocalScale(_) => {
-                None
-            }
+            _ => None,
         }
     }
 
     /// Returns the view with the mistake corrected.
     pub fn corrected(self, view: &RasterView) -> RasterView {
         let mut corrected = *view;
-        let pose = &mut corrected.camera_from_world;
-        let opencv_from_opengl = DAffine3::from_mat3(DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
+        let (pose, camera) = (&mut corrected.camera_from_world, &mut corrected.intrinsics);
+        let turned = |x, y, z| DAffine3::from_mat3(DMat3::from_diagonal(DVec3::new(x, y, z)));
         match self {
-            Self::OpenGlAxes => *pose = opencv_from_opengl * *pose,
+            Self::OpenGlAxes => *pose = turned(1.0, -1.0, -1.0) * *pose,
             Self::WorldFromCamera => *pose = pose.inverse(),
-            Self::WorldFromOpenGlCamera => *pose = opencv_from_opengl * pose.inverse(),
+            Self::WorldFromOpenGlCamera => *pose = turned(1.0, -1.0, -1.0) * pose.inverse(),
+            Self::UpsideDown => {
+                *pose = turned(-1.0, -1.0, 1.0) * *pose;
+                camera.centre_x_px = f64::from(camera.width_px) - camera.centre_x_px;
+                camera.centre_y_px = f64::from(camera.height_px) - camera.centre_y_px;
+            }
             Self::FocalScale(factor) => {
-                corrected.intrinsics.focal_x_px *= factor;
-                corrected.intrinsics.focal_y_px *= factor;
+                camera.focal_x_px *= factor;
+                camera.focal_y_px *= factor;
+            }
+            Self::IntrinsicsOfSize(factor) => {
+                camera.focal_x_px /= factor;
+                camera.focal_y_px /= factor;
+                camera.centre_x_px /= factor;
+                camera.centre_y_px /= factor;
+            }
+            Self::CentreAtZero => {
+                camera.centre_x_px = f64::from(camera.width_px) / 2.0;
+                camera.centre_y_px = f64::from(camera.height_px) / 2.0;
             }
             Self::SceneScale(_) | Self::WorldAxes(_) | Self::Frame(_) => {
                 if let Some(similarity) = self.splat_from_poses() {
                     *pose = similarity.camera_from_target(*pose);
                 }
             }
+            Self::Mirrored(_) | Self::Activated { .. } => {}
         }
         corrected
+    }
+
+    /// Returns the splat with the mistake corrected, with colours of degree 0; `None` if the mistake is not the splat's.
+    pub fn corrected_splat(self, scene: &Gaussians) -> Option<Gaussians> {
+        let mut corrected = match self {
+            Self::Mirrored(_) | Self::Activated { .. } => Gaussians {
+                means_in_world: scene.means_in_world.clone(),
+                rotations_wxyz: scene.rotations_wxyz.clone(),
+                scales: scene.scales.clone(),
+                opacities: scene.opacities.clone(),
+                sh_dc: scene.sh_dc.clone(),
+                ..Gaussians::default()
+            },
+            _ => return None,
+        };
+        match self {
+            Self::Mirrored(axis) => {
+                corrected.means_in_world.iter_mut().for_each(|mean| mean[axis] = -mean[axis]);
+                // The mirrored rotation turns the other way about the axes in the mirror's plane.
+                let mirror = |wxyz: &mut [f32; 4]| {
+                    (0..3).filter(|at| *at != axis).for_each(|at| wxyz[at + 1] = -wxyz[at + 1]);
+                };
+                corrected.rotations_wxyz.iter_mut().for_each(mirror);
+            }
+            Self::Activated { scales, opacities } => corrected.deactivate(scales, opacities),
+            _ => {}
+        }
+        Some(corrected)
     }
 }
 
@@ -89,18 +163,147 @@ impl fmt::Display for Mistake {
                 f,
                 "the poses are world-from-camera with OpenGL axes; invert them, then negate the y and z rows"
             ),
-            Self::SceneScale(factor) => {
-                write!(
-                    f,
-                    "the scene is {factor:.4} times as large as the cameras' world; multiply the camera positions by \
-                     {factor:.4}"
-                )
-            }
+            Self::UpsideDown => write!(
+                f,
+                "the photos are stored upside down against their cameras, perhaps with an EXIF orientation; turn their \
+                 pixels (exiftran -a, or mogrify -auto-orient)"
+            ),
             Self::FocalScale(factor) => {
                 write!(f, "the focal length belongs to another image size or sensor; multiply it by {factor}")
             }
+            Self::IntrinsicsOfSize(factor) => write!(
+                f,
+                "the intrinsics belong to photos {factor:.3} times as large; divide focal lengths and principal point by \
+                 {factor:.3}"
+            ),
+            Self::CentreAtZero => {
+                write!(f, "the principal point is at 0; set it to half the width and half the height")
+            }
+            Self::SceneScale(factor) => write!(
+                f,
+                "the scene is {factor:.4} times as large as the cameras' world; multiply the camera positions by \
+                 {factor:.4}"
+            ),
             Self::WorldAxes(axes) => write_axes(*axes, f),
             Self::Frame(frame) => write!(f, "{}", frame.cause),
+            Self::Mirrored(axis) => {
+                let axis = ["x", "y", "z"][(*axis).min(2)];
+                write!(
+                    f,
+                    "splat and poses are mirror images along {axis}; export one of them with right-handed axes"
+                )
+            }
+            Self::Activated { scales, opacities } => {
+                let what = match (scales, opacities) {
+                    (true, false) => "scales instead of their logarithms",
+                    (false, _) => "opacities instead of logits",
+                    (true, true) => "scales and opacities instead of logarithms and logits",
+                };
+                write!(
+                    f,
+                    "the splat file has {what}; use --activated {}",
+                    activated_name(*scales, *opacities)
+                )
+            }
         }
     }
+}
+
+fn activated_name(scales: bool, opacities: bool) -> &'static str {
+    match (scales, opacities) {
+        (true, false) => "scales",
+        (false, _) => "opacities",
+        (true, true) => "scales,opacities",
+    }
+}
+
+impl fmt::Display for FrameCause {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::OtherPoses => "the splat is in the world of --also-poses, not in that of --views",
+            Self::NerfstudioDefaults => {
+                "the splat is in nerfstudio's trained frame (oriented, centred and scaled by its defaults); put the \
+                 run's dataparser_transforms.json beside the splat"
+            }
+            Self::FrameFileNotMeant => {
+                "the splat is in the world of the poses, not in the frame that the file states; use --splat-frame none"
+            }
+            Self::Shifted => "the splat is shifted against the poses",
+        })
+    }
+}
+
+/// Returns the frames in which nerfstudio trains by default: cameras centred at their mean, the mean of their up axes
+/// turned to z, scaled so that the largest coordinate of a camera is 1 (`auto_orient_and_center_poses`, methods `up` of
+/// its own data sets and `none` of ScanNet), each with and without a change of axes from COLMAP's.
+pub fn nerfstudio_defaults(views: &[View]) -> Vec<FrameCandidate> {
+    let world_from_camera: Vec<DAffine3> =
+        views.iter().map(|view| view.camera_from_world.inverse()).collect();
+    let mut candidates = Vec::new();
+    for axes in [Similarity::IDENTITY, from_axes(COLMAP_AXES)] {
+        let centres: Vec<DVec3> =
+            world_from_camera.iter().map(|pose| axes.transform_point(pose.translation)).collect();
+        let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
+        // Up is against the y axis of OpenCV's cameras.
+        let up: DVec3 = world_from_camera.iter().map(|pose| -(axes.rotation * pose.matrix3.y_axis)).sum();
+        let oriented = up.try_normalize().map(|up| DQuat::from_rotation_arc(up, DVec3::Z));
+        for rotation in oriented.into_iter().chain([DQuat::IDENTITY]) {
+            let centred = Similarity { rotation, translation: -(rotation * mean), ..Similarity::IDENTITY };
+            let coordinate = |c: &DVec3| centred.transform_point(*c).abs().max_element();
+            let largest = centres.iter().map(coordinate).fold(0.0_f64, f64::max);
+            if largest > 0.0 && largest.is_finite() {
+                let splat_from_poses = Similarity::from_scale(1.0 / largest).after(&centred).after(&axes);
+                candidates.push(FrameCandidate { cause: FrameCause::NerfstudioDefaults, splat_from_poses });
+            }
+        }
+    }
+    candidates
+}
+
+/// Returns the rotation to a world whose axis i is axis |axes[i]| of the old one, counted from 1, with its sign.
+fn from_axes(axes: [i8; 3]) -> Similarity {
+    let row = |axis: i8| {
+        let mut row = DVec3::ZERO;
+        row[usize::from(axis.unsigned_abs().clamp(1, 3)) - 1] = f64::from(axis.signum());
+        row
+    };
+    let matrix = DMat3::from_cols(row(axes[0]), row(axes[1]), row(axes[2])).transpose();
+    Similarity::from_rotation(DQuat::from_mat3(&matrix).normalize())
+}
+
+/// Returns the 23 rotations by right angles other than the identity, as the axes of [`from_axes`].
+fn right_angles() -> Vec<[i8; 3]> {
+    let mut all = Vec::new();
+    for (order, parity) in
+        [([1, 2, 3], 1), ([2, 3, 1], 1), ([3, 1, 2], 1), ([2, 1, 3], -1), ([1, 3, 2], -1), ([3, 2, 1], -1)]
+    {
+        for signs in 0..8_u8 {
+            let sign = |axis: u8| if signs >> axis & 1 == 0 { 1 } else { -1 };
+            let axes: [i8; 3] = [order[0] * sign(0), order[1] * sign(1), order[2] * sign(2)];
+            if parity * sign(0) * sign(1) * sign(2) == 1 && axes != [1, 2, 3] {
+                all.push(axes);
+            }
+        }
+    }
+    all
+}
+
+/// Writes the cause of a world with these axes.
+fn write_axes(axes: [i8; 3], f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    let name = |axis: i8| {
+        let letter = ["x", "y", "z"][usize::from(axis.unsigned_abs().clamp(1, 3)) - 1];
+        if axis < 0 { format!("-{letter}") } else { letter.to_owned() }
+    };
+    let [x, y, z] = axes.map(name);
+    let cause = match axes {
+        COLMAP_AXES => " (nerfstudio's world against COLMAP's)",
+        [1, -3, 2] => " (z up against y up)",
+        [1, 3, -2] => " (y up against z up)",
+        [1, -2, -3] => " (y and z negated: OpenGL's world against OpenCV's)",
+        _ => "",
+    };
+    write!(
+        f,
+        "the worlds of splat and cameras have other axes{cause}: the splat's x, y, z are the cameras' {x}, {y}, {z}"
+    )
 }

@@ -1,18 +1,15 @@
 //! Checks that photos, poses and scene belong together, before any expensive work.
 //!
 //! The check draws sample views of the scene, compares each with its photo and, where they differ, looks for common
-//! mistakes in poses and intrinsics.
+//! mistakes in poses, intrinsics and splat.
 
 mod align;
 mod diagnosis;
-mod error;
-mod frames;
 mod mistake;
 mod report;
-mod search;
+mod suspicion;
 #[cfg(test)]
 mod tests;
-mod trial;
 mod view;
 
 use std::path::PathBuf;
@@ -20,17 +17,15 @@ use std::path::PathBuf;
 use slag_common::Gaussians;
 
 use crate::ingest::IngestError;
-use crate::raster::Rasterizer;
+use crate::raster::{RasterError, Rasterizer};
 use diagnosis::{CLEAR_GAIN_DB, Samples};
-use view::{at_width, draw, flat_psnr_db, mean, picture, picture_name};
+use view::{at_width, mean, picture, picture_name};
 
 pub use align::{AlignError, Alignment, align};
-pub use diagnosis::Diagnosis;
-pub use error::CheckError;
-pub use frames::{FrameCandidate, FrameCause, nerfstudio_defaults};
-pub use mistake::Mistake;
+pub use diagnosis::{Diagnosis, Trial};
+pub use mistake::{FrameCandidate, FrameCause, Mistake, nerfstudio_defaults};
 pub use report::{CheckReport, ViewCheck};
-pub use trial::Trial;
+pub use suspicion::{Suspicion, suspicions};
 pub use view::{CheckView, psnr_db};
 
 /// Settings of a check.
@@ -46,6 +41,8 @@ pub struct CheckOptions {
     pub diagnosis_views: usize,
     /// Similarities between the worlds of poses and splat that are tried beside common mistakes.
     pub frames: Vec<FrameCandidate>,
+    /// What the data alone says against the inputs.
+    pub suspicions: Vec<Suspicion>,
 }
 
 impl Default for CheckOptions {
@@ -56,16 +53,40 @@ impl Default for CheckOptions {
             diagnosis_width_px: 240,
             diagnosis_views: 4,
             frames: Vec::new(),
+            suspicions: Vec::new(),
         }
     }
 }
 
+/// Reason why a check fails.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckError {
+    #[error("no views to check; give at least one photo with its pose")]
+    NoViews,
+    #[error("none of the {n_views} sampled photos can be read, the first: {first}")]
+    NoPhotos { n_views: usize, first: IngestError },
+    #[error(
+        "view {view}: the photo has {} x {} px but its camera {} x {} px; give the photo that the camera describes",
+        image_px[0], image_px[1], camera_px[0], camera_px[1]
+    )]
+    ImageSize { view: String, image_px: [u32; 2], camera_px: [u32; 2] },
+    #[error("view {view}: {source}")]
+    Raster { view: String, source: RasterError },
+    #[error(transparent)]
+    Scene(#[from] RasterError),
+    #[error("view {view}: cannot encode its picture ({source}); choose a smaller width")]
+    Encode { view: String, source: image::ImageError },
+    #[error("{0}; choose another folder for the pictures")]
+    Write(#[from] std::io::Error),
+}
+
 /// Draws the views of a scene and compares them with their photos.
 ///
-/// Views are taken one at a time, so that one photo is in memory, plus `diagnosis_views` small copies.
+/// The scene is loaded once. Views are taken one at a time, so that one photo is in memory, plus `diagnosis_views` small copies.
+/// Photos that cannot be read are left out and named in the report.
 ///
 /// # Errors
-/// [`CheckError`] if a photo cannot be loaded, a view cannot be drawn or a picture cannot be written. A scene that
+/// [`CheckError`] if no photo can be read, a view cannot be drawn or a picture cannot be written. A scene that
 /// does not fit its photos is no error; the report then has a [`Diagnosis`].
 pub fn check<V>(
     scene: &Gaussians,
@@ -84,37 +105,53 @@ where
     if let Some(dir) = &options.pictures_dir {
         fs_err::create_dir_all(dir)?;
     }
+    let loaded = rasterizer.load(scene)?;
     let mut checks = Vec::with_capacity(n_views);
+    let mut unreadable = Vec::new();
     let mut unusable_gaussians = 0;
     let mut samples = Samples::new(n_views, options.diagnosis_views, options.diagnosis_width_px);
     for (index, view) in views.enumerate() {
-        let view = view?;
+        let view = match view {
+            Ok(view) => view,
+            Err(error) => {
+                unreadable.push(error);
+                continue;
+            }
+        };
         let small = at_width(&view, options.width_px)?;
-        let drawing = draw(scene, &small, rasterizer)?;
+        let drawing = small.draw(&*loaded)?;
         unusable_gaussians = unusable_gaussians.max(drawing.counters.unusable);
         if let Some(dir) = &options.pictures_dir {
             fs_err::write(dir.join(picture_name(index, &view.name)), picture(&small, &drawing)?)?;
         }
         checks.push(ViewCheck {
             name: view.name.clone(),
-            psnr_db: psnr_db(&small.image, |pixel, c| drawing.rgb[pixel * 3 + c]),
-            flat_psnr_db: flat_psnr_db(&small.image),
+            psnr_db: small.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]),
+            flat_psnr_db: small.flat_psnr_db(),
             covered_share: mean(drawing.coverage.iter().map(|&alpha| f64::from(u8::from(alpha > 0.5)))),
             visible_gaussians: drawing.counters.visible,
         });
         samples.add(index, &view)?;
+    }
+    if checks.is_empty() {
+        return Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) });
     }
     let mut report = CheckReport {
         mean_psnr_db: mean(checks.iter().map(|c| c.psnr_db)),
         mean_flat_psnr_db: mean(checks.iter().map(|c| c.flat_psnr_db)),
         mean_covered_share: mean(checks.iter().map(|c| c.covered_share)),
         views: checks,
+        unreadable: unreadable.iter().map(ToString::to_string).collect(),
         unusable_gaussians,
+        suspicions: options.suspicions.iter().map(|suspicion| suspicion.text.clone()).collect(),
         notes: Vec::new(),
         diagnosis: None,
     };
-    if report.mean_psnr_db < report.mean_flat_psnr_db + CLEAR_GAIN_DB {
-        report.diagnosis = Some(samples.diagnose(scene, rasterizer, report.means(), &options.frames)?);
+    let fits = report.mean_psnr_db >= report.mean_flat_psnr_db + CLEAR_GAIN_DB;
+    if !fits || options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some()) {
+        let found = samples.diagnose(scene, &*loaded, rasterizer, &report, options)?;
+        // Where the drawings match as they are, only a mistake that improves them counts.
+        report.diagnosis = Some(found).filter(|found| !fits || found.mistake.is_some());
     }
     Ok(report)
 }

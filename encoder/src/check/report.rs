@@ -3,9 +3,8 @@
 use std::fmt;
 
 use serde::Serialize;
-use slag_common::Similarity;
 
-use super::diagnosis::{Diagnosis, Means};
+use super::diagnosis::Diagnosis;
 
 /// Comparison of one view with its photo.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -35,20 +34,14 @@ pub struct CheckReport {
     pub mean_covered_share: f64,
     /// Largest number of Gaussians that cannot be drawn in a view.
     pub unusable_gaussians: usize,
+    /// Why photos were left out: they cannot be read.
+    pub unreadable: Vec<String>,
+    /// What the data alone say against the inputs.
+    pub suspicions: Vec<String>,
     /// What else is known of the inputs, a sentence each.
     pub notes: Vec<String>,
     /// Likely mistake; `None` if the drawings match the photos.
     pub diagnosis: Option<Diagnosis>,
-}
-
-impl CheckReport {
-    pub(super) fn means(&self) -> Means {
-        Means {
-            psnr_db: self.mean_psnr_db,
-            flat_psnr_db: self.mean_flat_psnr_db,
-            covered_share: self.mean_covered_share,
-        }
-    }
 }
 
 /// Prints a table of the views and the diagnosis.
@@ -70,42 +63,18 @@ impl fmt::Display for CheckReport {
             "{:<28} {:>8.2} {:>14.2} {covered:>9}",
             "mean", self.mean_psnr_db, self.mean_flat_psnr_db
         )?;
-        for note in &self.notes {
-            writeln!(f, "{note}")?;
+        if let Some(first) = self.unreadable.first() {
+            writeln!(f, "{} photos are left out, the first: {first}", self.unreadable.len())?;
+        }
+        for line in self.suspicions.iter().chain(&self.notes) {
+            writeln!(f, "{line}")?;
         }
         match &self.diagnosis {
             None => writeln!(f, "the drawings match the photos"),
-            Some(Diagnosis { mistake: Some(mistake), and, tried, splat_from_poses, .. }) => {
-                let best_db = tried.first().map_or(f64::NAN, |trial| trial.psnr_db);
-                let and = and.map_or(String::new(), |and| format!("; and {and}"));
-                writeln!(
-                    f,
-                    "the drawings do not match the photos; likely mistake: {mistake}{and} ({best_db:.2} dB with the \
-                     correction)"
-                )?;
-                if let Some(Similarity { scale, rotation, translation }) = splat_from_poses {
-                    let (axis, angle_rad) = rotation.to_axis_angle();
-                    writeln!(
-                        f,
-                        "the splat's world is that of the poses times {scale:.6}, rotated by {:.3} degrees about \
-                         ({:.4}, {:.4}, {:.4}), then moved by ({:.6}, {:.6}, {:.6}); write it with --write-frame FILE \
-                         and encode with --splat-frame FILE",
-                        angle_rad.to_degrees(),
-                        axis.x,
-                        axis.y,
-                        axis.z,
-                        translation.x,
-                        translation.y,
-                        translation.z
-                    )?;
-                }
-                Ok(())
+            Some(diagnosis) => {
+                writeln!(f, "the inputs do not fit together")?;
+                diagnosis.advice.iter().try_for_each(|advice| writeln!(f, "{advice}"))
             }
-            Some(_) => writeln!(
-                f,
-                "the drawings do not match the photos, and no common mistake explains it; check that the scene was made \
-                 from these photos, in the frame of these poses"
-            ),
         }
     }
 }

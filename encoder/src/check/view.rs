@@ -3,11 +3,10 @@
 use std::io::Cursor;
 
 use image::imageops::{self, FilterType};
-use image::{ImageFormat, RgbImage};
-use slag_common::Gaussians;
+use image::{GrayImage, ImageFormat, RgbImage};
 
-use super::error::CheckError;
-use crate::raster::{Drawing, RasterView, Rasterizer};
+use super::CheckError;
+use crate::raster::{Drawing, LoadedScene, RasterView};
 
 /// A photo with its camera.
 #[derive(Clone, Debug)]
@@ -16,6 +15,8 @@ pub struct CheckView {
     pub name: String,
     /// The undistorted photo.
     pub image: RgbImage,
+    /// Pixels that belong to the photo, row-major, as 255 and 0; `None` if all do.
+    pub valid: Option<GrayImage>,
     /// Its camera, at the resolution of the photo.
     pub view: RasterView,
 }
@@ -34,18 +35,20 @@ pub(super) fn at_width(view: &CheckView, width_px: u32) -> Result<CheckView, Che
     let intrinsics = camera.scaled_to_width(width_px.clamp(1, image_px.0));
     let image =
         imageops::resize(&view.image, intrinsics.width_px, intrinsics.height_px, FilterType::Lanczos3);
-    Ok(CheckView { name: view.name.clone(), image, view: RasterView { intrinsics, ..view.view } })
+    let valid = view
+        .valid
+        .as_ref()
+        .map(|valid| imageops::resize(valid, intrinsics.width_px, intrinsics.height_px, FilterType::Nearest));
+    Ok(CheckView { name: view.name.clone(), image, valid, view: RasterView { intrinsics, ..view.view } })
 }
 
-/// Draws a view over black, like trainers of splats.
-pub(super) fn draw(
-    scene: &Gaussians,
-    view: &CheckView,
-    rasterizer: &dyn Rasterizer,
-) -> Result<Drawing, CheckError> {
-    rasterizer
-        .draw(scene, &view.view, [0.0; 3])
-        .map_err(|source| CheckError::Raster { view: view.name.clone(), source })
+impl CheckView {
+    /// Draws the view over black, like trainers of splats.
+    pub(super) fn draw(&self, scene: &dyn LoadedScene) -> Result<Drawing, CheckError> {
+        scene
+            .draw(&self.view, [0.0; 3])
+            .map_err(|source| CheckError::Raster { view: self.name.clone(), source })
+    }
 }
 
 /// Returns the PSNR of a picture against a photo, dB; 100 where they are equal.
@@ -60,11 +63,27 @@ pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
     -10.0 * mean(squares).max(1e-10).log10()
 }
 
-/// Returns the PSNR of the photo's mean colour, dB.
-pub(super) fn flat_psnr_db(photo: &RgbImage) -> f64 {
-    let colour: [f32; 3] =
-        std::array::from_fn(|c| mean(photo.pixels().map(|p| f64::from(p[c]) / 255.0)) as f32);
-    psnr_db(photo, |_, c| colour[c])
+impl CheckView {
+    /// Returns the PSNR of a picture against the photo, dB, of the pixels that belong to it.
+    pub(super) fn psnr_db(&self, value: impl Fn(usize, usize) -> f32) -> f64 {
+        let Some(valid) = &self.valid else { return psnr_db(&self.image, value) };
+        let of_photo = |pixel: usize, c: usize| f32::from(self.image.as_raw()[pixel * 3 + c]) / 255.0;
+        let share = mean(valid.pixels().map(|valid| f64::from(u8::from(valid[0] > 0)))).max(1e-6);
+        let all = psnr_db(&self.image, |pixel, c| match valid.as_raw()[pixel] {
+            0 => of_photo(pixel, c),
+            _ => value(pixel, c),
+        });
+        all + 10.0 * share.log10()
+    }
+
+    /// Returns the PSNR of the photo's mean colour, dB.
+    pub(super) fn flat_psnr_db(&self) -> f64 {
+        let is_valid = |pixel: usize| self.valid.as_ref().is_none_or(|valid| valid.as_raw()[pixel] > 0);
+        let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| is_valid(*pixel));
+        let colour: [f32; 3] =
+            std::array::from_fn(|c| mean(pixels().map(|(_, p)| f64::from(p[c]) / 255.0)) as f32);
+        self.psnr_db(|_, c| colour[c])
+    }
 }
 
 /// Returns a PNG with the photo on the left and the drawing on the right.

@@ -4,13 +4,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
+use image::GrayImage;
 use slag_common::poses::SplatFrame;
 use slag_common::{View, durable, poses, splat};
 
 use super::Exit;
 use super::common::{InputArgs, print};
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
-use crate::ingest::{self, FoundFrame, RotatedPhotos};
+use crate::ingest::{self, FoundFrame, LoadedImage, RotatedPhotos};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -45,56 +46,58 @@ pub struct CheckArgs {
 
 pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     let input = &args.input;
-    let scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
+    let mut scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
+    input.activated.undo(&mut scene);
     let mut set = poses::read(&input.views, input.images.as_deref())?;
-    let mut notes = Vec::new();
+    let mut notes = set.notes.clone();
     let frame = ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?;
     let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;
     if let Some(n) = input.every {
         set = set.every(n);
     }
-    if let Some(first) = set.without_pose.first() {
-        let (n, of) = (set.without_pose.len(), set.views.len() + set.without_pose.len());
-        notes.push(format!("{n} of {of} frames have no pose (-inf) and are left out, the first is {first}"));
-    }
-    let all = set.views;
-    let missing: Vec<_> = ingest::missing_images(&all).into_iter().map(|v| v.image_path.clone()).collect();
+    notes.extend(set.left_out());
+    let n_left_out = set.damaged.len();
+    let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
+    let in_splat = |view: View| View {
+        camera_from_world: stated
+            .map_or(view.camera_from_world, |stated| stated.camera_from_target(view.camera_from_world)),
+        ..view
+    };
+    let all: Vec<View> = set.views.into_iter().map(in_splat).collect();
+    let suspicions = check::suspicions(&scene, &all);
+    let (missing, there): (Vec<View>, Vec<View>) = all.into_iter().partition(|v| !v.image_path.is_file());
     if let Some(first) = missing.first() {
-        let message = format!(
-            "{} of {} photos are missing, the first is {}",
-            missing.len(),
-            all.len(),
-            first.display()
-        );
-        if input.strict || missing.len() == all.len() {
+        let (n, of) = (missing.len(), missing.len() + there.len());
+        let message = format!("{n} of {of} photos are missing, the first is {}", first.image_path.display());
+        if input.strict || there.is_empty() {
             return Err(anyhow!("{message}; give their folder with --images"));
         }
-        tracing::warn!("{message}");
+        notes.push(message);
     }
-    let there: Vec<_> = all.into_iter().filter(|v| !missing.contains(&v.image_path)).collect();
     let n = (args.samples as usize).min(there.len());
-    let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
     // One at a time: a photo is loaded when the check reaches it.
     let rotated = RotatedPhotos::default();
     let views = (0..n).map(|i| {
         let loaded = ingest::load_image(&there[i * there.len() / n])?;
         rotated.add(&loaded);
-        let camera_from_world = loaded.view.camera_from_world;
-        let view = RasterView {
-            camera_from_world: stated.map_or(camera_from_world, |s| s.camera_from_target(camera_from_world)),
-            intrinsics: loaded.view.intrinsics,
-        };
-        Ok(CheckView { name: loaded.view.name, image: loaded.image, view })
+        let LoadedImage { view: View { name, intrinsics, camera_from_world, .. }, image, valid, .. } = loaded;
+        let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());
+        let valid = bytes.and_then(|bytes| GrayImage::from_raw(image.width(), image.height(), bytes));
+        Ok(CheckView { name, image, valid, view: RasterView { camera_from_world, intrinsics } })
     });
     let options = CheckOptions {
         width_px: args.raster_width,
         pictures_dir: args.out.clone(),
         frames,
+        suspicions,
         ..CheckOptions::default()
     };
     let devices = Devices::open(&args.device, GpuOptions::default())?;
     let mut report = check::check(&scene, views, &devices, &options)?;
     rotated.warn();
+    if let (true, Some(first)) = (input.strict, report.unreadable.first()) {
+        return Err(anyhow!("{first}"));
+    }
     // Cameras were in the stated frame already; what is reported and written begins at the poses.
     if let (Some(stated), Some(diagnosis)) = (stated, &mut report.diagnosis) {
         diagnosis.splat_from_poses = diagnosis.splat_from_poses.map(|found| found.after(&stated));
@@ -104,7 +107,12 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     }
     report.notes = notes;
     print(json, &report, &report)?;
-    Ok(if missing.is_empty() { Exit::Done } else { Exit::Partly })
+    let is_partial = !missing.is_empty() || !report.unreadable.is_empty() || n_left_out > 0;
+    Ok(match (&report.diagnosis, is_partial) {
+        (Some(_), _) => Exit::Mismatch,
+        (None, true) => Exit::Partly,
+        (None, false) => Exit::Done,
+    })
 }
 
 /// Returns the similarities to try; all begin where `frame` leads, if there is one.

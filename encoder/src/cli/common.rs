@@ -18,7 +18,7 @@ use slag_models::{ModelDir, SessionOptions, TextEncoder};
 use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
 
-use crate::ingest::FrameChoice;
+use crate::ingest::{Activated, FrameChoice};
 use crate::store::StoreReader;
 use crate::store::metadata::{MetadataReader, clock_unix_secs};
 
@@ -88,9 +88,25 @@ pub struct InputArgs {
     /// file in that format, as `check --write-frame` makes it.
     #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
     pub splat_frame: FrameChoice,
+    /// What the splat file has in place of logarithms of scales and logits of opacities: `scales`, `opacities` or
+    /// `scales,opacities`, as some exporters write them; `check` tells.
+    #[arg(long, value_name = "WHICH", default_value = "none", value_parser = parse_activated)]
+    pub activated: Activated,
     /// Treats a missing or unreadable photo or mask as an error instead of leaving the view out.
     #[arg(long)]
     pub strict: bool,
+}
+
+fn parse_activated(text: &str) -> Result<Activated, String> {
+    let mut found = Activated::default();
+    for word in text.split(',').filter(|word| *word != "none") {
+        match word {
+            "scales" => found.scales = true,
+            "opacities" => found.opacities = true,
+            _ => return Err("expected none, scales, opacities or scales,opacities".into()),
+        }
+    }
+    Ok(found)
 }
 
 /// Parses the file that states the splat's frame.

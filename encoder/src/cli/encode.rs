@@ -109,6 +109,9 @@ pub struct EncodeArgs {
     /// Name of the scene [default: the name of the store's folder].
     #[arg(long, value_name = "NAME")]
     pub name: Option<String>,
+    /// Publishes the scene even where no Gaussian lies in a mask, so that nothing can be found.
+    #[arg(long)]
+    pub allow_empty: bool,
     /// World units are metres; a geo-reference implies it.
     #[arg(long)]
     pub metric: bool,
@@ -211,6 +214,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             dropped: args.views.dropped.clone(),
             every: args.input.every,
             splat_frame: args.input.splat_frame.clone(),
+            activated: args.input.activated,
             metric,
             geo,
         },
@@ -251,6 +255,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             view_order: args.views.order(views_limit),
             time_budget: args.views.time_budget,
             strict: args.input.strict,
+            allow_empty: args.allow_empty,
             restart: args.restart,
             keep_views: args.refine.keep_views || args.views.changes_photos(),
             gpus: vec![0],

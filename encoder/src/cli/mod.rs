@@ -47,6 +47,8 @@ pub enum Exit {
     Failed,
     /// Done without some inputs; the summary names them.
     Partly,
+    /// The inputs do not fit together (`check`).
+    Mismatch,
     /// Interrupted by the user; the same command resumes.
     Interrupted,
 }
@@ -58,6 +60,7 @@ impl From<Exit> for ExitCode {
             Exit::Done => 0,
             Exit::Failed => 1,
             Exit::Partly => 3,
+            Exit::Mismatch => 4,
             Exit::Interrupted => 130,
         }
         .into()

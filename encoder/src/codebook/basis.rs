@@ -118,7 +118,6 @@ impl ScoreMetric {
             as f32
     }
 
-    /// Returns F' C F.
     fn whitened(&self, covariance: &[f32]) -> Vec<f32> {
         let dim = self.dim;
         let factor = Panels::new(dim, dim, |i, j| self.factor[i * dim + j] as f32);

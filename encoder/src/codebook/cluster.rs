@@ -62,7 +62,6 @@ pub fn clusters(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Clusters
     Clusters { codes, centres }
 }
 
-/// Returns the nearest centre of each point.
 pub fn nearest(points: Rows<'_>, centres: &[f32]) -> Vec<u32> {
     let width = points.width;
     // ||p - c||² = ||p||² - 2 (p·c - ||c||²/2); the first term is the same for all centres.

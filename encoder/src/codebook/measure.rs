@@ -21,7 +21,6 @@ pub struct Sample<'a> {
     stride: usize,
     /// Standard deviation over the sample of a text's scores, mean over the texts.
     spread: f32,
-    /// Of all scores.
     pub moments: ScoreMoments,
 }
 
@@ -30,7 +29,6 @@ pub struct Sample<'a> {
 pub struct ScoreMoments {
     /// Mean of the scores.
     pub mean: f64,
-    /// Mean of their squares.
     pub mean_square: f64,
 }
 

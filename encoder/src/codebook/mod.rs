@@ -9,27 +9,26 @@
 pub mod basis;
 pub mod cluster;
 mod compare;
-mod decoder;
 mod fine;
 pub mod measure;
 mod outliers;
 pub mod residual;
-mod settings;
+
+use std::ops::Range;
 
 use half::f16;
 use rayon::prelude::*;
 use slag_common::shard::{self, ScoreErrors};
 
-use basis::Basis;
-use compare::compare;
-use decoder::Decoder;
+use basis::{Basis, MAX_COMPONENTS};
+use cluster::Clusters;
+use compare::{Decoder, Reference};
 use measure::ScoreMoments;
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 
 pub use basis::{ScoreMetric, TextBank};
 pub use fine::FineResiduals;
-pub use settings::CodebookSettings;
 
 /// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled house, whose
 /// errors have heavy tails; 1.25 for normally distributed errors.
@@ -38,12 +37,51 @@ const RMS_OF_MEAN: f32 = 1.35;
 const BYTES_BESIDE_COMPONENTS: usize = 8;
 /// One centroid of an outlier for so many components of an embedding, in a cell of any size: a sixteenth of the bytes of its basis.
 const OUTLIERS_OF_DIM: usize = 16;
+/// Step of the centroids' components.
+const CENTROID_STEP: f32 = 1.0 / 127.0;
 /// Share of the residual code's error budget that the dimensions without a component may take.
 const TAIL_SHARE: f32 = 0.3;
 
 /// Returns the most bytes per embedding that building a codebook takes: components, residuals, codes.
 pub fn working_bytes_per_embedding(dim: usize) -> usize {
     4 * dim.min(128) * size_of::<f32>() + 64
+}
+
+/// How fine a codebook is. Errors are means of `|score error|`, relative to the spread of scores (their
+/// standard deviation over the scene).
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct CodebookSettings {
+    /// Largest accepted error of the compact profile.
+    pub compact_error: f32,
+    /// Largest accepted error of the balanced profile.
+    pub balanced_error: f32,
+    /// Most components of a centroid: the dimension of compact and balanced shards. Fewer are taken where the errors
+    /// allow it; even, 2 to [`MAX_COMPONENTS`].
+    pub max_components: usize,
+    /// Fewest Gaussians per centroid, on average.
+    pub min_gaussians_per_centroid: usize,
+    /// Bytes per Gaussian that centroids of outliers may take, beside a sixteenth of the basis: they lower the hard bound
+    /// of scores. 0: no such centroids.
+    pub outlier_bytes: f32,
+    /// Most subspaces of the residual code (half a byte each); below 2 there is no code.
+    pub max_subspaces: usize,
+    /// Whether residuals are also stored in 8 bits per component, as in exact shards.
+    pub has_fine: bool,
+}
+
+impl Default for CodebookSettings {
+    /// On the labelled house, 0.1 keeps the exact field's task accuracy, and 0.02 its ranking (README.md).
+    fn default() -> Self {
+        Self {
+            compact_error: 0.1,
+            balanced_error: 0.02,
+            max_components: MAX_COMPONENTS,
+            min_gaussians_per_centroid: 45,
+            outlier_bytes: 0.25,
+            max_subspaces: 32,
+            has_fine: false,
+        }
+    }
 }
 
 /// The metric and the texts that errors of scores are measured by.
@@ -84,7 +122,12 @@ pub struct Codebook {
     pub residuals: Option<CodebookResiduals>,
 }
 
-/// The residual code of a codebook.
+impl Codebook {
+    pub fn stored_basis(&self) -> shard::Basis<'_> {
+        shard::Basis { mean: &self.mean, vectors: &self.basis, steps: &self.basis_steps }
+    }
+}
+
 pub struct CodebookResiduals {
     /// Subspaces and codewords.
     pub code: ResidualCode,
@@ -108,173 +151,185 @@ pub fn build(
     score_context: &ScoreMetricContext,
     settings: &CodebookSettings,
 ) -> Codebook {
-    let dim = embeddings.width;
     let rms = |error: f32| error * RMS_OF_MEAN * score_context.spread;
-    let tolerance = TAIL_SHARE * rms(settings.balanced_error);
-    let mut fitted = Basis::fit(embeddings, &score_context.metric, tolerance, settings.max_components);
-    let m = fitted.n_components;
-    let points = fitted.components(embeddings);
-    let max_centroids = (embeddings.len() / settings.min_gaussians_per_centroid.max(1)).max(1);
-    let mut found = cluster::clusters(Rows::all(&points, m), rms(settings.compact_error), max_centroids);
-    if settings.outlier_bytes > 0.0 {
-        let n_more = settings.outlier_bytes * embeddings.len() as f32 / (m + BYTES_BESIDE_COMPONENTS) as f32;
-        let n_more = n_more as usize + dim / OUTLIERS_OF_DIM;
-        // A bound within the spread of scores tells them apart.
-        outliers::separate(
-            embeddings,
-            &fitted,
-            Rows::all(&points, m),
-            &mut found,
-            n_more,
-            score_context.spread,
-        );
-    }
-    let (order, centroid_starts) = sorted(&found.codes, found.centres.len() / m);
-
-    // Rotated to the residuals' eigenvectors; each residual is divided by its centroid's scale.
-    let mut residuals = points;
-    residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(point, centroid)| {
-        let centre = &found.centres[*centroid as usize * m..][..m];
-        point.iter_mut().zip(centre).for_each(|(p, c)| *p -= c);
-    });
-    let scales =
-        residual_scales(Rows { values: &residuals, width: m, index: Some(&order) }, &centroid_starts);
-    residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(residual, centroid)| {
-        let scale = scales[*centroid as usize].recip();
-        residual.iter_mut().for_each(|v| *v *= scale);
-    });
-    let (turn, variances) = residual::rotation(Rows::all(&residuals, m));
-    let turned =
-        |vectors: &[f32]| Panels::new(m, m, |old, new| turn[new * m + old]).product(Rows::all(vectors, m));
-    let residuals = turned(&residuals);
-    let scale_of: Vec<f32> = found.codes.iter().map(|centroid| scales[*centroid as usize]).collect();
-    let planned = residual::plan(
-        Rows::all(&residuals, m),
-        &scale_of,
-        &variances,
-        rms(settings.balanced_error),
-        settings.max_subspaces,
-    );
-    drop(residuals);
-    let components_in_order: Vec<usize> = match &planned {
-        Some((order, _)) => order.clone(),
-        None => (0..m).collect(),
-    };
-    let turn: Vec<f32> = components_in_order.iter().flat_map(|c| &turn[c * m..][..m]).copied().collect();
-    fitted.rotate(&turn);
-
-    // Centroids in 8 bits: each component has its own range, which goes into its basis vector.
+    let Clustered { mut basis, points, found } = Clustered::new(embeddings, score_context, settings);
+    let m = basis.n_components;
+    let members = Members::new(&found.codes, found.centres.len() / m);
+    let scaled = ScaledResiduals::new(points, &found, &members, m);
+    let (code, turn) = scaled.plan(&found.codes, rms(settings.balanced_error), settings.max_subspaces);
+    let scales = scaled.scales;
+    basis.rotate(&turn);
     let centres = Panels::new(m, m, |old, new| turn[new * m + old]).product(Rows::all(&found.centres, m));
-    let ranges = ranges(&centres, m, &scales);
-    let centroid_step = 1.0 / 127.0;
-    let centroids: Vec<i8> =
-        centres.iter().enumerate().map(|(at, v)| (v / ranges[at % m] * 127.0).round() as i8).collect();
-    let (mut basis, mut basis_steps) = (Vec::with_capacity(m * dim), Vec::with_capacity(m));
-    for (vector, range) in fitted.basis.chunks_exact(dim).zip(&ranges) {
-        let scaled: Vec<f32> = vector.iter().map(|v| v * range).collect();
-        let (values, step) = shard::quantise(&scaled);
-        basis.extend(values);
-        basis_steps.push(step);
-    }
-    let decoder = Decoder { dim, m, mean: &fitted.mean, basis: &basis, steps: &basis_steps };
-    let decoded_centroids =
-        decoder.decode(&centroids.iter().map(|v| f32::from(*v) * centroid_step).collect::<Vec<_>>(), true);
-
-    let measured = measure::Sample::new(embeddings, &order, &score_context.bank);
-    let (radii, errors) = compare(embeddings, &order, &centroid_starts, &decoded_centroids, None, &measured);
-    let residuals = planned.map(|(_, code)| {
-        let coded = coded(embeddings, &fitted, &order, &centroid_starts, &decoded_centroids, &scales);
-        let fine = settings.has_fine.then(|| {
-            let (fine, decoded) = fine::round(&coded, m, &centroid_starts, &scales, &ranges);
-            let (_, errors) = compare(
-                embeddings,
-                &order,
-                &centroid_starts,
-                &decoded_centroids,
-                Some((&decoder, &decoded)),
-                &measured,
-            );
-            FineResiduals { errors, ..fine }
-        });
-        let (codes, mut decoded) = code.encode(Rows::all(&coded, m));
-        let covered = code.n_components();
-        // As readers decode: in the centroids' units, multiplied by the centroids' scales.
-        let mut residual_norms = vec![0.0f32; scales.len()];
-        let mut codewords = code.codewords.clone();
-        for starts in code.subspace_starts.windows(2) {
-            let (from, to) = (starts[0] as usize, starts[1] as usize);
-            for (at, codeword) in
-                codewords[shard::CODEWORDS * from..shard::CODEWORDS * to].iter_mut().enumerate()
-            {
-                *codeword = f16::from_f32(codeword.to_f32() / ranges[from + at % (to - from)]);
-            }
-        }
-        for centroid in 0..scales.len() {
-            for at in centroid_starts[centroid] as usize..centroid_starts[centroid + 1] as usize {
-                let decoded = &mut decoded[at * covered..][..covered];
-                decoded.iter_mut().zip(&ranges).for_each(|(v, range)| {
-                    *v = f16::from_f32(*v / range).to_f32() * scales[centroid];
-                });
-                let length = decoded.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-                residual_norms[centroid] = residual_norms[centroid].max((length as f32).next_up());
-            }
-        }
-        let part =
-            Decoder { m: covered, basis: &basis[..covered * dim], steps: &basis_steps[..covered], ..decoder };
-        let (radii, errors) = compare(
-            embeddings,
-            &order,
-            &centroid_starts,
-            &decoded_centroids,
-            Some((&part, &decoded)),
-            &measured,
-        );
-        let code = ResidualCode { codewords, ..code };
-        CodebookResiduals { code, residual_scales: scales, residual_norms, codes, radii, errors, fine }
-    });
-    let Basis { mean, .. } = fitted;
+    let stored = StoredCentroids::new(&basis, &centres, &scales);
+    let decoded_centroids = stored.decoded();
+    let sample = measure::Sample::new(embeddings, &members.order, &score_context.bank);
+    let reference =
+        Reference { embeddings, members: &members, decoded_centroids: &decoded_centroids, sample: &sample };
+    let (radii, errors) = reference.compare(None);
+    let residuals =
+        code.map(|code| code_residuals(code, &reference, &basis, &stored, scales, settings.has_fine));
+    let moments = sample.moments;
+    let StoredCentroids { basis: vectors, basis_steps, centroids, .. } = stored;
+    let Members { order, starts: centroid_starts } = members;
     Codebook {
         order,
         centroid_starts,
         n_components: m,
-        mean,
-        basis,
+        mean: basis.mean,
+        basis: vectors,
         basis_steps,
         centroids,
-        centroid_step,
+        centroid_step: CENTROID_STEP,
         radii,
         errors,
-        moments: measured.moments,
+        moments,
         residuals,
     }
 }
 
-/// Returns the points ordered by centroid, and where the centroids start.
-fn sorted(codes: &[u32], n_centroids: usize) -> (Vec<u32>, Vec<u32>) {
-    let mut starts = vec![0u32; n_centroids + 1];
-    codes.iter().for_each(|centroid| starts[*centroid as usize + 1] += 1);
-    (0..n_centroids).for_each(|centroid| starts[centroid + 1] += starts[centroid]);
-    let mut next = starts.clone();
-    let mut order = vec![0; codes.len()];
-    for (point, centroid) in codes.iter().enumerate() {
-        order[next[*centroid as usize] as usize] = point as u32;
-        next[*centroid as usize] += 1;
-    }
-    (order, starts)
+/// Embeddings in the cell's coordinates, and their clusters.
+struct Clustered {
+    basis: Basis,
+    /// `[n][m]`.
+    points: Vec<f32>,
+    found: Clusters,
 }
 
-/// Returns the root mean square of each centroid's residuals.
-fn residual_scales(residuals: Rows<'_>, centroid_starts: &[u32]) -> Vec<f32> {
-    centroid_starts
-        .par_windows(2)
-        .map(|members| {
-            let squares = |at: usize| residuals.get(at).iter().map(|v| f64::from(v * v)).sum::<f64>();
-            let members = members[0] as usize..members[1] as usize;
-            let n = members.len() as f64;
+impl Clustered {
+    fn new(embeddings: Rows<'_>, context: &ScoreMetricContext, settings: &CodebookSettings) -> Self {
+        let (n, dim) = (embeddings.len(), embeddings.width);
+        let rms = |error: f32| error * RMS_OF_MEAN * context.spread;
+        let tolerance = TAIL_SHARE * rms(settings.balanced_error);
+        let basis = Basis::fit(embeddings, &context.metric, tolerance, settings.max_components);
+        let m = basis.n_components;
+        let points = basis.components(embeddings);
+        let rows = Rows::all(&points, m);
+        let max_centroids = (n / settings.min_gaussians_per_centroid.max(1)).max(1);
+        let mut found = cluster::clusters(rows, rms(settings.compact_error), max_centroids);
+        if settings.outlier_bytes > 0.0 {
+            let n_more = settings.outlier_bytes * n as f32 / (m + BYTES_BESIDE_COMPONENTS) as f32;
+            let n_more = n_more as usize + dim / OUTLIERS_OF_DIM;
+            // A bound within the spread of scores tells them apart.
+            outliers::separate(embeddings, &basis, rows, &mut found, n_more, context.spread);
+        }
+        Self { basis, points, found }
+    }
+}
+
+/// Points in the order of their centroids.
+struct Members {
+    /// By place in that order: the point.
+    order: Vec<u32>,
+    /// `[K + 1]`: first place of each centroid.
+    starts: Vec<u32>,
+}
+
+impl Members {
+    fn new(codes: &[u32], n_centroids: usize) -> Self {
+        let mut starts = vec![0u32; n_centroids + 1];
+        codes.iter().for_each(|centroid| starts[*centroid as usize + 1] += 1);
+        (0..n_centroids).for_each(|centroid| starts[centroid + 1] += starts[centroid]);
+        let mut next = starts.clone();
+        let mut order = vec![0; codes.len()];
+        for (point, centroid) in codes.iter().enumerate() {
+            order[next[*centroid as usize] as usize] = point as u32;
+            next[*centroid as usize] += 1;
+        }
+        Self { order, starts }
+    }
+
+    /// Returns the places of a centroid's members.
+    fn places(&self, centroid: usize) -> Range<usize> {
+        self.starts[centroid] as usize..self.starts[centroid + 1] as usize
+    }
+}
+
+/// What the centroids leave of the points, each divided by its centroid's scale.
+struct ScaledResiduals {
+    m: usize,
+    /// `[n][m]`, by point.
+    residuals: Vec<f32>,
+    /// `[K]`: root mean square of the residuals.
+    scales: Vec<f32>,
+}
+
+impl ScaledResiduals {
+    fn new(points: Vec<f32>, found: &Clusters, members: &Members, m: usize) -> Self {
+        let mut residuals = points;
+        residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(point, centroid)| {
+            let centre = &found.centres[*centroid as usize * m..][..m];
+            point.iter_mut().zip(centre).for_each(|(p, c)| *p -= c);
+        });
+        let in_order = Rows { values: &residuals, width: m, index: Some(&members.order) };
+        let squares = |place: usize| in_order.get(place).iter().map(|v| f64::from(v * v)).sum::<f64>();
+        let scale = |centroid: usize| {
+            let places = members.places(centroid);
+            let n = places.len() as f64;
             // At least 1e-6: members that coincide must not cause a division by zero.
-            ((members.map(squares).sum::<f64>() / n).sqrt() as f32).max(1e-6)
-        })
-        .collect()
+            ((places.map(squares).sum::<f64>() / n).sqrt() as f32).max(1e-6)
+        };
+        let scales: Vec<f32> = (0..members.starts.len() - 1).into_par_iter().map(scale).collect();
+        residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(residual, centroid)| {
+            let scale = scales[*centroid as usize].recip();
+            residual.iter_mut().for_each(|v| *v *= scale);
+        });
+        Self { m, residuals, scales }
+    }
+
+    /// Returns the residual code, if one is needed, and the rotation (rows `[m][m]`) to the residuals' eigenvectors in the
+    /// order of its components.
+    fn plan(&self, codes: &[u32], max_rms: f32, max_subspaces: usize) -> (Option<ResidualCode>, Vec<f32>) {
+        let m = self.m;
+        let residuals = Rows::all(&self.residuals, m);
+        let (turn, variances) = residual::rotation(residuals);
+        let turned = Panels::new(m, m, |old, new| turn[new * m + old]).product(residuals);
+        let scale_of: Vec<f32> = codes.iter().map(|centroid| self.scales[*centroid as usize]).collect();
+        let planned = residual::plan(Rows::all(&turned, m), &scale_of, &variances, max_rms, max_subspaces);
+        let (order, code) = match planned {
+            Some((order, code)) => (order, Some(code)),
+            None => ((0..m).collect(), None),
+        };
+        (code, order.iter().flat_map(|c| &turn[c * m..][..m]).copied().collect())
+    }
+}
+
+/// Centroids and basis in 8 bits: each component has its own range, which goes into its basis vector.
+struct StoredCentroids<'a> {
+    mean: &'a [f16],
+    /// `[m]`: what a component of 1 stands for.
+    ranges: Vec<f32>,
+    basis: Vec<i8>,
+    basis_steps: Vec<f32>,
+    centroids: Vec<i8>,
+}
+
+impl<'a> StoredCentroids<'a> {
+    fn new(fitted: &'a Basis, centres: &[f32], scales: &[f32]) -> Self {
+        let (m, dim) = (fitted.n_components, fitted.mean.len());
+        let ranges = ranges(centres, m, scales);
+        let centroids =
+            centres.iter().enumerate().map(|(at, v)| (v / ranges[at % m] * 127.0).round() as i8).collect();
+        let (mut basis, mut basis_steps) = (Vec::with_capacity(m * dim), Vec::with_capacity(m));
+        for (vector, range) in fitted.basis.chunks_exact(dim).zip(&ranges) {
+            let scaled: Vec<f32> = vector.iter().map(|v| v * range).collect();
+            let (values, step) = shard::quantise(&scaled);
+            basis.extend(values);
+            basis_steps.push(step);
+        }
+        Self { mean: &fitted.mean, ranges, basis, basis_steps, centroids }
+    }
+
+    /// Returns the decoder of the first `m` components.
+    fn decoder(&self, m: usize) -> Decoder<'_> {
+        let dim = self.mean.len();
+        Decoder { dim, m, mean: self.mean, basis: &self.basis[..m * dim], steps: &self.basis_steps[..m] }
+    }
+
+    /// Returns the centroids as readers decode them, `[K][dim]`.
+    fn decoded(&self) -> Vec<f32> {
+        let components: Vec<f32> = self.centroids.iter().map(|v| f32::from(*v) * CENTROID_STEP).collect();
+        self.decoder(self.ranges.len()).decode(&components)
+    }
 }
 
 /// Returns the largest absolute value of each component. A lower bound keeps residuals within the range of half floats and
@@ -288,23 +343,52 @@ fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
     ranges
 }
 
-/// Returns the residuals of the stored centroids, in shard order, divided by the centroids' scales.
-fn coded(
-    embeddings: Rows<'_>,
-    basis: &Basis,
-    order: &[u32],
-    centroid_starts: &[u32],
-    decoded_centroids: &[f32],
-    scales: &[f32],
-) -> Vec<f32> {
+/// Codes what the stored centroids leave, and measures what readers decode.
+fn code_residuals(
+    code: ResidualCode,
+    reference: &Reference<'_>,
+    fitted: &Basis,
+    stored: &StoredCentroids<'_>,
+    scales: Vec<f32>,
+    has_fine: bool,
+) -> CodebookResiduals {
+    let (m, ranges, members) = (fitted.n_components, &stored.ranges, reference.members);
+    let residuals = residuals_of_stored(reference, fitted, &scales);
+    let fine = has_fine.then(|| {
+        let (fine, decoded) = fine::round(&residuals, m, &members.starts, &scales, ranges);
+        let (_, errors) = reference.compare(Some((&stored.decoder(m), &decoded)));
+        FineResiduals { errors, ..fine }
+    });
+    let (codes, mut decoded) = code.encode(Rows::all(&residuals, m));
+    let covered = code.n_components();
+    // As readers decode: in the centroids' units, multiplied by the centroids' scales.
+    let mut residual_norms = vec![0.0f32; scales.len()];
+    for centroid in 0..scales.len() {
+        for at in members.places(centroid) {
+            let decoded = &mut decoded[at * covered..][..covered];
+            decoded.iter_mut().zip(ranges).for_each(|(v, range)| {
+                *v = f16::from_f32(*v / range).to_f32() * scales[centroid];
+            });
+            let length = decoded.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            residual_norms[centroid] = residual_norms[centroid].max((length as f32).next_up());
+        }
+    }
+    let (radii, errors) = reference.compare(Some((&stored.decoder(covered), &decoded)));
+    let code = code.divided(ranges);
+    CodebookResiduals { code, residual_scales: scales, residual_norms, codes, radii, errors, fine }
+}
+
+/// Returns the residuals of the stored centroids, in the order of the members, divided by the centroids' scales.
+fn residuals_of_stored(reference: &Reference<'_>, basis: &Basis, scales: &[f32]) -> Vec<f32> {
+    let Reference { embeddings, members, decoded_centroids, .. } = *reference;
     let (m, dim) = (basis.n_components, embeddings.width);
     let in_order: Vec<u32> =
-        order.iter().map(|at| embeddings.index.map_or(*at, |index| index[*at as usize])).collect();
+        members.order.iter().map(|at| embeddings.index.map_or(*at, |index| index[*at as usize])).collect();
     let mut points = basis.components(Rows { index: Some(&in_order), ..embeddings });
     let centroids = basis.components(Rows::all(decoded_centroids, dim));
-    for (centroid, members) in centroid_starts.windows(2).enumerate() {
-        let scale = scales[centroid].recip();
-        for point in points[members[0] as usize * m..members[1] as usize * m].chunks_exact_mut(m) {
+    for centroid in 0..scales.len() {
+        let (scale, places) = (scales[centroid].recip(), members.places(centroid));
+        for point in points[places.start * m..places.end * m].chunks_exact_mut(m) {
             point.iter_mut().zip(&centroids[centroid * m..]).for_each(|(p, r)| *p = (*p - r) * scale);
         }
     }

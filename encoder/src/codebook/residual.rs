@@ -19,7 +19,6 @@ const MAX_SUBSPACE_COMPONENTS: usize = 8;
 /// Numbers of subspaces are multiples of this.
 const SUBSPACES_STEP: usize = 4;
 
-/// A residual code.
 pub struct ResidualCode {
     /// `[G + 1]`.
     pub subspace_starts: Vec<u32>,
@@ -104,6 +103,18 @@ impl ResidualCode {
             })
             .collect();
         Self { subspace_starts, codewords: codewords.concat() }
+    }
+
+    /// Returns the code with each component of its codewords divided by a range, as they are stored.
+    pub(super) fn divided(mut self, ranges: &[f32]) -> Self {
+        for starts in self.subspace_starts.windows(2) {
+            let (from, to) = (starts[0] as usize, starts[1] as usize);
+            let codewords = &mut self.codewords[CODEWORDS * from..CODEWORDS * to];
+            for (at, codeword) in codewords.iter_mut().enumerate() {
+                *codeword = f16::from_f32(codeword.to_f32() / ranges[from + at % (to - from)]);
+            }
+        }
+        self
     }
 
     /// Returns the number of subspaces.

@@ -14,7 +14,7 @@ use crate::lift::refine::Refinement;
 use crate::lift::{CellField, PartContributions, RegionTable};
 use crate::objects::SceneObjects;
 use crate::occupancy::SceneOccupancy;
-use crate::shard::{self, BuiltShard, CellEmbeddings, CellExtras, ShardSettings};
+use crate::shard::{BuiltShard, CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
 use crate::store::Store;
 
 /// What all views together say about every cell.
@@ -121,7 +121,8 @@ impl CellMaker<'_> {
         let extras = CellExtras { objects, occupancy, photo_poses };
         let embeddings = &in_work.embeddings;
         let made = self.context.time("codebook", || {
-            shard::build(scene, cell_id, cell, embeddings, encoder_id, score_context, settings, &extras)
+            ShardBuilder { scene, encoder_id, score_context, settings }
+                .build(cell_id, cell, embeddings, extras)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
             let (hash, len_bytes) = self.context.time("write", || self.store.put_bytes(&shard.bytes))?;

@@ -154,13 +154,27 @@ pub enum EncodeError {
         reason: String,
     },
     /// The scene has no usable Gaussian.
-    #[error("{}: none of {n_gaussians} Gaussians is usable (finite, positive scales, a rotation); export the splat again", path.display())]
+    #[error("{}: hardly any of {n_gaussians} Gaussians can be seen (finite, positive scales, a rotation, not transparent); export the splat again", path.display())]
     NoGaussians {
         /// The splat file.
         path: PathBuf,
         /// Gaussians in it.
         n_gaussians: usize,
     },
+    /// A view has no pose, and `strict` is set.
+    #[error("view {view} has no pose: {reason}; remove it from the poses, or leave out --strict")]
+    NoPose {
+        /// The view.
+        view: String,
+        /// What its pose is.
+        reason: String,
+    },
+    /// No Gaussian has an embedding.
+    #[error(
+        "no Gaussian of the scene lies in any mask: robots would find nothing; check the masks and the poses \
+         (`slag-encoder check`), or publish all the same with --allow-empty"
+    )]
+    NoEvidence,
     /// The memory budget is too small.
     #[error(transparent)]
     Memory(#[from] MemoryError),

@@ -13,8 +13,11 @@ use super::error::EncodeError;
 use super::report::SkippedView;
 use super::settings::{EncodeSettings, InputSettings};
 use crate::cells::{self, CellSplit};
-use crate::ingest;
 use crate::memory::{MemoryPlan, Phase};
+use crate::{check, ingest};
+
+/// A splat of which fewer than one in so many Gaussians can be seen is damaged.
+const MIN_VISIBLE_ONE_IN: usize = 20;
 
 /// Bytes that a pixel of a photo takes until its crops are made: three as read and three without distortion, one for
 /// whether the lens shows it, four each for its depth and its segment.
@@ -41,16 +44,27 @@ impl Inputs {
         let geo_reference = inputs.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
         let options = ReadOptions { with_sh_rest: false };
         let mut scene = context.time("read", || splat::read(&inputs.scene, &options))?;
+        inputs.activated.undo(&mut scene);
         let set = read_views(inputs)?;
+        let damaged = set.damaged;
         let frame = ingest::find_frame(&inputs.scene, &inputs.splat_frame, set.source, set.applied)?;
         if let Some(frame) = frame {
             tracing::info!("{frame}; the splat is brought into the world of the poses");
             frame.to_poses(&mut scene);
         }
-        let (views, missing) = find_views(settings, set.views)?;
+        let (views, mut missing) = find_views(settings, set.views)?;
+        if let (true, Some((view, reason))) = (settings.run.strict, damaged.first()) {
+            return Err(EncodeError::NoPose { view: view.clone(), reason: reason.clone() });
+        }
+        missing.extend(damaged.into_iter().map(|(view, reason)| SkippedView { view, reason }));
+        context.install(|| check::suspicions(&scene, &views)).iter().for_each(|suspicion| {
+            tracing::warn!("{}; `slag-encoder check` tells more", suspicion.text);
+        });
         let limits = settings.cells.limits;
         let split = context.time("cells", || context.install(|| cells::split(&scene, limits)));
-        if split.cells.is_empty() {
+        let n_visible =
+            (0..scene.len()).filter(|i| scene.is_usable(*i) && scene.opacities[*i] >= 1.0 / 255.0).count();
+        if split.cells.is_empty() || n_visible * MIN_VISIBLE_ONE_IN < scene.len() {
             return Err(EncodeError::NoGaussians { path: inputs.scene.clone(), n_gaussians: scene.len() });
         }
         if split.n_for_precision > cells::MAX_CELLS_FOR_PRECISION {
@@ -92,6 +106,7 @@ pub fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeErro
 /// Reads the poses of every nth frame.
 fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
     let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;
+    set.notes.iter().for_each(|note| tracing::warn!("{note}"));
     for path in &inputs.added {
         add_views(&mut set, &inputs.views, path)?;
     }
@@ -100,9 +115,8 @@ fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
         set = set.every(n);
         tracing::info!("every {n}th frame: {} of {n_frames}", set.views.len() + set.without_pose.len());
     }
-    if let Some(first) = set.without_pose.first() {
-        let (n, of) = (set.without_pose.len(), set.views.len() + set.without_pose.len());
-        tracing::info!("{n} of {of} frames have no pose (-inf) and are left out, the first is {first}");
+    if let Some(left_out) = set.left_out() {
+        tracing::info!("{left_out}");
     }
     drop_views(&mut set.views, &inputs.dropped)?;
     Ok(set)

@@ -90,6 +90,9 @@ pub(super) fn plan<'a>(
         engines.models.text_side()?;
     }
     let segmenter = segmenter_of(&settings.view, &settings.run.gpus, engines)?;
+    if let Some(without) = segmenter.check_views(&inputs.views, settings.run.strict)? {
+        tracing::warn!("{without}");
+    }
     let ids = context.time("identity", || {
         context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))
     })?;

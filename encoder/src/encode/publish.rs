@@ -30,6 +30,10 @@ pub(super) fn publish(
     executor: &dyn Executor,
     context: &RunContext<'_>,
 ) -> Result<EncodeSummary, EncodeError> {
+    let n_usable = (plan.inputs.scene.len() - plan.inputs.split.n_rejected) as u64;
+    if built.n_without_evidence >= n_usable && !plan.settings.run.allow_empty {
+        return Err(EncodeError::NoEvidence);
+    }
     let generation = plan.store.next_generation()?;
     let text_model =
         plan.settings.output.text_model.then(|| carry(plan.store, plan.engines.models)).transpose()?;

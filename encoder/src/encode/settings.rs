@@ -13,7 +13,7 @@ use crate::cells::{CellLimits, PositionError};
 use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
-use crate::ingest::FrameChoice;
+use crate::ingest::{Activated, FrameChoice};
 use crate::lift::Aggregation;
 use crate::occupancy::OccupancySettings;
 use crate::raster::WeightKind;
@@ -62,6 +62,8 @@ pub struct InputSettings {
     pub every: Option<NonZeroU32>,
     /// What states the splat's frame against that of the poses.
     pub splat_frame: FrameChoice,
+    /// What the splat file has in place of logarithms and logits.
+    pub activated: Activated,
     /// Whether a world unit is a metre; a geo-reference implies it.
     pub metric: bool,
     /// A geo-reference file.
@@ -217,6 +219,8 @@ pub struct RunSettings {
     pub time_budget: Option<Duration>,
     /// Whether a missing or unreadable input ends the encode.
     pub strict: bool,
+    /// Publishes a generation in which no Gaussian has an embedding.
+    pub allow_empty: bool,
     /// Whether an unfinished encode of another splat or with other settings is dropped.
     pub restart: bool,
     /// Whether the views' contributions are kept after publication, for an encode with another aggregation.
@@ -272,6 +276,7 @@ impl EncodeSettings {
                 dropped: Vec::new(),
                 every: None,
                 splat_frame: FrameChoice::Auto,
+                activated: Activated::default(),
                 metric,
                 geo: None,
             },
@@ -315,6 +320,7 @@ impl EncodeSettings {
                 view_order: ViewOrder::Names,
                 time_budget: None,
                 strict: false,
+                allow_empty: false,
                 restart: false,
                 keep_views: false,
                 gpus: vec![0],

@@ -1,52 +1,33 @@
 //! Geo-reference of the world frame, from a JSON file.
 
+use std::collections::HashMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
+use serde::de::Error;
+use serde_json::Value;
 use slag_common::frames::{GeoReference, Geographic};
 
 /// Reason why a geo-reference cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum GeoError {
-    /// The file cannot be read; the message contains its path.
     #[error("{0}; check that the file exists and may be read")]
     Io(#[from] io::Error),
-    /// The file is not JSON of the expected form.
     #[error(r#"{}: {source}; expected {{"origin": {{"lat": DEGREES, "lon": DEGREES, "alt": METRES}}}}"#, path.display())]
     Json {
-        /// The file.
         path: PathBuf,
-        /// Line, column and reason.
         #[source]
         source: serde_json::Error,
     },
-    /// A coordinate is out of range.
     #[error("{}: origin.{field} = {value} is outside {min}..={max}; write degrees and metres of WGS 84", path.display())]
-    Range {
-        /// The file.
-        path: PathBuf,
-        /// `lat`, `lon` or `alt`.
-        field: &'static str,
-        /// The value found.
-        value: f64,
-        /// Smallest valid value.
-        min: f64,
-        /// Largest valid value.
-        max: f64,
-    },
+    Range { path: PathBuf, field: &'static str, value: f64, min: f64, max: f64 },
 }
 
+/// A map, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's.
 #[derive(Deserialize)]
 struct GeoFile {
-    origin: Origin,
-}
-
-#[derive(Deserialize)]
-struct Origin {
-    lat: f64,
-    lon: f64,
-    alt: f64,
+    origin: HashMap<String, Value>,
 }
 
 /// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; other fields are ignored.
@@ -55,20 +36,20 @@ struct Origin {
 /// [`GeoError`] if the file cannot be read, is malformed, or contains a coordinate out of range.
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let bytes = fs_err::read(path)?;
-    let GeoFile { origin } =
-        serde_json::from_slice(&bytes).map_err(|source| GeoError::Json { path: path.to_owned(), source })?;
-    // The range of heights is from the deepest trench to the edge of space.
-    let ranges = [
-        ("lat", origin.lat, -90.0, 90.0),
-        ("lon", origin.lon, -180.0, 180.0),
-        ("alt", origin.alt, -12e3, 100e3),
-    ];
-    for (field, value, min, max) in ranges {
-        if !(min..=max).contains(&value) {
-            return Err(GeoError::Range { path: path.to_owned(), field, value, min, max });
+    let malformed = |source| GeoError::Json { path: path.to_owned(), source };
+    // A map first, for the same reason as above.
+    let file: HashMap<String, Value> = serde_json::from_slice(&bytes).map_err(malformed)?;
+    let file = GeoFile::deserialize(Value::from_iter(file)).map_err(malformed)?;
+    let field = |field: &'static str, min: f64, max: f64| {
+        let value = file.origin.get(field).and_then(Value::as_f64);
+        let value = value.ok_or_else(|| malformed(Error::missing_field(field)))?;
+        match (min..=max).contains(&value) {
+            true => Ok(value),
+            false => Err(GeoError::Range { path: path.to_owned(), field, value, min, max }),
         }
-    }
-    Ok(GeoReference {
-        origin: Geographic { latitude_deg: origin.lat, longitude_deg: origin.lon, height_m: origin.alt },
-    })
+    };
+    // The range of heights is from the deepest trench to the edge of space.
+    let (latitude_deg, longitude_deg) = (field("lat", -90.0, 90.0)?, field("lon", -180.0, 180.0)?);
+    let origin = Geographic { latitude_deg, longitude_deg, height_m: field("alt", -12e3, 100e3)? };
+    Ok(GeoReference { origin })
 }

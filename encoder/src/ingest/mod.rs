@@ -5,7 +5,7 @@ mod jpeg;
 mod splat_frame;
 mod undistort;
 
-use std::io;
+use std::io::{self, BufRead};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -14,7 +14,7 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Rg
 use slag_common::{Distortion, Hash32, Intrinsics, View};
 
 pub use geo::{GeoError, read_geo_reference};
-pub use splat_frame::{FoundFrame, FrameChoice, find_frame};
+pub use splat_frame::{Activated, FoundFrame, FrameChoice, find_frame};
 pub use undistort::Undistorter;
 
 /// Largest factor between the size in the intrinsics and that of downscaled photos.
@@ -29,7 +29,7 @@ pub struct LoadedImage {
     pub image: RgbImage,
     /// The mapping that undistorted the image, if the lens has distortion.
     pub undistorter: Option<Undistorter>,
-    /// Pixels inside the lens image, row-major; `None` if all are.
+    /// Pixels inside the lens image that are not transparent, row-major; `None` if all are.
     pub valid: Option<Vec<bool>>,
     /// Whether its file has an EXIF orientation, which is ignored: poses are computed from the pixels as stored.
     pub is_rotated: bool,
@@ -71,38 +71,24 @@ impl RotatedPhotos {
 /// Reason why a photo cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum IngestError {
-    /// A file cannot be read; the message contains its path.
     #[error("{0}; check that the file exists and may be read")]
     Io(#[from] io::Error),
-    /// A file is damaged or no image.
     #[error("{}: {source}; give a JPEG, PNG or WebP that opens elsewhere", path.display())]
     Decode {
-        /// The image.
         path: PathBuf,
-        /// The decoder's error.
         #[source]
         source: ImageError,
     },
-    /// A JPEG is truncated.
     #[error("{}: the file ends before its image does; copy the photo again", path.display())]
-    Cut {
-        /// The image.
-        path: PathBuf,
-    },
-    /// The size of an image does not match its camera.
+    Cut { path: PathBuf },
+    #[error("{}: a HEIC or AVIF image; convert the photos to JPEG, for example with heif-convert", path.display())]
+    Heif { path: PathBuf },
     #[error(
         "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other; \
          give the images that the poses were computed from, or whole-factor reductions of them",
         path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1]
     )]
-    Size {
-        /// The image.
-        path: PathBuf,
-        /// Width and height of the image.
-        found_px: [u32; 2],
-        /// Width and height according to the camera.
-        expected_px: [u32; 2],
-    },
+    Size { path: PathBuf, found_px: [u32; 2], expected_px: [u32; 2] },
 }
 
 /// Returns the BLAKE3 hash of a file's content.
@@ -132,7 +118,8 @@ pub fn photo_area_px(view: &View) -> u64 {
 /// Loads the photo of a view and undistorts it.
 ///
 /// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay unchanged.
-/// An EXIF orientation is ignored, see [`RotatedPhotos`].
+/// Transparent pixels are outside of the photo. An EXIF orientation is applied where only the turned photo has its camera's
+/// size, and else ignored, see [`RotatedPhotos`].
 ///
 /// # Errors
 /// [`IngestError`] if the file cannot be read or decoded, or its size does not match the camera.
@@ -140,34 +127,69 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     let (photo, is_rotated) = decode(&view.image_path, &view.intrinsics)?;
     let intrinsics = view.intrinsics.scaled_to(photo.width(), photo.height());
     let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
+    let opaque = photo.color().has_alpha().then(|| opaque_pixels(&photo)).filter(|all| all.contains(&false));
+    let mut image = photo.into_rgb8();
+    if let Some(opaque) = &opaque {
+        // Their colours are left from editing, or noise.
+        let hidden = image.pixels_mut().zip(opaque).filter(|(_, opaque)| !**opaque);
+        hidden.for_each(|(pixel, _)| pixel.0 = [0; 3]);
+    }
     if intrinsics.distortion == Distortion::None {
-        return Ok(LoadedImage { view, image: photo, undistorter: None, valid: None, is_rotated });
+        return Ok(LoadedImage { view, image, undistorter: None, valid: opaque, is_rotated });
     }
     let undistorter = Undistorter::new(intrinsics);
-    let (image, valid) = undistorter.image(&photo);
+    let (image, mut valid) = undistorter.image(&image);
+    if let Some(opaque) = opaque {
+        let labels: Vec<u32> = opaque.into_iter().map(u32::from).collect();
+        let opaque = undistorter.labels(&labels, 0);
+        valid.iter_mut().zip(opaque).for_each(|(valid, opaque)| *valid &= opaque == 1);
+    }
     Ok(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), is_rotated })
 }
 
-/// Returns the pixels, and whether the file has an EXIF orientation.
-fn decode(path: &Path, camera: &Intrinsics) -> Result<(RgbImage, bool), IngestError> {
+/// Returns which pixels are at least half opaque.
+fn opaque_pixels(photo: &DynamicImage) -> Vec<bool> {
+    photo.to_luma_alpha8().pixels().map(|pixel| pixel.0[1] >= 128).collect()
+}
+
+/// Returns the pixels, and whether the file has an EXIF orientation that was ignored.
+fn decode(path: &Path, camera: &Intrinsics) -> Result<(DynamicImage, bool), IngestError> {
     let failed = |source| IngestError::Decode { path: path.to_owned(), source };
     let open = || Ok::<_, IngestError>(io::BufReader::new(fs_err::File::open(path)?));
+    let mut start = open()?;
+    if start.fill_buf()?.get(4..12).is_some_and(|brand| HEIF_BRANDS.contains(&brand)) {
+        return Err(IngestError::Heif { path: path.to_owned() });
+    }
     let reader = ImageReader::new(open()?).with_guessed_format()?;
     if reader.format() == Some(ImageFormat::Jpeg) && !jpeg::is_whole(open()?)? {
         return Err(IngestError::Cut { path: path.to_owned() });
     }
     let mut decoder = reader.into_decoder().map_err(failed)?;
     let (width_px, height_px) = decoder.dimensions();
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     // Checks the size before it allocates any pixel.
-    if !is_scale_of(camera, width_px, height_px) {
+    let fits = is_scale_of(camera, width_px, height_px);
+    let turns = swaps_sides(orientation) && is_scale_of(camera, height_px, width_px);
+    if !fits && !turns {
         return Err(IngestError::Size {
             path: path.to_owned(),
             found_px: [width_px, height_px],
             expected_px: [camera.width_px, camera.height_px],
         });
     }
-    let is_rotated = decoder.orientation().is_ok_and(|found| found != Orientation::NoTransforms);
-    Ok((DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgb8(), is_rotated))
+    let mut photo = DynamicImage::from_decoder(decoder).map_err(failed)?;
+    if !fits {
+        photo.apply_orientation(orientation);
+    }
+    Ok((photo, fits && orientation != Orientation::NoTransforms))
+}
+
+/// Bytes 4 to 12 of HEIF files, which phones write.
+const HEIF_BRANDS: [&[u8]; 4] = [b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypavif"];
+
+fn swaps_sides(orientation: Orientation) -> bool {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
 /// Returns whether a size is exactly proportional to that of the camera, or is a reduction of it by an integer factor with

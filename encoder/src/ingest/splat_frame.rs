@@ -18,6 +18,22 @@ pub enum FrameChoice {
     File(PathBuf),
 }
 
+/// What a splat file has in place of logarithms of scales and logits of opacities.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Activated {
+    pub scales: bool,
+    pub opacities: bool,
+}
+
+impl Activated {
+    /// Brings a splat that was decoded as usual to the values of its file.
+    pub fn undo(self, scene: &mut Gaussians) {
+        if self != Self::default() {
+            scene.deactivate(self.scales, self.opacities);
+        }
+    }
+}
+
 /// A file that states the splat's frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FoundFrame {

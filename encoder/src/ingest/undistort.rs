@@ -22,7 +22,7 @@ impl Undistorter {
     /// the range of the lens model.
     fn source_px(&self, column: u32, row: u32) -> Option<[f64; 2]> {
         let ideal = self.camera.distorted_from_pixel([f64::from(column) + 0.5, f64::from(row) + 0.5]);
-        if ideal[0].hypot(ideal[1]) > self.max_radius {
+        if ideal[0].hypot(ideal[1]) > self.max_radius || self.camera.distortion.folds_at(ideal) {
             return None;
         }
         let [u, v] = self.camera.pixel_from_distorted(self.camera.distort(ideal));

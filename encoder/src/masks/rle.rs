@@ -23,40 +23,16 @@ pub struct Rle {
 /// Reason why a run-length encoding is rejected.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum RleError {
-    /// The runs do not fill the image.
     #[error("runs add up to {found} pixels, expected {expected}; encode the mask again")]
-    Sum {
-        /// Pixels of the image.
-        expected: u64,
-        /// Sum of the runs.
-        found: u64,
-    },
-    /// The image is too large.
+    Sum { expected: u64, found: u64 },
     #[error("size {width_px} x {height_px} px, expected at most 65535 px per side; encode the mask again")]
-    Size {
-        /// Width of the image.
-        width_px: u32,
-        /// Height of the image.
-        height_px: u32,
-    },
-    /// A run is negative or too long.
+    Size { width_px: u32, height_px: u32 },
     #[error("run {index} is out of range; encode the mask again")]
-    Run {
-        /// Position of the run, counted from 0.
-        index: usize,
-    },
-    /// A character is no digit, or a number is too long or incomplete.
+    Run { index: usize },
     #[error("counts: invalid digit at byte {offset_bytes}; encode the mask again")]
-    Digit {
-        /// Offset within the text.
-        offset_bytes: usize,
-    },
-    /// The mask is a list of polygons.
+    Digit { offset_bytes: usize },
     #[error("found {n_polygons} polygons, expected run lengths; convert them with annToRLE of pycocotools")]
-    Polygons {
-        /// Length of the list.
-        n_polygons: usize,
-    },
+    Polygons { n_polygons: usize },
 }
 
 impl Rle {

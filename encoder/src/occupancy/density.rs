@@ -75,10 +75,13 @@ impl Ellipsoid {
         (mean - reach - 0.5).ceil() as i64..=(mean + reach - 0.5).floor() as i64
     }
 
-    fn tiles(&self, axis: usize) -> RangeInclusive<i32> {
+    /// Returns the tiles along an axis that the box reaches; `None` if they are more than a thing has.
+    fn tiles(&self, axis: usize) -> Option<RangeInclusive<i32>> {
         let voxels = self.voxels(axis);
-        let tile = |voxel: i64| voxel.div_euclid(TILE_EDGE as i64) as i32;
-        tile(*voxels.start())..=tile(*voxels.end())
+        // A reach beyond 64 bits saturates: the quotients' difference still fits.
+        let [first, last] = [*voxels.start(), *voxels.end()].map(|voxel| voxel.div_euclid(TILE_EDGE as i64));
+        // The mean is on the lattice, so a narrow box is within 32 bits.
+        (last - first < i64::from(MAX_TILES)).then_some(first as i32..=last as i32)
     }
 
     /// Adds `alpha exp(-d^2 / 2)` to the voxels of a tile, row by row along z: where a row enters and leaves the ellipsoid is
@@ -121,8 +124,8 @@ pub(super) fn occupied(scene: &Gaussians, usable: &[u32], lattice: Lattice) -> O
     let reached: Vec<Option<[RangeInclusive<i32>; 3]>> = usable
         .par_iter()
         .map(|index| {
-            let tiles = ellipsoid(index).map(|e| [0, 1, 2].map(|axis| e.tiles(axis)))?;
-            tiles.iter().all(|along| along.end() - along.start() < MAX_TILES).then_some(tiles)
+            let ellipsoid = ellipsoid(index)?;
+            Some([ellipsoid.tiles(0)?, ellipsoid.tiles(1)?, ellipsoid.tiles(2)?])
         })
         .collect();
     let n_background = reached.iter().filter(|tiles| tiles.is_none()).count();
@@ -172,122 +175,4 @@ fn blocks_of(tile: [i32; 3], sums: &[f32]) -> Vec<(BlockAt, u64)> {
 }
 
 #[cfg(test)]
-mod tests {
-    use slag_math::random::Random;
-
-    use super::*;
-
-    fn random_scene(random: &mut Random, n: usize) -> Gaussians {
-        let mut scene = Gaussians::default();
-        for _ in 0..n {
-            scene.means_in_world.push(DVec3::from([0; 3].map(|_| random.between(-2.0, 2.0))));
-            let q = DQuat::from_xyzw(random.normal(), random.normal(), random.normal(), random.normal());
-            let q = q.normalize();
-            scene.rotations_wxyz.push([q.w, q.x, q.y, q.z].map(|v| v as f32));
-            scene.scales.push([0; 3].map(|_| (10f64.powf(random.between(-3.0, -0.7))) as f32));
-            scene.opacities.push(random.between(0.05, 1.0) as f32);
-            scene.sh_dc.push([0.0; 3]);
-        }
-        scene
-    }
-
-    /// Oracle: the definition, in f64, for every voxel and every Gaussian; voxels within a thousandth of the threshold may
-    /// fall on either side, since sums are f32.
-    #[test]
-    fn voxels_are_occupied_as_defined() {
-        let mut random = Random::new(17);
-        let lattice = Lattice { voxel: 0.1 };
-        let scene = random_scene(&mut random, 60);
-        let usable: Vec<u32> = (0..60).collect();
-        let found: BTreeMap<BlockAt, u64> = occupied(&scene, &usable, lattice).blocks.into_iter().collect();
-        let (mut n_occupied, mut n_undecided) = (0, 0);
-        for voxel in (-30..30).flat_map(|x| (-30..30).flat_map(move |y| (-30..30).map(move |z| [x, y, z]))) {
-            let centre = (DVec3::from(voxel.map(f64::from)) + 0.5) * lattice.voxel;
-            let sum: f64 = (0..scene.len())
-                .map(|k| {
-                    let [w, x, y, z] = scene.rotations_wxyz[k].map(f64::from);
-                    let own = DQuat::from_xyzw(x, y, z, w).normalize().inverse()
-                        * (centre - scene.means_in_world[k]);
-                    // In the Gaussian's own axes the widened covariance stays diagonal.
-                    let d2: f64 = (0..3)
-                        .map(|axis| {
-                            let scale = f64::from(scene.scales[k][axis]);
-                            own[axis].powi(2) / (scale * scale + VOXEL_VARIANCE * lattice.voxel.powi(2))
-                        })
-                        .sum();
-                    if d2 <= 9.0 { f64::from(scene.opacities[k]) * (-0.5 * d2).exp() } else { 0.0 }
-                })
-                .sum();
-            let opacity = 1.0 - (-sum).exp();
-            let block = voxel.map(|v: i32| v.div_euclid(4));
-            let [x, y, z] = voxel.map(|v: i32| v.rem_euclid(4));
-            let is_occupied = found.get(&block).is_some_and(|mask| mask >> (16 * x + 4 * y + z) & 1 == 1);
-            n_occupied += usize::from(is_occupied);
-            if (opacity - 0.1).abs() < 1e-3 {
-                n_undecided += 1;
-                continue;
-            }
-            assert_eq!(is_occupied, opacity >= 0.1, "{voxel:?}: {opacity}");
-        }
-        assert!(n_occupied > 200 && n_undecided < n_occupied / 20, "{n_occupied} {n_undecided}");
-    }
-
-    /// By hand: a wide thin Gaussian is a surface; a ball of fog and a Gaussian that is wider than 8 tiles of 64 voxels are not.
-    #[test]
-    fn background_is_left_out() {
-        let mut scene = Gaussians::default();
-        for (k, scales) in [[1.0, 1.0, 0.02], [0.3, 0.25, 0.3], [4.4, 4.4, 0.02]].into_iter().enumerate() {
-            scene.means_in_world.push(DVec3::X * 100.0 * k as f64);
-            scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-            scene.scales.push(scales);
-            scene.opacities.push(0.9);
-            scene.sh_dc.push([0.0; 3]);
-        }
-        let found = occupied(&scene, &[0, 1, 2], Lattice { voxel: 0.05 });
-        assert_eq!(found.n_background, 2);
-        assert!(!found.blocks.is_empty() && found.blocks.iter().all(|([x, ..], _)| x.abs() < 20));
-    }
-
-    /// A plane of opaque Gaussians, 2 mm thick, in any direction: every voxel that it cuts is occupied, and none whose centre
-    /// is farther than one and a half edges.
-    #[test]
-    fn a_thin_surface_has_no_holes() {
-        let mut random = Random::new(5);
-        let lattice = Lattice { voxel: 0.05 };
-        for spacing in [0.012, 0.05, 0.11] {
-            let normal = DVec3::new(random.normal(), random.normal(), random.normal()).normalize();
-            let (u, v) = (normal.any_orthonormal_vector(), normal.cross(normal.any_orthonormal_vector()));
-            let middle = DVec3::from([0; 3].map(|_| random.between(-5.0, 5.0)));
-            let rotation = DQuat::from_rotation_arc(DVec3::Z, normal);
-            let n = (0.8 / spacing) as i32;
-            let mut scene = Gaussians::default();
-            for (i, j) in (-n..=n).flat_map(|i| (-n..=n).map(move |j| (i, j))) {
-                scene
-                    .means_in_world
-                    .push(middle + u * (f64::from(i) * spacing) + v * (f64::from(j) * spacing));
-                scene.rotations_wxyz.push([rotation.w, rotation.x, rotation.y, rotation.z].map(|q| q as f32));
-                scene.scales.push([(0.62 * spacing) as f32, (0.62 * spacing) as f32, 0.002]);
-                scene.opacities.push(0.97);
-                scene.sh_dc.push([0.0; 3]);
-            }
-            let usable: Vec<u32> = (0..scene.len() as u32).collect();
-            let found: BTreeMap<BlockAt, u64> =
-                occupied(&scene, &usable, lattice).blocks.into_iter().collect();
-            let is_occupied = |voxel: [i32; 3]| {
-                let [x, y, z] = voxel.map(|v| v.rem_euclid(4));
-                let mask = found.get(&voxel.map(|v| v.div_euclid(4)));
-                mask.is_some_and(|mask| mask >> (16 * x + 4 * y + z) & 1 == 1)
-            };
-            for _ in 0..20_000 {
-                let at = middle + u * random.between(-0.5, 0.5) + v * random.between(-0.5, 0.5);
-                let voxel = (at / lattice.voxel).floor().to_array().map(|v| v as i32);
-                assert!(is_occupied(voxel), "{spacing}: {at}");
-                let beside = at + normal * random.between(1.5, 3.0) * lattice.voxel;
-                let voxel = (beside / lattice.voxel).floor().to_array().map(|v| v as i32);
-                let centre = (DVec3::from(voxel.map(f64::from)) + 0.5) * lattice.voxel;
-                let is_far = (centre - middle).dot(normal) > 1.5 * lattice.voxel;
-                assert!(!is_far || !is_occupied(voxel), "{spacing}: {beside}");
-            }
-        }
-    }
-}
+mod tests;

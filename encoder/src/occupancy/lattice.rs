@@ -33,7 +33,6 @@ impl Lattice {
         DVec3::from(at.map(f64::from)) * self.block()
     }
 
-    /// Returns the centre of a block.
     pub(super) fn centre(self, at: BlockAt) -> DVec3 {
         self.corner(at) + self.block() / 2.0
     }

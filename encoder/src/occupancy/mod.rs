@@ -32,9 +32,7 @@ pub struct OccupancySettings {
     pub voxel_m: f64,
 }
 
-/// The occupancy of a scene.
 pub struct SceneOccupancy {
-    /// By cell.
     pub cells: Vec<BuiltOccupancy>,
     /// What was found.
     pub report: OccupancyReport,
@@ -53,7 +51,6 @@ pub struct OccupancyReport {
     pub n_background: usize,
     /// Bytes of all cells, in each profile.
     pub len_bytes: u64,
-    /// Seconds.
     pub secs: f64,
 }
 

@@ -26,6 +26,14 @@ pub trait Segmenter: Sync {
         Ok(None)
     }
 
+    /// Checks that the views have masks, where these exist already; returns a sentence on those without.
+    ///
+    /// # Errors
+    /// [`SegmentError`] if no view has masks, or with `strict` if one has none.
+    fn check_views(&self, _views: &[View], _strict: bool) -> Result<Option<String>, SegmentError> {
+        Ok(None)
+    }
+
     /// Returns whether the segmenter uses [`SegmentInput::depth`], which costs a drawing of the scene.
     fn wants_depth(&self) -> bool {
         false

@@ -1,33 +1,29 @@
 //! Stage 6: a cell's field becomes its shards.
 
-mod photos;
 mod positions;
 
 use half::f16;
 use rayon::prelude::*;
-use slag_common::Gaussians;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::hash::Hash32;
 use slag_common::occupancy::Occupancy;
-use slag_common::photo_poses::PhotoPoses;
+use slag_common::photo_poses::{BuiltPhotoPoses, PhotoPoses};
 use slag_common::shard::{
-    Additions, Basis, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader,
-    ShardView,
+    Additions, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
+use slag_common::{Gaussians, View};
 
 use crate::cells::{Cell, CellSplit};
 use crate::codebook::measure::ScoreMoments;
-use crate::codebook::{self, CodebookSettings, ScoreMetricContext};
+use crate::codebook::{self, Codebook, CodebookResiduals, CodebookSettings, ScoreMetricContext};
 use crate::memory::{MemoryPlan, Phase};
 use crate::objects::SceneObjects;
 use crate::objects::shards::{CellObjects, CentroidBasis};
-pub use photos::photo_poses;
 use positions::QuantisedPositions;
 use slag_math::matrix::Rows;
 
 /// A cell's shard, with its entry in the manifest.
 pub struct BuiltShard {
-    /// The profile.
     pub profile: Profile,
     /// The file.
     pub bytes: Vec<u8>,
@@ -41,7 +37,6 @@ pub struct BuiltShard {
 pub struct BuiltCell {
     /// One per profile.
     pub shards: Vec<BuiltShard>,
-    /// Centroids.
     pub n_centroids: u32,
     /// Subspaces of the residual code.
     pub n_subspaces: u32,
@@ -56,7 +51,6 @@ pub struct BuiltCell {
 /// The profiles to build, and their precision.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ShardSettings {
-    /// Profiles.
     pub profiles: Vec<Profile>,
     /// Precision of embeddings.
     pub codebook: CodebookSettings,
@@ -107,7 +101,7 @@ pub fn expected_bytes(len_bytes: u64) -> u64 {
 }
 
 /// What a cell's shards carry besides Gaussians and their embeddings.
-#[derive(Default)]
+#[derive(Clone, Copy, Default)]
 pub struct CellExtras<'a> {
     /// The objects of the scene, if it has any.
     pub objects: Option<&'a SceneObjects>,
@@ -117,65 +111,151 @@ pub struct CellExtras<'a> {
     pub photo_poses: Option<PhotoPoses<'a>>,
 }
 
-/// Builds a cell's shards.
-#[expect(clippy::too_many_arguments, reason = "the parts of a cell")]
-pub fn build(
-    scene: &Gaussians,
-    cell_id: u32,
-    cell: &Cell,
-    embeddings: &CellEmbeddings,
-    encoder_id: Hash32,
-    score_context: &ScoreMetricContext,
-    settings: &ShardSettings,
-    extras: &CellExtras<'_>,
-) -> BuiltCell {
-    let dim = embeddings.dim;
-    let (with, without): (Vec<u32>, Vec<u32>) =
-        (0..cell.gaussians.len() as u32).partition(|local| embeddings.has_evidence[*local as usize]);
-    let rows = Rows { values: &embeddings.vectors, width: dim, index: Some(&with) };
-    let has_fine = settings.profiles.contains(&Profile::Exact);
-    let codebook = codebook::build(rows, score_context, &CodebookSettings { has_fine, ..settings.codebook });
-    let n_with = with.len();
-    // Shard order: by centroid, then along the Morton curve, the order of locals.
-    let in_order = codebook.order.iter().map(|at| with[*at as usize]);
-    let locals: Vec<u32> = in_order.chain(without.iter().copied()).collect();
+/// What is common to the shards of a scene.
+#[derive(Clone, Copy)]
+pub struct ShardBuilder<'a> {
+    pub scene: &'a Gaussians,
+    pub encoder_id: Hash32,
+    pub score_context: &'a ScoreMetricContext,
+    pub settings: &'a ShardSettings,
+}
 
-    let in_input = || locals.iter().map(|local| cell.gaussians[*local as usize]).collect::<Vec<u32>>();
-    let appearance = settings.appearance.then(|| AppearanceColumns::of(scene, &in_input()));
-    let packed_indices = settings.input_indices.then(|| IndexColumn::pack(&in_input()));
-    let positions = QuantisedPositions::new(scene, cell, &locals);
-    let header = ShardHeader {
-        cell_id,
-        n_gaussians: locals.len() as u32,
-        n_centroids: codebook.radii.len() as u32,
-        dim: dim as u32,
-        n_components: codebook.n_components as u32,
-        n_subspaces: 0,
-        position_bits: cell.grid.bits,
-        centroid_step: codebook.centroid_step,
-        origin_in_world: cell.mean_bounds.min.to_array(),
-        position_step: cell.grid.step,
-        box_min: cell.bounds.min.to_array(),
-        box_max: cell.bounds.max.to_array(),
-        errors: codebook.errors,
-        encoder_id: encoder_id.0,
-    };
-    let compact = ShardView {
-        header,
-        positions: positions.view(),
-        centroid_starts: &codebook.centroid_starts,
-        centroids: &codebook.centroids,
-        radii: &codebook.radii,
-        basis: Some(Basis { mean: &codebook.mean, vectors: &codebook.basis, steps: &codebook.basis_steps }),
-        residuals: None,
-        exact: None,
-        packed_indices: packed_indices.as_ref().map(IndexColumn::view),
-    };
-    let balanced = codebook.residuals.as_ref().map_or(compact, |residuals| ShardView {
+/// The Gaussians of a cell in the order of its shards: by centroid, then along the Morton curve; those without evidence
+/// last. Three numbers name a Gaussian: its place in this order, its *local* (its place in [`Cell::gaussians`] and in
+/// [`CellEmbeddings`]) and its index in the input.
+struct ShardOrder<'a> {
+    cell: &'a Cell,
+    /// By place: the local.
+    locals: Vec<u32>,
+    n_with_evidence: usize,
+}
+
+impl ShardOrder<'_> {
+    fn in_input(&self) -> Vec<u32> {
+        self.locals.iter().map(|local| self.cell.gaussians[*local as usize]).collect()
+    }
+
+    /// Returns the embeddings in f16, `[n_with_evidence][dim]`.
+    fn halves(&self, embeddings: &CellEmbeddings) -> Vec<f16> {
+        let dim = embeddings.dim;
+        let mut halves = vec![f16::ZERO; self.n_with_evidence * dim];
+        halves.par_chunks_exact_mut(dim).zip(&self.locals).for_each(|(out, local)| {
+            let embedding = &embeddings.vectors[*local as usize * dim..][..dim];
+            out.iter_mut().zip(embedding).for_each(|(o, v)| *o = f16::from_f32(*v));
+        });
+        halves
+    }
+}
+
+impl ShardBuilder<'_> {
+    /// Builds a cell's shards.
+    pub fn build(
+        &self,
+        cell_id: u32,
+        cell: &Cell,
+        embeddings: &CellEmbeddings,
+        extras: CellExtras<'_>,
+    ) -> BuiltCell {
+        let (settings, dim) = (self.settings, embeddings.dim);
+        let (codebook, order) = self.codebook(cell, embeddings);
+        let positions = QuantisedPositions::new(self.scene, cell, &order.locals);
+        let packed_indices = settings.input_indices.then(|| IndexColumn::pack(&order.in_input()));
+        let compact = ShardView {
+            header: self.header(cell_id, cell, &codebook, dim),
+            positions: positions.view(),
+            centroid_starts: &codebook.centroid_starts,
+            centroids: &codebook.centroids,
+            radii: &codebook.radii,
+            basis: Some(codebook.stored_basis()),
+            residuals: None,
+            exact: None,
+            packed_indices: packed_indices.as_ref().map(IndexColumn::view),
+        };
+        let balanced = with_residuals(&compact, codebook.residuals.as_ref());
+        let of_cell = |objects| {
+            CellObjects::new(objects, cell_id, &order.locals, &CentroidBasis::new(dim, compact.basis))
+        };
+        let objects = extras.objects.map(of_cell);
+        let objects = objects.as_ref().map(CellObjects::view);
+        let appearance = settings.appearance.then(|| AppearanceColumns::of(self.scene, &order.in_input()));
+        let additions = Additions {
+            objects: objects.as_ref(),
+            appearance: appearance.as_ref().map(AppearanceColumns::view),
+            occupancy: extras.occupancy.as_ref(),
+            photo_poses: extras.photo_poses,
+        };
+        let chosen = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
+        let shards = chosen.map(|profile| match profile {
+            Profile::Compact => built(profile, &compact, additions),
+            Profile::Balanced => built(profile, &balanced, additions),
+            Profile::Exact => {
+                // Codes and fine residuals decide which embeddings readers look at.
+                let fine = codebook.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
+                let exact = ExactColumns {
+                    input_indices: &order.in_input(),
+                    embeddings: &order.halves(embeddings),
+                    fine: fine.map(|fine| Fine {
+                        errors: fine.errors,
+                        steps: &fine.steps,
+                        scales: &fine.scales,
+                        values: &fine.values,
+                    }),
+                };
+                let exact = Some(exact);
+                let view = ShardView { radii: compact.radii, exact, packed_indices: None, ..balanced };
+                built(profile, &view, additions)
+            }
+        });
+        BuiltCell {
+            shards: shards.collect(),
+            n_centroids: compact.header.n_centroids,
+            n_subspaces: balanced.header.n_subspaces,
+            position_error: positions.error,
+            moments: codebook.moments,
+            n_without_evidence: order.locals.len() - order.n_with_evidence,
+        }
+    }
+
+    fn codebook<'c>(&self, cell: &'c Cell, embeddings: &CellEmbeddings) -> (Codebook, ShardOrder<'c>) {
+        let (with, without): (Vec<u32>, Vec<u32>) =
+            (0..cell.gaussians.len() as u32).partition(|local| embeddings.has_evidence[*local as usize]);
+        let rows = Rows { values: &embeddings.vectors, width: embeddings.dim, index: Some(&with) };
+        let has_fine = self.settings.profiles.contains(&Profile::Exact);
+        let settings = CodebookSettings { has_fine, ..self.settings.codebook };
+        let codebook = codebook::build(rows, self.score_context, &settings);
+        let in_order = codebook.order.iter().map(|at| with[*at as usize]);
+        let locals = in_order.chain(without).collect();
+        (codebook, ShardOrder { cell, locals, n_with_evidence: with.len() })
+    }
+
+    fn header(&self, cell_id: u32, cell: &Cell, codebook: &Codebook, dim: usize) -> ShardHeader {
+        ShardHeader {
+            cell_id,
+            n_gaussians: cell.gaussians.len() as u32,
+            n_centroids: codebook.radii.len() as u32,
+            dim: dim as u32,
+            n_components: codebook.n_components as u32,
+            n_subspaces: 0,
+            position_bits: cell.grid.bits,
+            centroid_step: codebook.centroid_step,
+            origin_in_world: cell.mean_bounds.min.to_array(),
+            position_step: cell.grid.step,
+            box_min: cell.bounds.min.to_array(),
+            box_max: cell.bounds.max.to_array(),
+            errors: codebook.errors,
+            encoder_id: self.encoder_id.0,
+        }
+    }
+}
+
+/// Returns the balanced shard of a compact one, which is the same where no residual code is needed.
+fn with_residuals<'a>(compact: &ShardView<'a>, residuals: Option<&'a CodebookResiduals>) -> ShardView<'a> {
+    let Some(residuals) = residuals else { return *compact };
+    ShardView {
         header: ShardHeader {
             n_subspaces: residuals.code.n_subspaces() as u32,
             errors: residuals.errors,
-            ..header
+            ..compact.header
         },
         radii: &residuals.radii,
         residuals: Some(Residuals {
@@ -185,62 +265,36 @@ pub fn build(
             residual_norms: &residuals.residual_norms,
             codes: &residuals.codes,
         }),
-        ..compact
-    });
-    let of_cell =
-        |objects| CellObjects::new(objects, cell_id, &locals, &CentroidBasis::new(dim, compact.basis));
-    let objects = extras.objects.map(of_cell);
-    let objects = objects.as_ref().map(CellObjects::view);
-    let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
-    let spread = codebook.errors.spread;
-    let built = |profile, view: &ShardView<'_>| {
-        let mut bytes = Vec::new();
-        let appearance = appearance.as_ref().map(AppearanceColumns::view);
-        let additions = Additions {
-            objects: objects.as_ref(),
-            appearance,
-            occupancy: extras.occupancy.as_ref(),
-            photo_poses: extras.photo_poses,
-        };
-        view.write_with(&mut bytes, additions).expect("writing to memory cannot fail");
-        let (score_error_bound, score_errors) = match profile {
-            Profile::Exact => (F16_ROUNDING, ScoreErrors { spread, ..ScoreErrors::default() }),
-            _ => (largest(view.radii), view.header.errors),
-        };
-        BuiltShard { profile, bytes, score_error_bound, score_errors }
-    };
-    let shards = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
-    let shards = shards.map(|profile| match profile {
-        Profile::Compact => built(profile, &compact),
-        Profile::Balanced => built(profile, &balanced),
-        Profile::Exact => {
-            let input_indices = in_input();
-            let mut halves = vec![f16::ZERO; n_with * dim];
-            halves.par_chunks_exact_mut(dim).zip(&locals[..n_with]).for_each(|(out, local)| {
-                let embedding = &embeddings.vectors[*local as usize * dim..][..dim];
-                out.iter_mut().zip(embedding).for_each(|(o, v)| *o = f16::from_f32(*v));
-            });
-            // Codes and fine residuals decide which embeddings readers look at.
-            let fine = codebook.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
-            let fine = fine.map(|fine| Fine {
-                errors: fine.errors,
-                steps: &fine.steps,
-                scales: &fine.scales,
-                values: &fine.values,
-            });
-            let exact = Some(ExactColumns { input_indices: &input_indices, embeddings: &halves, fine });
-            built(profile, &ShardView { radii: compact.radii, exact, packed_indices: None, ..balanced })
-        }
-    });
-    BuiltCell {
-        shards: shards.collect(),
-        n_centroids: header.n_centroids,
-        n_subspaces: balanced.header.n_subspaces,
-        position_error: positions.error,
-        moments: codebook.moments,
-        n_without_evidence: without.len(),
+        ..*compact
     }
+}
+
+fn built(profile: Profile, view: &ShardView<'_>, additions: Additions<'_>) -> BuiltShard {
+    let mut bytes = Vec::new();
+    view.write_with(&mut bytes, additions).expect("writing to memory cannot fail");
+    let (score_error_bound, score_errors) = match profile {
+        Profile::Exact => {
+            (F16_ROUNDING, ScoreErrors { spread: view.header.errors.spread, ..ScoreErrors::default() })
+        }
+        _ => (view.radii.iter().copied().fold(0.0, f32::max), view.header.errors),
+    };
+    BuiltShard { profile, bytes, score_error_bound, score_errors }
 }
 
 /// Largest distance between an embedding and its f16 form: half a step of f16 at 1, and of its denormals.
 const F16_ROUNDING: f32 = 5e-4;
+
+/// Returns the photos of each cell: a photo belongs to the cell whose Gaussians' means are nearest to its camera, the first of
+/// such cells, so a robot has the cameras of the area that it fetched and no photo twice.
+pub fn photo_poses(split: &CellSplit, views: &[&View]) -> Vec<BuiltPhotoPoses> {
+    let mut of_cells = vec![BuiltPhotoPoses::default(); split.cells.len()];
+    for view in views {
+        let at = view.camera_from_world.inverse().translation;
+        let distances = split.cells.iter().map(|cell| cell.mean_bounds.distance_to(at));
+        let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+        if let Some((cell, _)) = nearest {
+            of_cells[cell].push(split.cells[cell].mean_bounds.min, view);
+        }
+    }
+    of_cells
+}

@@ -4,9 +4,16 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{DAffine3, DQuat, DVec3};
-use slag_common::{Distortion, Gaussians, Intrinsics};
-use slag_encoder::check::{CheckError, CheckOptions, CheckReport, CheckView, Mistake, check};
-use slag_encoder::raster::{CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer};
+use slag_common::{Distortion, Gaussians, Intrinsics, View};
+use slag_encoder::check::{
+    CheckError, CheckOptions, CheckReport, CheckView, FrameCause, Mistake, check, suspicions,
+};
+use slag_encoder::ingest::IngestError;
+use slag_encoder::masks::RegionMap;
+use slag_encoder::raster::{
+    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, StageTime, ViewWeights,
+    WeightKind,
+};
 
 use super::fixtures::{needs_shared, shared};
 
@@ -58,6 +65,7 @@ fn read_views(root: &Path, step: usize) -> Vec<CheckView> {
             CheckView {
                 name: fields[9].to_owned(),
                 image: image::open(root.join("images").join(fields[9])).unwrap().into_rgb8(),
+                valid: None,
                 view: RasterView {
                     camera_from_world: DAffine3::from_rotation_translation(rotation, translation),
                     intrinsics,
@@ -107,6 +115,7 @@ fn shrunk(view: &CheckView, width_px: u32) -> CheckView {
     CheckView {
         name: view.name.clone(),
         image: image::imageops::thumbnail(&view.image, width, height),
+        valid: None,
         view: RasterView { intrinsics, ..view.view },
     }
 }
@@ -166,6 +175,20 @@ fn planted_mistakes_are_diagnosed() {
     };
     assert_eq!(diagnosed(&scene, &y_up), Some(Mistake::WorldAxes([1, -3, 2])));
 
+    let upside_down = |view: &mut RasterView| {
+        let m = DAffine3::from_rotation_z(std::f64::consts::PI);
+        view.camera_from_world = m * view.camera_from_world;
+    };
+    assert_eq!(diagnosed(&scene, &upside_down), Some(Mistake::UpsideDown));
+
+    let mut mirrored = scene.clone();
+    for (mean, rotation) in mirrored.means_in_world.iter_mut().zip(&mut mirrored.rotations_wxyz) {
+        mean.x = -mean.x;
+        let [w, x, y, z] = *rotation;
+        *rotation = [w, x, -y, -z];
+    }
+    assert_eq!(diagnosed(&mirrored, &|_| {}), Some(Mistake::Mirrored(0)));
+
     let other_way = |view: &mut RasterView| {
         let pose = &mut view.camera_from_world;
         pose.translation += DVec3::new(0.0, 0.0, -500.0);
@@ -198,28 +221,141 @@ fn tiny_view() -> CheckView {
     CheckView {
         name: "a".to_owned(),
         image: image::RgbImage::new(4, 4),
+        valid: None,
         view: RasterView { camera_from_world: DAffine3::IDENTITY, intrinsics },
     }
 }
 
-/// Counts drawings.
-struct Counting(AtomicUsize);
+/// What the data alone say: each fault planted by hand, with the correction that the drawings confirm.
+#[needs_shared]
+#[test]
+fn faults_of_the_data_are_suspected_and_confirmed() {
+    let root = shared("scenes/brighton");
+    let scene = read_scene(&root.join("point_cloud.ply"));
+    let photos: Vec<CheckView> = read_views(&root, 9).iter().map(|view| shrunk(view, 160)).collect();
+    let views = |photos: &[CheckView]| -> Vec<View> {
+        let view = |photo: &CheckView| View {
+            name: photo.name.clone(),
+            image_path: photo.name.clone().into(),
+            intrinsics: photo.view.intrinsics,
+            camera_from_world: photo.view.camera_from_world,
+        };
+        photos.iter().map(view).collect()
+    };
+    assert_eq!(suspicions(&scene, &views(&photos)), []);
+    let diagnosed = |scene: &Gaussians, photos: &[CheckView]| {
+        let suspicions = suspicions(scene, &views(photos));
+        assert_eq!(suspicions.len(), 1, "{suspicions:?}");
+        let options = CheckOptions { suspicions, ..CheckOptions::default() };
+        run(scene, photos, &options).diagnosis.and_then(|diagnosis| diagnosis.mistake)
+    };
+    for (scales, opacities) in [(true, false), (false, true), (true, true)] {
+        let mut activated = scene.clone();
+        if scales {
+            activated.scales.iter_mut().flatten().for_each(|s| *s = s.exp());
+        }
+        if opacities {
+            activated.opacities.iter_mut().for_each(|o| *o = 1.0 / (1.0 + (-*o).exp()));
+        }
+        assert_eq!(diagnosed(&activated, &photos), Some(Mistake::Activated { scales, opacities }));
+    }
+    let with_camera = |edit: &dyn Fn(&mut Intrinsics)| {
+        let mut photos = photos.clone();
+        photos.iter_mut().for_each(|photo| edit(&mut photo.view.intrinsics));
+        diagnosed(&scene, &photos)
+    };
+    let larger = with_camera(&|camera| {
+        camera.focal_x_px *= 1.5;
+        camera.focal_y_px *= 1.5;
+        camera.centre_x_px *= 1.5;
+        camera.centre_y_px *= 1.5;
+    });
+    assert!(matches!(larger, Some(Mistake::IntrinsicsOfSize(f)) if (f - 1.5).abs() < 0.02), "{larger:?}");
+    let at_zero = with_camera(&|camera| (camera.centre_x_px, camera.centre_y_px) = (0.0, 0.0));
+    assert_eq!(at_zero, Some(Mistake::CentreAtZero));
+    // An offset of UTM's size in doubles: exact, once it is subtracted.
+    let mut shifted = scene.clone();
+    shifted.means_in_world.iter_mut().for_each(|mean| *mean += DVec3::new(500_000.0, 5_400_000.0, 0.0));
+    let found = diagnosed(&shifted, &photos);
+    assert!(matches!(found, Some(Mistake::Frame(f)) if f.cause == FrameCause::Shifted), "{found:?}");
+    // The same in 32 bits has lost the scene, which only the data tell.
+    shifted.means_in_world.iter_mut().for_each(|mean| *mean = mean.as_vec3().as_dvec3());
+    let texts: Vec<String> = suspicions(&shifted, &views(&photos)).into_iter().map(|s| s.text).collect();
+    assert!(texts.len() == 2 && texts[0].contains("UTM"), "{texts:?}");
+}
 
-impl Rasterizer for Counting {
-    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
-        self.0.fetch_add(1, Ordering::Relaxed);
-        CpuRasterizer.load(scene)
+/// Photos that cannot be read are left out and named; transparent parts do not count.
+#[test]
+fn unreadable_photos_are_left_out_and_hidden_pixels_do_not_count() {
+    let unreadable = || Err(IngestError::Cut { path: "b.jpg".into() });
+    let views = [Ok(tiny_view()), unreadable(), Ok(tiny_view())];
+    let report = check(&Gaussians::default(), views, &CpuRasterizer, &CheckOptions::default()).unwrap();
+    assert_eq!((report.views.len(), report.unreadable.len()), (2, 1));
+    assert!(report.to_string().contains("b.jpg"));
+    let none = check(&Gaussians::default(), [unreadable()], &CpuRasterizer, &CheckOptions::default());
+    assert!(matches!(none, Err(CheckError::NoPhotos { n_views: 1, .. })));
+
+    // Black everywhere, but for a white pixel that is hidden or not.
+    let mut view = tiny_view();
+    view.image.put_pixel(1, 2, image::Rgb([255; 3]));
+    let psnr_db = |view: CheckView| {
+        check(&Gaussians::default(), [Ok(view)], &CpuRasterizer, &CheckOptions::default())
+            .unwrap()
+            .mean_psnr_db
+    };
+    assert!((psnr_db(view.clone()) - 10.0 * 16.0_f64.log10()).abs() < 1e-9);
+    let hidden = |x, y| image::Luma([if (x, y) == (1, 2) { 0 } else { 255 }]);
+    view.valid = Some(image::GrayImage::from_fn(4, 4, hidden));
+    assert!(psnr_db(view) > 99.0);
+}
+
+/// Counts how often a scene is loaded and drawn.
+#[derive(Default)]
+struct Counting {
+    loads: AtomicUsize,
+    draws: AtomicUsize,
+}
+
+struct CountingScene<'s>(Box<dyn LoadedScene + 's>, &'s AtomicUsize);
+
+impl LoadedScene for CountingScene<'_> {
+    fn weights_and_times(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+        is_timed: bool,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
+        self.0.weights_and_times(view, regions, kind, is_timed)
+    }
+
+    fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
+        self.1.fetch_add(1, Ordering::Relaxed);
+        self.0.draw(view, background)
     }
 }
 
-/// Each photo is loaded after the previous view was drawn: one photo is in memory, whatever their number.
+/// A rasterizer that lives as long as the test.
+struct Counted(&'static Counting);
+
+impl Rasterizer for Counted {
+    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
+        self.0.loads.fetch_add(1, Ordering::Relaxed);
+        Ok(Box::new(CountingScene(CpuRasterizer.load(scene)?, &self.0.draws)))
+    }
+}
+
+/// Each photo is loaded after the previous view was drawn: one photo is in memory, whatever their number. The scene is loaded
+/// once, and once more for each correction of the splat itself.
 #[test]
-fn photos_are_loaded_one_at_a_time() {
-    let rasterizer = Counting(AtomicUsize::new(0));
+fn photos_are_loaded_one_at_a_time_and_the_scene_once() {
+    let counting: &'static Counting = Box::leak(Box::default());
     let views = (0..9).map(|n_drawn| {
-        assert_eq!(rasterizer.0.load(Ordering::Relaxed), n_drawn, "drawings before photo {n_drawn}");
+        assert_eq!(counting.draws.load(Ordering::Relaxed), n_drawn, "drawings before photo {n_drawn}");
         Ok(tiny_view())
     });
-    let report = check(&Gaussians::default(), views, &rasterizer, &CheckOptions::default()).unwrap();
+    let report = check(&Gaussians::default(), views, &Counted(counting), &CheckOptions::default()).unwrap();
     assert_eq!(report.views.len(), 9);
+    assert!(report.diagnosis.is_some() && counting.draws.load(Ordering::Relaxed) > 100);
+    assert_eq!(counting.loads.load(Ordering::Relaxed), 1 + 3, "mirrored along three axes");
 }

@@ -13,7 +13,7 @@ use super::embeddings::{Field, place_in_cube};
 use slag_encoder::cells::{CellLimits, PositionError, split};
 use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext};
 use slag_encoder::progress::Progress;
-use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
+use slag_encoder::shard::{CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
 use slag_encoder::store::{Extras, Store};
 use slag_math::matrix::Rows;
 
@@ -54,8 +54,10 @@ pub(super) fn publish(
         let in_order = cell.gaussians.iter().flat_map(|k| &vectors[*k as usize * dim..][..dim]);
         let vectors = in_order.copied().collect();
         let embeddings = CellEmbeddings { dim, vectors, has_evidence: vec![true; n] };
-        let (cell_id, extras) = (cell_id as u32, CellExtras::default());
-        let built = shard::build(&scene, cell_id, cell, &embeddings, id, &context, &settings, &extras);
+        let cell_id = cell_id as u32;
+        let builder =
+            ShardBuilder { scene: &scene, encoder_id: id, score_context: &context, settings: &settings };
+        let built = builder.build(cell_id, cell, &embeddings, CellExtras::default());
         let mut shards = BTreeMap::new();
         for made in &built.shards {
             let (hash, len_bytes) = store.put_bytes(&made.bytes)?;

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::limits::{check_size, too_large};
 use super::undistort::undistorted;
+use super::{check_size, too_large};
 use crate::masks::Mask;
 use crate::masks::rle::{Rle, RleError};
 use crate::segment::error::SegmentError;
@@ -98,6 +98,23 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     let named =
         images.into_iter().map(|image| (image.file_name, rles_of_id.remove(&image.id).unwrap_or_default()));
     Ok(named.collect())
+}
+
+/// Returns the masks of a photo: by its name; or else by the one entry whose name is an ending of the photo's, or the other
+/// way round, at a folder; or else by the name that Roboflow makes of it, `NAME_jpg.rf.HASH.jpg`.
+pub(super) fn entry<'a>(masks_of_image: &'a MasksOfImage, name: &str) -> Option<&'a Vec<(usize, Rle)>> {
+    let is_ending =
+        |long: &str, short: &str| long.strip_suffix(short).is_some_and(|rest| rest.ends_with('/'));
+    let file = name.rsplit('/').next().unwrap_or(name);
+    let exported = format!("{}.rf.", file.replace('.', "_"));
+    let one = |is: &dyn Fn(&str) -> bool| {
+        let mut found = masks_of_image.iter().filter(|(entry, _)| is(entry));
+        found.next().filter(|_| found.next().is_none()).map(|(_, rles)| rles)
+    };
+    masks_of_image
+        .get(name)
+        .or_else(|| one(&|entry| is_ending(entry, name) || is_ending(name, entry)))
+        .or_else(|| one(&|entry| entry.rsplit('/').next().is_some_and(|entry| entry.starts_with(&exported))))
 }
 
 /// Decodes run-length masks and undistorts them like the photo.

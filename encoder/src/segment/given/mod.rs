@@ -2,7 +2,6 @@
 
 mod coco;
 mod id_image;
-mod limits;
 mod undistort;
 
 use std::path::{Path, PathBuf};
@@ -13,15 +12,15 @@ use super::error::SegmentError;
 use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
 use crate::masks::rle::Rle;
 use crate::masks::{Mask, NO_REGION, masks_of_labels};
-use limits::too_large;
 
 /// Masks from files.
 ///
 /// A folder has one file per photo: for `left/a.jpg`, one of `left/a.png`, `left/a.jpg.png`, `left/a.json` and
 /// `left/a.jpg.json`. A PNG (gray of up to 16 bits, or with a palette) contains ids: 0 is background, each other id a
 /// mask. A JSON file is a list of `{"segmentation": {"size": [height, width], "counts": ..}}`, as SAM's automatic
-/// generator writes it, or an object with such a list as `annotations`; its masks may overlap. A JSON file in place of
-/// the folder is a COCO data set of all photos.
+/// generator writes it, or an object with such a list as `annotations`; its masks may overlap. A folder `left/a/` has a
+/// black and white PNG for each mask, as SAM's `amg.py` writes it. A JSON file in place of the folder is a COCO data set of
+/// all photos, whose `file_name` may lack folders of the photo's name or have further ones.
 ///
 /// Masks belong to the photos as taken and are undistorted with them.
 #[derive(Debug)]
@@ -45,8 +44,7 @@ impl GivenMasks {
         let source = if fs_err::metadata(path)?.is_dir() {
             Source::Folder(path.to_owned())
         } else {
-            let masks_of_image = coco::read_data_set(path)?;
-            Source::DataSet { path: path.to_owned(), masks_of_image }
+            Source::DataSet { path: path.to_owned(), masks_of_image: coco::read_data_set(path)? }
         };
         Ok(Self { source, ignore_ids })
     }
@@ -55,7 +53,7 @@ impl GivenMasks {
     pub fn covers(&self, view: &View) -> bool {
         match &self.source {
             Source::Folder(dir) => file_of(dir, view).is_some(),
-            Source::DataSet { masks_of_image, .. } => masks_of_image.contains_key(&view.name),
+            Source::DataSet { masks_of_image, .. } => coco::entry(masks_of_image, &view.name).is_some(),
         }
     }
 
@@ -64,26 +62,56 @@ impl GivenMasks {
     /// # Errors
     /// [`SegmentError`] if the file is malformed or does not have the photo's size.
     pub fn load(&self, input: &SegmentInput<'_>) -> Result<Option<Vec<Mask>>, SegmentError> {
-        match &self.source {
-            Source::DataSet { path, masks_of_image, .. } => match masks_of_image.get(&input.view.name) {
-                Some(rles) => coco::masks_of_rles(path, rles, input).map(Some),
-                None => Ok(None),
-            },
-            Source::Folder(dir) => match file_of(dir, input.view) {
-                Some(path) if path.extension().is_some_and(|e| e == "png") => {
-                    self.masks_of_png(&path, input).map(Some)
-                }
-                Some(path) => coco::masks_of_rles(&path, &coco::read_list(&path)?, input).map(Some),
-                None => Ok(None),
-            },
+        let path = match &self.source {
+            Source::DataSet { path, masks_of_image } => {
+                let rles = coco::entry(masks_of_image, &input.view.name);
+                return rles.map(|rles| coco::masks_of_rles(path, rles, input)).transpose();
+            }
+            Source::Folder(dir) => file_of(dir, input.view),
+        };
+        let Some(path) = path else { return Ok(None) };
+        if path.is_dir() {
+            let mut masks = Vec::new();
+            for path in binary_masks(&path)? {
+                masks.extend(self.masks_of_png(&path, input, true)?);
+            }
+            return Ok(Some(masks));
+        }
+        match path.extension().is_some_and(|e| e == "png") {
+            true => self.masks_of_png(&path, input, false).map(Some),
+            false => coco::masks_of_rles(&path, &coco::read_list(&path)?, input).map(Some),
         }
     }
 
-    fn masks_of_png(&self, path: &Path, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
+    /// Returns up to three names that the files or entries have.
+    fn names_found(&self) -> Vec<String> {
+        match &self.source {
+            Source::DataSet { masks_of_image, .. } => masks_of_image.keys().take(3).cloned().collect(),
+            Source::Folder(dir) => {
+                let name =
+                    |entry: std::io::Result<fs_err::DirEntry>| entry.ok()?.file_name().into_string().ok();
+                let entries = fs_err::read_dir(dir).into_iter().flatten();
+                let mut names: Vec<String> = entries.filter_map(name).collect();
+                names.sort();
+                names.truncate(3);
+                names
+            }
+        }
+    }
+
+    /// Returns the masks of an id image; `is_binary`: the one mask of a black and white image.
+    fn masks_of_png(
+        &self,
+        path: &Path,
+        input: &SegmentInput<'_>,
+        is_binary: bool,
+    ) -> Result<Vec<Mask>, SegmentError> {
         let mut labels = id_image::read_ids(path, input)?;
         for label in &mut labels {
-            if *label == 0 || self.ignore_ids.contains(label) {
+            if *label == 0 || !is_binary && self.ignore_ids.contains(label) {
                 *label = NO_REGION;
+            } else if is_binary {
+                *label = 0;
             }
         }
         if let Some(undistorter) = input.undistorter {
@@ -102,16 +130,47 @@ impl Segmenter for GivenMasks {
         format!("given masks, ignored ids {:?}", self.ignore_ids)
     }
 
+    fn check_views(&self, views: &[View], strict: bool) -> Result<Option<String>, SegmentError> {
+        let without: Vec<&View> = views.iter().filter(|view| !self.covers(view)).collect();
+        let Some(first) = without.first() else { return Ok(None) };
+        let path = match &self.source {
+            Source::Folder(path) | Source::DataSet { path, .. } => path,
+        };
+        let view = first.name.clone();
+        if without.len() == views.len() {
+            let found = self.names_found();
+            let is_langsplat = found.iter().any(|name| name.ends_with("_s.npy") || name.ends_with("_f.npy"));
+            let hint = match is_langsplat {
+                true => {
+                    "; these are LangSplat's maps: write each level of NAME_s.npy as ids into NAME.png, 0 for -1"
+                }
+                false => "",
+            };
+            let found = if found.is_empty() { "nothing".into() } else { found.join(", ") };
+            return Err(SegmentError::NoMatch { path: path.clone(), view, found, hint });
+        }
+        if strict {
+            return Err(SegmentError::Missing {
+                path: path.clone(),
+                view,
+                n: without.len(),
+                of: views.len(),
+            });
+        }
+        let (n, of) = (without.len(), views.len());
+        Ok(Some(format!("{n} of {of} views have no masks in {}, the first is {view}", path.display())))
+    }
+
     fn identity_of_view(&self, view: &View) -> Result<Option<Hash32>, SegmentError> {
         match &self.source {
-            Source::Folder(dir) => file_of(dir, view).map(|path| hash_of_file(&path)).transpose(),
+            Source::Folder(dir) => file_of(dir, view).map(|path| hash_of_masks(&path)).transpose(),
             Source::DataSet { masks_of_image, .. } => {
                 let hash = |rles: &Vec<(usize, Rle)>| -> Result<Hash32, SegmentError> {
                     // Their places in the file name them in errors only.
                     let rles: Vec<&Rle> = rles.iter().map(|(_, rle)| rle).collect();
                     Ok(Hash32::of(&serde_json::to_vec(&rles).map_err(std::io::Error::from)?))
                 };
-                masks_of_image.get(&view.name).map(hash).transpose()
+                coco::entry(masks_of_image, &view.name).map(hash).transpose()
             }
         }
     }
@@ -121,18 +180,53 @@ impl Segmenter for GivenMasks {
     }
 }
 
-/// Returns the file with a view's masks in a folder of masks, if there is one.
+/// Returns the file with a view's masks in a folder of masks, if there is one, or the folder with a file a mask.
 pub fn file_of(dir: &Path, view: &View) -> Option<PathBuf> {
     let image = dir.join(&view.name);
     let appended = |ending| dir.join(format!("{}.{ending}", view.name));
-    [image.with_extension("png"), appended("png"), image.with_extension("json"), appended("json")]
-        .into_iter()
-        .find(|path| path.is_file())
+    let files =
+        [image.with_extension("png"), appended("png"), image.with_extension("json"), appended("json")];
+    let folder = || Some(image.with_extension("")).filter(|folder| folder.join("0.png").is_file());
+    files.into_iter().find(|path| path.is_file()).or_else(folder)
 }
 
-/// Returns the hash of a mask file: its ending, which says how it is read, and its content.
-fn hash_of_file(path: &Path) -> Result<Hash32, SegmentError> {
+/// Returns the images of a folder with a black and white PNG for each mask, by number.
+fn binary_masks(folder: &Path) -> Result<Vec<PathBuf>, SegmentError> {
+    let mut numbered = Vec::new();
+    for entry in fs_err::read_dir(folder)? {
+        let path = entry?.path();
+        let number = path.file_stem().and_then(|stem| stem.to_str()?.parse::<u32>().ok());
+        if let (Some(number), true) = (number, path.extension().is_some_and(|ending| ending == "png")) {
+            numbered.push((number, path));
+        }
+    }
+    numbered.sort();
+    Ok(numbered.into_iter().map(|(_, path)| path).collect())
+}
+
+/// Returns the hash of a view's masks: the ending of the file, which says how it is read, and its content.
+fn hash_of_masks(path: &Path) -> Result<Hash32, SegmentError> {
+    if path.is_dir() {
+        let hashes =
+            binary_masks(path)?.iter().map(|path| hash_of_masks(path)).collect::<Result<Vec<_>, _>>()?;
+        return Ok(Hash32::of(&hashes.iter().flat_map(|hash| hash.0).collect::<Vec<u8>>()));
+    }
     let (content, _) = Hash32::of_reader(fs_err::File::open(path)?)?;
     let ending = path.extension().unwrap_or_default().as_encoded_bytes();
     Ok(Hash32::of(&[ending, &content.0].concat()))
+}
+
+/// Returns the error for masks above [`MAX_MASK_BYTES`].
+fn too_large(path: &Path) -> SegmentError {
+    SegmentError::TooLarge { path: path.to_owned(), limit_bytes: MAX_MASK_BYTES }
+}
+
+/// Checks that masks have the size of the photo.
+fn check_size(path: &Path, [width, height]: [u32; 2], input: &SegmentInput<'_>) -> Result<(), SegmentError> {
+    let expected_px = [input.image.width(), input.image.height()];
+    if [width, height] == expected_px {
+        return Ok(());
+    }
+    let view = input.view.name.clone();
+    Err(SegmentError::Size { path: path.to_owned(), view, found_px: [width, height], expected_px })
 }

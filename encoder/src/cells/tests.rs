@@ -1,0 +1,76 @@
+use proptest::prelude::*;
+
+use super::*;
+
+fn scene(means: &[[f64; 3]], scale: f32) -> Gaussians {
+    let n = means.len();
+    Gaussians {
+        means_in_world: means.iter().map(|m| DVec3::from(*m)).collect(),
+        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        scales: vec![[scale, 2.0 * scale, 0.0]; n],
+        opacities: vec![0.5; n],
+        sh_dc: vec![[0.0; 3]; n],
+        sh_rest: Vec::new(),
+        sh_degree: 0,
+    }
+}
+
+proptest! {
+    #[test]
+    fn every_usable_gaussian_lies_in_one_cell_within_the_limits(
+        mut means in prop::collection::vec(prop::array::uniform3(-100.0..100.0f64), 1..2000),
+        max_gaussians in 1usize..300, max_width in 5.0..50.0f64, repeat in 0usize..400,
+    ) {
+        let first = means[0];
+        means.extend(std::iter::repeat_n(first, repeat));
+        means.push([f64::NAN, 0.0, 0.0]);
+        let scene = scene(&means, 0.5);
+        let limits = CellLimits { max_width: Some(max_width), ..CellLimits::by_count(max_gaussians) };
+        let result = split(&scene, limits);
+        prop_assert_eq!((result.n_rejected, result.n_for_precision), (1, 0));
+        let mut seen = vec![0; means.len()];
+        for (id, cell) in result.cells.iter().enumerate() {
+            prop_assert!(cell.gaussians.len() <= max_gaussians);
+            let narrow = cell.mean_bounds.size().max_element() <= max_width;
+            prop_assert!(narrow || cell.gaussians.len() <= MIN_GAUSSIANS_TO_NARROW);
+            for (local, g) in cell.gaussians.iter().enumerate() {
+                seen[*g as usize] += 1;
+                prop_assert_eq!(result.cell_of_gaussian[*g as usize], id as u32);
+                prop_assert_eq!(result.local_of_gaussian[*g as usize], local as u32);
+                let mean = scene.means_in_world[*g as usize];
+                let half = DVec3::new(1.5, 3.0, 0.0);
+                prop_assert!((mean - half).cmpge(cell.bounds.min - 1e-6).all() && (mean + half).cmple(cell.bounds.max + 1e-6).all());
+            }
+        }
+        prop_assert!(seen[..means.len() - 1].iter().all(|n| *n == 1));
+        prop_assert_eq!(result.cell_of_gaussian[means.len() - 1], NO_CELL);
+    }
+}
+
+/// Neighbouring doubles that are farther apart than a cell may be wide, in numbers that ask for a cut.
+#[test]
+fn cells_narrower_than_coordinates_resolve_end() {
+    let large = 1e18f64;
+    let means: Vec<[f64; 3]> = (0..2 * MIN_GAUSSIANS_TO_NARROW)
+        .map(|i| [if i % 2 == 0 { large } else { large.next_up() }, 0.0, 0.0])
+        .collect();
+    let limits = CellLimits { max_width: Some(25.0), ..CellLimits::by_count(usize::MAX) };
+    let result = split(&scene(&means, 0.5), limits);
+    let sizes: Vec<usize> = result.cells.iter().map(|cell| cell.gaussians.len()).collect();
+    assert_eq!(sizes, [MIN_GAUSSIANS_TO_NARROW; 2]);
+}
+
+/// More cells than files are worth are counted, for the caller to refuse.
+#[test]
+fn errors_finer_than_coordinates_are_counted() {
+    let means: Vec<[f64; 3]> = (0..100).map(|i| [f64::from(i) * 1e9, 0.0, 0.0]).collect();
+    let position_error = PositionError::Within(1e-9);
+    let result = split(&scene(&means, 0.5), CellLimits { position_error, ..CellLimits::by_count(1000) });
+    assert_eq!((result.cells.len(), result.n_for_precision), (100, 100));
+}
+
+#[test]
+fn morton_interleaves_bits() {
+    assert_eq!(spread_bits(0b1011), 0b1_000_001_001);
+    assert_eq!(spread_bits((1 << 21) - 1).count_ones(), 21);
+}

@@ -1,0 +1,149 @@
+//! What the data alone say against the inputs, without a drawing.
+
+use glam::DVec3;
+use slag_common::{Gaussians, Similarity, View};
+use slag_math::stats::{Rank, quantile};
+
+use super::mistake::{FrameCandidate, FrameCause, Mistake};
+
+/// Share of the Gaussians that must look wrong: a splat may have a few of any kind.
+const MOST: f64 = 0.999;
+/// Opacity below which a Gaussian is not drawn at all.
+const INVISIBLE: f32 = 1.0 / 255.0;
+/// Relative difference between the middle of a photo and its principal point that no lens has.
+const OFF_CENTRE: f64 = 0.15;
+/// The worlds of splat and cameras are apart if their middles are this many of their sizes from each other.
+const APART: f64 = 10.0;
+
+/// Something that looks wrong.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Suspicion {
+    /// A sentence for the user.
+    pub text: String,
+    /// The mistake that would explain it; drawings tell.
+    pub mistake: Option<Mistake>,
+}
+
+/// Returns what looks wrong in a splat and the poses of its photos.
+pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
+    let usable: Vec<usize> = (0..scene.len()).filter(|i| scene.is_usable(*i)).collect();
+    let mut found = Vec::new();
+    let mut say = |mistake: Option<Mistake>, text: String| found.push(Suspicion { text, mistake });
+    if usable.is_empty() {
+        say(None, "the splat has no Gaussians that can be drawn".into());
+    } else if usable.iter().all(|i| scene.scales[*i][2] == 0.0) {
+        say(None, "the Gaussians are flat, as those of 2DGS: their third axis is taken as 0".into());
+    }
+    let n_lost = scene.len() - usable.len();
+    if 2 * n_lost > scene.len() {
+        say(None, format!("{n_lost} of {} Gaussians cannot be drawn; export the splat again", scene.len()));
+    }
+    if !usable.is_empty() && share(&usable, |i| scene.opacities[i] < INVISIBLE) > MOST {
+        say(None, "all Gaussians are transparent; export the splat again".into());
+    }
+    if let Some(mistake @ Mistake::Activated { .. }) = activated(scene, &usable) {
+        say(Some(mistake), mistake.to_string());
+    }
+    if let Some((rounding, size)) = rounded(scene, &usable) {
+        say(
+            None,
+            format!(
+                "the splat's coordinates are so large that 32 bits round them to {rounding:.1e}, more than its small \
+                 Gaussians measure ({size:.1e}): subtract an offset before training (UTM coordinates, perhaps)"
+            ),
+        );
+    }
+    if let Some(frame) = shifted(scene, views) {
+        let [x, y, z] = frame.splat_from_poses.translation.to_array();
+        let text = format!(
+            "splat and cameras are far apart, by about ({x:.0}, {y:.0}, {z:.0}): one has an offset that the other lacks"
+        );
+        say(Some(Mistake::Frame(frame)), text);
+    }
+    if let Some(mistake) = intrinsics(views) {
+        say(Some(mistake), mistake.to_string());
+    }
+    found
+}
+
+fn share(usable: &[usize], is: impl Fn(usize) -> bool) -> f64 {
+    usable.iter().filter(|i| is(**i)).count() as f64 / usable.len().max(1) as f64
+}
+
+/// A scale s read as a logarithm becomes exp(s): above 1, and just above it for most. An opacity of 0 to 1 read as a logit
+/// becomes 0.5 to 0.731.
+fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
+    let scale_share = |most: f32| share(usable, |i| scene.scales[i].iter().all(|s| (1.0..=most).contains(s)));
+    let scales = scale_share(f32::INFINITY) > MOST && scale_share(1.5) > 0.5;
+    let opacities = share(usable, |i| (0.5..=0.7311).contains(&scene.opacities[i])) > MOST;
+    (usable.len() >= 1000 && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
+}
+
+/// Returns the rounding of coordinates that were stored in 32 bits and the size of small Gaussians, where the first is larger.
+fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<(f64, f64)> {
+    let means = || usable.iter().map(|i| scene.means_in_world[*i]);
+    let is_f32 = |mean: DVec3| mean.to_array().iter().all(|x| f64::from(*x as f32) == *x);
+    if !means().step_by(usable.len() / 1000 + 1).all(is_f32) {
+        return None;
+    }
+    let mut farthest: Vec<f64> = means().map(|mean| mean.abs().max_element()).collect();
+    let mut sizes: Vec<f32> =
+        usable.iter().map(|i| scene.scales[*i].into_iter().fold(0.0, f32::max)).collect();
+    let rounding = quantile(&mut farthest, 500, Rank::After)? * f64::from(f32::EPSILON);
+    let size = f64::from(quantile(&mut sizes, 100, Rank::After)?);
+    (rounding > size && size > 0.0).then_some((rounding, size))
+}
+
+/// Returns the round offset between splat and cameras, where they are far apart.
+fn shifted(scene: &Gaussians, views: &[View]) -> Option<FrameCandidate> {
+    let positions: Vec<DVec3> = views.iter().map(View::position_in_world).collect();
+    let cameras = positions.iter().sum::<DVec3>() / positions.len().max(1) as f64;
+    let size = scene_diagonal(scene) + camera_spread(&positions);
+    let offset = at_per_mille(scene, 500) - cameras;
+    if views.is_empty() || offset.length() <= APART * size || size <= 0.0 {
+        return None;
+    }
+    // People subtract round numbers: the round one near enough is exact, if there is one.
+    let unit = 10f64.powf(size.log10().ceil());
+    let translation = (offset / unit).round() * unit;
+    let splat_from_poses = Similarity { translation, ..Similarity::IDENTITY };
+    translation.is_finite().then_some(FrameCandidate { cause: FrameCause::Shifted, splat_from_poses })
+}
+
+/// Returns the mistake of principal points that are far from the middle of the photos in the same way.
+fn intrinsics(views: &[View]) -> Option<Mistake> {
+    let mut factors = Vec::new();
+    for camera in views.iter().map(|view| view.intrinsics) {
+        let x = 2.0 * camera.centre_x_px / f64::from(camera.width_px);
+        let y = 2.0 * camera.centre_y_px / f64::from(camera.height_px);
+        if x == 0.0 && y == 0.0 {
+            return Some(Mistake::CentreAtZero);
+        }
+        if (x / y - 1.0).abs() > OFF_CENTRE || x <= 0.0 {
+            return None;
+        }
+        factors.push((x + y) / 2.0);
+    }
+    let factor = quantile(&mut factors, 500, Rank::After)?;
+    ((factor - 1.0).abs() > OFF_CENTRE).then_some(Mistake::IntrinsicsOfSize(factor))
+}
+
+/// Returns the diagonal of the box around the middle 90 % of the means along each axis.
+pub(super) fn scene_diagonal(scene: &Gaussians) -> f64 {
+    (at_per_mille(scene, 950) - at_per_mille(scene, 50)).length()
+}
+
+pub(super) fn at_per_mille(scene: &Gaussians, per_mille: usize) -> DVec3 {
+    let along = |axis: usize| {
+        let finite = |p: &DVec3| Some(p[axis]).filter(|v| v.is_finite());
+        let mut values: Vec<f64> = scene.means_in_world.iter().filter_map(finite).collect();
+        quantile(&mut values, per_mille, Rank::Between).unwrap_or_default()
+    };
+    DVec3::new(along(0), along(1), along(2))
+}
+
+/// Returns the largest distance of a position from the mean of all positions.
+pub(super) fn camera_spread(positions: &[DVec3]) -> f64 {
+    let centre = positions.iter().sum::<DVec3>() / positions.len().max(1) as f64;
+    positions.iter().map(|p| p.distance(centre)).fold(0.0, f64::max)
+}
