@@ -1,6 +1,7 @@
 //! The programs together, as one test program: it is linked once, and its tests share what they encode.
 
 mod api;
+mod cases;
 mod doc_tests;
 mod doors;
 mod drone;
