@@ -71,12 +71,6 @@ impl BuiltOccupancy {
         Self { header, runs, masks }
     }
 
-    /// Copies columns.
-    pub fn copy_of(columns: Occupancy<'_>) -> Self {
-        let Occupancy { header, runs, masks } = columns;
-        Self { header, runs: runs.to_vec(), masks: masks.to_vec() }
-    }
-
     /// Returns the columns as readers see them.
     pub fn view(&self) -> Occupancy<'_> {
         Occupancy { header: self.header, runs: &self.runs, masks: &self.masks }
