@@ -1,14 +1,17 @@
 #!/bin/sh
 # Runs the aarch64 slag-edge under emulation: fetches a small generated scene from a real server and compares the
 # answers with those of a native build.
+# usage: smoke.sh [dist|dev]      as for build.sh
 set -eu
 cd "$(dirname "$0")/.."
 . jetson/room.sh
 native=target/debug/slag-edge
+folder=${1:-dist}
+[ "$folder" != dev ] || folder=debug
 # After `test.sh` they are there; alone, cargo would build them again, with the features of fewer packages.
 [ -n "${SLAG_PROGRAMS_ARE_BUILT:-}" ] || cargo build --locked --bin slag-encoder --bin slag-lab --bin slag-edge
 arm() {
-    qemu-aarch64-static -L /usr/aarch64-linux-gnu target/aarch64-unknown-linux-gnu/dist/slag-edge "$@"
+    qemu-aarch64-static -L /usr/aarch64-linux-gnu "target/aarch64-unknown-linux-gnu/$folder/slag-edge" "$@"
 }
 
 work=$(mktemp -d)

@@ -1,9 +1,9 @@
 #!/bin/sh
 # Installs what SLAG needs beside Rust: a C linker, Python's pip (to unpack ONNX Runtime), ONNX Runtime, and
 # Vulkan with a software GPU, on which the GPU rasteriser is tested where there is no other.
-# usage: setup.sh [demo|install|test|cross|page|image]      default: test
+# usage: setup.sh [demo|install|test|cross|page|packages|image]      default: test
 #   demo, install: without what tests need; cross: also for the aarch64 build and its smoke test; page: also for tests of the
-#   page; image: also what lays out and judges the encoder's image
+#   page; packages: also for tests of the packages; image: also what lays out and judges the encoder's image
 # Does nothing where all is there already. Made for Debian 12; elsewhere install the same by hand.
 set -eu
 cd "$(dirname "$0")/.."
@@ -15,8 +15,8 @@ fail() {
 
 purpose=${1:-test}
 case $purpose in
-demo | install | test | cross | page | image) ;;
-*) fail "there is no purpose '$purpose'; expected demo, install, test, cross, page or image" ;;
+demo | install | test | cross | page | packages | image) ;;
+*) fail "there is no purpose '$purpose'; expected demo, install, test, cross, page, packages or image" ;;
 esac
 
 # "command:package" pairs; the packages are Debian 12's, pinned by its major versions where it has several.
@@ -27,7 +27,8 @@ demo | install) ;;
 *) wanted="$wanted man:man-db" ;;
 esac
 case $purpose in
-cross) wanted="$wanted aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu aarch64-linux-gnu-gcc:libc6-dev-arm64-cross qemu-aarch64-static:qemu-user-static debootstrap:debootstrap systemd-analyze:systemd" ;;
+cross) wanted="$wanted aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu aarch64-linux-gnu-gcc:libc6-dev-arm64-cross qemu-aarch64-static:qemu-user-static" ;;
+packages) wanted="$wanted debootstrap:debootstrap systemd-analyze:systemd" ;;
 image) wanted="$wanted mmdebstrap:mmdebstrap skopeo:skopeo umoci:umoci" ;;
 page) wanted="$wanted chromium:chromium" ;;
 esac

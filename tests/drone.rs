@@ -8,19 +8,9 @@ use slag_tests::*;
 fn check_confirms_the_poses() {
     let scene = shared("scenes/brighton");
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let report = run_json(&mut encoder(&[
-        "check",
-        "--scene",
-        text(&scene.join("point_cloud.ply")),
-        "--views",
-        text(&scene.join("sparse/0")),
-        "--samples",
-        "18",
-        "--raster-width",
-        "1000",
-        "--out",
-        text(dir.path()),
-    ]));
+    let mut check = encoder(&["check", "--scene", text(&scene.join("point_cloud.ply"))]);
+    check.args(["--views", text(&scene.join("sparse/0")), "--out", text(dir.path())]);
+    let report = run_json(check.args(["--samples", "18", "--raster-width", "1000"]));
     let psnr_db = report["mean_psnr_db"].as_f64().expect("a figure");
     println!("mean PSNR of 18 photos: {psnr_db:.2} dB");
     assert!((psnr_db - 25.02).abs() <= 0.5);
@@ -37,21 +27,9 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let store = dir.path().join("brighton");
     let models = root().join("tests/models/conse");
     // Six photos show the road end to end; all eighteen only take longer.
-    let summary = run_json(&mut encoder(&[
-        "encode",
-        "--scene",
-        text(&scene.join("point_cloud.ply")),
-        "--views",
-        text(&scene.join("sparse/0")),
-        "--masks",
-        "auto",
-        "--models",
-        text(&models),
-        "--views-limit",
-        "6",
-        "--store",
-        text(&store),
-    ]));
+    let mut encode = encoder(&["encode", "--scene", text(&scene.join("point_cloud.ply"))]);
+    encode.args(["--views", text(&scene.join("sparse/0")), "--masks", "auto", "--models", text(&models)]);
+    let summary = run_json(encode.args(["--views-limit", "6", "--store", text(&store)]));
     println!("{summary:#}");
     let n_cells = summary["n_cells"].as_u64().expect("a count");
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
@@ -62,12 +40,10 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let nearby = origin["cells"].as_array().expect("cells").len() as u64;
     assert!(0 < nearby && nearby < n_cells, "{nearby} of {n_cells} cells");
 
-    let fetch = |at: &[&str], cache: &str| {
+    let fetch = |at: [&str; 2], cache: &str| {
         let cache = dir.path().join(cache);
-        let mut args =
-            vec!["fetch", "--trust-first", "--from", &server.url, "--radius", "30", "--cache", text(&cache)];
-        args.extend(at);
-        let report = run_json(&mut edge(&args));
+        let mut command = edge(&["fetch", "--trust-first", "--from", &server.url, "--radius", "30"]);
+        let report = run_json(command.args(at).args(["--cache", text(&cache)]));
         println!("{report}");
         let mut shards: Vec<String> = fs_err::read_dir(cache.join("shards"))
             .expect("shards")
@@ -76,24 +52,16 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
         shards.sort();
         shards
     };
-    let by_metres = fetch(&["--at", "0,0,2"], "metres");
-    let by_degrees = fetch(&["--at-geo", "46.842657,-91.994008,160.509"], "degrees");
+    let by_metres = fetch(["--at", "0,0,2"], "metres");
+    let by_degrees = fetch(["--at-geo", "46.842657,-91.994008,160.509"], "degrees");
     assert_eq!(by_metres, by_degrees);
     assert_eq!(by_metres.len() as u64, nearby);
 
     let cache = dir.path().join("metres");
     let models = text(&models);
     for question in ["car", "tree", "boat"] {
-        let reply = run_json(&mut edge(&[
-            "query",
-            question,
-            "--cache",
-            text(&cache),
-            "--models",
-            models,
-            "--near",
-            "0,0,2",
-        ]));
+        let mut ask = edge(&["query", question, "--cache", text(&cache), "--models", models]);
+        let reply = run_json(ask.args(["--near", "0,0,2"]));
         println!("{question}: {reply}");
         assert!(reply["answers"].is_array());
     }

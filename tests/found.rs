@@ -10,13 +10,11 @@ use slag_tests::*;
 /// World units: far less than the distance between most neighbours.
 const POSITION_ERROR: &str = "0.0004";
 
-/// A generated room, encoded with input indices in fine positions.
-fn encoded(dir: &Path, profiles: &str) -> Gaussians {
-    let room = dir.join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "12"]));
+/// Encodes the room with input indices in fine positions; returns its Gaussians.
+fn encoded(store: &Path, profiles: &str) -> Gaussians {
     let flags = ["--input-indices", "--position-error", POSITION_ERROR, "--profiles", profiles];
-    run(encode_room(&room, &dir.join("store")).args(["--models", "colours"]).args(flags));
-    splat::read(&room.join("scene.ply"), &ReadOptions { with_sh_rest: true }).expect("reads")
+    run(encode_quickly(&generated(&ROOM), store).args(["--models", "colours"]).args(flags));
+    splat::read(&generated(&ROOM).join("scene.ply"), &ReadOptions { with_sh_rest: true }).expect("reads")
 }
 
 /// Asserts that each point's input index is that of the splat's Gaussian nearest to it, found by comparing with all.
@@ -48,14 +46,12 @@ fn read_points(path: &Path) -> Vec<[f64; 4]> {
 #[test]
 fn a_robots_answer_names_gaussians_of_the_input() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let scene = encoded(dir.path(), "compact,balanced");
     let store = dir.path().join("store");
+    let scene = encoded(&store, "compact,balanced");
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
     for profile in ["compact", "balanced"] {
         let cache = dir.path().join(profile);
-        let fetch =
-            ["fetch", "--trust-first", "--from", &server.url, "--at", "3.5,2.7,0", "--profile", profile];
-        run(edge(&fetch).args(["--cache", text(&cache)]));
+        run(fetch(&server.url, &cache).args(["--profile", profile]));
         for kind in ["objects", "clusters", "gaussians"] {
             let file = dir.path().join(format!("{profile}-{kind}.ply"));
             let query = ["query", "red", "--models", "colours", "--kind", kind, "--limit", "200"];
@@ -80,8 +76,8 @@ fn a_robots_answer_names_gaussians_of_the_input() {
 #[test]
 fn an_answer_on_the_encoder_is_a_splat_and_a_picture() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let scene = encoded(dir.path(), "compact");
-    let (store, room) = (dir.path().join("store"), dir.path().join("room"));
+    let (store, room) = (dir.path().join("store"), generated(&ROOM));
+    let scene = encoded(&store, "compact");
     let files = ["points.ply", "splat.ply", "view.png", "scores.npy"].map(|name| dir.path().join(name));
     let [points, found, picture_file, scores] = &files;
     let query = ["query", "red", "--store", text(&store), "--models", "colours", "--threshold", "0.4"];
@@ -120,22 +116,18 @@ fn an_answer_on_the_encoder_is_a_splat_and_a_picture() {
     assert!(coloured.len() > 200 && n_red * 10 > coloured.len() * 9, "{n_red} of {}", coloured.len());
 
     // Another splat is refused, and advice is given where nothing says which Gaussian is which.
-    let fails = |command: &mut std::process::Command| {
-        let output = command.output().expect("starts");
-        assert_eq!(output.status.code(), Some(1));
-        String::from_utf8_lossy(&output.stderr).into_owned()
-    };
     let mut moved = scene.clone();
     moved.means_in_world.iter_mut().for_each(|mean| mean.x += 0.01);
     let other = dir.path().join("moved.ply");
     ply::write(&other, &moved).expect("writes");
-    let error = fails(encoder(&query).args(["--scene", text(&other)]));
-    assert!(error.contains("moved.ply") && error.contains("lies at"), "{error}");
+    let error = refused(encoder(&query).args(["--scene", text(&other)]), "moved.ply");
+    assert!(error.contains("lies at"), "{error}");
     ply::write(&other, &scene.select(&[0, 1, 2])).expect("writes");
-    assert!(fails(encoder(&query).args(["--scene", text(&other)])).contains("3 Gaussians"));
+    refused(encoder(&query).args(["--scene", text(&other)]), "3 Gaussians");
     let mut unknown_view = encoder(&query);
     unknown_view.args(["--scene", text(&scene_file), "--png", text(picture_file)]);
-    let error =
-        fails(unknown_view.args(["--views", text(&room.join("transforms.json")), "--view", "no.png"]));
-    assert!(error.contains("no.png"), "{error}");
+    refused(
+        unknown_view.args(["--views", text(&room.join("transforms.json")), "--view", "no.png"]),
+        "no.png",
+    );
 }

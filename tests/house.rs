@@ -11,6 +11,15 @@ use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
+/// Returns the command that encodes the house with its given masks into a store.
+fn encode_house(views: &str, store: &Path, flags: &str) -> std::process::Command {
+    let house = shared("scenes/house_a");
+    let mut command = encoder(&["encode", "--scene", text(&house.join("point_cloud.ply"))]);
+    command.args(["--views", text(&house.join(views)), "--masks", text(&house.join("gt/masks"))]);
+    command.args(["--metric", "--store", text(store)]).args(flags.split(' '));
+    command
+}
+
 /// Encodes the house with its given masks and the ConSE encoder, and compares total weights, embeddings, and each word's
 /// AUC and IoU. The tolerances are the reference's own, because crops, resizing and runtime versions differ slightly.
 #[needs_shared]
@@ -20,37 +29,14 @@ fn the_field_agrees_with_the_independent_reference() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let store = dir.path().join("house");
     let models = root().join("tests/models/conse");
-    let (scene, views, masks) =
-        (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
-    let summary = run_json(&mut encoder(&[
-        "encode",
-        "--scene",
-        text(&scene),
-        "--views",
-        text(&views),
-        "--masks",
-        text(&masks),
-        "--models",
-        text(&models),
-        "--preset",
-        "plain",
-        "--background",
-        "white",
-        "--min-mask-px",
-        "200",
-        // The reference's width.
-        "--raster-width",
-        "640",
-        "--metric",
-        "--strict",
-        "--store",
-        text(&store),
-    ]));
+    // The reference's width.
+    let flags = "--preset plain --background white --min-mask-px 200 --raster-width 640 --strict";
+    let summary = run_json(encode_house("sparse/0", &store, flags).args(["--models", text(&models)]));
     println!("{summary:#}");
     assert_eq!(summary["n_masks"], 1423, "the reference has as many masks");
 
     check_embeddings(&house, &store);
-    check_words(&house, &store, &models, dir.path());
+    check_words(&house, &store, &models);
 }
 
 /// A model that wants windows over the photo gets them: vectors turn, as far as a share of 0.35 can turn them, and their number is that of the masks.
@@ -58,24 +44,13 @@ fn the_field_agrees_with_the_independent_reference() {
 #[needs_shared]
 #[test]
 fn masks_take_a_share_of_windows() {
-    let (house, _) = (shared("scenes/house_a"), shared("models/image_encoder"));
+    shared("models/image_encoder");
     let dir = tempfile::tempdir().expect("a temporary folder");
     let encode = |regions: &str| {
         let store = dir.path().join(regions);
-        let (scene, views, masks) =
-            (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
-        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
-        command.args(["--masks", text(&masks), "--models", text(&root().join("tests/models/conse"))]);
-        command.args(["--preset", "plain", "--regions", regions, "--store", text(&store)]);
-        run_json(command.args([
-            "--views-limit",
-            "2",
-            "--view-order",
-            "nth",
-            "--raster-width",
-            "160",
-            "--metric",
-        ]));
+        let flags = "--preset plain --views-limit 2 --view-order nth --raster-width 160 --regions";
+        let mut command = encode_house("sparse/0", &store, flags);
+        run(command.args([regions, "--models", text(&root().join("tests/models/conse"))]));
         read_regions(&StoreReader::open(&store).expect("a published store")).expect("regions")
     };
     let (with, without) = (encode("masks"), encode("crops"));
@@ -98,7 +73,6 @@ fn masks_take_a_share_of_windows() {
 #[needs_shared]
 #[test]
 fn a_gpu_gives_the_field_of_the_cpu() {
-    let house = shared("scenes/house_a");
     let found = run_json(&mut encoder(&["devices"]));
     if found["adapters"].as_array().expect("a list").is_empty() {
         assert!(std::env::var("CI").as_deref() != Ok("true"), "no GPU: install mesa-vulkan-drivers");
@@ -108,20 +82,8 @@ fn a_gpu_gives_the_field_of_the_cpu() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let encode = |device: &str| {
         let store = dir.path().join(device);
-        let (scene, views, masks) =
-            (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
-        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
-        command.args(["--preset", "plain"]);
-        command.args(["--masks", text(&masks), "--store", text(&store), "--device", device]);
-        run_json(command.args([
-            "--views-limit",
-            "6",
-            "--view-order",
-            "nth",
-            "--raster-width",
-            "320",
-            "--metric",
-        ]));
+        let flags = "--preset plain --views-limit 6 --view-order nth --raster-width 320 --device";
+        run(encode_house("sparse/0", &store, flags).arg(device));
         let reader = StoreReader::open(&store).expect("a published store");
         let n_regions = read_regions(&reader).expect("regions").len();
         let mut sums = BTreeMap::new();
@@ -203,50 +165,36 @@ fn check_embeddings(house: &Path, store: &Path) {
     assert!(weight_errors[n * 95 / 100] <= 0.01);
 }
 
-/// A word's area under the ROC curve, and the IoU of the multi-class answer.
-struct Words {
-    words: Vec<String>,
-    aucs: Vec<f64>,
-    ious: Vec<f64>,
-}
-
-impl Words {
-    fn means(&self) -> (f64, f64) {
-        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        (mean(&self.aucs), mean(&self.ious))
-    }
-}
-
-/// Compares the words' figures with the reference's, and those of each profile with the field's.
-fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
-    let bytes = fs_err::read(house.join("gt/reference.json")).expect("reads");
-    let reference: Value = serde_json::from_slice(&bytes).expect("JSON");
+/// Compares the program's evaluation with the reference's figures, and that of each profile with the field's.
+fn check_words(house: &Path, store: &Path, models: &Path) {
+    let reference = read_json(&house.join("gt/reference.json"));
     let reference = &reference["results"]["white"];
-    let words: Vec<String> = reference["auc"].as_object().expect("words").keys().cloned().collect();
-    let field = judge(house, store, models, dir, &words, None);
+    let figure = |value: &Value| value.as_f64().unwrap_or_else(|| panic!("no figure: {value}"));
+    let evaluated = |profile: &[&str]| {
+        let mut eval = lab(&["eval", "labelled", "--store", text(store)]);
+        run_json(eval.args(["--truth", text(house), "--models", text(models)]).args(profile))
+    };
+    let means =
+        |report: &Value| (figure(&report["mean_area_under_roc"]), figure(&report["multi_class"][0]["miou"]));
+    let field = evaluated(&[]);
+    let words = field["words"].as_array().expect("words");
+    assert_eq!(words.len(), reference["auc"].as_object().expect("words").len());
     println!("{:<18} {:>7} {:>9} {:>7} {:>9}", "word", "AUC", "reference", "IoU", "reference");
-    for (w, word) in field.words.iter().enumerate() {
-        let [auc, iou] = ["auc", "iou"].map(|m| reference[m][word].as_f64().expect("a figure"));
-        println!("{word:<18} {:>7.4} {auc:>9.4} {:>7.4} {iou:>9.4}", field.aucs[w], field.ious[w]);
+    for found in words {
+        let word = found["word"].as_str().expect("text");
+        let [auc, iou] = ["auc", "iou"].map(|m| figure(&reference[m][word]));
+        println!("{word:<18} {} {auc:>9.4} {} {iou:>9.4}", found["area_under_roc"], found["iou"]);
     }
-    let (auc, iou) = field.means();
+    let (auc, iou) = means(&field);
     println!("{:<18} {auc:>7.4} {:>9} {iou:>7.4} {:>9}", "mean", reference["auc_mean"], reference["miou"]);
-    assert!((auc - reference["auc_mean"].as_f64().expect("a figure")).abs() <= 0.01);
-    assert!((iou - reference["miou"].as_f64().expect("a figure")).abs() <= 0.02);
-
-    // The program's own evaluation shares no code with the one above.
-    let flags = ["--store", text(store), "--truth", text(house), "--models", text(models)];
-    let report = run_json(&mut lab(&[&["eval", "labelled"], &flags[..]].concat()));
-    let figure = |value: &Value| value.as_f64().expect("a figure");
-    assert!((figure(&report["mean_area_under_roc"]) - auc).abs() < 1e-4);
-    assert!((figure(&report["multi_class"][0]["miou"]) - iou).abs() < 1e-4);
-    assert_eq!(report["words"].as_array().expect("words").len(), words.len());
+    assert!((auc - figure(&reference["auc_mean"])).abs() <= 0.01);
+    assert!((iou - figure(&reference["miou"])).abs() <= 0.02);
 
     let manifest = StoreReader::open(store).expect("a published store").manifest().clone();
     for (profile, most_bytes) in
         [(Profile::Compact, 10.0), (Profile::Balanced, 24.5), (Profile::Exact, 1200.0)]
     {
-        let of_profile = judge(house, store, models, dir, &words, Some(profile)).means();
+        let of_profile = means(&evaluated(&["--profile", profile.name()]));
         let bytes: u64 = manifest.cells.iter().map(|cell| cell.shards[&profile].len_bytes).sum();
         let bytes = bytes as f64 / manifest.n_gaussians as f64;
         println!("{profile}: {bytes:.2} bytes a Gaussian, AUC {:.4}, mIoU {:.4}", of_profile.0, of_profile.1);
@@ -254,62 +202,4 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
         // The profile promises half a point; the others are closer.
         assert!((of_profile.0 - auc).abs() <= 0.005 && of_profile.1 - iou >= -0.005, "{profile}");
     }
-}
-
-/// Scores the words against the labels, by the field in full precision or as a profile decodes it.
-fn judge(
-    house: &Path,
-    store: &Path,
-    models: &Path,
-    dir: &Path,
-    words: &[String],
-    profile: Option<Profile>,
-) -> Words {
-    let read = |name: &str| -> Value {
-        serde_json::from_slice(&fs_err::read(house.join(name)).expect("reads")).expect("JSON")
-    };
-    let instances = read("gt/instances.json");
-    let category: BTreeMap<u64, String> = instances["instances"]
-        .as_array()
-        .expect("instances")
-        .iter()
-        .map(|i| (i["id"].as_u64().expect("an id"), i["category"].as_str().expect("a category").to_owned()))
-        .collect();
-    let truth: Vec<u16> = read_npy(&house.join("gt/gaussian_instance.npy"));
-    // Background and unlabelled Gaussians are left out.
-    let (objects, labels): (Vec<usize>, Vec<&String>) =
-        truth.iter().enumerate().filter_map(|(k, id)| category.get(&u64::from(*id)).map(|c| (k, c))).unzip();
-
-    let mut scores = Vec::new();
-    for word in words {
-        let path = dir.join("scores.npy");
-        let scores_to = ["--scores", text(&path), "--limit", "0"];
-        let mut command = encoder(&["query", "--store", text(store), "--models", text(models), word]);
-        if let Some(profile) = profile {
-            command.args(["--profile", profile.name()]);
-        }
-        run(command.args(scores_to));
-        let all: Vec<f32> = read_npy(&path);
-        assert_eq!(all.len(), truth.len());
-        // Gaussians that were never seen score below all others.
-        scores.push(
-            objects.iter().map(|k| if all[*k].is_nan() { -2.0 } else { all[*k] }).collect::<Vec<f32>>(),
-        );
-    }
-    // The multi-class answer is the best word, over Gaussians of the words' categories.
-    let of_words: Vec<usize> = (0..objects.len()).filter(|i| words.contains(labels[*i])).collect();
-    let best: Vec<usize> = of_words
-        .iter()
-        .map(|i| (0..words.len()).max_by(|a, b| scores[*a][*i].total_cmp(&scores[*b][*i])).expect("words"))
-        .collect();
-    let (mut aucs, mut ious) = (Vec::new(), Vec::new());
-    for (w, word) in words.iter().enumerate() {
-        let positive: Vec<bool> = labels.iter().map(|label| *label == word).collect();
-        aucs.push(roc_auc(&scores[w], &positive));
-        let count = |test: &dyn Fn(bool, bool) -> bool| {
-            of_words.iter().zip(&best).filter(|(i, b)| test(labels[**i] == word, **b == w)).count() as f64
-        };
-        ious.push(count(&|is, said| is && said) / count(&|is, said| is || said).max(1.0));
-    }
-    Words { words: words.to_vec(), aucs, ious }
 }

@@ -8,9 +8,6 @@ use serde_json::Value;
 use slag_math::random::Random;
 use slag_tests::*;
 
-const N_ENCODE_KILLS: usize = 12;
-const N_FETCH_KILLS: usize = 100;
-
 /// Runs a command and returns its output, or kills it after a while.
 fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
     // The output fits in the pipe's buffer, so nobody has to read it meanwhile.
@@ -30,12 +27,12 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
 
 #[test]
 fn killed_encodes_resume_and_show_nothing_half() {
+    let n_wanted = trials(4, 100);
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let room = dir.path().join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "6"]));
+    let room = generated(&ROOM);
     let whole = dir.path().join("whole");
     let start = Instant::now();
-    run(&mut encode_room(&room, &whole));
+    run(&mut encode_quickly(&room, &whole));
     let encode_time = start.elapsed();
     let expected = content(&whole);
 
@@ -43,12 +40,12 @@ fn killed_encodes_resume_and_show_nothing_half() {
     // new one.
     let mut random = Random::new(7);
     let (mut n_kills, mut n_stores, mut n_resumed) = (0, 0, 0);
-    while n_kills < N_ENCODE_KILLS {
+    while n_kills < n_wanted {
         let store = dir.path().join(format!("store{n_stores}"));
         let printed = loop {
-            let enough = n_kills == N_ENCODE_KILLS;
+            let enough = n_kills == n_wanted;
             let after = if enough { Duration::MAX } else { encode_time.mul_f64(0.5 * random.unit()) };
-            match run_or_kill(&mut encode_room(&room, &store), after) {
+            match run_or_kill(&mut encode_quickly(&room, &store), after) {
                 Some(printed) => break printed,
                 None => n_kills += 1,
             }
@@ -68,31 +65,24 @@ fn killed_encodes_resume_and_show_nothing_half() {
 /// Kills a robot with generation 1 on board while it fetches generation 2, in which all shards differ.
 #[test]
 fn killed_fetches_leave_the_old_or_the_new_generation() {
+    let n_wanted = trials(12, 2000);
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let room = dir.path().join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10"]));
     let (first, second) = (dir.path().join("first"), dir.path().join("second"));
-    run(&mut encode_room(&room, &first));
     // The same key and scene, one generation on.
+    encoded_into(&first, &ROOM, &SITE);
     copy_dir(&first, &second);
-    run(encode_room(&room, &second).args(["--name", "first", "--compact-error", "0.4"]));
+    run(encode_quickly(&generated(&ROOM), &second).args(SITE).args(["--compact-error", "0.4"]));
     let stores =
         [&first, &second].map(|store| Service::start(&mut encoder(&["serve", "--store", text(store)])));
-    let fetch = |from: &Service, cache: &Path| {
-        let mut command =
-            edge(&["fetch", "--trust-first", "--from", &from.url, "--at", "3.5,2.7,0", "--radius", "50"]);
-        command.args(["--cache", text(cache)]);
-        command
-    };
     let ask = |cache: &Path| {
-        let answers = run_json(&mut edge(&["query", "blue", "--cache", text(cache)]));
+        let answers = run_json(&mut edge(&["query", "blue", "--models", "colours", "--cache", text(cache)]));
         (answers["generation"].as_u64().expect("a number"), answers["answers"].clone())
     };
     let (old, new) = (dir.path().join("old"), dir.path().join("new"));
-    run(&mut fetch(&stores[0], &old));
+    run(&mut fetch(&stores[0].url, &old));
     copy_dir(&old, &new);
     let start = Instant::now();
-    run(&mut fetch(&stores[1], &new));
+    run(&mut fetch(&stores[1].url, &new));
     let fetch_time = start.elapsed();
     let expected = [ask(&old), ask(&new)];
     assert_eq!(expected.each_ref().map(|(generation, _)| *generation), [1, 2]);
@@ -100,19 +90,19 @@ fn killed_fetches_leave_the_old_or_the_new_generation() {
 
     let mut random = Random::new(11);
     let (mut n_kills, mut n_runs, mut n_new) = (0, 0, 0);
-    while n_kills < N_FETCH_KILLS {
+    while n_kills < n_wanted {
         let cache = dir.path().join(format!("cache{n_runs}"));
         copy_dir(&old, &cache);
         let is_killed =
-            run_or_kill(&mut fetch(&stores[1], &cache), fetch_time.mul_f64(random.unit())).is_none();
+            run_or_kill(&mut fetch(&stores[1].url, &cache), fetch_time.mul_f64(random.unit())).is_none();
         let found = ask(&cache);
         assert!(expected.contains(&found), "run {n_runs}: generation {} answers otherwise", found.0);
         assert!(is_killed || found.0 == 2, "run {n_runs}: a fetch that ended well is there");
         n_kills += usize::from(is_killed);
         n_new += u64::from(is_killed && found.0 == 2);
         // Often enough to show that leftovers of a kill do no harm.
-        if n_runs % 10 == 0 {
-            run(&mut fetch(&stores[1], &cache));
+        if n_runs % 4 == 0 {
+            run(&mut fetch(&stores[1].url, &cache));
             assert_eq!(ask(&cache), expected[1], "run {n_runs}: the next fetch");
         }
         fs_err::remove_dir_all(&cache).expect("there");

@@ -79,10 +79,8 @@ fn poisons() -> Vec<(Vec<(&'static str, f64)>, bool)> {
 #[test]
 fn a_poisoned_scene_leaves_no_nan_in_the_store() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let room = dir.path().join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "6"]));
-    let (clean, scene) = (room.join("scene.ply"), room.join("poisoned.ply"));
-    let mut ply = Ply::read(&clean);
+    let (room, store, scene) = (generated(&ROOM), dir.path().join("store"), dir.path().join("poisoned.ply"));
+    let mut ply = Ply::read(&room.join("scene.ply"));
     let poisons = poisons();
     let stride = ply.len() / (3 * poisons.len());
     let mut rejected = BTreeSet::new();
@@ -96,19 +94,10 @@ fn a_poisoned_scene_leaves_no_nan_in_the_store() {
     }
     ply.write(&scene);
 
-    let store = dir.path().join("store");
     let (views, cells) = (room.join("transforms.json"), "20000");
-    let summary = run_json(&mut encoder(&[
-        "encode",
-        "--scene",
-        text(&scene),
-        "--views",
-        text(&views),
-        "--cell-gaussians",
-        cells,
-        "--store",
-        text(&store),
-    ]));
+    let mut encode = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
+    encode.args(["--masks", text(&room.join("gt/masks")), "--raster-width", "320"]);
+    let summary = run_json(encode.args(["--cell-gaussians", cells, "--store", text(&store)]));
     let n_rejected = rejected.len() as u64;
     println!("{n_rejected} of {} Gaussians rejected", ply.len());
     assert_eq!(summary["n_rejected"], n_rejected);

@@ -1,8 +1,9 @@
 //! The generated room: the demo as a user runs it, reproducible stores, the robot's service.
 
-use std::path::Path;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use slag_tests::*;
 
 #[test]
@@ -17,6 +18,7 @@ fn the_demo_answers_rightly() {
 
 /// Evaluates the embedded encoders on shapes, and pairs of noun and colour, that they never saw. Their card has all
 /// figures, by the same command.
+#[nightly("evaluates 30 scenes")]
 #[test]
 fn the_embedded_encoders_tell_things() {
     let report = run_json(&mut lab(&["eval", "encoder", "--n-scenes", "30"]));
@@ -31,121 +33,62 @@ fn the_embedded_encoders_tell_things() {
     assert!(report["found"].as_f64() > Some(0.7) && report["found_absent"].as_f64() < Some(0.01));
 }
 
-fn generate(dir: &Path, n_views: &str) -> (std::path::PathBuf, std::path::PathBuf) {
-    let room = dir.join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", n_views]));
-    (room.join("scene.ply"), room.join("transforms.json"))
+/// The store that [`stores_are_equal_to_the_byte`] and [`an_interrupted_encode_resumes`] expect.
+fn encoded_at_once() -> PathBuf {
+    made("store", &["with the encoder's own masks"], |store| {
+        run(encode_room(&generated(&ROOM), store).args(["--models", "colours", "--threads", "1"]));
+    })
 }
 
 /// Shards do not depend on threads, the order of views in the poses file, or working memory.
 #[test]
 fn stores_are_equal_to_the_byte() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let (scene, views) = generate(dir.path(), "8");
-    let mut poses: Value = serde_json::from_slice(&fs_err::read(&views).expect("reads")).expect("JSON");
-    poses["frames"].as_array_mut().expect("frames").reverse();
-    poses["frames"].as_array_mut().expect("frames").swap(0, 4);
-    let shuffled = views.with_file_name("shuffled.json");
-    fs_err::write(&shuffled, poses.to_string()).expect("writes");
-    let encode = |name: &str, views: &Path, threads: &str, memory: &str| {
-        let store = dir.path().join(name);
-        run(&mut encoder(&[
-            "encode",
-            "--scene",
-            text(&scene),
-            "--views",
-            text(views),
-            "--threads",
-            threads,
-            "--memory",
-            memory,
-            "--cell-gaussians",
-            "20000",
-            "--store",
-            text(&store),
-        ]));
-        content(&store)
-    };
-    let one = encode("one", &views, "1", "2GiB");
+    let room = dir.path().join("room");
+    copy_dir(&generated(&ROOM), &room);
+    let mut poses = read_json(&room.join("transforms.json"));
+    let frames = poses["frames"].as_array_mut().expect("frames");
+    frames.reverse();
+    frames.swap(0, 4);
+    fs_err::write(room.join("transforms.json"), poses.to_string()).expect("writes");
+    let one = content(&encoded_at_once());
     assert!(one.len() > 4, "several cells and profiles");
-    assert_eq!(encode("two", &views, "2", "2GiB"), one);
-    assert_eq!(encode("shuffled", &shuffled, "4", "96MiB"), one);
+    let store = dir.path().join("store");
+    run(encode_room(&room, &store).args("--models colours --threads 4 --memory 96MiB".split(' ')));
+    assert_eq!(content(&store), one);
 }
 
 /// Each mistake of a user gets a message that says what to do.
 #[test]
 fn mistakes_are_named() {
+    let room = generated(&ROOM);
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let (scene, views) = generate(dir.path(), "1");
-    let store = dir.path().join("store");
-    let fails = |args: &[&str]| {
-        let output = encoder(args).output().expect("starts");
-        assert!(!output.status.success());
-        String::from_utf8_lossy(&output.stderr).into_owned()
-    };
-    let absent = dir.path().join("absent");
-    let encode = |views: &str, images: &str| {
-        fails(&[
-            "encode",
-            "--scene",
-            text(&scene),
-            "--views",
-            views,
-            "--images",
-            images,
-            "--store",
-            text(&store),
-        ])
-    };
-    assert!(encode(text(&views), text(&absent)).contains("--images"));
-    assert!(encode(text(&absent), text(dir.path())).contains("absent"));
-    assert!(fails(&["query", "red", "--store", text(&absent)]).contains("absent"));
-    assert!(fails(&["query", "red", "--store", text(&absent), "--models", text(&absent)]).contains("absent"));
+    let (store, absent) = (dir.path().join("store"), dir.path().join("absent"));
+    refused(encode_room(&room, &store).arg("--images").arg(&absent), "--images");
+    refused(&mut encode_room(&absent, &store), "absent");
+    let query = ["query", "red", "--store", text(&absent)];
+    refused(&mut encoder(&query), "absent");
+    refused(encoder(&query).arg("--models").arg(&absent), "absent");
 }
 
 /// The robot's service: answers, refusals as problem details, and a new generation without a restart.
 #[test]
 fn the_robots_service_answers() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let (scene, views) = generate(dir.path(), "8");
     let (store, cache) = (dir.path().join("store"), dir.path().join("cache"));
-    let encode = || {
-        run(&mut encoder(&[
-            "encode",
-            "--scene",
-            text(&scene),
-            "--views",
-            text(&views),
-            "--metric",
-            "--store",
-            text(&store),
-        ]));
-    };
-    encode();
+    encoded_into(&store, &ROOM, &[]);
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
-    run(&mut edge(&[
-        "fetch",
-        "--trust-first",
-        "--from",
-        &server.url,
-        "--at",
-        "3.5,2.7,0",
-        "--cache",
-        text(&cache),
-    ]));
+    run(&mut fetch(&server.url, &cache));
     let robot = Service::start(&mut edge(&["serve", "--cache", text(&cache)]));
     let reply = robot.get("/query?text=sofa&near=3.5,2.7,0");
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");
     let reply = robot.get("/query?text=elephant");
-    assert!(
-        reply["answers"].as_array().expect("answers").is_empty() && reply["reason"]["detail"].is_string(),
-        "{reply}"
-    );
+    assert!(reply["answers"] == json!([]) && reply["reason"]["detail"].is_string(), "{reply}");
     assert_eq!(robot.get("/status")["scene"]["generation"], 1);
 
     // The robot remembers its source and place.
-    encode();
-    run(&mut edge(&["fetch", "--radius", "50", "--cache", text(&cache)]));
+    run(&mut encode_quickly(&generated(&ROOM), &store));
+    run(edge(&["fetch", "--cache"]).arg(&cache));
     for _ in 0..100 {
         if robot.get("/status")["scene"]["generation"] == 2 {
             return;
@@ -160,16 +103,15 @@ fn the_robots_service_answers() {
 #[test]
 fn odd_views_are_counted_not_fatal() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let (scene, views) = generate(dir.path(), "5");
-    let images = views.with_file_name("images");
-    let mut poses: Value = serde_json::from_slice(&fs_err::read(&views).expect("reads")).expect("JSON");
-    let frames = poses["frames"].as_array_mut().expect("frames");
+    let (room, masks, store) = (dir.path().join("room"), dir.path().join("masks"), dir.path().join("store"));
+    copy_dir(&generated(&["--n-views", "5"]), &room);
+    let (views, images) = (room.join("transforms.json"), room.join("images"));
+    let mut poses = read_json(&views);
     // A camera 1,000 m up that looks up: nothing is in view.
-    frames[4]["transform_matrix"] =
-        serde_json::json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1000], [0, 0, 0, 1]]);
+    poses["frames"][4]["transform_matrix"] =
+        json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1000], [0, 0, 0, 1]]);
     fs_err::write(&views, poses.to_string()).expect("writes");
     // 0000: two masks, one of them a single pixel; 0001: none; 0004: one, of a view that sees nothing.
-    let masks = dir.path().join("masks");
     fs_err::create_dir(&masks).expect("makes");
     let mut ids = image::GrayImage::new(640, 480);
     image::imageops::replace(&mut ids, &image::GrayImage::from_pixel(200, 200, image::Luma([7])), 200, 150);
@@ -181,32 +123,21 @@ fn odd_views_are_counted_not_fatal() {
     fs_err::write(images.join("0002.png"), &photo[..photo.len() / 2]).expect("writes");
     fs_err::remove_file(images.join("0003.png")).expect("removes");
 
-    let store = dir.path().join("store");
-    let encode = |strict: &[&str]| {
-        let (scene, views) = (text(&scene), text(&views));
-        let inputs = ["encode", "--scene", scene, "--views", views, "--masks", text(&masks), "--json"];
-        encoder(&inputs)
-            .args(["--min-mask-px", "1", "--store", text(&store)])
-            .args(strict)
-            .output()
-            .expect("starts")
+    let encode = |flag: &str| {
+        let mut command = encode_room(&room, &store);
+        command.args(["--masks", text(&masks), "--min-mask-px", "1", flag]);
+        command
     };
-    let output = encode(&["--strict"]);
-    assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&output.stdout).contains("0003.png"));
+    refused(&mut encode("--strict"), "0003.png");
 
-    let output = encode(&["--restart"]);
+    let output = encode("--restart").output().expect("starts");
     assert_eq!(output.status.code(), Some(3), "done with some inputs left out");
     let summary: Value = serde_json::from_slice(&output.stdout).expect("a summary");
-    assert_eq!(summary["n_views"], 3);
-    assert_eq!(summary["n_views_without_masks"], 1);
-    assert_eq!(summary["n_masks"], 3);
-    let skipped: Vec<&str> = summary["skipped_views"]
-        .as_array()
-        .expect("a list")
-        .iter()
-        .map(|s| s["view"].as_str().expect("a name"))
-        .collect();
+    for (name, expected) in [("n_views", 3), ("n_views_without_masks", 1), ("n_masks", 3)] {
+        assert_eq!(summary[name], expected, "{name}");
+    }
+    let skipped = summary["skipped_views"].as_array().expect("a list");
+    let skipped: Vec<&Value> = skipped.iter().map(|skipped| &skipped["view"]).collect();
     assert_eq!(skipped, ["0002.png", "0003.png"]);
     assert!(summary["n_without_evidence"].as_u64() < summary["n_gaussians"].as_u64());
 }
@@ -216,37 +147,23 @@ fn odd_views_are_counted_not_fatal() {
 #[test]
 fn an_interrupted_encode_resumes() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let (scene, views) = generate(dir.path(), "10");
-    let store = dir.path().join("store");
-    let args = [
-        "encode",
-        "--scene",
-        text(&scene),
-        "--views",
-        text(&views),
-        "--threads",
-        "1",
-        "--store",
-        text(&store),
-    ];
-    let mut child = encoder(&args).stderr(std::process::Stdio::null()).spawn().expect("starts");
+    let (room, store) = (generated(&ROOM), dir.path().join("store"));
+    let encode = || {
+        let mut command = encode_room(&room, &store);
+        command.args(["--models", "colours", "--threads", "1"]);
+        command
+    };
+    let mut child = encode().stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts");
     // Once the first view's contributions are on disk, the encode works on the others.
     let sums = store.join("job/views");
     while fs_err::read_dir(&sums).map_or(0, Iterator::count) == 0 {
         assert!(child.try_wait().expect("waits").is_none(), "ended before it could be interrupted");
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
-    // A second encode into the same store is refused.
-    let second = encoder(&args).output().expect("starts");
-    assert!(String::from_utf8_lossy(&second.stderr).contains("another slag-encoder"));
-    let interrupt = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status();
-    assert!(interrupt.expect("kill runs").success());
+    refused(&mut encode(), "another slag-encoder");
+    run(Command::new("kill").args(["-INT", &child.id().to_string()]));
     assert_eq!(child.wait().expect("waits").code(), Some(130));
-    let summary = run_json(&mut encoder(&args));
+    let summary: Value = serde_json::from_slice(&run(&mut encode()).stdout).expect("a summary");
     assert!(summary["n_views_resumed"].as_u64() > Some(0), "{summary}");
-    let whole = dir.path().join("whole");
-    let mut args = args;
-    args[args.len() - 1] = text(&whole);
-    run(&mut encoder(&args));
-    assert_eq!(content(&store), content(&whole));
+    assert_eq!(content(&store), content(&encoded_at_once()));
 }

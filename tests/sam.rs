@@ -27,27 +27,14 @@ fn sam_finds_masks_the_same_for_any_number_of_threads() {
         let store = dir.path().join(name);
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--json"]);
         command.args(["--images", text(&images), "--segmenter", text(segmenter), "--store", text(&store)]);
-        command.args([
-            "--models",
-            text(&root().join("tests/models/conse")),
-            "--views-limit",
-            "3",
-            "--view-order",
-            "nth",
-            "--metric",
-        ]);
+        command.args(["--models", text(&root().join("tests/models/conse"))]);
+        command.args("--views-limit 3 --view-order nth --metric --raster-width 320".split(' '));
         // Random weights find weak masks.
-        command.args([
-            "--sam-predicted-iou",
-            "0",
-            "--sam-stability",
-            "0.2",
-            "--sam-stability-offset",
-            "0.05",
-        ]);
-        command.args(["--raster-width", "320", "--points-per-side", "8", "--sam-points-per-batch", "24"]);
-        command.args(["--sam-crop-layers", "1", "--sam-min-region-px", "3000"]);
-        command.args(["--sam-box-nms", "1", "--sam-crop-nms", "1", "--sam-mask-nms", "0.7"]).args(more);
+        command.args("--sam-predicted-iou 0 --sam-stability 0.2 --sam-stability-offset 0.05".split(' '));
+        command.args("--points-per-side 8 --sam-points-per-batch 24 --sam-crop-layers 1".split(' '));
+        command
+            .args("--sam-min-region-px 3000 --sam-box-nms 1 --sam-crop-nms 1 --sam-mask-nms 0.7".split(' '));
+        command.args(more);
         let output = command.env("SOURCE_DATE_EPOCH", "1700000000").output().expect("starts");
         let summary: Value = serde_json::from_slice(&output.stdout)
             .unwrap_or_else(|_| panic!("no JSON: {}", String::from_utf8_lossy(&output.stderr)));

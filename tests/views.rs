@@ -8,58 +8,66 @@ use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
-fn encode(room: &Path, store: &Path, more: &[&str]) -> Value {
-    let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
-    let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
-    command.args(["--masks", text(&room.join("gt/masks")), "--store", text(store), "--raster-width", "320"]);
-    run_json(command.args(more))
+/// The room of these tests.
+const VIEWS: [&str; 4] = ["--n-views", "10", "--seed", "31"];
+
+/// Encodes the room's scene with its true masks, and returns the summary.
+fn encode_scene(room: &Path, views: &Path, store: &Path, more: &[&str]) -> Value {
+    let mut command = encoder(&["encode", "--scene", text(&room.join("scene.ply")), "--views", text(views)]);
+    command.args(["--masks", text(&room.join("gt/masks")), "--store", text(store), "--name", "room"]);
+    run_json(command.args(["--metric", "--raster-width", "320"]).args(more))
+}
+
+/// Views that were used, and those of them that were not done again.
+fn counts(summary: &Value) -> [u64; 2] {
+    ["n_views", "n_views_resumed"].map(|name| summary[name].as_u64().expect("a count"))
 }
 
 #[test]
 fn an_encode_of_some_views_goes_on_with_more() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let room = dir.path().join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
-    let (whole, store) = (dir.path().join("whole"), dir.path().join("store"));
-    let summary = encode(&room, &whole, &[]);
+    let room = generated(&VIEWS);
+    let store = dir.path().join("store");
+    let encode_into = |name: &str, more: &[&str]| {
+        encode_scene(&room, &room.join("transforms.json"), &dir.path().join(name), more)
+    };
+    let encode = |more: &[&str]| encode_into("store", more);
+    let summary = encode_into("whole", &[]);
     assert_eq!((&summary["view_order"], &summary["coverage"]), (&"names".into(), &Value::Null));
-    let expected = content(&whole);
+    let expected = content(&dir.path().join("whole"));
 
-    let counts =
-        |summary: &Value| ["n_views", "n_views_resumed"].map(|name| summary[name].as_u64().expect("a count"));
     let coverage = |summary: &Value| summary["coverage"]["coverage"].as_f64().expect("a share");
-    let three = encode(&room, &store, &["--views-limit", "3"]);
+    let three = encode(&["--views-limit", "3"]);
     assert_eq!((counts(&three), &three["view_order"]), ([3, 0], &"coverage".into()));
     let of_three = content(&store);
-    let six = encode(&room, &store, &["--views-limit", "6", "--threads", "1"]);
+    let six = encode(&["--views-limit", "6", "--threads", "1"]);
     assert_eq!(counts(&six), [6, 3], "the first three are not done again");
     assert!(coverage(&six) > coverage(&three) && coverage(&three) > 0.3, "{three} {six}");
     assert_ne!(content(&store), of_three);
     // A lower limit: the same three, from kept contributions.
-    let three = encode(&room, &store, &["--views-limit", "3"]);
+    let three = encode(&["--views-limit", "3"]);
     assert_eq!(counts(&three), [3, 3]);
     assert_eq!(content(&store), of_three, "the views that are left over do not show");
     // A budget of no time: the kept views, and no more.
-    let stopped = encode(&room, &store, &["--time-budget", "0.000001"]);
+    let stopped = encode(&["--time-budget", "0.000001"]);
     assert_eq!(counts(&stopped), [6, 6]);
     // All views: the bytes of an encode without an order.
-    let all = encode(&room, &store, &["--view-order", "coverage"]);
+    let all = encode(&["--view-order", "coverage"]);
     assert_eq!((counts(&all), coverage(&all)), ([10, 6], 1.0));
     assert_eq!(content(&store), expected);
     // All views were used, so nothing is kept.
-    assert_eq!(counts(&encode(&room, &store, &["--view-order", "nth", "--views-limit", "2"])), [2, 0]);
+    assert_eq!(counts(&encode(&["--view-order", "nth", "--views-limit", "2"])), [2, 0]);
     // Another raster width is another job; the published views are no unfinished work.
-    assert_eq!(counts(&encode(&room, &store, &["--views-limit", "2", "--min-mask-px", "300"])), [2, 0]);
+    assert_eq!(counts(&encode(&["--views-limit", "2", "--min-mask-px", "300"])), [2, 0]);
 
     // An empty store and no time: a generation of one view.
-    let one = encode(&room, &dir.path().join("one"), &["--time-budget", "0.000001", "--threads", "1"]);
+    let one = encode_into("one", &["--time-budget", "0.000001", "--threads", "1"]);
     assert_eq!(counts(&one), [1, 0]);
 
     // Kept contributions: another codebook of the same views, without their photos.
-    let kept = dir.path().join("kept");
-    assert_eq!(counts(&encode(&room, &kept, &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
-    assert_eq!(counts(&encode(&room, &kept, &[])), [10, 10]);
-    assert_eq!(content(&kept), expected);
+    assert_eq!(counts(&encode_into("kept", &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
+    assert_eq!(counts(&encode_into("kept", &[])), [10, 10]);
+    assert_eq!(content(&dir.path().join("kept")), expected);
 }
 
 /// A finer raster gives views no more weight, and the summary states the cost of views and cells. Threads and resuming change
@@ -67,13 +75,11 @@ fn an_encode_of_some_views_goes_on_with_more() {
 #[test]
 fn what_was_spent_is_reported() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let room = dir.path().join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
+    let room = generated(&VIEWS);
     let encode = |name: &str, more: &[&str]| {
-        let (scene, views, store) =
-            (room.join("scene.ply"), room.join("transforms.json"), dir.path().join(name));
+        let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
-        command.args(["--store", text(&store), "--preset", "plain", "--mask-levels", "4"]);
+        command.args(["--store", text(&dir.path().join(name)), "--preset", "plain", "--mask-levels", "4"]);
         run_json(command.args(more))
     };
     let column = |summary: &Value, name: &str| {
@@ -121,9 +127,9 @@ fn what_was_spent_is_reported() {
 fn photos_are_added_and_withdrawn() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
+    copy_dir(&generated(&VIEWS), &room);
     let (masks, views) = (room.join("gt/masks"), room.join("transforms.json"));
-    let poses: Value = serde_json::from_slice(&fs_err::read(&views).expect("reads")).expect("JSON");
+    let poses = read_json(&views);
     let name = |i: usize| poses["frames"][i]["file_path"].as_str().expect("a path").to_owned();
     let poses_of = |file: &str, frames: &[usize]| {
         let mut some = poses.clone();
@@ -132,13 +138,8 @@ fn photos_are_added_and_withdrawn() {
         room.join(file)
     };
     let encode = |store: &str, views: &Path, more: &[&str]| {
-        let (scene, store) = (room.join("scene.ply"), dir.path().join(store));
-        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(views), "--metric"]);
-        command.args(["--masks", text(&masks), "--store", text(&store), "--raster-width", "320"]);
-        command.args(["--name", "room"]);
-        let summary = run_json(command.args(more));
-        let counts = ["n_views", "n_views_resumed"].map(|name| summary[name].as_u64().expect("a count"));
-        (counts, content(&store))
+        let store = dir.path().join(store);
+        (counts(&encode_scene(&room, views, &store, more)), content(&store))
     };
     let first = poses_of("first.json", &[0, 2, 3, 5, 6, 7]);
     let second = poses_of("second.json", &[1, 4, 8, 9]);
@@ -175,62 +176,32 @@ fn photos_are_added_and_withdrawn() {
     assert_eq!(replaced.0, [10, 9]);
     assert_eq!(replaced.1, encode("replaced", &views, &[]).1);
 
-    let fails = |more: &[&str]| {
-        let (scene, store) = (room.join("scene.ply"), dir.path().join("grown"));
-        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
-        let output = command.args(["--store", text(&store)]).args(more).output().expect("starts");
-        assert!(!output.status.success());
-        String::from_utf8_lossy(&output.stderr).into_owned()
+    let fails = |flag: &str, value: &str, expected: &str| {
+        let mut command =
+            encoder(&["encode", "--scene", text(&room.join("scene.ply")), "--views", text(&views)]);
+        refused(command.args(["--store", text(&dir.path().join("grown")), flag, value]), expected);
     };
-    assert!(fails(&["--add", text(&second)]).contains("has a pose already"));
-    assert!(fails(&["--drop", "absent.png"]).contains("absent.png"));
+    fails("--add", text(&second), "has a pose already");
+    fails("--drop", "absent.png", "absent.png");
 
     // The splat was trained again: of its Gaussians, backwards, a hundred are gone and fifty have moved by a bit.
     let scene = room.join("scene.ply");
-    let mut ply = fs_err::read(&scene).expect("reads");
+    let ply = fs_err::read(&scene).expect("reads");
     let end = b"end_header\n";
     let head = ply.windows(end.len()).position(|part| part == end).expect("a header") + end.len();
-    let header = String::from_utf8_lossy(&ply[..head]).into_owned();
-    let n: usize = header
-        .lines()
-        .find_map(|line| line.strip_prefix("element vertex "))
-        .and_then(|n| n.parse().ok())
-        .expect("a count");
-    let row = (ply.len() - head) / n;
-    let rows = ply.split_off(head);
-    let kept = rows.chunks(row).rev().skip(100).enumerate();
-    for (i, gaussian) in kept {
-        ply.extend(gaussian);
+    let header = String::from_utf8_lossy(&ply[..head]);
+    let count = header.lines().find_map(|line| line.strip_prefix("element vertex ")).expect("a count");
+    let n: usize = count.parse().expect("a number");
+    let mut changed = header.replace(&format!("vertex {n}\n"), &format!("vertex {}\n", n - 100)).into_bytes();
+    let rows = ply[head..].chunks((ply.len() - head) / n).rev().skip(100);
+    for (i, gaussian) in rows.enumerate() {
         // The lowest byte of its x, the first property.
-        let at = ply.len() - row;
-        ply[at] ^= u8::from(i < 50);
+        changed.push(gaussian[0] ^ u8::from(i < 50));
+        changed.extend(&gaussian[1..]);
     }
-    fs_err::write(
-        &scene,
-        header.replace(&format!("vertex {n}\n"), &format!("vertex {}\n", n - 100)).into_bytes(),
-    )
-    .expect("writes");
-    let body = &ply[head..];
-    std::io::Write::write_all(
-        &mut fs_err::OpenOptions::new().append(true).open(&scene).expect("opens"),
-        body,
-    )
-    .expect("writes");
-    let summary = || {
-        let (scene, store) = (room.join("scene.ply"), dir.path().join("grown"));
-        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
-        command.args([
-            "--masks",
-            text(&masks),
-            "--store",
-            text(&store),
-            "--raster-width",
-            "320",
-            "--name",
-            "room",
-        ]);
-        run_json(command.args(["--keep-views", "--views-limit", "2"]))
-    };
+    fs_err::write(&scene, changed).expect("writes");
+    let again = ["--keep-views", "--views-limit", "2"];
+    let summary = || encode_scene(&room, &views, &dir.path().join("grown"), &again);
     let retrained = summary();
     assert_eq!(retrained["n_views_resumed"], 0);
     let lost = &retrained["lost_views"];

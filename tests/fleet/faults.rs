@@ -4,6 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use slag_math::random::Random;
+use slag_tests::nightly;
 
 use super::nats::Fleet;
 use super::network::{Network, Weather};
@@ -12,8 +13,8 @@ use super::support::*;
 /// Seeds, unless `SLAG_FAULT_RUNS` gives another number; `SLAG_FAULT_SEED` is the first one.
 const N_RUNS: u64 = 20;
 
+#[nightly("half a minute a run; SLAG_FAULT_RUNS=N chooses how many")]
 #[test]
-#[ignore = "half a minute a run: SLAG_FAULT_RUNS=N cargo test -p slag-tests --test fleet -- --ignored seeded"]
 fn seeded_faults_do_not_show() {
     let number = |name: &str, default: u64| {
         std::env::var(name).ok().map_or(default, |text| text.parse().expect("a number"))

@@ -6,6 +6,7 @@ mod folder;
 mod hosts;
 mod nats;
 mod network;
+#[cfg(feature = "nightly")]
 mod s3;
 mod secured;
 mod support;

@@ -109,6 +109,7 @@ fn a_folder_and_a_queue_conform() {
 
 /// One worker is killed, one stands still for longer than the queue waits for it and goes on; the server is killed in the
 /// middle and comes back with nothing.
+#[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
     let (fleet, server) = Fleet::new(free_port());
@@ -136,6 +137,7 @@ fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
 
 /// Views that a worker took down with it are given up once they were handed out too often: they are named, and the encode
 /// is one of the others. Without the queue's limit they are done by the next encode.
+#[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn views_that_end_workers_are_given_up_and_named() {
     let (fleet, _server) = Fleet::new(free_port());
@@ -159,6 +161,7 @@ fn views_that_end_workers_are_given_up_and_named() {
 }
 
 /// Work that takes longer than the queue waits is not handed out again, as its worker says that it is at it.
+#[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn work_in_progress_is_not_handed_out_again() {
     let (fleet, _server) = Fleet::new(free_port());

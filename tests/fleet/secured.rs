@@ -68,6 +68,7 @@ impl Secured {
 }
 
 /// Each role does its work with its key; a worker's key fills no queue, an unknown key and an unknown authority do nothing.
+#[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn each_role_has_its_key_and_no_more() {
     let fleet = Secured::start();

@@ -50,7 +50,7 @@ export function makeRoom() {
   const [store, cache] = ["store", "cache"].map((name) => join(folder, name));
   // Kept views make the next generation quick.
   const encode = (...flags) => run("slag-encoder", ["encode", "--scene", join(room, "scene.ply"), "--views", join(room, "transforms.json"),
-    "--metric", "--store", store, "--appearance", "--photo-poses", "--occupancy", "--keep-views", "--quiet", ...flags]);
+    "--masks", join(room, "gt/masks"), "--metric", "--store", store, "--appearance", "--photo-poses", "--occupancy", "--keep-views", "--quiet", ...flags]);
   encode();
   const fetch = (url) => run("slag-edge", ["fetch", "--trust-first", "--from", url, "--at", "0,0,0", "--radius", "100", "--cache", cache, "--quiet"]);
   return { room, store, cache, encode, fetch, close };

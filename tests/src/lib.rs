@@ -6,15 +6,17 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 
 use serde_json::Value;
-pub use slag_test_support::{needs_shared, shared};
+pub use slag_test_support::{needs_shared, nightly, shared, trials};
 
 mod authority;
+mod made;
 mod python;
 mod site;
 
 pub use authority::Authority;
+pub use made::{encoded, encoded_into, generated, made};
 pub use python::{judge, python_with};
-pub use site::Site;
+pub use site::{ROOM, SITE, Site};
 
 /// Returns the project's root.
 pub fn root() -> PathBuf {
@@ -23,8 +25,8 @@ pub fn root() -> PathBuf {
 
 /// Returns a program of the project, built as the tests are.
 ///
-/// `cargo test --workspace` builds all programs before the tests; `./test.sh` says so by `SLAG_PROGRAMS_ARE_BUILT`.
-/// Without that variable the programs are built first: a part of the tests may run alone.
+/// `./test.sh` builds all programs before the tests, and says so by `SLAG_PROGRAMS_ARE_BUILT`. Without that variable they
+/// are built first: a part of the tests may run alone.
 pub fn program(name: &str) -> PathBuf {
     static BUILT: OnceLock<PathBuf> = OnceLock::new();
     let folder = BUILT.get_or_init(|| {
@@ -34,6 +36,8 @@ pub fn program(name: &str) -> PathBuf {
         if std::env::var_os("SLAG_PROGRAMS_ARE_BUILT").is_none() {
             let mut build = Command::new(env!("CARGO"));
             build.current_dir(root()).args(["build", "--workspace", "--bins", "--locked"]);
+            // scripts/timed-test.sh sets it, and cargo would build again what depends on it.
+            build.env_remove("RUSTC_BOOTSTRAP");
             if folder.ends_with("release") {
                 build.arg("--release");
             }
@@ -81,6 +85,15 @@ pub fn run(command: &mut Command) -> Output {
     output
 }
 
+/// Runs a command that must fail and say what is wrong; returns what it prints.
+pub fn refused(command: &mut Command, expected: &str) -> String {
+    let output = command.output().expect("the program starts");
+    let printed = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{command:?}: {printed}");
+    assert!(printed.contains(expected), "{command:?}: {expected} is not in {printed}");
+    printed
+}
+
 /// Runs a command that must succeed and returns the JSON object that it prints.
 pub fn run_json(command: &mut Command) -> Value {
     let output = run(command.arg("--json"));
@@ -93,6 +106,26 @@ pub fn encode_room(room: &Path, store: &Path) -> Command {
     let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
     command.args(["--cell-gaussians", "4096", "--store", text(store), "--json"]);
     command.env("SOURCE_DATE_EPOCH", "1700000000");
+    command
+}
+
+/// Returns the command by which a robot without trust fetches what lies around the middle of a generated room.
+pub fn fetch(from: &str, cache: &Path) -> Command {
+    let mut command =
+        edge(&["fetch", "--trust-first", "--from", from, "--at", "3.5,2.7,0", "--radius", "50"]);
+    command.arg("--cache").arg(cache);
+    command
+}
+
+/// Reads a file of JSON.
+pub fn read_json(path: &Path) -> Value {
+    serde_json::from_slice(&fs_err::read(path).expect("the file is there")).expect("JSON")
+}
+
+/// As [`encode_room`], with the room's true masks and small rasters, which take a fifth of the time.
+pub fn encode_quickly(room: &Path, store: &Path) -> Command {
+    let mut command = encode_room(room, store);
+    command.args(["--masks", text(&room.join("gt/masks")), "--raster-width", "320"]);
     command
 }
 
@@ -141,6 +174,13 @@ impl Service {
         Self { child, url }
     }
 
+    /// Serves a folder of static files by Python.
+    pub fn of_files(folder: &Path) -> Self {
+        let mut python = Command::new("python3");
+        python.args("-u -m http.server 0 --bind 127.0.0.1 --directory".split(' ')).arg(folder);
+        Self::start_as(python.stderr(Stdio::null()))
+    }
+
     /// Returns a resource as JSON.
     pub fn get(&self, path: &str) -> Value {
         let text =
@@ -170,8 +210,7 @@ pub fn read_npy<T: npyz::Deserialize>(path: &Path) -> Vec<T> {
 
 /// Returns the hashes of all shards and fields of a store, by role: what must not depend on the run.
 pub fn content(store: &Path) -> Vec<(String, String)> {
-    let manifest = fs_err::read(store.join("manifest")).expect("a published store");
-    let manifest: Value = serde_json::from_slice(&manifest).expect("JSON");
+    let manifest = read_json(&store.join("manifest"));
     let mut content = Vec::new();
     for cell in manifest["cells"].as_array().expect("cells") {
         for (profile, shard) in cell["shards"].as_object().expect("shards") {
@@ -179,50 +218,4 @@ pub fn content(store: &Path) -> Vec<(String, String)> {
         }
     }
     content
-}
-
-/// Returns the area under the ROC curve: the chance that a positive scores above a negative, ties
-/// counting half (Mann and Whitney 1947).
-pub fn roc_auc(scores: &[f32], positive: &[bool]) -> f64 {
-    let mut order: Vec<usize> = (0..scores.len()).collect();
-    order.sort_by(|a, b| scores[*a].total_cmp(&scores[*b]));
-    let n_positive = positive.iter().filter(|p| **p).count() as f64;
-    let n_negative = scores.len() as f64 - n_positive;
-    let mut rank_sum = 0.0;
-    let mut rank = 0.0;
-    for tied in order.chunk_by(|a, b| scores[*a] == scores[*b]) {
-        let mean_rank = rank + (tied.len() as f64 + 1.0) / 2.0;
-        rank_sum += mean_rank * tied.iter().filter(|i| positive[**i]).count() as f64;
-        rank += tied.len() as f64;
-    }
-    (rank_sum - n_positive * (n_positive + 1.0) / 2.0) / (n_positive * n_negative)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Oracle: all pairs.
-    #[test]
-    fn auc_equals_counting_pairs() {
-        let scores = [0.1f32, 0.4, 0.4, 0.8, 0.35, 0.4, 0.9];
-        let positive = [false, true, false, true, false, true, false];
-        let mut won = 0.0;
-        let mut pairs = 0.0;
-        for i in 0..7 {
-            for j in 0..7 {
-                if positive[i] && !positive[j] {
-                    pairs += 1.0;
-                    won += if scores[i] > scores[j] {
-                        1.0
-                    } else if scores[i] == scores[j] {
-                        0.5
-                    } else {
-                        0.0
-                    };
-                }
-            }
-        }
-        assert!((roc_auc(&scores, &positive) - won / pairs).abs() < 1e-12);
-    }
 }

@@ -6,7 +6,7 @@ use std::time::UNIX_EPOCH;
 
 use slag_common::Hash32;
 
-use crate::{copy_dir, encode_room, lab, program, run};
+use crate::{copy_dir, encode_quickly, lab, program, run};
 
 /// Returns a generated scene: `scene.ply`, `transforms.json`, photos and their labels. Tests do not write to it.
 ///
@@ -17,10 +17,10 @@ pub fn generated(flags: &[&str]) -> PathBuf {
 
 /// Returns a store of a generated scene; tests do not write to it. [`encoded_into`] makes a copy.
 ///
-/// `flags`: of `slag-encoder encode`, in addition to those of [`encode_room`].
+/// `flags`: of `slag-encoder encode`, in addition to those of [`encode_quickly`].
 pub fn encoded(scene: &[&str], flags: &[&str]) -> PathBuf {
     let key = [scene, &["encode"], flags].concat();
-    made("store", &key, |out| drop(run(encode_room(&generated(scene), out).args(flags))))
+    made("store", &key, |out| drop(run(encode_quickly(&generated(scene), out).args(flags))))
 }
 
 /// Copies the store of [`encoded`] to a folder, which a test may serve and change.
@@ -30,7 +30,7 @@ pub fn encoded_into(store: &Path, scene: &[&str], flags: &[&str]) {
 
 /// Returns the folder that `make` fills, unless this or another test program has filled it for the same kind, key and
 /// programs. It lies beside the programs; what other programs made is removed.
-fn made(kind: &str, key: &[&str], make: impl FnOnce(&Path)) -> PathBuf {
+pub fn made(kind: &str, key: &[&str], make: impl FnOnce(&Path)) -> PathBuf {
     static MADE: OnceLock<PathBuf> = OnceLock::new();
     let folder = MADE.get_or_init(|| {
         let programs = ["slag-encoder", "slag-lab"].map(|name| {

@@ -1,8 +1,14 @@
 //! A generated room that is encoded, served, and fetched to a robot's storage.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use crate::{Service, edge, encode_room, encoder, lab, run, text};
+use crate::{Service, edge, encode_quickly, encoded_into, encoder, generated, run, text};
+
+/// The room that most tests share.
+pub const ROOM: [&str; 2] = ["--n-views", "8"];
+
+/// Flags of the encode of a [`Site`].
+pub const SITE: [&str; 6] = ["--models", "colours", "--occupancy", "0.1", "--name", "room"];
 
 /// A service with a generated room whose things are known by their colours, and a robot's storage that holds it.
 pub struct Site {
@@ -12,22 +18,23 @@ pub struct Site {
 }
 
 impl Site {
-    /// Generates, encodes, serves and fetches the room.
+    /// Serves and fetches the room.
     pub fn new() -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let store = dir.path().join("store");
-        encode(&dir.path().join("room"), &store, 1);
+        encoded_into(&store, &ROOM, &SITE);
         let store = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
         let site = Self { store, dir };
-        let at = ["fetch", "--trust-first", "--from", &site.store.url, "--at", "3.5,2.7,0"];
-        run(edge(&at).args(["--cache", text(&site.cache())]));
+        let at = ["fetch", "--trust-first", "--from", &site.store.url, "--at", "3.5,2.7,0", "--cache"];
+        run(edge(&at).arg(site.cache()));
         site
     }
 
     /// Replaces the room by one with other things, and fetches this second generation.
     pub fn publish_another(&self) {
-        encode(&self.dir.path().join("other-room"), &self.dir.path().join("store"), 2);
-        run(edge(&["fetch"]).args(["--cache", text(&self.cache())]));
+        let other = generated(&["--n-views", "8", "--seed", "2"]);
+        run(encode_quickly(&other, &self.dir.path().join("store")).args(SITE));
+        run(edge(&["fetch", "--cache"]).arg(self.cache()));
     }
 
     /// Returns the robot's storage.
@@ -45,11 +52,4 @@ impl Default for Site {
     fn default() -> Self {
         Self::new()
     }
-}
-
-/// Generates a room and encodes it into a store.
-fn encode(room: &Path, store: &Path, seed: u32) {
-    let seed = seed.to_string();
-    run(&mut lab(&["generate", "scene", "--out", text(room), "--n-views", "12", "--seed", &seed]));
-    run(encode_room(room, store).args(["--models", "colours", "--occupancy", "0.1", "--name", "room"]));
 }

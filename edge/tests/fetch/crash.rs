@@ -13,6 +13,7 @@ use super::server::{Fault, Server};
 use super::sim::SimFiles;
 use super::{Robot, assert_holds, at};
 use slag_math::random::Random;
+use slag_test_support::trials;
 
 /// Damages one copy of what the robot believes, or neither: the medium rots while the power is off. Only if the
 /// power cut damaged none: together they would be two faults.
@@ -114,7 +115,7 @@ fn a_power_cut_after_a_killed_fetch() {
     let files = Arc::new(trial.before.fork(None, 0));
     trial.fetch(&files, 1).1.expect("works");
     for kill_step in 1..=files.n_steps() {
-        for seed in kill_step * 100..kill_step * 100 + 8 {
+        for seed in kill_step * 100..kill_step * 100 + trials(2, 8) {
             let killed = Arc::new(trial.before.fork(Some(kill_step), seed));
             let _ = trial.fetch(&killed, 1);
             // The step may come after the second fetch; then the power fails after it.

@@ -1,5 +1,6 @@
-//! Storage and network fail together, in a thousand trials (`SLAG_TRIALS=10000`: more). After each, the old or the new
-//! generation answers a real query, whole. Storage includes the two copies of the trust state, and the records of use.
+//! Storage and network fail together, in a thousand trials (a quarter of them outside the nightly checks;
+//! `SLAG_TRIALS=10000`: more). After each, the old or the new generation answers a real query, whole. Storage includes
+//! the two copies of the trust state, and the records of use.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -22,6 +23,7 @@ use super::server::{Fault, Seen, Server};
 use super::sim::SimFiles;
 use super::{Robot, at};
 use slag_math::random::Random;
+use slag_test_support::trials;
 
 /// The keys of the next root.
 const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
@@ -33,7 +35,7 @@ const N: u32 = 60;
 const SILENCE: Duration = Duration::from_millis(80);
 
 fn n_trials() -> u64 {
-    std::env::var("SLAG_TRIALS").map_or(1000, |n| n.parse().expect("SLAG_TRIALS is a number"))
+    std::env::var("SLAG_TRIALS").map_or(trials(250, 1000), |n| n.parse().expect("SLAG_TRIALS is a number"))
 }
 
 /// Encodes every text as the first axis; every centroid of these scenes has a cosine of 0.5 with it.

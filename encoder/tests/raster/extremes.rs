@@ -11,6 +11,7 @@ use super::backends::{Backend, backends};
 use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
 use super::table::{Case, Row};
 use slag_math::random::Random;
+use slag_test_support::{is_nightly, trials};
 
 /// Many views of few Gaussians each: none hides the others.
 fn cases(
@@ -197,11 +198,12 @@ fn on_the_cuts() {
 /// Contributions are compared relative to themselves: 2,300 layers of alpha 1/255 leave the last one 1e-4.
 #[test]
 fn pile() {
+    let n_gaussians = trials(20_000, 100_000);
     let case = |[low, high]: [f64; 2]| {
         let random = &mut Random::new(3);
         let view = posed(random, [2, 2], 50.0);
         let mut scene = Gaussians::default();
-        for _ in 0..100_000 {
+        for _ in 0..n_gaussians {
             // 8,000 different depths as f32: most are ties, which the index decides.
             let mean = unproject(
                 &view,
@@ -217,7 +219,7 @@ fn pile() {
         Case::new(scene, view, regions)
     };
     let cases: Vec<Case> = [[0.00394, 0.00394], [0.0, 0.01], [0.9, 1.0]].map(case).into();
-    let range = "100,000 Gaussians on a pixel, to 2,300 blended";
+    let range = "20,000 Gaussians on a pixel (100,000 in the nightly checks), to 2,300 blended";
     Row { name: "pile", range, claimed: 1e-5, unit_px: 1e-4 }.check(&cases);
 }
 
@@ -320,7 +322,11 @@ fn sums_over_many_pixels() {
     let regions = RegionMap { width_px, height_px, n_regions: 1, region_of_pixel: vec![0; n_px] };
     let cap = 0.999;
     let weights = [0.7, 0.3 * cap, 0.3 * (1.0 - cap) * 0.01].map(|weight| weight * n_px as f64);
-    for Backend { name, rasterizer, bound_factor, keeps_order, .. } in backends() {
+    for Backend { name, rasterizer, bound_factor, keeps_order, is_software_gpu, .. } in backends() {
+        if *is_software_gpu && !is_nightly() {
+            println!("left to the nightly checks: {name}");
+            continue;
+        }
         let found = rasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
         if !keeps_order {
             // Wider than the squares that f32 holds.

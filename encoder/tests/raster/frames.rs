@@ -9,6 +9,8 @@ use slag_encoder::check::{
 use slag_encoder::ingest::load_image;
 use slag_encoder::raster::{CpuRasterizer, RasterView};
 
+use slag_test_support::nightly;
+
 use super::fixtures::{needs_shared, shared};
 
 struct House {
@@ -55,6 +57,7 @@ impl House {
     }
 }
 
+#[nightly("checks the house eight times")]
 #[needs_shared]
 #[test]
 fn moved_splats_are_brought_back() {

@@ -2,7 +2,8 @@
 //!
 //! Some tests use scenes and models that are too large for the repository. They lie in `../shared`, or in the folder
 //! that `SLAG_SHARED` names. Mark such a test with [`needs_shared`]: where the data is absent, `cargo test` lists the
-//! test as ignored; in CI it runs and fails.
+//! test as ignored; in CI it runs and fails. Tests that take minutes and guard against rare faults are marked with
+//! [`nightly`].
 
 mod damage;
 mod loop_disk;
@@ -13,7 +14,17 @@ use std::path::{Path, PathBuf};
 pub use damage::damaged;
 pub use loop_disk::{BLOCK_BYTES, LoopDisk};
 pub use memory::{CountingAllocator, Taken, memory_of};
-pub use slag_test_needs::{needs_loop_disk, needs_shared};
+pub use slag_test_needs::{needs_loop_disk, needs_shared, nightly};
+
+/// Returns how often a test tries: `few` times, or `many` in the nightly checks.
+pub fn trials<T>(few: T, many: T) -> T {
+    if is_nightly() { many } else { few }
+}
+
+/// Returns whether these are the nightly checks.
+pub fn is_nightly() -> bool {
+    std::env::var_os("SLAG_NIGHTLY").is_some()
+}
 
 /// Returns the root of the workspace.
 pub fn workspace_root() -> PathBuf {

@@ -1,6 +1,6 @@
-//! Attributes that ignore a test where the machine lacks what it needs.
+//! Attributes that ignore a test: where the machine lacks what it needs, or outside the nightly checks.
 //!
-//! A macro of its own rather than a `cfg` from build scripts: a build script that watches a folder that does not exist
+//! Macros of their own rather than a `cfg` from build scripts: a build script that watches a folder that does not exist
 //! runs at every build, and each crate's library would be compiled again with it.
 
 use std::path::{Path, PathBuf};
@@ -13,17 +13,30 @@ use proc_macro::TokenStream;
 /// test.
 #[proc_macro_attribute]
 pub fn needs_shared(_: TokenStream, test: TokenStream) -> TokenStream {
-    if !test.to_string().contains("#[test]") {
-        return parsed("compile_error!(\"`needs_shared` stands above `#[test]`\");");
-    }
-    // Tells the compiler that the result depends on these variables.
-    let mut marked = parsed(
-        "const _: (Option<&str>, Option<&str>) = (option_env!(\"CI\"), option_env!(\"SLAG_SHARED\"));",
-    );
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..");
     let folder = std::env::var_os("SLAG_SHARED").map_or_else(|| root.join("../shared"), PathBuf::from);
-    if !folder.is_dir() && std::env::var_os("CI").is_none() {
-        marked.extend(parsed("#[ignore = \"needs the test data in ../shared\"]"));
+    let is_ignored = !folder.is_dir() && std::env::var_os("CI").is_none();
+    marked(test, &["CI", "SLAG_SHARED"], is_ignored.then_some("needs the test data in ../shared"))
+}
+
+/// Leaves a test to `.ci/nightly`, which sets `SLAG_NIGHTLY`. Stands above `#[test]`; the argument says why.
+#[proc_macro_attribute]
+pub fn nightly(why: TokenStream, test: TokenStream) -> TokenStream {
+    let reason = format!("nightly: {}", why.to_string().trim_matches('"'));
+    marked(test, &["SLAG_NIGHTLY"], std::env::var_os("SLAG_NIGHTLY").is_none().then_some(&reason))
+}
+
+/// `variables`: what the mark depends on, so that the compiler looks again when one changes.
+fn marked(test: TokenStream, variables: &[&str], reason: Option<&str>) -> TokenStream {
+    let code = test.to_string();
+    if !code.contains("#[test]") {
+        return parsed("compile_error!(\"this attribute stands above `#[test]`\");");
+    }
+    let looked_at = variables.iter().map(|name| format!("option_env!({name:?}),")).collect::<String>();
+    let mut marked = parsed(&format!("const _: &[Option<&str>] = &[{looked_at}];"));
+    // Another of these attributes may have marked it.
+    if let Some(reason) = reason.filter(|_| !code.contains("#[ignore")) {
+        marked.extend(parsed(&format!("#[ignore = {reason:?}]")));
     }
     marked.extend(test);
     marked
@@ -37,12 +50,7 @@ pub fn needs_loop_disk(_: TokenStream, test: TokenStream) -> TokenStream {
     let has = |name: &str| ["/sbin", "/usr/sbin"].iter().any(|dir| Path::new(dir).join(name).exists());
     let is_possible =
         is_root && has("mkfs.ext2") && has("debugfs") && Path::new("/dev/loop-control").exists();
-    let mut marked = match is_possible {
-        true => TokenStream::new(),
-        false => parsed("#[ignore = \"needs root, loop devices and e2fsprogs\"]"),
-    };
-    marked.extend(test);
-    marked
+    marked(test, &[], (!is_possible).then_some("needs root, loop devices and e2fsprogs"))
 }
 
 fn parsed(code: &str) -> TokenStream {
