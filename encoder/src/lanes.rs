@@ -72,16 +72,6 @@ impl<T> Lanes<T> {
         self.state().gpus.iter().map(|gpu| gpu.n_lanes).sum()
     }
 
-    /// Returns whether there are no lanes.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Takes a lane, if one is free.
-    pub fn try_take(&self) -> Option<Lane<'_, T>> {
-        self.take_of(&mut self.state())
-    }
-
     /// Takes a lane, and waits for one where none is free. There must be one.
     pub fn take(&self) -> Lane<'_, T> {
         let mut state = self.state();
@@ -114,7 +104,6 @@ impl<T> Lanes<T> {
 }
 
 impl<T> Lane<'_, T> {
-    /// Returns the number of its GPU.
     pub fn gpu(&self) -> u32 {
         self.lanes.state().gpus[self.gpu].number
     }
@@ -158,7 +147,7 @@ mod tests {
         assert_eq!(lanes.len(), 4);
         let mut held: Vec<_> = (0..4).map(|_| lanes.take()).collect();
         assert_eq!(held.iter().map(Lane::gpu).collect::<Vec<_>>(), [4, 7, 4, 7]);
-        assert!(lanes.try_take().is_none());
+        assert!(lanes.take_of(&mut lanes.state()).is_none());
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| lanes.take().gpu());
             held.remove(1);

@@ -18,7 +18,6 @@ pub trait Progress: Sync {
     /// Tells that a photo has masks. `draw` draws them over the photo, reduced; it takes milliseconds, so only receivers that
     /// show the picture call it.
     fn segmented(&self, _view: &str, _n_masks: usize, _draw: &dyn Fn() -> RgbImage) {}
-    /// Tells that a view is left out.
     fn left_out(&self, _view: &str, _reason: &str) {}
     /// Tells the things that were found.
     fn objects(&self, _objects: &mut dyn Iterator<Item = FoundObject>) {}
@@ -33,7 +32,6 @@ pub struct FoundObject {
     pub position_m: DVec3,
     /// Its box.
     pub bounds: Aabb,
-    /// Its Gaussians.
     pub n_gaussians: u32,
     /// Masks that show it.
     pub n_masks: u32,

@@ -13,25 +13,28 @@ use std::fmt;
 pub use process::{give_back, held_bytes, peak_bytes};
 
 /// The steps that hold memory one after the other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
     /// From the first view to the end.
     Always,
     /// While views are worked on.
     Views,
+    /// While superpoints are found.
+    Superpoints,
     /// While objects are found.
     Objects,
-    /// While masks and superpoints are weighed.
+    /// While Gaussians share evidence.
     Refine,
     /// While cells become shards.
     Cells,
 }
 
+const PHASES: [Phase; 5] = [Phase::Views, Phase::Superpoints, Phase::Objects, Phase::Refine, Phase::Cells];
+
 /// Memory set aside for one purpose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reservation {
-    /// The purpose.
     pub purpose: &'static str,
     /// Bytes, at most.
     pub len_bytes: u64,
@@ -41,7 +44,7 @@ pub struct Reservation {
 }
 
 /// The most memory that a run is expected to take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct PlannedPeak {
     /// Bytes of the whole process.
     pub len_bytes: u64,
@@ -128,8 +131,7 @@ impl MemoryPlan {
         let of_phase = |phase: Phase| {
             self.of_phase(phase).fold(held_bytes, |sum, r| sum.saturating_add(r.expected_bytes))
         };
-        let phases = [Phase::Views, Phase::Objects, Phase::Refine, Phase::Cells];
-        let phase = phases.into_iter().max_by_key(|phase| of_phase(*phase)).unwrap_or(Phase::Always);
+        let phase = PHASES.into_iter().max_by_key(|phase| of_phase(*phase)).unwrap_or(Phase::Always);
         PlannedPeak { len_bytes: of_phase(phase), phase }
     }
 
@@ -157,8 +159,7 @@ impl MemoryPlan {
     /// # Errors
     /// [`MemoryError`] if `contributions_bytes` do not fit beside the reservations of some phase.
     pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
-        let phases = [Phase::Views, Phase::Objects, Phase::Refine, Phase::Cells];
-        let phases = &phases[usize::from(!self.is_before_views)..];
+        let phases = &PHASES[usize::from(!self.is_before_views)..];
         let most = phases.iter().copied().max_by_key(|phase| self.reserved_bytes(*phase));
         let most = most.unwrap_or(Phase::Always);
         let needed_bytes = self.reserved_bytes(most).saturating_add(contributions_bytes);

@@ -218,7 +218,11 @@ fn write_entries(n_loaded: u32, n_slots: u32, thread: u32) {
     }
     workgroupBarrier();
     if thread == 0u {
-        first_entry = atomicAdd(&counters[COUNTER_ENTRIES], atomicLoad(&n_found));
+        // Counts stop far above every capacity, so that they cannot wrap: the groups that run at once add less than the rest.
+        first_entry = MAX_CAPACITY;
+        if atomicLoad(&counters[COUNTER_ENTRIES]) <= MAX_CAPACITY {
+            first_entry = atomicAdd(&counters[COUNTER_ENTRIES], atomicLoad(&n_found));
+        }
         atomicStore(&n_found, 0u);
     }
     at += workgroupUniformLoad(&first_entry);

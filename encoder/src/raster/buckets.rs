@@ -5,31 +5,39 @@ use rayon::prelude::*;
 
 /// Items grouped in buckets, in one contiguous array.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Buckets<T> {
+pub(super) struct Buckets<T> {
     /// Bucket `b` contains `items[starts[b]..starts[b + 1]]`; the length is the number of buckets plus one.
-    starts: Vec<u32>,
+    starts: Vec<usize>,
     items: Vec<T>,
 }
 
+/// Returns where each bucket starts, and where the last one ends. `spans`: the buckets `first..=last` of each item.
+fn starts_of(n_buckets: usize, spans: impl Iterator<Item = (u32, u32)>) -> Vec<usize> {
+    // How many items begin and end at each bucket; of large ones there may be more than 2^32 in all.
+    let (mut begin, mut end) = (vec![0_usize; n_buckets + 1], vec![0_usize; n_buckets + 1]);
+    for (first, last) in spans {
+        begin[first as usize] += 1;
+        end[last as usize + 1] += 1;
+    }
+    let (mut n_in_bucket, mut n_before) = (0, 0);
+    let starts = begin.iter().zip(&end).map(|(begin, end)| {
+        let start = n_before;
+        n_in_bucket = n_in_bucket + begin - end;
+        n_before += n_in_bucket;
+        start
+    });
+    starts.collect()
+}
+
 impl<T: Copy + Zeroable> Buckets<T> {
-    /// Copies each item to its buckets `first..=last`, in order. The copies must be fewer than 2^32.
-    pub fn new(n_buckets: usize, spanned: &[(T, (u32, u32))]) -> Self {
-        let mut starts = vec![0_u32; n_buckets + 1];
-        for &(_, (first, last)) in spanned {
-            for start in &mut starts[first as usize + 1..=last as usize + 1] {
-                *start += 1;
-            }
-        }
-        let mut n_items = 0;
-        for start in &mut starts {
-            n_items += *start;
-            *start = n_items;
-        }
-        let mut items = bytemuck::zeroed_vec(n_items as usize);
+    /// Copies each item to its buckets `first..=last`, in order.
+    pub(super) fn new(n_buckets: usize, spanned: &[(T, (u32, u32))]) -> Self {
+        let starts = starts_of(n_buckets, spanned.iter().map(|(_, span)| *span));
+        let mut items = bytemuck::zeroed_vec(starts[n_buckets]);
         let mut next = starts.clone();
         for &(item, (first, last)) in spanned {
             for at in &mut next[first as usize..=last as usize] {
-                items[*at as usize] = item;
+                items[*at] = item;
                 *at += 1;
             }
         }
@@ -39,38 +47,38 @@ impl<T: Copy + Zeroable> Buckets<T> {
 
 impl<T> Buckets<T> {
     /// Returns the items of a bucket.
-    pub fn of(&self, bucket: usize) -> &[T] {
-        &self.items[self.starts[bucket] as usize..self.starts[bucket + 1] as usize]
+    pub(super) fn of(&self, bucket: usize) -> &[T] {
+        &self.items[self.starts[bucket]..self.starts[bucket + 1]]
     }
 
     /// Iterates over the items of each bucket.
-    pub fn iter(&self) -> impl Iterator<Item = &[T]> {
-        self.starts.windows(2).map(|ends| &self.items[ends[0] as usize..ends[1] as usize])
+    pub(super) fn iter(&self) -> impl Iterator<Item = &[T]> {
+        self.starts.windows(2).map(|ends| &self.items[ends[0]..ends[1]])
     }
 
     /// Iterates over the items of each bucket, mutably.
-    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
         let mut rest = self.items.as_mut_slice();
         self.starts.windows(2).map(move |ends| {
-            let (bucket, after) = std::mem::take(&mut rest).split_at_mut((ends[1] - ends[0]) as usize);
+            let (bucket, after) = std::mem::take(&mut rest).split_at_mut(ends[1] - ends[0]);
             rest = after;
             bucket
         })
     }
 
     /// Returns the total number of items in all buckets.
-    pub fn n_items(&self) -> usize {
+    pub(super) fn n_items(&self) -> usize {
         self.items.len()
     }
 
     /// Converts each item.
-    pub fn map<U>(self, f: impl FnMut(T) -> U) -> Buckets<U> {
+    pub(super) fn map<U>(self, f: impl FnMut(T) -> U) -> Buckets<U> {
         Buckets { starts: self.starts, items: self.items.into_iter().map(f).collect() }
     }
 }
 
 /// Concatenates parts. All threads copy, so that page faults are spread over them.
-pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
+pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
     let mut joined: Vec<T> = bytemuck::zeroed_vec(parts.iter().map(Vec::len).sum());
     let mut rest = joined.as_mut_slice();
     let mut places = Vec::with_capacity(parts.len());
@@ -81,4 +89,20 @@ pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
     }
     places.into_par_iter().for_each(|(place, part)| place.copy_from_slice(part));
     joined
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand; then more than 2^32 items, of which only the places are computed.
+    #[test]
+    fn buckets_start_where_those_before_end() {
+        let spans = [(0, 1), (1, 3), (3, 3)];
+        assert_eq!(starts_of(5, spans.into_iter()), [0, 1, 3, 4, 6, 6]);
+        let wide = std::iter::repeat_n((0, (1 << 16) - 1), 70_000);
+        let starts = starts_of(1 << 16, wide);
+        assert!(starts.iter().enumerate().all(|(bucket, start)| *start == bucket * 70_000));
+        assert!(starts[1 << 16] > u32::MAX as usize);
+    }
 }

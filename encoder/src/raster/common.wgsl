@@ -135,6 +135,12 @@ struct Entry {
 // Prefix sum within a workgroup, which gives every stage the positions of its output.
 var<workgroup> block_values: array<u32, WORKGROUP_SIZE>;
 
+// Adds counts. Beyond the largest number they stay there: no buffer holds so many, and a count that wraps would look as if it
+// fitted.
+fn saturating_sum(a: u32, b: u32) -> u32 {
+    return select(a + b, 0xffffffffu, b > 0xffffffffu - a);
+}
+
 // Returns the sum of the values of all lower threads (Hillis and Steele 1986).
 fn block_scan(value: u32, thread: u32) -> u32 {
     block_values[thread] = value;
@@ -142,13 +148,13 @@ fn block_scan(value: u32, thread: u32) -> u32 {
     for (var step = 1u; step < WORKGROUP_SIZE; step *= 2u) {
         var sum = block_values[thread];
         if thread >= step {
-            sum += block_values[thread - step];
+            sum = saturating_sum(sum, block_values[thread - step]);
         }
         workgroupBarrier();
         block_values[thread] = sum;
         workgroupBarrier();
     }
-    let before = block_values[thread] - value;
+    let before = select(0u, block_values[max(thread, 1u) - 1u], thread > 0u);
     workgroupBarrier();
     return before;
 }

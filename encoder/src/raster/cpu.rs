@@ -22,6 +22,10 @@ use crate::masks::RegionMap;
 pub struct CpuRasterizer;
 
 impl Rasterizer for CpuRasterizer {
+    fn identity(&self) -> String {
+        "cpu".into()
+    }
+
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         CpuWith(InstructionSet::widest()).load(scene)
     }
@@ -32,6 +36,10 @@ impl Rasterizer for CpuRasterizer {
 pub struct CpuWith(pub InstructionSet);
 
 impl Rasterizer for CpuWith {
+    fn identity(&self) -> String {
+        CpuRasterizer.identity()
+    }
+
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         check_scene(scene)?;
         Ok(Box::new(CpuScene { prepared: Prepared::new(scene), instructions: self.0 }))

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
-use std::sync::{Condvar, Mutex, PoisonError};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use slag_common::Gaussians;
 
@@ -24,7 +24,6 @@ pub enum DeviceChoice {
     Auto,
     /// All GPUs, or an error. A software adapter is used if there is no other.
     Gpu,
-    /// The CPU.
     Cpu,
     /// The adapters with these numbers in the list.
     Adapters(Vec<usize>),
@@ -70,21 +69,17 @@ impl fmt::Display for DeviceChoice {
 /// Reason why no device can be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
-    /// There is no GPU.
     #[error(
         "no GPU found; install its Vulkan driver (Debian: libvulkan1 and the vendor's driver, or \
          mesa-vulkan-drivers), or use --device cpu"
     )]
     NoAdapter,
-    /// There is no adapter with this number.
     #[error("adapter {number} does not exist; `slag-encoder devices` lists the {n_adapters} adapters")]
     NoSuchAdapter {
         /// The chosen number.
         number: usize,
-        /// Number of adapters.
         n_adapters: usize,
     },
-    /// None of the chosen adapters can be opened.
     #[error(transparent)]
     Unfit(#[from] RasterError),
 }
@@ -161,7 +156,6 @@ impl Devices {
         Self { gpus, views_in_flight: views_in_flight.max(1) }
     }
 
-    /// Returns the GPUs.
     pub fn gpus(&self) -> &[GpuRasterizer] {
         &self.gpus
     }
@@ -176,6 +170,12 @@ impl Devices {
 }
 
 impl Rasterizer for Devices {
+    /// Views go to any of the GPUs: another set of kinds mixes other bits.
+    fn identity(&self) -> String {
+        let kinds: BTreeSet<String> = self.gpus.iter().map(Rasterizer::identity).collect();
+        if kinds.is_empty() { CpuRasterizer.identity() } else { Vec::from_iter(kinds).join(", ") }
+    }
+
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         let cpu = CpuRasterizer.load(scene)?;
         let mut gpus = Vec::new();
@@ -222,16 +222,20 @@ struct DeviceSlots {
     is_usable: Vec<bool>,
 }
 
-impl SharedScene<'_> {
+impl<'s> SharedScene<'s> {
+    fn slots(&self) -> MutexGuard<'_, DeviceSlots> {
+        self.slots.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Takes a slot of the GPU with the most free slots, and waits for one if necessary; `None` if no GPU is usable.
-    fn take(&self) -> Option<usize> {
-        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+    fn take(&self) -> Option<Slot<'_, 's>> {
+        let mut slots = self.slots();
         while slots.is_usable.contains(&true) {
             let usable = (0..self.gpus.len()).filter(|gpu| slots.is_usable[*gpu] && slots.n_free[*gpu] > 0);
             // The first of equals: `max_by_key` returns the last.
             if let Some(gpu) = usable.rev().max_by_key(|gpu| slots.n_free[*gpu]) {
                 slots.n_free[gpu] -= 1;
-                return Some(gpu);
+                return Some(Slot { scene: self, gpu });
             }
             slots = self.freed.wait(slots).unwrap_or_else(PoisonError::into_inner);
         }
@@ -240,25 +244,9 @@ impl SharedScene<'_> {
 
     /// Runs work on the next free GPU; if it fails, on another GPU, and finally on the CPU.
     fn run<T>(&self, work: impl Fn(&dyn LoadedScene) -> Result<T, RasterError>) -> Result<T, RasterError> {
-        while let Some(gpu) = self.take() {
-            let result = work(self.gpus[gpu].as_ref());
-            let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
-            let failed = matches!(result, Err(RasterError::Device { .. }));
-            if failed && slots.is_usable[gpu] {
-                slots.is_usable[gpu] = false;
-                if let Err(error) = &result {
-                    let rest = slots.is_usable.iter().filter(|usable| **usable).count();
-                    tracing::warn!("ignoring a GPU: {error}; {rest} other GPUs remain");
-                }
-                // Waiting threads must see that there may be no usable GPU.
-                self.freed.notify_all();
-            } else if !failed {
-                slots.n_free[gpu] += 1;
-                self.freed.notify_one();
-            }
-            drop(slots);
-            match result {
-                Err(RasterError::Device { .. }) => {}
+        while let Some(slot) = self.take() {
+            match work(self.gpus[slot.gpu].as_ref()) {
+                Err(error @ RasterError::Device { .. }) => slot.give_up(&error),
                 Err(error @ RasterError::DeviceCapacity { .. }) => {
                     tracing::warn!("rasterising a view on the CPU: {error}");
                     return work(self.cpu.as_ref());
@@ -267,6 +255,32 @@ impl SharedScene<'_> {
             }
         }
         work(self.cpu.as_ref())
+    }
+}
+
+/// A slot of a GPU, free again when this is dropped, whatever became of the view.
+struct Slot<'a, 's> {
+    scene: &'a SharedScene<'s>,
+    gpu: usize,
+}
+
+impl Slot<'_, '_> {
+    /// Leaves the GPU out from now on.
+    fn give_up(self, error: &RasterError) {
+        let mut slots = self.scene.slots();
+        if std::mem::replace(&mut slots.is_usable[self.gpu], false) {
+            let rest = slots.is_usable.iter().filter(|usable| **usable).count();
+            tracing::warn!("ignoring a GPU: {error}; {rest} other GPUs remain");
+            // Waiting threads must see that there may be no usable GPU.
+            self.scene.freed.notify_all();
+        }
+    }
+}
+
+impl Drop for Slot<'_, '_> {
+    fn drop(&mut self) {
+        self.scene.slots().n_free[self.gpu] += 1;
+        self.scene.freed.notify_one();
     }
 }
 
@@ -287,5 +301,28 @@ impl LoadedScene for SharedScene<'_> {
 
     fn gpus(&self) -> Option<GpuSlots> {
         Some(GpuSlots { n_gpus: self.gpus.len(), views_in_flight: self.views_in_flight })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// With one slot, the view after one that panicked waits for ever unless the slot is given back.
+    #[test]
+    fn a_panic_gives_its_slot_back() {
+        let gaussians = Gaussians::default();
+        let cpu = || CpuRasterizer.load(&gaussians).expect("loads");
+        let scene = SharedScene {
+            gpus: vec![cpu()],
+            views_in_flight: 1,
+            cpu: cpu(),
+            slots: Mutex::new(DeviceSlots { n_free: vec![1], is_usable: vec![true] }),
+            freed: Condvar::new(),
+        };
+        let panics = || scene.run(|_| -> Result<(), RasterError> { panic!("a broken view") });
+        std::panic::catch_unwind(std::panic::AssertUnwindSafe(panics)).expect_err("it panics");
+        assert_eq!(scene.slots().n_free, [1]);
+        scene.run(|_| Ok(())).expect("goes on");
     }
 }

@@ -14,9 +14,7 @@ use super::weights::{ViewCounters, WeightKind};
 /// The picture of a scene in one view; all arrays are row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Drawing {
-    /// Width, pixels.
     pub width_px: u32,
-    /// Height, pixels.
     pub height_px: u32,
     /// Colour over the background, `[height * width][3]`; at least 0, not limited to 1.
     pub rgb: Vec<f32>,

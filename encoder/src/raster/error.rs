@@ -5,7 +5,6 @@ use super::constants::MAX_IMAGE_PX;
 /// Reason why a view cannot be rasterised.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum RasterError {
-    /// The columns of the scene differ in length.
     #[error("scene column {column} has {found} values, expected {expected}; read the scene again")]
     ColumnLength {
         /// Field of [`slag_common::Gaussians`].
@@ -15,33 +14,23 @@ pub enum RasterError {
         /// Actual number of values.
         found: usize,
     },
-    /// The scene has too many Gaussians to index.
     #[error("the scene has {found} Gaussians, expected at most {max}; split it into parts", max = u32::MAX)]
     SceneSize {
         /// Number of Gaussians.
         found: usize,
     },
-    /// The spherical harmonics have an unsupported degree.
     #[error("spherical harmonics of degree {found}, expected at most 3; convert the scene")]
     ShDegree {
         /// The scene's degree.
         found: u8,
     },
-    /// The image has no pixels, or too many.
     #[error(
         "image of {width_px} x {height_px} px, expected 1 to {max} px in total; choose another raster width",
         max = MAX_IMAGE_PX
     )]
-    ImageSize {
-        /// Width, pixels.
-        width_px: u32,
-        /// Height, pixels.
-        height_px: u32,
-    },
-    /// The camera has lens distortion.
+    ImageSize { width_px: u32, height_px: u32 },
     #[error("the camera has lens distortion; undistort the image and use its pinhole camera")]
     Distorted,
-    /// The focal lengths or the principal point are invalid.
     #[error(
         "invalid camera: focal lengths {focal_px:?} px, principal point {centre_px:?} px; correct the intrinsics"
     )]
@@ -51,13 +40,11 @@ pub enum RasterError {
         /// Principal point x, y.
         centre_px: [f64; 2],
     },
-    /// The pose is not a rotation with a finite translation.
     #[error("the pose is not rigid (deviation {off:e}); correct the rotation of the view")]
     Pose {
         /// Largest entry of `R'R - I`; infinite for a reflection, NaN if the pose is not finite.
         off: f64,
     },
-    /// The region map and the view differ in size.
     #[error(
         "the region map has {} x {} px ({found_values} values) but the view {} x {} px; \
          rasterise at the resolution of the masks",
@@ -71,15 +58,12 @@ pub enum RasterError {
         /// Number of values in the map.
         found_values: usize,
     },
-    /// A GPU fails; another backend may succeed.
     #[error("{adapter}: {what}; use --device cpu to work without it")]
     Device {
         /// Name of the device.
         adapter: String,
-        /// The error.
         what: String,
     },
-    /// A view does not fit a GPU; other views may.
     #[error("{adapter}: {what}; rasterise at a smaller width or use --device cpu")]
     DeviceCapacity {
         /// Name of the device.
@@ -87,7 +71,6 @@ pub enum RasterError {
         /// The missing resource.
         what: String,
     },
-    /// A pixel has the number of a region that does not exist.
     #[error(
         "pixel {pixel} has region {found}, but the map has {n_regions} regions; create the region map again"
     )]
@@ -96,7 +79,6 @@ pub enum RasterError {
         pixel: usize,
         /// The region of the pixel.
         found: u32,
-        /// Number of regions.
         n_regions: u32,
     },
 }

@@ -5,32 +5,32 @@
 //!
 //! | stage | job |
 //! |---|---|
-//! | [`project`] | Gaussian to ellipse on the screen, in `f64` relative to the camera |
-//! | [`bin`] | depth order, and the Gaussians of each 16x16 tile in this order |
-//! | [`blend`] | alpha and transmittance per pixel, in [`simd`] vectors |
-//! | [`contributions`] | weights summed per (Gaussian, region) |
-//! | [`draw`] | colour, depth and coverage per pixel |
-//! | [`sh`] | colour of a Gaussian seen from the camera |
+//! | `project` | Gaussian to ellipse on the screen, in `f64` relative to the camera |
+//! | `bin` | depth order, and the Gaussians of each 16x16 tile in this order |
+//! | `blend` | alpha and transmittance per pixel, in `simd` vectors |
+//! | `contributions` | weights summed per (Gaussian, region) |
+//! | `draw` | colour, depth and coverage per pixel |
+//! | `sh` | colour of a Gaussian seen from the camera |
 
-pub mod adapter;
-pub mod bin;
-pub mod blend;
-pub mod buckets;
+mod adapter;
+mod bin;
+mod blend;
+mod buckets;
 pub mod constants;
-pub mod contributions;
+mod contributions;
 mod cpu;
 pub mod devices;
-pub mod draw;
+mod draw;
 mod error;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(not(feature = "gpu"))]
 #[path = "no_gpu.rs"]
 pub mod gpu;
-pub mod project;
+mod project;
 mod rasterizer;
-pub mod sh;
-pub mod simd;
+mod sh;
+mod simd;
 mod validate;
 mod view;
 mod weights;
@@ -38,6 +38,7 @@ mod weights;
 pub use cpu::{CpuRasterizer, CpuWith};
 pub use draw::Drawing;
 pub use error::RasterError;
+pub(crate) use project::Prepared as PreparedScene;
 pub use rasterizer::{GpuSlots, LoadedScene, Rasterizer};
 pub use view::RasterView;
 pub use weights::{RegionWeight, StageTime, ViewCounters, ViewWeights, WeightKind};

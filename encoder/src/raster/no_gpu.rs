@@ -8,7 +8,6 @@ pub use super::adapter::{AdapterReport, GpuOptions, Precision};
 use super::error::RasterError;
 use super::rasterizer::{LoadedScene, Rasterizer};
 
-/// An adapter; there is none.
 pub struct Adapter {
     /// Its description.
     pub report: AdapterReport,
@@ -53,6 +52,10 @@ impl GpuRasterizer {
 }
 
 impl Rasterizer for GpuRasterizer {
+    fn identity(&self) -> String {
+        match self.none {}
+    }
+
     fn load<'s>(&self, _: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         match self.none {}
     }

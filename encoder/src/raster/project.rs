@@ -24,7 +24,6 @@ pub struct ScreenGaussian {
     pub gaussian: u32,
     /// Camera z, world units.
     pub depth: f32,
-    /// Opacity.
     pub opacity: f32,
     /// Largest `u^2 + v^2` at which alpha may count.
     pub reach2: f32,

@@ -11,7 +11,6 @@ use crate::masks::RegionMap;
 /// The GPUs that rasterise a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpuSlots {
-    /// Number of GPUs.
     pub n_gpus: usize,
     /// Views that each of them works on at once.
     pub views_in_flight: usize,
@@ -26,6 +25,9 @@ impl GpuSlots {
 
 /// A backend that rasterises scenes.
 pub trait Rasterizer: Send + Sync {
+    /// Returns a text that differs where contributions differ in their last bits.
+    fn identity(&self) -> String;
+
     /// Prepares a scene: validates it and, on a device with its own memory, uploads it.
     ///
     /// # Errors
@@ -33,9 +35,6 @@ pub trait Rasterizer: Send + Sync {
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError>;
 
     /// Rasterises one view of a scene; see [`LoadedScene::weights`].
-    ///
-    /// # Errors
-    /// Those of [`Self::load`] and [`LoadedScene::weights`].
     fn weights(
         &self,
         scene: &Gaussians,
@@ -47,9 +46,6 @@ pub trait Rasterizer: Send + Sync {
     }
 
     /// Draws one view of a scene; see [`LoadedScene::draw`].
-    ///
-    /// # Errors
-    /// Those of [`Self::load`] and [`LoadedScene::draw`].
     fn draw(
         &self,
         scene: &Gaussians,
@@ -80,9 +76,6 @@ pub trait LoadedScene: Send + Sync {
 
     /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure them.
     /// Measuring may slow the view down.
-    ///
-    /// # Errors
-    /// Those of [`Self::weights`].
     fn weights_timed(
         &self,
         view: &RasterView,
@@ -93,9 +86,6 @@ pub trait LoadedScene: Send + Sync {
     }
 
     /// Returns what [`Self::weights_timed`] returns; where no times are wanted, there may be none.
-    ///
-    /// # Errors
-    /// Those of [`Self::weights`].
     fn weights_and_times(
         &self,
         view: &RasterView,

@@ -41,18 +41,18 @@ fn scan(@builtin(local_invocation_index) thread: u32) {
             let at = start + thread * PER_THREAD + i;
             own[i] = sum;
             if at < n {
-                sum += values[at];
+                sum = saturating_sum(sum, values[at]);
             }
         }
-        let before = carry + block_scan(sum, thread);
+        let before = saturating_sum(carry, block_scan(sum, thread));
         for (var i = 0u; i < PER_THREAD; i++) {
             let at = start + thread * PER_THREAD + i;
             if at < n {
-                values[at] = before + own[i];
+                values[at] = saturating_sum(before, own[i]);
             }
         }
         if thread == WORKGROUP_SIZE - 1u {
-            length = before + sum;
+            length = saturating_sum(before, sum);
         }
         carry = workgroupUniformLoad(&length);
     }
@@ -64,7 +64,7 @@ fn scan(@builtin(local_invocation_index) thread: u32) {
             let block = select(WORKGROUP_SIZE, SORT_BLOCK, kind == 1u);
             let at = (job.total * 2u + kind) * 4u;
             // Kernels use a stride for items beyond the largest dispatch.
-            dispatches[at] = min((carry + block - 1u) / block, MAX_DISPATCH);
+            dispatches[at] = min(carry / block + u32(carry % block > 0u), MAX_DISPATCH);
             dispatches[at + 1u] = 1u;
             dispatches[at + 2u] = 1u;
         }

@@ -339,6 +339,10 @@ impl LoadedScene for CountingScene<'_> {
 struct Counted(&'static Counting);
 
 impl Rasterizer for Counted {
+    fn identity(&self) -> String {
+        CpuRasterizer.identity()
+    }
+
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         self.0.loads.fetch_add(1, Ordering::Relaxed);
         Ok(Box::new(CountingScene(CpuRasterizer.load(scene)?, &self.0.draws)))

@@ -8,9 +8,7 @@ use crate::raster::error::RasterError;
 
 /// A band of a view.
 pub struct Band<'a> {
-    /// The device.
     pub device: &'a Device,
-    /// The chunks of the scene.
     pub chunks: &'a [SceneChunk],
     /// Uploads the Gaussians of a chunk that is not on the device.
     pub upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
@@ -26,7 +24,6 @@ impl Band<'_> {
     }
 }
 
-/// Returns the number of tiles and pixels of a band.
 pub fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (u32, u32) {
     let tile = TILE_SIZE_PX as u32;
     let rows_px = (tile_rows[1] * tile).min(height_px) - tile_rows[0] * tile;

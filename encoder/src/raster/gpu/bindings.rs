@@ -4,7 +4,6 @@ use std::collections::HashMap;
 
 use super::device::Device;
 
-/// Returns the binding of a whole buffer.
 pub fn whole(buffer: &wgpu::Buffer) -> wgpu::BufferBinding<'_> {
     buffer.as_entire_buffer_binding()
 }

@@ -12,7 +12,6 @@ pub const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
 
 /// A chunk of the scene on the device.
 pub struct SceneChunk {
-    /// Number of Gaussians.
     pub n_gaussians: u32,
     /// The [`Chunk`] and the [`ScanJob`] of its blocks, [`JOB_STRIDE_BYTES`] apart.
     pub jobs: wgpu::Buffer,

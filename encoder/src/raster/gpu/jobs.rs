@@ -24,7 +24,6 @@ pub enum Scan {
     Heads,
 }
 
-/// The sort keys.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SortKey {
     /// Depth of a visible Gaussian.

@@ -23,7 +23,6 @@ pub struct SceneGaussian {
     pub mean_low: [f32; 3],
     /// See [`crate::raster::project::ScreenGaussian::reach2`].
     pub reach2: f32,
-    /// Rotation.
     pub rotation_wxyz: [f32; 4],
     /// Standard deviations, world units.
     pub scales: [f32; 3],
@@ -67,7 +66,6 @@ fn high_and_low(value: DVec3) -> ([f32; 3], [f32; 3]) {
 pub struct Chunk {
     /// Index of its first Gaussian in the scene.
     pub first_gaussian: u32,
-    /// Number of Gaussians.
     pub n_gaussians: u32,
 }
 
@@ -138,7 +136,6 @@ impl RegionSum {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct Background {
-    /// Colour.
     pub rgb: [f32; 3],
     /// Unused.
     pub padding: u32,

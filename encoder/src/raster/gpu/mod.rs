@@ -43,7 +43,7 @@ use buffers::{REGION_BYTES, Size};
 use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
 pub use device::{Adapter, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
-use shader::{Counter, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
+use shader::{Counter, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
 use workspace::{Counts, PIXEL_BYTES, Workspace};
 
 /// A backend on one GPU.
@@ -71,6 +71,11 @@ impl GpuRasterizer {
 }
 
 impl Rasterizer for GpuRasterizer {
+    fn identity(&self) -> String {
+        let AdapterReport { name, backend, precision, .. } = self.report();
+        format!("{name} {backend} {precision:?}")
+    }
+
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         check_scene(scene)?;
         Ok(Box::new(GpuScene::new(Arc::clone(&self.device), self.options, scene)?))
@@ -169,7 +174,7 @@ impl<'s> GpuScene<'s> {
 
     /// Returns the largest number of elements of this size in one binding.
     fn max_elements(&self, bytes: u64) -> u32 {
-        u32::try_from(self.max_binding_bytes / bytes).unwrap_or(u32::MAX)
+        (self.max_binding_bytes / bytes).min(u64::from(MAX_CAPACITY)) as u32
     }
 
     /// Returns the largest capacities that bindings allow.
@@ -239,10 +244,8 @@ impl<'s> GpuScene<'s> {
         px_bytes: u64,
         mut work: impl FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
     ) -> Result<ViewCounters, RasterError> {
-        let mut workspace = self.take_workspace();
-        let result = self.bands_of(&mut workspace, view, px_bytes, &mut work);
-        self.return_workspace(workspace);
-        result
+        let mut lent = LentWorkspace { scene: self, workspace: self.take_workspace() };
+        self.bands_of(&mut lent.workspace, view, px_bytes, &mut work)
     }
 
     fn bands_of(
@@ -330,6 +333,17 @@ impl<'s> GpuScene<'s> {
         Ok(counters)
     }
 
+    /// Refuses a view whose pixels are not told apart by the device's numbers.
+    fn check_size(&self, view: &RasterView) -> Result<(), RasterError> {
+        let size_px = view.intrinsics.width_px.max(view.intrinsics.height_px);
+        if self.device.report.precision == Precision::F64 || size_px <= MAX_SIZE_OF_F32_PX {
+            return Ok(());
+        }
+        let what =
+            format!("{size_px} px along a side, a device without f64 tells {MAX_SIZE_OF_F32_PX} apart");
+        Err(self.device.capacity_error(what))
+    }
+
     /// Uploads the colours of all Gaussians seen from a view.
     fn colours(&self, view: &RasterView) -> Result<wgpu::Buffer, RasterError> {
         let position_in_world = view.camera_from_world.inverse().translation;
@@ -369,6 +383,19 @@ fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     }))
 }
 
+/// A workspace, or its place, that goes back whatever becomes of the view; a panic may have left it half used.
+struct LentWorkspace<'a, 's> {
+    scene: &'a GpuScene<'s>,
+    workspace: Option<Workspace>,
+}
+
+impl Drop for LentWorkspace<'_, '_> {
+    fn drop(&mut self) {
+        let workspace = self.workspace.take().filter(|_| !std::thread::panicking());
+        self.scene.return_workspace(workspace);
+    }
+}
+
 /// The pixels of a band.
 struct Rows {
     /// Row-major range within the image.
@@ -377,6 +404,8 @@ struct Rows {
     is_whole: bool,
 }
 
+/// Longest side of a view that a device without f64 projects: centres of pixels are multiples of a half.
+const MAX_SIZE_OF_F32_PX: u32 = 1 << 23;
 /// Largest number of regions in a view; the next number stands for "no region".
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
@@ -389,6 +418,7 @@ impl LoadedScene for GpuScene<'_> {
         is_timed: bool,
     ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
         check_view(view)?;
+        self.check_size(view)?;
         check_regions(regions, &view.intrinsics)?;
         if regions.n_regions > MAX_REGIONS {
             let what = format!("the view has {} regions, expected at most {MAX_REGIONS}", regions.n_regions);
@@ -418,6 +448,7 @@ impl LoadedScene for GpuScene<'_> {
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
         check_view(view)?;
+        self.check_size(view)?;
         if self.chunks.is_empty() {
             return CpuRasterizer.load(self.scene)?.draw(view, background);
         }
@@ -448,6 +479,39 @@ impl LoadedScene for GpuScene<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A panic in one view gives its place to the next one, which would wait for ever otherwise.
+    #[test]
+    fn a_panic_gives_its_place_back() {
+        let Some(adapter) = adapters().into_iter().next() else {
+            println!("skipped: no GPU");
+            return;
+        };
+        let device = Arc::new(adapter.open(Precision::F32).expect("opens"));
+        let (gaussians, options) =
+            (Gaussians::default(), GpuOptions { views_in_flight: 1, ..GpuOptions::default() });
+        let scene = GpuScene::new(device, options, &gaussians).expect("loads");
+        let mut view = RasterView {
+            camera_from_world: glam::DAffine3::IDENTITY,
+            intrinsics: slag_common::Intrinsics {
+                width_px: 16,
+                height_px: 16,
+                focal_x_px: 16.0,
+                focal_y_px: 16.0,
+                centre_x_px: 8.0,
+                centre_y_px: 8.0,
+                distortion: slag_common::Distortion::None,
+            },
+        };
+        let panics = || scene.each_band(&view, REGION_BYTES, |_, _, _| panic!("a broken view"));
+        std::panic::catch_unwind(std::panic::AssertUnwindSafe(panics)).expect_err("it panics");
+        assert_eq!(scene.pool().n_made, 0);
+        scene.each_band(&view, REGION_BYTES, |_, _, _| Ok(bytemuck::Zeroable::zeroed())).expect("goes on");
+        assert_eq!(scene.pool().idle.len(), 1);
+        (view.intrinsics.width_px, view.intrinsics.height_px) = (MAX_SIZE_OF_F32_PX + 1, 1);
+        let refused = scene.draw(&view, [0.0; 3]).expect_err("too wide for f32").to_string();
+        assert!(refused.contains("8388608"), "{refused}");
+    }
 
     /// Three views, and memory for one of them: the places of two are given up, the last one is kept, and none is made anew.
     #[test]

@@ -23,6 +23,8 @@ pub const MAX_DISPATCH: u32 = 65_535;
 pub const SUM_FRACTION_BITS: u32 = 35;
 /// Bits of a region number: two share a word, and so do a region and a pixel of its tile.
 pub const REGION_BITS: u32 = 16;
+/// Most items of a buffer: counts above it do not fit, and stay far below 2^32.
+pub const MAX_CAPACITY: u32 = 1 << 31;
 /// Stands for "no counter".
 pub const NONE: u32 = u32::MAX;
 
@@ -109,6 +111,7 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         ("SORT_BLOCK", SORT_BLOCK),
         ("RADIX", RADIX),
         ("MAX_DISPATCH", MAX_DISPATCH),
+        ("MAX_CAPACITY", MAX_CAPACITY),
         ("N_COUNTERS", Counter::ALL.len() as u32),
         ("NONE", NONE),
         ("REGION_BITS", REGION_BITS),

@@ -304,6 +304,41 @@ mod tests {
     use crate::raster::gpu::device::adapters;
     use crate::raster::gpu::jobs::Scan;
 
+    /// 40 blocks of 2^27 pairs each, more than 2^32: the total stays at the largest number, which no buffer holds.
+    #[test]
+    fn counts_that_would_wrap_stay_at_the_largest() {
+        let Some(adapter) = adapters().into_iter().next() else {
+            println!("skipped: no GPU");
+            return;
+        };
+        let device = adapter.open(adapter.report.precision).expect("opens");
+        let capacities = Capacities { visible: 10_000, pairs: 1, entries: 1 };
+        let size = Size { capacities, n_tiles: 1, n_px: 1, n_chunk: 1 };
+        let mut workspace = Workspace::new(&device, size).expect("there is memory");
+        for (of_block, expected) in [(1 << 20, 40 << 20), (1 << 27, u32::MAX)] {
+            let Buffers { counters, block_counts, .. } = &workspace.stages.buffers;
+            let mut counts: Counts = Zeroable::zeroed();
+            counts[Counter::Visible as usize] = 10_000;
+            device.queue.write_buffer(counters, 0, bytemuck::bytes_of(&counts));
+            device.queue.write_buffer(block_counts, 0, bytemuck::cast_slice(&[of_block; 40]));
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            workspace.stages.scan(&device, &mut pass, Scan::Pairs);
+            drop(pass);
+            let staging = device
+                .buffer("staging", COUNTERS_BYTES, Usage::MAP_READ | Usage::COPY_DST)
+                .expect("there is memory");
+            let counters = &workspace.stages.buffers.counters;
+            encoder.copy_buffer_to_buffer(counters, 0, &staging, 0, COUNTERS_BYTES);
+            let submission = device.queue.submit([encoder.finish()]);
+            staging.map_async(wgpu::MapMode::Read, .., |_| {});
+            device.wait(submission).expect("no error");
+            let bytes = staging.get_mapped_range(..).expect("mapped");
+            let found = bytemuck::cast_slice::<u8, u32>(&bytes)[Counter::Pairs as usize];
+            assert_eq!(found, expected, "{of_block} a block");
+        }
+    }
+
     /// Sorts entries by (member, region) on the device and on the host, at sizes around those of a workgroup and of a
     /// block. Half of the keys repeat, which reveals an unstable sort.
     #[test]
