@@ -59,21 +59,30 @@ pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError>
     check_dim(reader, query)?;
     let table = read_regions(reader)?;
     let region_scores = table.scores(query);
-    let manifest = reader.manifest();
-    let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
-    let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
-    for cell in &manifest.cells {
+    let mut scores = Scores::unknown(reader);
+    for cell in &reader.manifest().cells {
         let field = read_field(reader, cell.cell_id, cell.n_gaussians, table.len())?;
         let cosines = field.cosines(&region_scores);
-        for (k, index) in field.input_indices.iter().enumerate() {
-            if *index as usize >= n {
-                return Err(QueryError::Index { cell_id: cell.cell_id, index: *index, n });
-            }
-            scores.cosines[*index as usize] = cosines[k];
-            scores.total_weights[*index as usize] = field.total_weights[k];
+        for ((index, cosine), weight) in field.input_indices.iter().zip(cosines).zip(&field.total_weights) {
+            scores.set(cell.cell_id, *index, cosine, *weight)?;
         }
     }
     Ok(scores)
+}
+
+impl Scores {
+    fn unknown(reader: &StoreReader) -> Self {
+        let manifest = reader.manifest();
+        let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
+        Self { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] }
+    }
+
+    fn set(&mut self, cell_id: u32, index: u32, cosine: f32, total_weight: f32) -> Result<(), QueryError> {
+        let (at, n) = (index as usize, self.cosines.len());
+        *self.cosines.get_mut(at).ok_or(QueryError::Index { cell_id, index, n })? = cosine;
+        self.total_weights[at] = total_weight;
+        Ok(())
+    }
 }
 
 fn check_dim(reader: &StoreReader, query: &[f32]) -> Result<(), QueryError> {
@@ -90,10 +99,8 @@ fn check_dim(reader: &StoreReader, query: &[f32]) -> Result<(), QueryError> {
 /// Total weights are left at zero: shards do not keep them.
 pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -> Result<Scores, QueryError> {
     check_dim(reader, query)?;
-    let manifest = reader.manifest();
-    let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
-    let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
-    for cell in &manifest.cells {
+    let mut scores = Scores::unknown(reader);
+    for cell in &reader.manifest().cells {
         let cell_id = cell.cell_id;
         let read = |profile: Profile| -> Result<(AlignedBytes, ShardLayout), QueryError> {
             let missing = QueryError::NoShard { cell_id, profile };
@@ -110,8 +117,7 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
         for (at, cosine) in shard.scores(query).into_iter().enumerate() {
             let index = indexed.input_index(at);
             let index = index.ok_or(QueryError::NoShard { cell_id, profile: Profile::Exact })?;
-            let found = scores.cosines.get_mut(index as usize);
-            *found.ok_or(QueryError::Index { cell_id, index, n })? = cosine as f32;
+            scores.set(cell_id, index, cosine as f32, 0.0)?;
         }
     }
     Ok(scores)

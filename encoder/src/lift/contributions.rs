@@ -21,6 +21,8 @@ const REGION_BITS: u32 = 20;
 
 /// Gaussians of a slice: the contributions of one slice from all views fit a core's cache.
 pub const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
+/// Most regions, or masks, of all views and mixtures together.
+pub const MAX_IN_ALL: usize = u32::MAX as usize - 1;
 /// Most regions of a view.
 pub const MAX_REGIONS: usize = 1 << REGION_BITS;
 
@@ -49,7 +51,6 @@ struct Header {
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Run {
-    /// The cell.
     pub cell_id: u32,
     /// The slice: index within the cell / [`GAUSSIANS_PER_SLICE`].
     pub slice: u32,
@@ -112,21 +113,22 @@ pub struct ViewContributions {
 /// A contribution file cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum ContributionError {
-    /// File system error.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// The file is damaged.
     #[error("{}: {source}", path.display())]
     Damaged {
-        /// The file.
         path: PathBuf,
         /// The damage.
         source: ContainerError,
     },
-    /// More regions than an entry can name.
+    #[error("interrupted")]
+    Cancelled,
+    #[error(
+        "more than {MAX_IN_ALL} {what} in all views; use fewer views (--views-limit) or fewer masks (--min-mask-px)"
+    )]
+    TooManyInAll { what: &'static str },
     #[error("{}: {found} regions, the limit is {MAX_REGIONS}; give fewer masks or a lower --raster-width", path.display())]
     TooManyRegions {
-        /// The file.
         path: PathBuf,
         /// Regions of the view.
         found: usize,
@@ -166,17 +168,11 @@ impl ViewContributions {
     }
 
     /// Writes the file durably: a temporary name, fsync, rename, fsync of the folder.
-    ///
-    /// # Errors
-    /// [`ContributionError::Io`], [`ContributionError::TooManyRegions`].
     pub fn write(&self, path: &Path) -> Result<(), ContributionError> {
         Ok(slag_common::durable::write(path, &self.to_bytes(path)?)?)
     }
 
     /// Returns the file's bytes. `path`: its name, for errors.
-    ///
-    /// # Errors
-    /// [`ContributionError::TooManyRegions`].
     pub fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, ContributionError> {
         let found = self.masks_of_region.len();
         if found > MAX_REGIONS {
@@ -250,17 +246,13 @@ pub struct ViewRegions {
 }
 
 impl ViewRegions {
-    /// Returns the masks of each region.
-    pub fn masks_of_region(&self) -> impl Iterator<Item = &[u32]> {
+    pub fn masks_of_region(&self) -> impl ExactSizeIterator<Item = &[u32]> {
         self.starts.windows(2).map(|w| &self.masks[w[0] as usize..w[1] as usize])
     }
 }
 
 impl ContributionFile {
     /// Opens a file and checks everything but its entries.
-    ///
-    /// # Errors
-    /// [`ContributionError`].
     pub fn open(path: &Path) -> Result<(Self, ViewRegions), ContributionError> {
         let damaged = |source| ContributionError::Damaged { path: path.to_owned(), source };
         let mut file = fs_err::File::open(path)?;
@@ -296,7 +288,6 @@ impl ContributionFile {
         Ok((file, regions))
     }
 
-    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -322,9 +313,6 @@ impl ContributionFile {
     }
 
     /// Reads and checks the entries of some runs.
-    ///
-    /// # Errors
-    /// [`ContributionError`].
     pub(super) fn read(&self, runs: Range<usize>) -> Result<Vec<PackedEntry>, ContributionError> {
         let bytes = self.bytes_of_runs(runs.clone());
         let mut entries =

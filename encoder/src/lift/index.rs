@@ -43,7 +43,6 @@ pub struct ContributionIndex {
     pub(super) parts: Vec<Part>,
     /// The Gaussians of each slice, by their index within its cell.
     pub(super) locals_of_slice: Vec<Range<usize>>,
-    n_views_without_masks: usize,
     /// The transposed parts, once a pass has read them and the budget holds them.
     pub(super) kept: OnceLock<Vec<PartContributions>>,
 }
@@ -58,9 +57,6 @@ pub struct RawGroup {
 impl ContributionIndex {
     /// Opens the files of all views, in the order of the views' names, and collects their regions. `n_gaussians_of_cell`:
     /// number of Gaussians of each cell of the scene.
-    ///
-    /// # Errors
-    /// [`ContributionError`].
     pub fn open(
         paths: &[PathBuf],
         dim: usize,
@@ -82,7 +78,7 @@ impl ContributionIndex {
             if regions.dim != dim {
                 return Err(of_another_scene(path));
             }
-            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region());
+            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region())?;
             files.push((file, first_region, regions.mask_vectors.len() / dim));
         }
         Ok((Self::of_files(files, n_gaussians_of_cell, part_entries)?, table))
@@ -101,7 +97,6 @@ impl ContributionIndex {
             locals_of_slice.extend(starts.map(|start| start..(start + GAUSSIANS_PER_SLICE).min(*n)));
             first_slice_of_cell.push(locals_of_slice.len());
         }
-        let mut n_views_without_masks = 0;
         let mut views = Vec::with_capacity(files.len());
         let mut entries_of_slice = vec![0u64; locals_of_slice.len()];
         for (file, first_region, n_masks) in files {
@@ -117,7 +112,6 @@ impl ContributionIndex {
                 let range = file.entries_of_run(run);
                 entries_of_slice[*slice as usize] += range.end - range.start;
             }
-            n_views_without_masks += usize::from(n_masks == 0);
             views.push(IndexedView { file, slices, first_region, n_masks });
         }
         let parts = first_slice_of_cell
@@ -128,7 +122,7 @@ impl ContributionIndex {
             })
             .collect();
         let kept = OnceLock::new();
-        Ok(Self { views, parts, locals_of_slice, n_views_without_masks, kept })
+        Ok(Self { views, parts, locals_of_slice, kept })
     }
 
     /// Returns the parts, ascending by cell and within it.
@@ -146,22 +140,14 @@ impl ContributionIndex {
         self.views.iter().map(|view| view.first_region).collect()
     }
 
-    /// Returns the number of views without any mask.
-    pub fn n_views_without_masks(&self) -> usize {
-        self.n_views_without_masks
-    }
-
-    /// Returns the number of masks of each view.
     pub fn n_masks_of_view(&self) -> impl Iterator<Item = usize> + '_ {
         self.views.iter().map(|view| view.n_masks)
     }
 
-    /// Returns the number of regions of each view.
     pub fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
         self.views.iter().map(|view| view.file.n_regions())
     }
 
-    /// Returns the number of entries of each view.
     pub fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
         self.views.iter().map(|view| view.file.n_entries())
     }
@@ -191,15 +177,15 @@ impl ContributionIndex {
         self.parts.iter().map(of_part).sum()
     }
 
-    /// Returns the bytes that `n_entries` of `n_gaussians` are expected to take where the plan leaves `rest_bytes`: those that
-    /// are kept for the next pass, and those of the parts that all threads work on at a time.
-    pub fn expected_bytes(n_entries: u64, n_gaussians: u64, n_threads: u64, rest_bytes: u64) -> (u64, u64) {
-        let all_bytes = n_entries * BYTES_PER_TRANSPOSED_ENTRY + n_gaussians * BYTES_PER_GAUSSIAN;
-        let n_at_once = n_entries.min(n_threads * GROUP_ENTRIES);
-        let group_bytes = all_bytes * n_at_once / n_entries.max(1);
-        match 2 * all_bytes <= rest_bytes {
+    /// Returns the bytes that a pass is expected to take of a budget: those that are kept for the next one, and those of the
+    /// parts that all threads work on at a time.
+    pub(crate) fn expected_bytes(&self, budget_bytes: u64, n_threads: u64) -> (u64, u64) {
+        let all_bytes = self.kept_bytes();
+        let n_at_once = self.n_entries().min(n_threads * GROUP_ENTRIES);
+        let group_bytes = (all_bytes as f64 * n_at_once as f64 / self.n_entries().max(1) as f64) as u64;
+        match 2 * all_bytes <= budget_bytes {
             true => (all_bytes, group_bytes),
-            false => (0, group_bytes.min(rest_bytes)),
+            false => (0, group_bytes.min(budget_bytes)),
         }
     }
 
@@ -224,9 +210,6 @@ impl ContributionIndex {
     }
 
     /// Reads and checks the entries of some parts.
-    ///
-    /// # Errors
-    /// [`ContributionError`].
     pub fn read(&self, parts: Range<usize>) -> Result<RawGroup, ContributionError> {
         let slices = self.slices_of(&parts);
         let runs_of = |view: &IndexedView| {
@@ -241,7 +224,6 @@ impl ContributionIndex {
         Ok(RawGroup { parts, views })
     }
 
-    /// Returns the slices of some parts.
     pub(super) fn slices_of(&self, parts: &Range<usize>) -> Range<usize> {
         let parts = &self.parts[parts.clone()];
         match (parts.first(), parts.last()) {

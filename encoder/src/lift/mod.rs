@@ -49,6 +49,6 @@ pub use contributions::{
 pub use field::CellField;
 pub use index::{ContributionIndex, RawGroup};
 pub use part::{Part, PartContributions};
-pub use passes::TransposedGroups;
+pub use passes::SceneContributions;
 pub use refine::Aggregation;
 pub use table::RegionTable;

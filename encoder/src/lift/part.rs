@@ -7,13 +7,11 @@ use crate::cells::CellSplit;
 /// Consecutive Gaussians of a cell: all of them, unless they have very many entries.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Part {
-    /// The cell.
     pub cell_id: u32,
     /// Number of the part within the cell.
     pub number: u32,
     /// Its Gaussians, by their index within the cell.
     pub locals: Range<usize>,
-    /// Number of its entries.
     pub n_entries: u64,
     /// Its slices, numbered over the whole scene.
     pub(super) slices: Range<usize>,
@@ -29,7 +27,6 @@ impl Part {
 /// The contributions of a part by Gaussian, in canonical order: views by name, then regions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PartContributions {
-    /// The part.
     pub part: Part,
     /// `[N + 1]`: where each Gaussian's entries start.
     pub starts: Vec<u64>,

@@ -2,16 +2,60 @@
 //! holds all parts, the first pass keeps them and later passes read no file.
 
 use std::ops::Range;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
+use slag_common::Gaussians;
 
 use super::contributions::ContributionError;
 use super::index::ContributionIndex;
 use super::part::PartContributions;
+use super::photos::Photo;
 use super::table::RegionTable;
+use crate::cells::CellSplit;
+
+/// The contributions of all views to a scene, and how passes go over them.
+#[derive(Clone, Copy)]
+pub struct SceneContributions<'a> {
+    pub index: &'a ContributionIndex,
+    pub gaussians: &'a Gaussians,
+    pub split: &'a CellSplit,
+    /// Each view's masks, in the order of the index.
+    pub photos: &'a [Photo],
+    /// Bytes for the contributions of a group of parts.
+    pub group_bytes: u64,
+    /// Set when the user asks to stop.
+    pub cancel: &'a AtomicBool,
+}
+
+impl SceneContributions<'_> {
+    /// # Errors
+    /// [`ContributionError::Cancelled`] if the user has asked to stop.
+    pub(crate) fn check_cancelled(&self) -> Result<(), ContributionError> {
+        match self.cancel.load(Ordering::Relaxed) {
+            true => Err(ContributionError::Cancelled),
+            false => Ok(()),
+        }
+    }
+
+    /// Calls `work` with each part, on all threads, and `merge` with the results, in the order of the parts.
+    pub(super) fn visit<T: Send>(
+        &self,
+        table: &RegionTable,
+        work: impl Fn(PartContributions) -> T + Sync,
+        mut merge: impl FnMut(T),
+    ) -> Result<(), ContributionError> {
+        for group in self.index.transposed_groups(table, self.group_bytes) {
+            self.check_cancelled()?;
+            let results: Vec<T> = group?.into_par_iter().map(&work).collect();
+            results.into_iter().for_each(&mut merge);
+        }
+        Ok(())
+    }
+}
 
 /// One pass over the transposed contributions, group by group in the order of [`ContributionIndex::parts`].
-pub struct TransposedGroups<'a> {
+pub(super) struct TransposedGroups<'a> {
     index: &'a ContributionIndex,
     table: &'a RegionTable,
     /// Parts to be read or copied.
@@ -33,7 +77,7 @@ enum Source<'a> {
 
 impl ContributionIndex {
     /// Returns what passes want of a budget: enough to keep all parts, if that is in the budget, else half.
-    pub fn budget_bytes(&self, budget_bytes: u64) -> u64 {
+    pub(crate) fn budget_bytes(&self, budget_bytes: u64) -> u64 {
         let to_keep_bytes = self.kept_bytes().saturating_add(self.largest_part_bytes()).saturating_mul(2);
         let wanted_bytes = if to_keep_bytes <= budget_bytes { to_keep_bytes } else { budget_bytes / 2 };
         wanted_bytes.max(self.largest_part_bytes())
@@ -41,7 +85,7 @@ impl ContributionIndex {
 
     /// Starts a pass that takes at most `budget_bytes`, or what the largest part needs. Total weights follow the table's
     /// present weights of masks. A group is what all threads work on at a time.
-    pub fn transposed_groups<'a>(
+    pub(super) fn transposed_groups<'a>(
         &'a self,
         table: &'a RegionTable,
         budget_bytes: u64,

@@ -17,7 +17,6 @@ const VERSION: u32 = 2;
 pub struct Photo {
     /// Name of the view.
     pub name: String,
-    /// The outline of each mask.
     pub outlines: Vec<MaskOutline>,
 }
 
@@ -62,9 +61,6 @@ impl MaskOutline {
 }
 
 /// Writes the outlines of a view's masks durably.
-///
-/// # Errors
-/// [`ContributionError::Io`].
 pub fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<(), ContributionError> {
     Ok(slag_common::durable::write(path, &outlines_to_bytes(outlines)?)?)
 }

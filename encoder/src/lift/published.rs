@@ -18,9 +18,6 @@ pub fn extra_field(cell_id: u32, part: u32) -> String {
 }
 
 /// Reads the full-precision field of a published cell of `n_gaussians`.
-///
-/// # Errors
-/// [`ReadFieldError`].
 pub fn read_field(
     reader: &StoreReader,
     cell_id: u32,
@@ -43,9 +40,6 @@ pub fn read_field(
 }
 
 /// Reads the region table of the published generation.
-///
-/// # Errors
-/// As [`read_field`].
 pub fn read_regions(reader: &StoreReader) -> Result<RegionTable, ReadFieldError> {
     let bytes = read_extra(reader, EXTRA_REGIONS)?;
     RegionTable::from_bytes(&bytes)
@@ -61,16 +55,13 @@ fn read_extra(reader: &StoreReader, name: &str) -> Result<AlignedBytes, ReadFiel
 /// A published field cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadFieldError {
-    /// Store error.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The generation has no such part.
     #[error("the store has no {name}: another version published it; encode again")]
     Absent {
         /// The part.
         name: String,
     },
-    /// The part is damaged.
     #[error("{name}: {source}")]
     Damaged {
         /// The part.

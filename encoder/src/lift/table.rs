@@ -13,11 +13,18 @@ use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 use slag_math::matrix::Rows;
 
+use super::contributions::{ContributionError, MAX_IN_ALL};
 use super::starts;
 use crate::memory::{MemoryPlan, Phase};
 
 const MAGIC: [u8; 8] = *b"SLAGREGN";
 const VERSION: u32 = 2;
+
+/// Returns the number of the first of `n_more` regions or masks that follow `n`.
+fn first_number(n: usize, n_more: usize, what: &'static str) -> Result<u32, ContributionError> {
+    let fits = n.checked_add(n_more).is_some_and(|end| end <= MAX_IN_ALL);
+    if fits { Ok(n as u32) } else { Err(ContributionError::TooManyInAll { what }) }
+}
 
 /// The masks of every region of the scene.
 #[derive(Clone, Debug, PartialEq)]
@@ -58,12 +65,10 @@ impl RegionTable {
         self.starts.len() - 1
     }
 
-    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Returns the number of masks.
     pub fn n_masks(&self) -> usize {
         self.mask_vectors.len() / self.dim
     }
@@ -81,12 +86,17 @@ impl RegionTable {
 
     /// Appends a view's regions and returns the number of the first; `mask_vectors` is `[n][dim]`,
     /// `masks_of_region` refers to it.
+    ///
+    /// # Errors
+    /// [`ContributionError::TooManyInAll`] if regions or masks can no longer be numbered; the table is then as it was.
     pub fn append<'a>(
         &mut self,
         mask_vectors: &[f32],
-        masks_of_region: impl Iterator<Item = &'a [u32]>,
-    ) -> u32 {
-        let (first, first_mask) = (self.len() as u32, self.n_masks() as u32);
+        masks_of_region: impl ExactSizeIterator<Item = &'a [u32]>,
+    ) -> Result<u32, ContributionError> {
+        let first = first_number(self.len(), masks_of_region.len(), "regions")?;
+        let n_masks = mask_vectors.len() / self.dim;
+        let first_mask = first_number(self.n_masks(), n_masks, "masks")?;
         // Exact: doubling would take twice the memory of the budget's estimate.
         self.mask_vectors.reserve_exact(mask_vectors.len());
         self.mask_vectors.extend(mask_vectors);
@@ -97,7 +107,7 @@ impl RegionTable {
         if !self.shares.is_empty() {
             self.shares.resize(self.masks.len(), 1.0);
         }
-        first
+        Ok(first)
     }
 
     /// Sets the weight of each mask. `weights`: `[n_masks]`, finite, not negative.
@@ -110,23 +120,17 @@ impl RegionTable {
         self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
     }
 
-    /// Returns the level of a mask, 0 the coarsest.
-    pub fn level_of(&self, mask: u32) -> usize {
-        self.levels.get(mask as usize).copied().unwrap_or(0).into()
-    }
-
-    /// Returns the number of levels of masks.
-    pub fn n_levels(&self) -> usize {
-        usize::from(self.levels.iter().copied().max().unwrap_or(0)) + 1
-    }
-
     /// Appends a region that is a mixture of masks, `(mask, weight)`, and returns its number.
-    pub fn append_mixture(&mut self, mixture: &[(u32, f32)]) -> u32 {
+    ///
+    /// # Errors
+    /// [`ContributionError::TooManyInAll`] if it can no longer be numbered.
+    pub(super) fn append_mixture(&mut self, mixture: &[(u32, f32)]) -> Result<u32, ContributionError> {
+        let number = first_number(self.len(), 1, "regions")?;
         self.shares.resize(self.masks.len(), 1.0);
         self.masks.extend(mixture.iter().map(|(mask, _)| mask));
         self.shares.extend(mixture.iter().map(|(_, share)| share));
         self.starts.push(self.masks.len() as u64);
-        self.len() as u32 - 1
+        Ok(number)
     }
 
     /// Returns the vectors of the masks, one per row.
@@ -168,27 +172,12 @@ impl RegionTable {
         }
     }
 
-    fn mask_scores(&self, query: &[f32]) -> Vec<f32> {
-        self.mask_vectors.par_chunks_exact(self.dim).map(|vector| slag_math::dot(vector, query)).collect()
-    }
-
     /// Returns `q · V_r` for every region.
     pub fn scores(&self, query: &[f32]) -> Vec<f32> {
-        let of_masks = self.mask_scores(query);
+        let vectors = self.mask_vectors.par_chunks_exact(self.dim);
+        let of_masks: Vec<f32> = vectors.map(|vector| slag_math::dot(vector, query)).collect();
         let score = |region| self.masks_of(region).map(|(mask, share)| share * of_masks[mask as usize]).sum();
         (0..self.len()).into_par_iter().map(score).collect()
-    }
-
-    /// Returns `q · V_r` for the masks of each level separately, `[n][n_levels]`.
-    pub fn scores_by_level(&self, query: &[f32]) -> Vec<f32> {
-        let of_masks = self.mask_scores(query);
-        let mut scores = vec![0.0; self.len() * self.n_levels()];
-        scores.par_chunks_exact_mut(self.n_levels()).enumerate().for_each(|(region, scores)| {
-            for (mask, share) in self.masks_of(region) {
-                scores[self.level_of(mask)] += share * of_masks[mask as usize];
-            }
-        });
-        scores
     }
 
     /// Writes the file form.
@@ -246,5 +235,21 @@ impl RegionTable {
         }
         let what = "masks out of range, or weights that are not finite".into();
         Err(ContainerError::Damaged { offset_bytes: 0, what })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Numbers of 32 bits, of which the last marks what has none: a table that large cannot be made here.
+    #[test]
+    fn regions_and_masks_that_cannot_be_numbered_are_refused() {
+        let number = |n, n_more| first_number(n, n_more, "regions").ok();
+        assert_eq!(number(7, 3), Some(7));
+        assert_eq!(number(u32::MAX as usize - 2, 1), Some(u32::MAX - 2));
+        assert_eq!(number(u32::MAX as usize - 2, 2), None);
+        assert_eq!(number(1 << 32, 0), None);
+        assert_eq!(number(usize::MAX, 1), None);
     }
 }

@@ -1,14 +1,15 @@
-//! How much masks speak for two superpoints being of one thing.
+//! How much masks speak for two superpoints being of one object.
 //!
 //! In a view that sees both, it is the share of the masks of either that show both: segmenters return wholes and parts side by
-//! side, so a thing's superpoints share its mask and those of all that contains it, and superpoints of two things only the latter.
+//! side, so an object's superpoints share its mask and those of all that contains it, and superpoints of two objects
+//! only the latter.
 //! Yin et al. ("SAI3D", CVPR 2024) join superpoints by masks, too, of one level.
 
 use std::cmp::Ordering;
 
 use rayon::prelude::*;
 
-use super::shown::{OfMask, OfView, Shown};
+use super::sightings::{MaskSighting, Sightings, ViewSighting};
 
 /// A mask shows a superpoint if it has at least this share of its Gaussians that the view sees, in halves.
 const INSIDE_HALVES: u32 = 1;
@@ -16,41 +17,42 @@ const INSIDE_HALVES: u32 = 1;
 const PRIOR: f64 = 0.3;
 const PRIOR_WEIGHT: f64 = 1.0;
 /// A share of 1.
-pub const SHARE: u64 = 1 << 20;
+pub(super) const SHARE: u64 = 1 << 20;
 
 /// What views say about two superpoints, or two sets of them; evidence is added. Integers, so that sums do not depend on their
 /// order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Evidence {
+pub(super) struct Evidence {
     /// Sum over the views of the share of masks that show both, in units of [`SHARE`], times Gaussians.
-    pub together: u64,
+    pub(super) together: u64,
     /// Sum over the views of the Gaussians of the smaller one.
-    pub n: u64,
+    pub(super) n: u64,
 }
 
 impl Evidence {
     /// Returns the affinity, 0..=1.
-    pub fn affinity(&self) -> f64 {
+    pub(super) fn affinity(&self) -> f64 {
         (self.together as f64 / SHARE as f64 + PRIOR * PRIOR_WEIGHT) / (self.n as f64 + PRIOR_WEIGHT)
     }
 }
 
 impl std::ops::AddAssign for Evidence {
     fn add_assign(&mut self, other: Self) {
-        self.together += other.together;
-        self.n += other.n;
+        // A share takes 20 bits: thousands of views of billions of Gaussians are the limit.
+        self.together = self.together.saturating_add(other.together);
+        self.n = self.n.saturating_add(other.n);
     }
 }
 
 /// Returns the evidence of each pair; pairs that no mask shows together are left out.
-pub fn of_pairs(shown: &Shown, pairs: &[(u32, u32)]) -> Vec<(u32, u32, Evidence)> {
-    let of_pair = |(a, b): &(u32, u32)| (*a, *b, of_pair(shown, *a as usize, *b as usize));
+pub(super) fn of_pairs(sightings: &Sightings, pairs: &[(u32, u32)]) -> Vec<(u32, u32, Evidence)> {
+    let of_pair = |(a, b): &(u32, u32)| (*a, *b, of_pair(sightings, *a as usize, *b as usize));
     pairs.par_iter().map(of_pair).filter(|(_, _, evidence)| evidence.together > 0).collect()
 }
 
-fn of_pair(shown: &Shown, a: usize, b: usize) -> Evidence {
+fn of_pair(sightings: &Sightings, a: usize, b: usize) -> Evidence {
     let mut evidence = Evidence::default();
-    let (mut of_a, mut of_b) = (shown.of(a).peekable(), shown.of(b).peekable());
+    let (mut of_a, mut of_b) = (sightings.of(a).peekable(), sightings.of(b).peekable());
     while let (Some(a), Some(b)) = (of_a.peek(), of_b.peek()) {
         match a.view.cmp(&b.view) {
             Ordering::Less => drop(of_a.next()),
@@ -71,17 +73,17 @@ fn of_pair(shown: &Shown, a: usize, b: usize) -> Evidence {
 }
 
 /// Returns the number of masks that show both superpoints, and of those that show either; none where a view sees one alone.
-fn shared(a: &OfView<'_>, b: &OfView<'_>) -> (u64, u64) {
+fn shared(a: &ViewSighting<'_>, b: &ViewSighting<'_>) -> (u64, u64) {
     if a.n == 0 || b.n == 0 {
         return (0, 0);
     }
-    let inside = |of_view: &OfView<'_>| {
+    let inside = |of_view: &ViewSighting<'_>| {
         let n = of_view.n;
-        move |of_mask: &&OfMask| of_mask.n > 0 && of_mask.n * 2 >= n * INSIDE_HALVES
+        move |of_mask: &&MaskSighting| of_mask.n > 0 && of_mask.n * 2 >= n * INSIDE_HALVES
     };
     let n_a = a.masks.iter().filter(inside(a)).count();
     let n_b = b.masks.iter().filter(inside(b)).count();
-    let is_of_b = |of_a: &&OfMask| {
+    let is_of_b = |of_a: &&MaskSighting| {
         let at = b.masks.binary_search_by_key(&of_a.mask, |of_b| of_b.mask);
         at.is_ok_and(|at| inside(b)(&&b.masks[at]))
     };

@@ -1,24 +1,25 @@
-//! Which nodes of the tree are things: those that views agree on.
+//! Which nodes of the tree are objects: those that views agree on.
 //!
 //! A view's agreement with a node is the best intersection over union between one of its masks and what it sees of the node. A
 //! node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan et al., CVPR 2024, judges masks). The
-//! nodes are chosen, none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: a thing
-//! wins over its parts if views agree on it nearly as well. A node without consensus is no thing.
+//! nodes are chosen, none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: an object
+//! wins over its parts if views agree on it nearly as well. A node without consensus is no object.
 
 use std::collections::BTreeMap;
 
 use rayon::prelude::*;
 
-use super::shown::{OfView, Shown};
+use super::sightings::{Sightings, ViewSighting};
 use super::tree::Tree;
 
 /// A view judges a node if it sees at least this share of it, in tenths: one side is enough.
 const OBSERVED_TENTHS: u64 = 1;
-/// Nodes below this consensus are no things.
+/// Nodes below this consensus are no objects.
 const MIN_CONSENSUS: f64 = 0.3;
-/// A mask with this intersection over union shows the node: a majority of their union.
-pub const SAME_IOU: f64 = 0.5;
-/// A thing needs masks in this many views: a single view has none to agree with.
+/// A mask with more than this intersection over union shows the node: a majority of their union, so that no mask shows two
+/// nodes that have nothing in common.
+const SAME_IOU: f64 = 0.5;
+/// An object needs masks in this many views: a single view has none to agree with.
 const MIN_VIEWS: usize = 2;
 
 /// What a view shows of a node.
@@ -37,17 +38,17 @@ type NodeViews = BTreeMap<u32, NodeView>;
 
 /// Numbers of Gaussians.
 #[derive(Clone, Copy)]
-pub struct Sizes<'a> {
+pub(super) struct Sizes<'a> {
     /// `[n_masks]`: sightings under each mask.
-    pub of_masks: &'a [u32],
+    pub(super) of_masks: &'a [u32],
     /// `[n]`: Gaussians of each superpoint.
-    pub of_superpoints: &'a [u32],
-    /// Fewest Gaussians of a thing.
-    pub min_gaussians: u32,
+    pub(super) of_superpoints: &'a [u32],
+    /// Fewest Gaussians of an object.
+    pub(super) min_gaussians: u32,
 }
 
 impl NodeView {
-    fn of(of_view: &OfView<'_>) -> Self {
+    fn of(of_view: &ViewSighting<'_>) -> Self {
         let masks = of_view.masks.iter().filter(|of| of.n > 0).map(|of| (of.mask, of.n)).collect();
         Self { n: of_view.n, masks, agreement: 0.0 }
     }
@@ -69,8 +70,8 @@ impl NodeView {
     /// Returns the masks with their intersections over union.
     fn ious(&self, n_of_mask: &[u32]) -> impl Iterator<Item = (u32, f64)> {
         self.masks.iter().map(|(mask, both)| {
-            let union = self.n + n_of_mask[*mask as usize] - both;
-            (*mask, f64::from(*both) / f64::from(union))
+            let union = u64::from(self.n) + u64::from(n_of_mask[*mask as usize]) - u64::from(*both);
+            (*mask, f64::from(*both) / union as f64)
         })
     }
 
@@ -80,22 +81,22 @@ impl NodeView {
 }
 
 /// Returns what views show of a superpoint.
-fn views_of(shown: &Shown, superpoint: usize, n_of_mask: &[u32]) -> NodeViews {
-    let of_view = |of_view: OfView<'_>| {
+fn views_of(sightings: &Sightings, superpoint: usize, n_of_mask: &[u32]) -> NodeViews {
+    let of_view = |of_view: ViewSighting<'_>| {
         let mut view = NodeView::of(&of_view);
         view.judge(n_of_mask);
         (of_view.view, view)
     };
-    shown.of(superpoint).filter(|of_view| of_view.n > 0).map(of_view).collect()
+    sightings.of(superpoint).filter(|of_view| of_view.n > 0).map(of_view).collect()
 }
 
-/// Returns the worth of a node of `n` Gaussians as a thing; 0 if it is none.
+/// Returns the worth of a node of `n` Gaussians as an object; 0 if it is none.
 fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     let judges = views.values().filter(|view| u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS);
     let (mut sum, mut n_judges, mut n_same) = (0.0, 0u32, 0);
     for view in judges {
         (sum, n_judges) = (sum + view.agreement, n_judges + 1);
-        n_same += usize::from(view.agreement >= SAME_IOU);
+        n_same += usize::from(view.agreement > SAME_IOU);
     }
     let consensus = sum / f64::from(n_judges.max(1));
     if n < min_gaussians || n_same < MIN_VIEWS || consensus < MIN_CONSENSUS {
@@ -107,9 +108,9 @@ fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     fourth * fourth * f64::from(n).sqrt().sqrt()
 }
 
-/// Returns the thing of each superpoint, or `None`; things are numbered in the order of their first superpoints.
-pub fn things(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<Option<u32>> {
-    let worths = worths(tree, shown, sizes);
+/// Returns the object of each superpoint, or `None`; objects are numbered in the order of their first superpoints.
+pub(super) fn objects(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<Option<u32>> {
+    let worths = worths(tree, sightings, sizes);
     // The best choice within each node: the node itself, or the best of its parts.
     let mut best = worths.clone();
     for node in tree.n_leaves..tree.len() {
@@ -119,8 +120,8 @@ pub fn things(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<Option<u32>> 
     let mut node_of: Vec<Option<usize>> = vec![None; tree.n_leaves];
     let mut waiting: Vec<(usize, Option<usize>)> = tree.roots().map(|root| (root, None)).collect();
     while let Some((node, within)) = waiting.pop() {
-        let is_thing = worths[node] > 0.0 && worths[node] >= best[node];
-        let within = within.or(is_thing.then_some(node));
+        let is_object = worths[node] > 0.0 && worths[node] >= best[node];
+        let within = within.or(is_object.then_some(node));
         match tree.parts_of(node) {
             Some(parts) => waiting.extend(parts.map(|part| (part, within))),
             None => node_of[node] = within,
@@ -135,10 +136,10 @@ pub fn things(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<Option<u32>> 
 }
 
 /// Returns the worth of each node.
-fn worths(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<f64> {
+fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
     let Sizes { of_masks, of_superpoints, min_gaussians } = sizes;
     let alone = |superpoint: usize| {
-        worth(&views_of(shown, superpoint, of_masks), of_superpoints[superpoint], min_gaussians)
+        worth(&views_of(sightings, superpoint, of_masks), of_superpoints[superpoint], min_gaussians)
     };
     let mut worths: Vec<f64> = (0..tree.n_leaves).into_par_iter().map(alone).collect();
     let mut n_of = of_superpoints.to_vec();
@@ -147,7 +148,7 @@ fn worths(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<f64> {
         let Some(parts) = tree.parts_of(node) else { continue };
         let mut take = |part: usize| match views_of_node.remove(&part) {
             Some(views) => views,
-            None => views_of(shown, part, of_masks),
+            None => views_of(sightings, part, of_masks),
         };
         let [mut views, mut fewer] = parts.map(&mut take);
         if fewer.len() > views.len() {
@@ -166,25 +167,31 @@ fn worths(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<f64> {
     worths
 }
 
-/// Returns the thing that each mask shows, or `None`: the first with [`SAME_IOU`]. `thing_of`: of each superpoint.
-pub fn things_of_masks(thing_of: &[Option<u32>], shown: &Shown, n_of_mask: &[u32]) -> Vec<Option<u32>> {
-    let n_things = thing_of.iter().flatten().max().map_or(0, |last| *last as usize + 1);
-    let mut superpoints: Vec<Vec<usize>> = vec![Vec::new(); n_things];
-    for (superpoint, thing) in thing_of.iter().enumerate() {
-        thing.iter().for_each(|thing| superpoints[*thing as usize].push(superpoint));
+/// Returns the object that each mask shows, or `None`. `object_of`: of each superpoint.
+pub(super) fn objects_of_masks(
+    object_of: &[Option<u32>],
+    sightings: &Sightings,
+    n_of_mask: &[u32],
+) -> Vec<Option<u32>> {
+    let n_objects = object_of.iter().flatten().max().map_or(0, |last| *last as usize + 1);
+    let mut superpoints: Vec<Vec<usize>> = vec![Vec::new(); n_objects];
+    for (superpoint, object) in object_of.iter().enumerate() {
+        object.iter().for_each(|object| superpoints[*object as usize].push(superpoint));
     }
     let same = |superpoints: &Vec<usize>| -> Vec<u32> {
         let mut views = NodeViews::new();
-        for of_view in superpoints.iter().flat_map(|superpoint| shown.of(*superpoint)).filter(|of| of.n > 0) {
+        for of_view in
+            superpoints.iter().flat_map(|superpoint| sightings.of(*superpoint)).filter(|of| of.n > 0)
+        {
             views.entry(of_view.view).or_default().add(NodeView::of(&of_view));
         }
-        let masks = views.values().flat_map(|view| view.ious(n_of_mask).filter(|(_, iou)| *iou >= SAME_IOU));
+        let masks = views.values().flat_map(|view| view.ious(n_of_mask).filter(|(_, iou)| *iou > SAME_IOU));
         masks.map(|(mask, _)| mask).collect()
     };
     let same: Vec<Vec<u32>> = superpoints.par_iter().map(same).collect();
-    let mut thing_of_mask = vec![None; n_of_mask.len()];
-    for (thing, masks) in (0u32..).zip(same) {
-        masks.iter().for_each(|mask| _ = thing_of_mask[*mask as usize].get_or_insert(thing));
+    let mut object_of_mask = vec![None; n_of_mask.len()];
+    for (object, masks) in (0u32..).zip(same) {
+        masks.iter().for_each(|mask| object_of_mask[*mask as usize] = Some(object));
     }
-    thing_of_mask
+    object_of_mask
 }

@@ -8,100 +8,165 @@ use slag_common::frames::Aabb;
 use slag_math::stats::trimmed_range;
 
 use super::choice::{self, Sizes};
-use super::members::Members;
 use super::object::{NONE, Object, ObjectsReport, SceneObjects};
-use super::scene::Scene;
-use super::shown::Shown;
+use super::sightings::Sightings;
 use super::tree::Tree;
 use super::{affinity, near, vectors};
-use crate::lift::ContributionError;
+use crate::codebook::ScoreMetricContext;
 use crate::lift::photos::MaskOutline;
+use crate::lift::refine::PendingRefinement;
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
+use crate::lift::{ContributionError, RegionTable, SceneContributions};
 
 /// Smaller objects are dropped, as the robot drops smaller clusters.
-pub const MIN_GAUSSIANS: usize = 10;
+const MIN_GAUSSIANS: u32 = 10;
 /// Share of the means that an object's box leaves out on either side of each axis, as boxes of clusters do: floaters
 /// would make the box as large as the room.
 const TRIMMED: f64 = 0.02;
 
-/// Finds the objects of a scene. Returns `None` if cancelled.
-///
-/// # Errors
-/// [`ContributionError`].
-pub fn find(scene: &Scene<'_>) -> Result<Option<SceneObjects>, ContributionError> {
-    let Scene { table, gaussians, .. } = scene;
-    let superpoints = match scene.superpoints {
+/// Finds the objects of a scene while its refinement is pending: superpoints are known, and nothing is mixed yet.
+pub(crate) fn find(
+    scene: &SceneContributions<'_>,
+    pending: &PendingRefinement,
+    score_context: &ScoreMetricContext,
+) -> Result<SceneObjects, ContributionError> {
+    find_among(scene, pending.table(), pending.superpoints(), score_context)
+}
+
+/// `superpoints`: where absent, they are found from colour and shape.
+pub(super) fn find_among(
+    scene: &SceneContributions<'_>,
+    table: &RegionTable,
+    superpoints: Option<&Superpoints>,
+    score_context: &ScoreMetricContext,
+) -> Result<SceneObjects, ContributionError> {
+    let superpoints = match superpoints {
         Some(superpoints) => Cow::Borrowed(superpoints),
-        None => Cow::Owned(Superpoints::new(gaussians, None, &SuperpointSettings::default())),
+        None => Cow::Owned(Superpoints::new(scene.gaussians, None, &SuperpointSettings::default())),
     };
-    let Some(shown) = Shown::gather(scene, &superpoints)? else { return Ok(None) };
-    let pairs = affinity::of_pairs(&shown, &near::pairs(gaussians, &superpoints));
-    if scene.is_cancelled() {
-        return Ok(None);
-    }
+    let sightings = Sightings::gather(scene, table, &superpoints)?;
+    let pairs = affinity::of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
+    scene.check_cancelled()?;
     let tree = Tree::new(superpoints.n, &pairs);
     drop(pairs);
-    if scene.is_cancelled() {
-        return Ok(None);
-    }
+    scene.check_cancelled()?;
     let mut n_of_mask = vec![0; table.n_masks()];
-    shown.masks().for_each(|(_, of_mask)| n_of_mask[of_mask.mask as usize] += of_mask.n);
+    sightings.masks().for_each(|(_, of_mask)| n_of_mask[of_mask.mask as usize] += of_mask.n);
     let n_of_superpoint = superpoints.sizes();
     let sizes =
-        Sizes { of_masks: &n_of_mask, of_superpoints: &n_of_superpoint, min_gaussians: MIN_GAUSSIANS as u32 };
-    let object_of = choice::things(&tree, &shown, sizes);
-    let object_of_mask = choice::things_of_masks(&object_of, &shown, &n_of_mask);
-    let members = Members::new(scene, &superpoints, &shown, &object_of, &object_of_mask);
-    let objects = describe(scene, &members, &scene.view_of_mask());
-    let calibration = vectors::calibrate(&objects, scene.score_context, table.dim());
+        Sizes { of_masks: &n_of_mask, of_superpoints: &n_of_superpoint, min_gaussians: MIN_GAUSSIANS };
+    let object_of_superpoint = choice::objects(&tree, &sightings, sizes);
+    let object_of_mask = choice::objects_of_masks(&object_of_superpoint, &sightings, &n_of_mask);
+    let masks = Masks::new(scene, &sightings, &object_of_superpoint, &object_of_mask);
+    let of_gaussian = |gaussian: &u32| {
+        let superpoint = superpoints.of_gaussian[*gaussian as usize];
+        object_of_superpoint.get(superpoint as usize).copied().flatten().unwrap_or(NONE)
+    };
+    let cells = scene.split.cells.iter();
+    let object_of: Vec<Vec<u32>> =
+        cells.map(|cell| cell.gaussians.iter().map(of_gaussian).collect()).collect();
+    let objects = describe(scene, table, &object_of, &masks);
+    let calibration = vectors::calibrate(&objects, score_context, table.dim());
     let report = ObjectsReport {
         n_objects: objects.len(),
         n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),
         n_masks: table.n_masks(),
         n_masks_of_objects: objects.iter().map(|object| object.n_masks as usize).sum(),
     };
-    Ok(Some(SceneObjects { objects, object_of: members.object_of, calibration, report }))
+    Ok(SceneObjects { objects, object_of, calibration, report })
 }
 
-fn describe(scene: &Scene<'_>, members: &Members, view_of_mask: &[u32]) -> Vec<Object> {
-    let mut gaussians: Vec<Vec<u32>> = vec![Vec::new(); members.masks.len()];
-    for (cell, of_cell) in scene.split.cells.iter().zip(&members.object_of) {
+/// The masks of each object, and how well each mask shows its object.
+struct Masks {
+    /// The masks of each object, ascending.
+    of_object: Vec<Vec<u32>>,
+    /// `[n_masks]`: blending weight of all Gaussians under the mask, pixels.
+    weights: Vec<f64>,
+    /// `[n_masks]`: of that, the weight of the Gaussians of its object.
+    own_weights: Vec<f64>,
+    /// `[n_masks]`: 1 - truncation.
+    uncut_shares: Vec<f32>,
+    /// `[n_masks]`: the view, and the number within it.
+    places: Vec<(u32, u32)>,
+}
+
+impl Masks {
+    fn new(
+        scene: &SceneContributions<'_>,
+        sightings: &Sightings,
+        object_of_superpoint: &[Option<u32>],
+        object_of_mask: &[Option<u32>],
+    ) -> Self {
+        let n_objects = object_of_superpoint.iter().flatten().max().map_or(0, |last| *last as usize + 1);
+        let outlines = scene.photos.iter().flat_map(|photo| &photo.outlines);
+        let places = (0u32..).zip(scene.index.n_masks_of_view());
+        let mut masks = Self {
+            of_object: vec![Vec::new(); n_objects],
+            weights: vec![0.0; object_of_mask.len()],
+            own_weights: vec![0.0; object_of_mask.len()],
+            uncut_shares: outlines.map(MaskOutline::uncut_share).collect(),
+            places: places.flat_map(|(view, n)| (0..n as u32).map(move |mask| (view, mask))).collect(),
+        };
+        for (mask, object) in (0u32..).zip(object_of_mask) {
+            object.iter().for_each(|object| masks.of_object[*object as usize].push(mask));
+        }
+        for (superpoint, of_mask) in sightings.masks() {
+            let mask = of_mask.mask as usize;
+            masks.weights[mask] += of_mask.weight;
+            if object_of_mask[mask].is_some() && object_of_mask[mask] == object_of_superpoint[superpoint] {
+                masks.own_weights[mask] += of_mask.weight;
+            }
+        }
+        masks
+    }
+
+    /// Returns the mask that shows an object best: the one with the largest product of the weight of the object's
+    /// Gaussians, their share of the mask's weight, and 1 - truncation.
+    fn best_of(&self, object: usize) -> usize {
+        let merit = |mask: u32| {
+            let (own, all) = (self.own_weights[mask as usize], self.weights[mask as usize]);
+            if all > 0.0 { own * own / all * f64::from(self.uncut_shares[mask as usize]) } else { 0.0 }
+        };
+        let better = |a: u32, b: u32| if merit(b) > merit(a) { b } else { a };
+        let best = self.of_object[object].iter().copied().reduce(better);
+        best.expect("an object is chosen by its masks, and no other has them") as usize
+    }
+}
+
+fn describe(
+    scene: &SceneContributions<'_>,
+    table: &RegionTable,
+    object_of: &[Vec<u32>],
+    masks: &Masks,
+) -> Vec<Object> {
+    let mut gaussians: Vec<Vec<u32>> = vec![Vec::new(); masks.of_object.len()];
+    for (cell, of_cell) in scene.split.cells.iter().zip(object_of) {
         for (gaussian, object) in cell.gaussians.iter().zip(of_cell).filter(|(_, object)| **object != NONE) {
             gaussians[*object as usize].push(*gaussian);
         }
     }
-    let uncut_shares: Vec<f32> =
-        scene.photos.iter().flat_map(|photo| &photo.outlines).map(MaskOutline::uncut_share).collect();
-    let mut first_mask_of_view = Vec::with_capacity(scene.photos.len());
-    let mut n_masks = 0;
-    for n in scene.index.n_masks_of_view() {
-        first_mask_of_view.push(n_masks);
-        n_masks += n as u32;
-    }
-    let of_masks = gaussians.into_par_iter().zip(&members.masks);
-    of_masks
-        .map(|(mut gaussians, masks)| {
-            gaussians.sort_unstable();
-            let hash = blake3::hash(bytemuck::cast_slice(&gaussians));
-            let id = hash.as_bytes()[..8].iter().rev().fold(0, |id, byte| id << 8 | u64::from(*byte));
-            let means: Vec<DVec3> =
-                gaussians.iter().map(|i| scene.gaussians.means_in_world[*i as usize]).collect();
-            let (position_in_world, box_in_world) = trimmed_box(&means);
-            let best = members.best_mask(masks, &uncut_shares);
-            let view = view_of_mask[best as usize] as usize;
-            let photo = &scene.photos[view];
-            Object {
-                id,
-                n_gaussians: gaussians.len() as u32,
-                n_masks: masks.len() as u32,
-                position_in_world,
-                box_in_world,
-                vectors: vectors::choose(masks, &members.mask_weights, scene.table),
-                photo: photo.name.clone(),
-                photo_box_px: photo.outlines[(best - first_mask_of_view[view]) as usize].box_px,
-            }
-        })
-        .collect()
+    let object = |(number, mut gaussians): (usize, Vec<u32>)| {
+        gaussians.sort_unstable();
+        let hash = blake3::hash(bytemuck::cast_slice(&gaussians));
+        let id = hash.as_bytes()[..8].iter().rev().fold(0, |id, byte| id << 8 | u64::from(*byte));
+        let means: Vec<DVec3> =
+            gaussians.iter().map(|i| scene.gaussians.means_in_world[*i as usize]).collect();
+        let (position_in_world, box_in_world) = trimmed_box(&means);
+        let (view, mask) = masks.places[masks.best_of(number)];
+        let photo = &scene.photos[view as usize];
+        let of_object = &masks.of_object[number];
+        Object {
+            id,
+            n_gaussians: gaussians.len() as u32,
+            n_masks: of_object.len() as u32,
+            position_in_world,
+            box_in_world,
+            vectors: vectors::choose(of_object, &masks.weights, table),
+            photo: photo.name.clone(),
+            photo_box_px: photo.outlines[mask as usize].box_px,
+        }
+    };
+    gaussians.into_par_iter().enumerate().map(object).collect()
 }
 
 /// Returns the box without the outermost means, and the mean of those inside.

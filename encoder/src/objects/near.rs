@@ -1,4 +1,4 @@
-//! Superpoints that lie near each other: only these can be of one thing.
+//! Superpoints that lie near each other: only these can be of one object.
 
 use rayon::prelude::*;
 use slag_common::Gaussians;
@@ -29,7 +29,7 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
 
 /// Returns the pairs of superpoints that lie near each other: a sampled Gaussian of one is among the nearest neighbours of a
 /// sample of the other. The lower number comes first; pairs are ascending.
-pub fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u32)> {
+pub(super) fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u32)> {
     let samples = samples(superpoints);
     let points: Vec<[f64; 3]> =
         samples.par_iter().map(|(_, gaussian)| scene.means_in_world[*gaussian as usize].to_array()).collect();

@@ -48,7 +48,6 @@ impl Object {
     }
 }
 
-/// The objects of a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneObjects {
     /// In the order of their first superpoints.
@@ -64,11 +63,9 @@ pub struct SceneObjects {
 /// Counts of objects and masks, for the summary.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ObjectsReport {
-    /// Objects.
     pub n_objects: usize,
     /// Gaussians that belong to one.
     pub n_gaussians: usize,
-    /// Masks.
     pub n_masks: usize,
     /// Masks that show an object; others cover several things, or parts.
     pub n_masks_of_objects: usize,

@@ -7,13 +7,17 @@ use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 use slag_math::random::Random;
 
+use super::affinity::Evidence;
+use super::find::find_among;
 use super::shards::{CellObjects, CentroidBasis};
 use super::*;
 use crate::cells::{CellLimits, CellSplit, split};
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::lift::photos::{MaskOutline, Photo};
 use crate::lift::superpoint::Superpoints;
-use crate::lift::{Contribution, ContributionIndex, RegionTable, ViewContributions};
+use crate::lift::{
+    Contribution, ContributionError, ContributionIndex, RegionTable, SceneContributions, ViewContributions,
+};
 
 /// Things in a row of cells, in files of contributions; thing i's masks have the vector of axis i.
 struct World {
@@ -104,19 +108,19 @@ impl World {
     }
 
     fn objects(&self, group_bytes: u64) -> SceneObjects {
-        self.objects_of(None, group_bytes, &AtomicBool::new(false)).expect("not cancelled")
+        self.objects_of(None, group_bytes, false).expect("not cancelled")
     }
 
     fn objects_of(
         &self,
         superpoints: Option<&Superpoints>,
         group_bytes: u64,
-        cancel: &AtomicBool,
-    ) -> Option<SceneObjects> {
-        let Self { gaussians, split, index, table, photos, score_context, .. } = self;
-        let scene =
-            Scene { index, table, gaussians, split, superpoints, photos, score_context, group_bytes, cancel };
-        find(&scene).expect("finds")
+        is_cancelled: bool,
+    ) -> Result<SceneObjects, ContributionError> {
+        let Self { gaussians, split, index, photos, .. } = self;
+        let cancel = &AtomicBool::new(is_cancelled);
+        let scene = SceneContributions { index, gaussians, split, photos, group_bytes, cancel };
+        find_among(&scene, &self.table, superpoints, &self.score_context)
     }
 }
 
@@ -161,8 +165,42 @@ fn objects_are_the_things_for_any_threads_and_memory() {
 }
 
 #[test]
-fn a_cancelled_search_returns_none() {
-    assert_eq!(world().objects_of(None, u64::MAX, &AtomicBool::new(true)), None);
+fn a_search_can_be_cancelled() {
+    let found = world().objects_of(None, u64::MAX, true);
+    assert!(matches!(found, Err(ContributionError::Cancelled)));
+}
+
+/// By hand: at the ends of a row, two pieces that are near nothing of each other, and in two views one mask over both: each has
+/// an intersection over union of one half with it. None has a mask of its own, so none is an object.
+#[test]
+fn a_mask_is_of_one_object_at_most() {
+    let (n, per_superpoint) = (1500u32, 10u32);
+    let gaussians = gaussians_at((0..n).map(|i| DVec3::new(f64::from(i), 0.0, 0.0)).collect());
+    let split = split(&gaussians, CellLimits::by_count(2000));
+    let seen = (0..n).filter(|i| *i < per_superpoint || *i >= n - per_superpoint);
+    let local = |i: u32| split.local_of_gaussian[i as usize];
+    let mut entries: Vec<Contribution> =
+        seen.map(|i| Contribution { local: local(i), region: 0, weight: 1.0 }).collect();
+    entries.sort_by_key(|entry| entry.local);
+    let view = ViewContributions {
+        dim: DIM,
+        mask_vectors: axis(0).collect(),
+        masks_of_region: vec![vec![0]],
+        entries_of_cell: vec![(0, entries)],
+    };
+    let world = World::new(gaussians, split, &[view.clone(), view]);
+    let of_gaussian = (0..n).map(|i| i / per_superpoint).collect();
+    let superpoints = Superpoints { of_gaussian, n: (n / per_superpoint) as usize };
+    let found = world.objects_of(Some(&superpoints), u64::MAX, false).expect("finds");
+    assert!(found.objects.is_empty(), "{:?}", found.objects);
+}
+
+/// Sums beyond 64 bits stay at the largest: thousands of views of billions of Gaussians.
+#[test]
+fn evidence_saturates() {
+    let mut evidence = Evidence { together: u64::MAX - 1, n: u64::MAX - 1 };
+    evidence += Evidence { together: 5, n: 5 };
+    assert_eq!(evidence, Evidence { together: u64::MAX, n: u64::MAX });
 }
 
 /// What shards say is what was found, in any order of the Gaussians.

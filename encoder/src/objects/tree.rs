@@ -1,4 +1,4 @@
-//! Superpoints are joined pair by pair, those with most affinity first: each join is a candidate for a thing, from a side of a
+//! Superpoints are joined pair by pair, those with most affinity first: each join is a candidate for an object, from a side of a
 //! cup to the whole table.
 //!
 //! The affinity of two sets is that of all their pairs that lie near each other, added up (average linkage, Sokal and
@@ -11,11 +11,11 @@ use super::affinity::Evidence;
 
 /// A forest over superpoints.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Tree {
+pub(super) struct Tree {
     /// Superpoints: nodes 0 to `n_leaves - 1`.
-    pub n_leaves: usize,
+    pub(super) n_leaves: usize,
     /// The two parts of each further node; both have lower numbers.
-    pub parts: Vec<[u32; 2]>,
+    pub(super) parts: Vec<[u32; 2]>,
 }
 
 /// Two slots to be joined: affinity as bits, which have the order of positive numbers, then the slots.
@@ -24,7 +24,7 @@ type Pair = (u64, Reverse<u32>, Reverse<u32>);
 impl Tree {
     /// Joins `n` superpoints until no two have evidence. Of equal affinities the pair with the lowest numbers comes first; a join
     /// goes by the number of the part that is near more others, of equally many the lower one.
-    pub fn new(n: usize, pairs: &[(u32, u32, Evidence)]) -> Self {
+    pub(super) fn new(n: usize, pairs: &[(u32, u32, Evidence)]) -> Self {
         let mut tree = Self { n_leaves: n, parts: Vec::new() };
         let mut neighbours: Vec<BTreeMap<u32, Evidence>> = vec![BTreeMap::new(); n];
         for (a, b, evidence) in pairs {
@@ -62,24 +62,18 @@ impl Tree {
         tree
     }
 
-    /// Returns the number of nodes.
-    pub fn len(&self) -> usize {
+    pub(super) fn len(&self) -> usize {
         self.n_leaves + self.parts.len()
     }
 
-    /// Returns whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     /// Returns the parts of a node; `None` for a superpoint.
-    pub fn parts_of(&self, node: usize) -> Option<[usize; 2]> {
+    pub(super) fn parts_of(&self, node: usize) -> Option<[usize; 2]> {
         let at = node.checked_sub(self.n_leaves)?;
         Some(self.parts[at].map(|part| part as usize))
     }
 
     /// Returns the nodes that are part of no other, ascending.
-    pub fn roots(&self) -> impl Iterator<Item = usize> {
+    pub(super) fn roots(&self) -> impl Iterator<Item = usize> {
         let mut is_part = vec![false; self.len()];
         self.parts.iter().flatten().for_each(|part| is_part[*part as usize] = true);
         (0..self.len()).filter(move |node| !is_part[*node])

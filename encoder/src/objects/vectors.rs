@@ -8,14 +8,14 @@ use crate::codebook::ScoreMetricContext;
 use crate::lift::RegionTable;
 use slag_math::dot;
 
-/// Most medoids of an object, in addition to its mean: one for each side of a thing.
-pub const MAX_MEDOIDS: usize = 4;
+/// Most medoids of an object, in addition to its mean: one for each side of an object.
+pub(super) const MAX_MEDOIDS: usize = 4;
 /// Most masks considered, the heaviest first: more hardly change the medoids, and time grows with the square.
 const MAX_MASKS: usize = 256;
 
 /// Returns `[n][dim]`: the direction of the weighted mean of some masks' vectors, then medoids. Each medoid in turn is the
 /// mask that most raises the weighted mean of all masks' cosines with their nearest medoid.
-pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
+pub(super) fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
     let dim = table.dim();
     let vector = |mask: u32| table.mask_vectors().get(mask as usize);
     let mut masks = masks.to_vec();
@@ -55,7 +55,7 @@ pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
 }
 
 /// Returns the mean and spread of the text bank's scores over objects, as cells have them over Gaussians.
-pub fn calibrate(objects: &[Object], score_context: &ScoreMetricContext, dim: usize) -> Calibration {
+pub(super) fn calibrate(objects: &[Object], score_context: &ScoreMetricContext, dim: usize) -> Calibration {
     let (mut sum, mut squares, mut n) = (0.0, 0.0, 0.0f64);
     for object in objects {
         for text in score_context.bank.vectors.chunks_exact(dim) {

@@ -6,7 +6,7 @@ use std::fmt;
 use anyhow::Result;
 use serde::Serialize;
 use slag_common::shard::Profile;
-use slag_encoder::encode::{EncodeSettings, Preset};
+use slag_encoder::encode::Preset;
 use slag_encoder::progress::Progress;
 
 use super::instances::InstanceReport;
@@ -41,14 +41,6 @@ pub(crate) struct DefaultsReport {
     rows: Vec<Row>,
 }
 
-fn plain(settings: &mut EncodeSettings) {
-    let plain = Preset::Plain.choices();
-    settings.aggregation = plain.aggregation;
-    settings.cells.objects = plain.objects;
-    settings.view.raster_width = plain.raster_width;
-    settings.view.regions = plain.regions;
-}
-
 pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<DefaultsReport> {
     let runner = Runner::open(args)?;
     let mut text = runner.text_encoder()?;
@@ -61,7 +53,7 @@ pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<Defaults
             let encoded = runner.encode(files, source, method, |settings| {
                 settings.cells.shards.profiles = vec![Profile::Exact];
                 if !is_default {
-                    plain(settings);
+                    Preset::Plain.apply(settings);
                 }
             })?;
             progress.advance(1);

@@ -16,7 +16,7 @@ use super::compose::{Layout, looking, pinhole};
 use super::grammar::Noun;
 use super::paint::{Colour, Material};
 use super::render::{NOTHING, Photo, Solids};
-use slag_encoder::embed::{self, Background};
+use slag_encoder::embed;
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::RasterView;
@@ -149,7 +149,7 @@ pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label
             }
             let cut = !segmented && random.below(4) == 0;
             let mask = if cut { cut_mask(&mask, &mut random) } else { mask };
-            let Some(crop) = embed::crop(&photo.image, &mask, Background::White) else { continue };
+            let Some(crop) = embed::crop(&photo.image, &mask) else { continue };
             let size = placed.bounds.size();
             let label = Label {
                 noun: placed.noun,

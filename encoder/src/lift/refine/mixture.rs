@@ -4,6 +4,7 @@
 use rayon::prelude::*;
 
 use super::points::{AXES, Point, add, length, make_unit, sum_of};
+use crate::lift::contributions::ContributionError;
 use crate::lift::embeddings::MIN_MEAN_LENGTH;
 use crate::lift::part::PartContributions;
 use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
@@ -11,6 +12,8 @@ use crate::lift::table::RegionTable;
 
 /// Most masks of a mixture, the heaviest first: enough for a hundred views of a few masks each.
 const MAX_MASKS: usize = 256;
+/// Contributions for each pair of superpoint and region, at least: those of the Gaussians of a superpoint.
+const ENTRIES_PER_SUM: u64 = 8;
 /// Evidence of a filled Gaussian, pixels: almost none.
 const FILLED_WEIGHT_PX: f32 = 1e-3;
 
@@ -60,6 +63,11 @@ impl PartSums {
 pub(super) struct SuperpointSums(Vec<Vec<(u32, f32)>>);
 
 impl SuperpointSums {
+    /// Returns the bytes that the sums of a partition take, of `n_entries` contributions.
+    pub(super) fn len_bytes(n_entries: u64) -> u64 {
+        n_entries / ENTRIES_PER_SUM * size_of::<(u32, f32)>() as u64
+    }
+
     pub(super) fn new(n_superpoints: usize) -> Self {
         Self(vec![Vec::new(); n_superpoints])
     }
@@ -115,7 +123,7 @@ impl Mixtures {
         sums: SuperpointSums,
         table: &mut RegionTable,
         mask_points: &[Point],
-    ) -> Self {
+    ) -> Result<Self, ContributionError> {
         let of_table = &*table;
         let mixture = |entries: Vec<(u32, f32)>| -> Vec<(u32, f32)> {
             let masks_of = |(region, weight): (u32, f32)| {
@@ -136,12 +144,12 @@ impl Mixtures {
             (mixture, length(&sum))
         };
         let mixtures: Vec<(Vec<(u32, f32)>, f32)> = sums.0.into_par_iter().map(with_length).collect();
-        let mut region = |(mixture, length): (Vec<(u32, f32)>, f32)| {
-            (length > MIN_MEAN_LENGTH)
-                .then(|| MixtureRegion { region: table.append_mixture(&mixture), length })
+        let mut region = |(mixture, length): (Vec<(u32, f32)>, f32)| match length > MIN_MEAN_LENGTH {
+            true => Ok(Some(MixtureRegion { region: table.append_mixture(&mixture)?, length })),
+            false => Ok(None),
         };
-        let regions = mixtures.into_iter().map(&mut region).collect();
-        Self { weight, of_gaussian: superpoints.of_gaussian, regions }
+        let regions = mixtures.into_iter().map(&mut region).collect::<Result<_, ContributionError>>()?;
+        Ok(Self { weight, of_gaussian: superpoints.of_gaussian, regions })
     }
 
     /// Adds an entry of its superpoint to each Gaussian of a part. With `fill`, a Gaussian without evidence takes the

@@ -31,7 +31,6 @@ pub(super) fn make_unit(point: &mut Point) {
     }
 }
 
-/// Returns the points of some regions, from the points of the masks.
 pub(super) fn of_regions(table: &RegionTable, mask_points: &[Point], regions: Range<usize>) -> Vec<Point> {
     let point = |region: usize| {
         let mut sum = [0.0; AXES];

@@ -1,56 +1,69 @@
-//! Drops contributions that say little about their Gaussian: those of a region that the Gaussian only touches, of a view that
-//! hardly shows it, and of a Gaussian that hardly shows anywhere.
+//! Drops the contributions of views that hardly show their Gaussian.
+
+use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::settings::Aggregation;
-use super::views::FirstRegions;
 use crate::lift::part::PartContributions;
 
-/// Gaussians that a thread works on at a time.
+/// Gaussians that a thread works on at a time, at least.
 const CHUNK: usize = 4096;
 
-/// Drops the contributions that the settings exclude. `mask_counts`: `[n_regions]`, the summed weight of each region's masks.
+/// A Gaussian's entries in one view, and their total weight.
+struct ViewEntries {
+    entries: Range<usize>,
+    weight: f32,
+}
+
+/// Cuts the entries of a Gaussian, ascending by region, into its views. `first_regions`: of each view, ascending.
+fn by_view(
+    contributions: &PartContributions,
+    entries: Range<usize>,
+    first_regions: &[u32],
+) -> Vec<ViewEntries> {
+    let mut views: Vec<ViewEntries> = Vec::new();
+    let mut end_region = 0;
+    for entry in entries {
+        let region = contributions.regions[entry];
+        if views.is_empty() || region >= end_region {
+            let next = first_regions.partition_point(|first| *first <= region);
+            end_region = first_regions.get(next).copied().unwrap_or(u32::MAX);
+            views.push(ViewEntries { entries: entry..entry, weight: 0.0 });
+        }
+        if let Some(view) = views.last_mut() {
+            view.entries.end = entry + 1;
+            view.weight += contributions.weights[entry];
+        }
+    }
+    views
+}
+
+/// Drops the entries of views in which a Gaussian has less than `min_view_share` of its weight in its best view.
+/// `mask_counts`: `[n_regions]`, the summed weight of each region's masks.
 pub(super) fn prune(
     contributions: &mut PartContributions,
-    settings: &Aggregation,
-    first_regions: &FirstRegions,
+    min_view_share: f32,
+    first_regions: &[u32],
     mask_counts: &[f32],
 ) {
-    let Aggregation { min_region_share, min_view_share, min_weight_px, .. } = *settings;
-    if min_region_share <= 0.0 && min_view_share <= 0.0 && min_weight_px <= 0.0 {
+    if min_view_share <= 0.0 {
         return;
     }
-    let n = contributions.total_weights.len();
-    let kept_of_chunk = |first: usize| -> Vec<Vec<u32>> {
-        let weights = &contributions.weights;
-        let kept_of = |k: usize| {
-            let views = first_regions.cut(contributions, contributions.entries_of(k));
-            let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
-            if views.iter().map(|view| view.weight).sum::<f32>() < min_weight_px {
-                return Vec::new();
-            }
-            let seen = views.into_iter().filter(|view| view.weight >= min_view_share * best);
-            seen.flat_map(|view| {
-                let largest = weights[view.entries.clone()].iter().copied().fold(0.0, f32::max);
-                let large = move |entry: &usize| weights[*entry] >= min_region_share * largest;
-                view.entries.filter(large).map(|entry| entry as u32)
-            })
-            .collect()
-        };
-        (first..(first + CHUNK).min(n)).map(kept_of).collect()
+    let kept_of = |k: usize| -> Vec<Range<usize>> {
+        let views = by_view(contributions, contributions.entries_of(k), first_regions);
+        let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
+        let seen = views.into_iter().filter(|view| view.weight >= min_view_share * best);
+        seen.map(|view| view.entries).collect()
     };
-    let firsts: Vec<usize> = (0..n).step_by(CHUNK).collect();
-    let kept: Vec<Vec<u32>> = firsts.into_par_iter().flat_map_iter(kept_of_chunk).collect();
+    let n = contributions.total_weights.len();
+    let kept: Vec<Vec<Range<usize>>> = (0..n).into_par_iter().with_min_len(CHUNK).map(kept_of).collect();
     let mut at = 0;
     for (k, kept) in kept.into_iter().enumerate() {
         let mut total = 0.0;
-        for entry in kept {
-            let entry = entry as usize;
-            (contributions.regions[at], contributions.weights[at]) =
-                (contributions.regions[entry], contributions.weights[entry]);
-            total += f64::from(contributions.weights[at])
-                * f64::from(mask_counts[contributions.regions[at] as usize]);
+        for entry in kept.into_iter().flatten() {
+            let (region, weight) = (contributions.regions[entry], contributions.weights[entry]);
+            (contributions.regions[at], contributions.weights[at]) = (region, weight);
+            total += f64::from(weight) * f64::from(mask_counts[region as usize]);
             at += 1;
         }
         contributions.starts[k + 1] = at as u64;

@@ -1,12 +1,13 @@
 use std::sync::atomic::AtomicBool;
 
 use glam::DVec3;
+use slag_common::Gaussians;
 use slag_common::container::AlignedBytes;
 use slag_common::frames::Aabb;
 use slag_math::random::mix64;
 
 use super::*;
-use crate::cells::{Cell, PositionGrid};
+use crate::cells::{Cell, CellSplit, PositionGrid};
 use crate::lift::photos::MaskOutline;
 use crate::lift::tests::{Scene, open};
 use crate::lift::{CellField, Contribution, ViewContributions};
@@ -102,23 +103,27 @@ struct Lifted {
 }
 
 fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
-    let mut opened = open(&views(), DIM, &[N], u64::MAX);
-    let Scene { index, table, .. } = &mut opened;
-    let (scene, split) = (gaussians(), split());
-    let subject = Subject { scene: &scene, split: &split };
-    let passes = Passes { index, group_bytes, cancel: &AtomicBool::new(false) };
-    let begun = Refinement::begin(settings, passes, table, subject, &photos()).expect("reads");
-    let finish =
-        |begun: Begun| begun.finish(passes, table, subject, &object_of()).expect("reads").expect("refines");
-    let refinement = begun.map(finish);
+    lift(&views(), DIM, &photos(), settings, group_bytes)
+}
+
+fn lift(
+    views: &[ViewContributions],
+    dim: usize,
+    photos: &[Photo],
+    settings: Aggregation,
+    group_bytes: u64,
+) -> Lifted {
+    let Scene { index, table, .. } = &open(views, dim, &[N], u64::MAX);
+    let (gaussians, split, cancel) = (&gaussians(), &split(), &AtomicBool::new(false));
+    let scene = SceneContributions { index, gaussians, split, photos, group_bytes, cancel };
+    let pending = PendingRefinement::begin(settings, &scene, table.clone()).expect("reads");
+    let (table, refinement) = pending.finish(&scene, &object_of()).expect("reads");
     let raw = index.read(0..1).expect("reads");
-    let mut contributions = index.transpose(&raw, table).expect("transposes").remove(0);
-    if let Some(refinement) = refinement {
-        refinement.apply(&mut contributions, &split.cells[0].gaussians);
-    }
-    let mut embeddings = vec![f32::NAN; N * DIM];
-    let field = CellField::new(split.cells[0].gaussians.clone(), contributions, table, &mut embeddings);
-    Lifted { field, table: table.clone(), embeddings }
+    let mut contributions = index.transpose(&raw, &table).expect("transposes").remove(0);
+    refinement.apply(&mut contributions, &split.cells[0].gaussians);
+    let mut embeddings = vec![f32::NAN; N * dim];
+    let field = CellField::new(split.cells[0].gaussians.clone(), contributions, &table, &mut embeddings);
+    Lifted { field, table, embeddings }
 }
 
 /// Entries of a Gaussian in float64, view by view: `(masks of the view, region, weight)`.
@@ -134,24 +139,9 @@ fn pruned(rows: Vec<Vec<(usize, f64)>>, settings: &Aggregation) -> Vec<Vec<(usiz
     let weight = |view: &Vec<(usize, f64)>| view.iter().map(|e| e.1).sum::<f64>();
     let best = rows.iter().map(weight).fold(0.0, f64::max);
     let kept = |view: Vec<(usize, f64)>| {
-        if weight(&view) < f64::from(settings.min_view_share) * best {
-            return Vec::new();
-        }
-        let largest = view.iter().map(|e| e.1).fold(0.0, f64::max);
-        view.into_iter().filter(|e| e.1 >= f64::from(settings.min_region_share) * largest).collect()
+        if weight(&view) < f64::from(settings.min_view_share) * best { Vec::new() } else { view }
     };
     rows.into_iter().map(kept).collect()
-}
-
-/// Views' weights to the power of 1 less the equalisation, and the same weight in all.
-fn equalised(rows: Vec<Vec<(usize, f64)>>, equalisation: f64) -> Vec<Vec<(usize, f64)>> {
-    let weights: Vec<f64> = rows.iter().map(|view| view.iter().map(|e| e.1).sum()).collect();
-    let total: f64 = weights.iter().sum();
-    let even: f64 = weights.iter().filter(|w| **w > 0.0).map(|w| w.powf(1.0 - equalisation)).sum();
-    let scaled = |(view, w): (Vec<(usize, f64)>, &f64)| {
-        view.into_iter().map(|(region, a)| (region, a * w.powf(-equalisation) * total / even)).collect()
-    };
-    rows.into_iter().zip(&weights).map(scaled).collect()
 }
 
 /// `Σ weight * how often the mask counts * its vector` over a view's entries.
@@ -176,44 +166,7 @@ fn oracle_counts(views: &[ViewContributions], settings: &Aggregation) -> Vec<Vec
     let whole = |v: usize, mask: usize| {
         (1.0 - ((v * 6 + mask) % 41) as f64 / 40.0).max(0.01).powf(settings.truncation_power.into())
     };
-    let whole: Vec<Vec<f64>> =
-        (0..views.len()).map(|v| (0..6).map(|mask| whole(v, mask)).collect()).collect();
-    if settings.agreement == 0.0 {
-        return whole;
-    }
-    let mut votes = vec![vec![(0.0, 0.0); 6]; views.len()];
-    for k in 0..N {
-        let rows = pruned(row(views, k), settings);
-        let parts: Vec<Vec<f64>> = rows
-            .iter()
-            .zip(views)
-            .zip(&whole)
-            .map(|((e, view), whole)| contribution(view, e, whole))
-            .collect();
-        for (v, entries) in rows.iter().enumerate() {
-            let rest: Vec<f64> = (0..DIM)
-                .map(|c| parts.iter().enumerate().filter(|(u, _)| *u != v).map(|(_, p)| p[c]).sum())
-                .collect();
-            if norm(&rest) < 1e-9 {
-                continue;
-            }
-            for (region, weight) in entries {
-                for mask in &views[v].masks_of_region[*region] {
-                    let mask = *mask as usize;
-                    let vector = &views[v].mask_vectors[mask * DIM..][..DIM];
-                    let cosine: f64 =
-                        rest.iter().zip(vector).map(|(r, m)| r * f64::from(*m)).sum::<f64>() / norm(&rest);
-                    votes[v][mask].0 += weight * cosine;
-                    votes[v][mask].1 += weight;
-                }
-            }
-        }
-    }
-    let count = |(sum, weight): &(f64, f64)| (sum / weight).max(0.01).powf(f64::from(settings.agreement));
-    let counts = |(of_view, whole): (&Vec<(f64, f64)>, &Vec<f64>)| {
-        of_view.iter().zip(whole).map(|(vote, whole)| count(vote) * whole).collect()
-    };
-    votes.iter().zip(&whole).map(counts).collect()
+    (0..views.len()).map(|v| (0..6).map(|mask| whole(v, mask)).collect()).collect()
 }
 
 fn assert_near(found: &[f32], expected: &[f64], what: &str) {
@@ -223,45 +176,29 @@ fn assert_near(found: &[f32], expected: &[f64], what: &str) {
     }
 }
 
+/// Oracle: the table and the contributions as they were read.
 #[test]
-fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
-    let mut opened = open(&views(), DIM, &[N], u64::MAX);
-    let Scene { index, table, .. } = &mut opened;
-    let before = table.clone();
-    let (scene, split) = (gaussians(), split());
-    let subject = Subject { scene: &scene, split: &split };
-    let passes = Passes { index, group_bytes: u64::MAX, cancel: &AtomicBool::new(false) };
-    let none = Refinement::begin(Aggregation::PLAIN, passes, table, subject, &photos());
-    assert!(none.expect("reads").is_none());
-    assert_eq!(*table, before);
-    assert_eq!(Aggregation::default(), Aggregation::PLAIN);
+fn the_plain_average_changes_neither_table_nor_contributions() {
+    let Scene { index, table, .. } = &open(&views(), DIM, &[N], u64::MAX);
+    let plain = lifted(Aggregation::default(), u64::MAX);
+    assert_eq!(plain.table, *table);
+    let contributions =
+        index.transpose(&index.read(0..1).expect("reads"), table).expect("transposes").remove(0);
+    let mut embeddings = vec![f32::NAN; N * DIM];
+    let field = CellField::new((0..N as u32).collect(), contributions, table, &mut embeddings);
+    assert_eq!((plain.field, plain.embeddings), (field, embeddings));
 }
 
 /// Oracle: float64 by definition, Gaussian by Gaussian.
 #[test]
 fn what_masks_and_views_count_is_that_of_the_definition() {
     let views = views();
-    let cases = [
-        (0.0, (0.5, 0.3), 0.0, 0.0),
-        (1.0, (0.0, 0.0), 0.0, 0.0),
-        (2.0, (0.5, 0.3), 0.0, 0.0),
-        (0.0, (0.0, 0.0), 2.0, 0.0),
-        (0.0, (0.0, 0.0), 0.0, 0.5),
-        (0.5, (0.0, 0.3), 2.0, 1.0),
-    ];
-    for (agreement, shares, truncation_power, equalisation) in cases {
-        let settings = Aggregation {
-            agreement,
-            truncation_power,
-            equalisation,
-            min_region_share: shares.0,
-            min_view_share: shares.1,
-            ..Aggregation::PLAIN
-        };
+    for (truncation_power, min_view_share) in [(0.0, 0.3), (2.0, 0.0), (2.0, 0.3), (0.5, 0.05)] {
+        let settings = Aggregation { truncation_power, min_view_share, ..Aggregation::PLAIN };
         let Lifted { field, table, embeddings } = lifted(settings, u64::MAX);
         let counts = oracle_counts(&views, &settings);
         for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
-            let rows = equalised(pruned(row(&views, k), &settings), equalisation.into());
+            let rows = pruned(row(&views, k), &settings);
             let mut expected = vec![0.0; DIM];
             for ((view, entries), counts) in views.iter().zip(&rows).zip(&counts) {
                 let part = contribution(view, entries, counts);
@@ -272,10 +209,6 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
             let query: Vec<f32> = (0..DIM).map(|c| random(c as u64) as f32).collect();
             let cosine = field.cosines(&table.scores(&query))[k];
             assert!((cosine - dot(&embeddings[k * DIM..][..DIM], &query)).abs() < 1e-4);
-        }
-        if agreement >= 1.0 {
-            let [good, bad] = [0, 3].map(|v| table.masks_of(v * 9).next().expect("a mask").1);
-            assert!(bad < 0.5 * good, "the view that contradicts: {bad}, another: {good}");
         }
     }
 }
@@ -365,51 +298,11 @@ fn an_object_gives_its_part_to_its_gaussians() {
     }
 }
 
-/// Oracle: what Weiszfeld's steps lead to has the smallest sum of distances; the mean has a larger one.
-#[test]
-fn the_median_leaves_the_view_that_contradicts() {
-    let views = views();
-    let cost = |of: &Lifted| -> f64 {
-        let mut cost = 0.0;
-        for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
-            for (view, entries) in views.iter().zip(row(&views, k)) {
-                let part = contribution(view, &entries, &[1.0; 6]);
-                let weight = norm(&part);
-                if weight > 0.0 {
-                    let offset = (0..DIM).map(|c| part[c] / weight - f64::from(of.embeddings[k * DIM + c]));
-                    cost += weight * norm(&offset.collect::<Vec<_>>());
-                }
-            }
-        }
-        cost
-    };
-    let mean = cost(&lifted(Aggregation::PLAIN, u64::MAX));
-    let costs = [1, 3, 20]
-        .map(|median_steps| cost(&lifted(Aggregation { median_steps, ..Aggregation::PLAIN }, u64::MAX)));
-    println!("{mean} {costs:?}");
-    assert!(costs[0] < 0.97 * mean && costs[1] < costs[0] && costs[2] <= costs[1]);
-}
-
-#[test]
-fn the_gate_takes_the_evidence_of_what_hardly_shows() {
-    let settings = Aggregation { min_weight_px: 30.0, ..Aggregation::PLAIN };
-    let Lifted { field, .. } = lifted(settings, u64::MAX);
-    let views = views();
-    let mut n_gated = 0;
-    for k in 0..N {
-        let weight: f64 = row(&views, k).iter().flatten().map(|e| e.1).sum();
-        assert_eq!(field.has_evidence(k), weight >= 30.0, "{k}: {weight}");
-        n_gated += usize::from(weight < 30.0);
-    }
-    assert!((10..80).contains(&n_gated), "{n_gated}");
-}
-
 #[test]
 fn threads_and_budget_do_not_show() {
-    let settings = Aggregation { median_steps: 2, ..Aggregation::REFINED };
     let run = |threads: usize, group_bytes: u64| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-        let Lifted { field, table, embeddings } = pool.install(|| lifted(settings, group_bytes));
+        let Lifted { field, table, embeddings } = pool.install(|| lifted(Aggregation::REFINED, group_bytes));
         (field, table, embeddings)
     };
     let expected = run(1, u64::MAX);
@@ -426,23 +319,9 @@ fn a_single_view_keeps_its_evidence() {
         masks_of_region: vec![vec![0]],
         entries_of_cell: vec![(0, vec![Contribution { local: 2, region: 0, weight: 1.0 }])],
     };
-    let mut opened = open(&[view], 64, &[N], u64::MAX);
-    let Scene { index, table, .. } = &mut opened;
-    let (scene, split) = (gaussians(), split());
-    let photos = [Photo {
-        name: "0".into(),
-        outlines: vec![MaskOutline { box_px: [0, 0, 8, 8], ..MaskOutline::default() }],
-    }];
-    let subject = Subject { scene: &scene, split: &split };
-    let passes = Passes { index, group_bytes: u64::MAX, cancel: &AtomicBool::new(false) };
-    let begun = Refinement::begin(Aggregation::REFINED, passes, table, subject, &photos);
-    let begun = begun.expect("reads").expect("begins");
-    let refinement = begun.finish(passes, table, subject, &object_of()).expect("reads").expect("refines");
-    let raw = index.read(0..1).expect("reads");
-    let mut contributions = index.transpose(&raw, table).expect("transposes").remove(0);
-    refinement.apply(&mut contributions, &split.cells[0].gaussians);
-    let mut embeddings = vec![0.0; N * 64];
-    let field = CellField::new((0..N as u32).collect(), contributions, table, &mut embeddings);
+    let outline = MaskOutline { box_px: [0, 0, 8, 8], ..MaskOutline::default() };
+    let photos = [Photo { name: "0".into(), outlines: vec![outline] }];
+    let Lifted { field, embeddings, .. } = lift(&[view], 64, &photos, Aggregation::REFINED, u64::MAX);
     // Its patch is filled, the others know nothing.
     assert!((0..N).all(|k| field.has_evidence(k) == (k < 30)));
     assert!((0..30).all(|k| (embeddings[k * 64 + 3] - 1.0).abs() < 1e-6));

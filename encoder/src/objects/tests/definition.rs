@@ -150,7 +150,7 @@ fn oracle(views: &Views, pairs: &[(u32, u32)], superpoint_of: &[u32]) -> (Vec<Op
             }
             let best = masks.values().map(|mask| iou(view, mask, set)).fold(0.0, f64::max);
             agreements.push(best);
-            n_same += usize::from(best >= 0.5);
+            n_same += usize::from(best > 0.5);
         }
         let consensus = agreements.iter().sum::<f64>() / agreements.len().max(1) as f64;
         let is_thing = set.len() >= 10 && n_same >= 2 && consensus >= 0.3;
@@ -169,7 +169,7 @@ fn oracle(views: &Views, pairs: &[(u32, u32)], superpoint_of: &[u32]) -> (Vec<Op
     let n_masks = |set: &usize| {
         let set = gaussians(&sets[*set]);
         let of_view = |(view, masks): (usize, &BTreeMap<u32, Set>)| {
-            masks.values().filter(|mask| iou(view, mask, &set) >= 0.5).count()
+            masks.values().filter(|mask| iou(view, mask, &set) > 0.5).count()
         };
         masks.iter().enumerate().map(of_view).sum()
     };
@@ -184,9 +184,7 @@ fn objects_are_those_of_the_definition() {
         let mut random = Random::new(seed);
         for views in [made_views(&mut random), random_views(&mut random)] {
             let (world, superpoints) = world_of(&views);
-            let found = world
-                .objects_of(Some(&superpoints), u64::MAX, &AtomicBool::new(false))
-                .expect("not cancelled");
+            let found = world.objects_of(Some(&superpoints), u64::MAX, false).expect("not cancelled");
             let pairs = near::pairs(&world.gaussians, &superpoints);
             let (expected, n_masks) = oracle(&views, &pairs, &superpoints.of_gaussian);
             let mut object_of = vec![None; superpoints.n];
@@ -210,8 +208,7 @@ fn objects_are_those_of_the_definition() {
 #[test]
 fn things_are_found_among_masks_of_parts_and_of_everything() {
     let (world, superpoints) = world_of(&made_views(&mut Random::new(1)));
-    let found =
-        world.objects_of(Some(&superpoints), u64::MAX, &AtomicBool::new(false)).expect("not cancelled");
+    let found = world.objects_of(Some(&superpoints), u64::MAX, false).expect("not cancelled");
     assert_eq!(found.objects.len(), N_THINGS as usize);
     for (cell, of_cell) in world.split.cells.iter().zip(&found.object_of) {
         let things = cell.gaussians.iter().map(|gaussian| gaussian / PER_ROW);

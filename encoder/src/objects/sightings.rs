@@ -2,9 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::scene::Scene;
 use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
-use crate::lift::{ContributionError, PartContributions, RegionTable};
+use crate::lift::{ContributionError, PartContributions, RegionTable, SceneContributions};
 use crate::memory::{MemoryPlan, Phase};
 
 /// A view sees a Gaussian if its weight there is at least this share of that in its best view: remnants behind other
@@ -19,34 +18,32 @@ const EXPECTED_ENTRIES_PER_REGION: u64 = 15;
 
 /// What a view shows of a superpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct OfView<'a> {
-    /// The view.
-    pub view: u32,
+pub(super) struct ViewSighting<'a> {
+    pub(super) view: u32,
     /// The superpoint's Gaussians that it sees.
-    pub n: u32,
+    pub(super) n: u32,
     /// The masks that show it, ascending.
-    pub masks: &'a [OfMask],
+    pub(super) masks: &'a [MaskSighting],
 }
 
 /// What a mask shows of a superpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct OfMask {
-    /// The mask.
-    pub mask: u32,
+pub(super) struct MaskSighting {
+    pub(super) mask: u32,
     /// The superpoint's Gaussians that the view sees under it.
-    pub n: u32,
+    pub(super) n: u32,
     /// Blending weight of its Gaussians under the mask, pixels.
-    pub weight: f64,
+    pub(super) weight: f64,
 }
 
 /// What all views show of all superpoints.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Shown {
+pub(super) struct Sightings {
     /// `[n + 1]`: where each superpoint's views start.
     starts: Vec<usize>,
     /// View, Gaussians, and where its masks start; one more at the end.
     views: Vec<(u32, u32, usize)>,
-    masks: Vec<OfMask>,
+    masks: Vec<MaskSighting>,
 }
 
 /// What a region shows of a superpoint.
@@ -60,27 +57,28 @@ struct Entry {
 
 /// Reserves what views show of superpoints, among `n_entries` contributions.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_entries: u64) {
-    let bytes = |per_region: u64| n_entries / per_region * (size_of::<Entry>() + size_of::<OfMask>()) as u64;
-    memory.reserve_expecting(Phase::Objects, "masks of superpoints", bytes(ENTRIES_PER_REGION), 0);
+    let bytes =
+        |per_region: u64| n_entries / per_region * (size_of::<Entry>() + size_of::<MaskSighting>()) as u64;
+    memory.reserve_expecting(
+        Phase::Objects,
+        "masks of superpoints",
+        bytes(ENTRIES_PER_REGION),
+        bytes(EXPECTED_ENTRIES_PER_REGION),
+    );
 }
 
-/// Returns the bytes of what views show of superpoints, expected of `n_entries` contributions.
-pub fn expected_bytes(n_entries: u64) -> u64 {
-    n_entries / EXPECTED_ENTRIES_PER_REGION * (size_of::<Entry>() + size_of::<OfMask>()) as u64
-}
-
-impl Shown {
-    /// Gathers what the views show, in one pass over all contributions. Returns `None` if cancelled.
-    ///
-    /// # Errors
-    /// [`ContributionError`].
-    pub fn gather(scene: &Scene<'_>, superpoints: &Superpoints) -> Result<Option<Self>, ContributionError> {
-        let view_of_region = scene.view_of_region();
+impl Sightings {
+    /// Gathers what the views show, in one pass over all contributions.
+    pub(super) fn gather(
+        scene: &SceneContributions<'_>,
+        table: &RegionTable,
+        superpoints: &Superpoints,
+    ) -> Result<Self, ContributionError> {
+        let regions = (0u32..).zip(scene.index.n_regions_of_view());
+        let view_of_region: Vec<u32> = regions.flat_map(|(view, n)| std::iter::repeat_n(view, n)).collect();
         let mut entries = Vec::new();
-        for contributions in scene.index.transposed_parts(scene.table, scene.group_bytes) {
-            if scene.is_cancelled() {
-                return Ok(None);
-            }
+        for contributions in scene.index.transposed_parts(table, scene.group_bytes) {
+            scene.check_cancelled()?;
             let contributions = contributions?;
             let gaussians = contributions.part.gaussians(scene.split);
             let chunks = gaussians.par_chunks(GAUSSIANS_PER_TASK).enumerate();
@@ -94,27 +92,27 @@ impl Shown {
         }
         // Of one pair in the order of the parts: sums are the same every time.
         entries.par_sort_by_key(|entry| (entry.superpoint, entry.region));
-        Ok(Some(Self::new(superpoints.n, &join(entries), scene.table, &view_of_region)))
+        Ok(Self::new(superpoints.n, &join(entries), table, &view_of_region))
     }
 
     fn new(n: usize, entries: &[Entry], table: &RegionTable, view_of_region: &[u32]) -> Self {
-        let mut shown = Self { starts: Vec::with_capacity(n + 1), views: Vec::new(), masks: Vec::new() };
+        let mut sightings = Self { starts: Vec::with_capacity(n + 1), views: Vec::new(), masks: Vec::new() };
         let view_of = |entry: &Entry| view_of_region[entry.region as usize];
         let mut rest = entries;
         for superpoint in 0..n as u32 {
-            shown.starts.push(shown.views.len());
+            sightings.starts.push(sightings.views.len());
             let own;
             (own, rest) = rest.split_at(rest.partition_point(|entry| entry.superpoint <= superpoint));
             for of_view in own.chunk_by(|a, b| view_of(a) == view_of(b)) {
-                let first = shown.masks.len();
+                let first = sightings.masks.len();
                 let n_seen = of_view.iter().map(|entry| entry.n).sum();
-                shown.views.push((view_of(&of_view[0]), n_seen, first));
+                sightings.views.push((view_of(&of_view[0]), n_seen, first));
                 let of_entry = |entry: &Entry| {
                     let masks = table.all_masks_of(entry.region as usize).iter();
                     let (n, weight) = (entry.n, entry.weight);
-                    masks.map(move |mask| OfMask { mask: *mask, n, weight })
+                    masks.map(move |mask| MaskSighting { mask: *mask, n, weight })
                 };
-                let mut masks: Vec<OfMask> = of_view.iter().flat_map(of_entry).collect();
+                let mut masks: Vec<MaskSighting> = of_view.iter().flat_map(of_entry).collect();
                 masks.sort_by_key(|of_mask| of_mask.mask);
                 masks.dedup_by(|next, kept| {
                     let is_same = next.mask == kept.mask;
@@ -124,34 +122,28 @@ impl Shown {
                     }
                     is_same
                 });
-                shown.masks.append(&mut masks);
+                sightings.masks.append(&mut masks);
             }
         }
-        shown.starts.push(shown.views.len());
-        shown.views.push((0, 0, shown.masks.len()));
-        shown
+        sightings.starts.push(sightings.views.len());
+        sightings.views.push((0, 0, sightings.masks.len()));
+        sightings
     }
 
-    /// Returns the number of superpoints.
-    pub fn len(&self) -> usize {
+    pub(super) fn len(&self) -> usize {
         self.starts.len().saturating_sub(1)
     }
 
-    /// Returns whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     /// Returns what each view shows of a superpoint, views ascending.
-    pub fn of(&self, superpoint: usize) -> impl Iterator<Item = OfView<'_>> {
+    pub(super) fn of(&self, superpoint: usize) -> impl Iterator<Item = ViewSighting<'_>> {
         (self.starts[superpoint]..self.starts[superpoint + 1]).map(|at| {
             let (view, n, first) = self.views[at];
-            OfView { view, n, masks: &self.masks[first..self.views[at + 1].2] }
+            ViewSighting { view, n, masks: &self.masks[first..self.views[at + 1].2] }
         })
     }
 
     /// Returns what each mask shows of each superpoint, superpoint by superpoint.
-    pub fn masks(&self) -> impl Iterator<Item = (usize, &OfMask)> {
+    pub(super) fn masks(&self) -> impl Iterator<Item = (usize, &MaskSighting)> {
         (0..self.len())
             .flat_map(|at| self.of(at).flat_map(move |of_view| of_view.masks.iter().map(move |of| (at, of))))
     }
