@@ -1,27 +1,21 @@
 //! Embedding: a crop for each mask, and a vector for each crop.
 
-mod patches;
 mod shared;
 mod surroundings;
 
 use std::num::NonZeroUsize;
 
 use image::{Rgb, RgbImage, imageops};
-use slag_models::{
-    Crop, ImageEncoder, InferenceError,
-    preprocess::{Filter, Preprocess, Window, resample},
-};
+use slag_models::{Crop, ImageEncoder, InferenceError, preprocess::Preprocess};
 
 use crate::masks::{BoxPx, Mask};
 
-pub use patches::{PatchUse, PhotoPatches};
 pub use shared::{Failure, OpenEncoder, SharedEncoders};
 pub use surroundings::Surroundings;
 
 /// Reason why masks cannot be embedded.
 #[derive(Debug, thiserror::Error)]
 pub enum EmbedError {
-    /// A mask is outside the image, is empty, or its box does not match its pixels.
     #[error(
         "mask {index}: box {box_px:?} with {n_inside} pixels inside does not fit an image of {width_px}x{height_px}; \
          segment this image again"
@@ -38,13 +32,11 @@ pub enum EmbedError {
         /// Height of the image.
         height_px: u32,
     },
-    /// The encoder failed on the patches of a photo, or has none.
     #[error("patches of the photo: {cause}")]
     Patches {
         /// The encoder's error.
         cause: Box<InferenceError>,
     },
-    /// The encoder failed on a batch.
     #[error("masks {first} to {last}: {cause}")]
     Encode {
         /// Index of the first mask in the batch.
@@ -56,30 +48,59 @@ pub enum EmbedError {
     },
 }
 
-/// Content of a crop outside its mask.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, serde::Serialize, serde::Deserialize)]
-pub enum Background {
-    /// White.
-    White,
-    /// Mid-grey (128), which is about 0 after the normalisation of most models.
-    Grey,
-    /// The blurred photo: surroundings without detail.
-    Blur,
-    /// The unchanged photo.
-    Keep,
+impl EmbedError {
+    /// Returns whether it lies in the crops or the photo: a model that cannot run fails on those of other views, too.
+    pub(crate) fn is_of_crops(&self) -> bool {
+        match self {
+            Self::Mask { .. } => true,
+            Self::Patches { cause } | Self::Encode { cause, .. } => {
+                !matches!(**cause, InferenceError::Session(_))
+            }
+        }
+    }
 }
 
-/// Standard deviation of [`Background::Blur`] relative to the longer edge of the box. It hides the surroundings of the
-/// mask but keeps their colours.
-const BLUR_OF_EDGE: f32 = 0.05;
+/// How the vectors of a photo's patches are used.
+pub enum PatchUse {
+    /// Each of these patches is a region with a vector of its own; numbers row by row.
+    Regions(Vec<usize>),
+    /// Masks take a share.
+    Masks(Surroundings),
+}
+
+impl PatchUse {
+    /// Adds the vectors of regions to those of the crops, `[masks][dim]`, or mixes the patches into them; all are unit vectors.
+    /// # Errors
+    /// [`EmbedError::Patches`] where the encoder fails.
+    pub(crate) fn add_to(
+        &self,
+        photo: &RgbImage,
+        vectors: &mut Vec<f32>,
+        encoder: &mut dyn ImageEncoder,
+    ) -> Result<(), EmbedError> {
+        let of_patches = encoder
+            .encode_patches(photo)
+            .map_err(|cause| EmbedError::Patches { cause: Box::new(cause) })?
+            .unwrap_or_default();
+        let dim = encoder.dim();
+        match self {
+            Self::Regions(numbers) => {
+                let chosen = numbers.iter().filter_map(|&k| of_patches.get(k * dim..(k + 1) * dim));
+                vectors.extend(chosen.flatten());
+            }
+            Self::Masks(surroundings) => surroundings.mix(vectors, &of_patches, dim),
+        }
+        Ok(())
+    }
+}
 
 /// Largest number of pixels in a batch of crops; large crops fill a batch before the encoder's preferred number.
 const MAX_BATCH_PIXELS: u64 = 1 << 24;
 
-/// Crops the image to the bounding box of a mask and replaces pixels outside the mask by the background.
+/// Crops the image to the bounding box of a mask; pixels outside the mask become white.
 ///
 /// Returns `None` if the mask does not fit the image or is empty.
-pub fn crop(image: &RgbImage, mask: &Mask, background: Background) -> Option<Crop> {
+pub fn crop(image: &RgbImage, mask: &Mask) -> Option<Crop> {
     let BoxPx { x0, y0, x1, y1 } = mask.box_px;
     let fits = x0 < x1 && y0 < y1 && x1 <= image.width() && y1 <= image.height();
     if !fits || !mask.inside.contains(&true) {
@@ -90,44 +111,13 @@ pub fn crop(image: &RgbImage, mask: &Mask, background: Background) -> Option<Cro
         return None;
     }
     let outside = pixels.pixels_mut().zip(&mask.inside).filter(|(_, inside)| !**inside);
-    match background {
-        Background::White => outside.for_each(|(pixel, _)| *pixel = Rgb([255; 3])),
-        Background::Grey => outside.for_each(|(pixel, _)| *pixel = Rgb([128; 3])),
-        Background::Keep => {}
-        Background::Blur => {
-            let blurred = blurred(&pixels, BLUR_OF_EDGE * (x1 - x0).max(y1 - y0) as f32);
-            let outside =
-                pixels.pixels_mut().zip(blurred.pixels()).zip(&mask.inside).filter(|(_, inside)| !**inside);
-            outside.for_each(|((pixel, blurred), _)| *pixel = *blurred);
-        }
-    }
+    outside.for_each(|(pixel, _)| *pixel = Rgb([255; 3]));
     Crop::new(pixels, mask.inside.clone())
 }
 
-/// Blurs an image with a Gaussian of standard deviation `sigma_px`.
-fn blurred(image: &RgbImage, sigma_px: f32) -> RgbImage {
-    // A wide Gaussian removes all detail beyond that of a smaller image, and its cost grows with its width. Short
-    // edges keep at least 8 pixels, so that rounding changes the proportions little.
-    let short_px = image.width().min(image.height()) as f32;
-    let shrink = (sigma_px / 4.0).min(short_px / 8.0).max(1.0);
-    let [width, height] =
-        [image.width(), image.height()].map(|edge| ((edge as f32 / shrink).round() as u32).max(1));
-    let small = imageops::blur(&resized(image, width, height), sigma_px / shrink);
-    resized(&small, image.width(), image.height())
-}
-
-fn resized(image: &RgbImage, width_px: u32, height_px: u32) -> RgbImage {
-    let whole = Window { left_px: 0, top_px: 0, width_px, height_px };
-    resample(image, Filter::Bicubic, [width_px, height_px].map(u64::from), whole)
-}
-
 /// Returns the crop of mask `index`, or the error.
-fn crop_of(
-    image: &RgbImage,
-    (index, mask): (usize, &Mask),
-    background: Background,
-) -> Result<Crop, EmbedError> {
-    crop(image, mask, background).ok_or_else(|| EmbedError::Mask {
+fn crop_of(image: &RgbImage, (index, mask): (usize, &Mask)) -> Result<Crop, EmbedError> {
+    crop(image, mask).ok_or_else(|| EmbedError::Mask {
         index,
         box_px: mask.box_px,
         n_inside: mask.inside.iter().filter(|&&inside| inside).count(),
@@ -139,13 +129,8 @@ fn crop_of(
 /// Returns the crop of each mask as the small square that the image encoder takes.
 /// # Errors
 /// [`EmbedError::Mask`] if a mask does not fit the image.
-pub fn squares(
-    image: &RgbImage,
-    masks: &[Mask],
-    background: Background,
-    preprocess: &Preprocess,
-) -> Result<Vec<Crop>, EmbedError> {
-    let square = |mask| Ok(Crop::whole(preprocess.square(crop_of(image, mask, background)?.image())));
+pub fn squares(image: &RgbImage, masks: &[Mask], preprocess: &Preprocess) -> Result<Vec<Crop>, EmbedError> {
+    let square = |mask| Ok(Crop::whole(preprocess.square(crop_of(image, mask)?.image())));
     masks.iter().enumerate().map(square).collect()
 }
 
@@ -175,7 +160,6 @@ pub fn embed_masks(
     image: &RgbImage,
     masks: &[Mask],
     encoder: &mut dyn ImageEncoder,
-    background: Background,
     batch: Option<NonZeroUsize>,
 ) -> Result<Vec<f32>, EmbedError> {
     let batch = batch.map_or(encoder.preferred_batch(), NonZeroUsize::get);
@@ -183,7 +167,7 @@ pub fn embed_masks(
     let mut crops = Vec::new();
     let mut n_pixels = 0;
     for (index, mask) in masks.iter().enumerate() {
-        let crop = crop_of(image, (index, mask), background)?;
+        let crop = crop_of(image, (index, mask))?;
         n_pixels += mask.inside.len() as u64;
         crops.push(crop);
         if crops.len() >= batch || n_pixels >= MAX_BATCH_PIXELS || index + 1 == masks.len() {

@@ -44,7 +44,6 @@ struct Shared {
 #[derive(Default)]
 struct Queue {
     waiting: VecDeque<Waiting>,
-    /// By number of the request.
     requests: BTreeMap<u64, Request>,
     next_request: u64,
     /// Whether a batch ended in a panic, and its crops with it.
@@ -70,10 +69,8 @@ struct Request {
 /// Reason why crops could not be embedded.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
-    /// The model does not open.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// The model fails on these crops.
     #[error(transparent)]
     Embed(#[from] EmbedError),
 }
@@ -84,7 +81,6 @@ impl SharedEncoders {
         Self::with_lanes(gpus, LANES_PER_GPU, open)
     }
 
-    /// Returns encoders with a number of lanes on each GPU.
     pub fn with_lanes(gpus: &[u32], n_lanes: usize, open: Box<OpenEncoder>) -> Self {
         let lanes = Lanes::new(gpus.iter().map(|gpu| (*gpu, (0..n_lanes).map(|_| None).collect())));
         let shared = Arc::new(Shared { open, lanes, queue: Mutex::default(), has_work: Condvar::new() });
@@ -107,7 +103,6 @@ impl SharedEncoders {
         memory.reserve(Phase::Views, "crops that wait for GPUs", n * square_bytes);
     }
 
-    /// Returns the load of each GPU.
     pub fn loads(&self) -> Vec<GpuLoad> {
         self.shared.lanes.loads()
     }

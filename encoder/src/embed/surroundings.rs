@@ -29,7 +29,6 @@ impl Surroundings {
         Self { share: SHARE_OF_WINDOWS, of_mask: masks.iter().map(shares).collect() }
     }
 
-    /// Returns the number of masks.
     pub fn n_masks(&self) -> usize {
         self.of_mask.len()
     }
