@@ -51,8 +51,6 @@ impl Boundaries {
     /// right, below left, below, below right.
     ///
     /// `depth_m`: `[height][width]`, along the camera's axis; 0, less or NaN where it is unknown.
-    /// # Errors
-    /// [`SessionError::Run`].
     pub fn of(&mut self, image: &RgbImage, depth_m: Option<&[f32]>) -> Result<Vec<f32>, SessionError> {
         let (width, height) = image.dimensions();
         let [wide, high] = [width, height].map(|side| side.next_multiple_of(MULTIPLE));

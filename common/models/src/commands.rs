@@ -1,4 +1,4 @@
-//! `models list|pull|verify|info`, shared by both programs.
+//! `models list|pull|verify`, shared by both programs.
 
 use std::fmt;
 use std::io::{self, BufRead, IsTerminal, Write};
@@ -8,13 +8,11 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use serde::Serialize;
 
-use crate::described::Described;
 use crate::hub::{
     Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, Source, cache_folder, models_folder,
 };
-use crate::sam::SamDescription;
 use crate::session::SessionError;
-use crate::{ImageEncoder, ModelDir, ModelError, Provider, SessionOptions, find_runtime};
+use crate::{ModelDir, Provider, SessionOptions, find_runtime};
 
 /// The `models` subcommands.
 #[derive(Debug, Subcommand)]
@@ -28,8 +26,6 @@ pub enum ModelsCommand {
         /// Names of pulled models, or folders [default: all pulled models].
         models: Vec<PathBuf>,
     },
-    /// Describes a model; with --run, also the devices that it runs on.
-    Info(InfoArgs),
 }
 
 /// `models pull`.
@@ -45,19 +41,6 @@ pub struct PullArgs {
     /// Address of a mirror of the hub.
     #[arg(long, value_name = "URL")]
     hub: Option<String>,
-}
-
-/// `models info`.
-#[derive(Debug, Args)]
-pub struct InfoArgs {
-    /// Name of a pulled model, or a folder.
-    model: PathBuf,
-    /// Opens the encoders and shows the devices that they run on.
-    #[arg(long)]
-    run: bool,
-    /// Options of running them.
-    #[command(flatten)]
-    how: RunArgs,
 }
 
 /// The name of the stand-in in `--models`.
@@ -99,20 +82,14 @@ impl RunArgs {
     }
 }
 
-/// Opens an image encoder, like [`ModelDir::image_encoder`].
-pub type OpenImage = dyn Fn(&ModelDir, &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError>;
-
 /// The calling program's side of the commands.
 pub struct Context<'a> {
     /// Looks up an environment variable.
     pub variable: &'a dyn Fn(&str) -> Option<std::ffi::OsString>,
-    /// Opens a model's image side; absent on robots. A program that does not reference [`ModelDir::image_encoder`]
-    /// does not contain the embedded image model.
-    pub image: Option<&'a OpenImage>,
+    /// Which files of a model are pulled.
+    pub side: Side,
     /// Asks the user a yes-or-no question.
     pub ask: &'a dyn Fn(&str) -> bool,
-    /// Returns the session options.
-    pub session: &'a dyn Fn(&RunArgs) -> Result<SessionOptions, SessionError>,
 }
 
 /// Returns the hub's options in this environment; `None` without a cache folder.
@@ -199,12 +176,11 @@ pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, Hub
             });
             Ok(Report::Verified(verified.collect::<Result<_, HubError>>()?))
         }
-        ModelsCommand::Info(args) => info(&hub.resolve(&args.model)?, args, context),
     }
 }
 
 fn pull(hub: &Hub, name: &str, accepted: &[String], context: &Context<'_>) -> Result<Pulled, HubError> {
-    let side = if context.image.is_some() { Side::Both } else { Side::Text };
+    let side = context.side;
     let entry = hub.entry(name)?;
     let files = match hub.pull(name, side, accepted.contains(&entry.licence)) {
         Err(HubError::Licence { name, licence, url, note }) => {
@@ -220,59 +196,6 @@ fn pull(hub: &Hub, name: &str, accepted: &[String], context: &Context<'_>) -> Re
     Ok(Pulled { name: name.to_owned(), licence, licence_url, licence_note, folder: hub.folder(entry), files })
 }
 
-fn described_files(folder: &Path, described: &Described) -> Vec<DescribedFile> {
-    let root = folder.join(described.files_root());
-    let files = described.files().into_iter().map(|(role, file)| DescribedFile {
-        role,
-        path: file.path.clone(),
-        is_here: root.join(&file.path).is_file(),
-    });
-    files.collect()
-}
-
-fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Report, HubError> {
-    let described = Described::read(folder)?;
-    let files = described_files(folder, &described);
-    let description = match described {
-        Described::Segmenter(segmenter) => {
-            let SamDescription { name, about, licence, .. } = *segmenter;
-            return Ok(Report::Segmenter(SegmenterInfo {
-                name,
-                about,
-                licence,
-                folder: folder.to_owned(),
-                files,
-            }));
-        }
-        Described::Encoders(description) => description,
-    };
-    let model = ModelDir::open(folder)?;
-    let mut info = Info {
-        name: description.name.clone(),
-        about: model.about().to_owned(),
-        licence: model.licence().to_owned(),
-        folder: folder.to_owned(),
-        dim: description.dim,
-        encoder_id: hex::encode(model.encoder_id().hash()),
-        threshold: model.threshold(),
-        files,
-        text_runs_on: None,
-        image_runs_on: None,
-        batch: None,
-    };
-    if args.run {
-        let session = (context.session)(&args.how).map_err(ModelError::from)?;
-        let runs_on = |placement: Option<&crate::Placement>| Some(placement?.to_string());
-        info.text_runs_on = runs_on(model.text_encoder(&session)?.placement());
-        if let Some(open) = context.image {
-            let image = open(&model, &session)?;
-            info.image_runs_on = runs_on(image.placement());
-            info.batch = Some(image.preferred_batch());
-        }
-    }
-    Ok(Report::Info(Box::new(info)))
-}
-
 /// The result of a command.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -283,10 +206,6 @@ pub enum Report {
     Pulled(Vec<Pulled>),
     /// Result of `verify`.
     Verified(Vec<Verified>),
-    /// Result of `info` on encoders.
-    Info(Box<Info>),
-    /// Result of `info` on a segmenter.
-    Segmenter(SegmenterInfo),
 }
 
 /// A model of the table.
@@ -321,43 +240,6 @@ pub struct Pulled {
 pub struct Verified {
     folder: PathBuf,
     files: Vec<String>,
-}
-
-/// The description of a model.
-#[derive(Debug, Serialize)]
-pub struct Info {
-    name: String,
-    about: String,
-    licence: String,
-    folder: PathBuf,
-    dim: u32,
-    encoder_id: String,
-    /// Cosine from which something counts as found; absent: calibrated by each scene.
-    threshold: Option<f32>,
-    files: Vec<DescribedFile>,
-    text_runs_on: Option<String>,
-    /// Absent if this program has no image side.
-    image_runs_on: Option<String>,
-    /// Crops in a run of the image encoder.
-    batch: Option<usize>,
-}
-
-/// The description of a segmenter.
-#[derive(Debug, Serialize)]
-pub struct SegmenterInfo {
-    name: String,
-    about: String,
-    licence: String,
-    folder: PathBuf,
-    files: Vec<DescribedFile>,
-}
-
-/// A file that a description names.
-#[derive(Debug, Serialize)]
-pub struct DescribedFile {
-    role: &'static str,
-    path: PathBuf,
-    is_here: bool,
 }
 
 /// Shows a report to people.
@@ -395,39 +277,6 @@ impl fmt::Display for Report {
                     model.files.join(", ")
                 )
             }),
-            Self::Info(info) => info.fmt(f),
-            Self::Segmenter(info) => {
-                writeln!(f, "name        {}\nabout       {}", info.name, info.about)?;
-                writeln!(f, "licence     {}\nfolder      {}", info.licence, info.folder.display())?;
-                info.files.iter().try_for_each(|file| file.fmt(f))
-            }
         }
-    }
-}
-
-impl fmt::Display for DescribedFile {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let here = if self.is_here { "" } else { " (absent)" };
-        let role = self.role.trim_start_matches("text.").trim_start_matches("segment.");
-        writeln!(f, "{role:11} {}{here}", self.path.display())
-    }
-}
-
-impl fmt::Display for Info {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "name        {}\nabout       {}", self.name, self.about)?;
-        writeln!(f, "licence     {}\nfolder      {}", self.licence, self.folder.display())?;
-        writeln!(f, "components  {}\nencoder id  {}", self.dim, self.encoder_id)?;
-        match self.threshold {
-            Some(cosine) => writeln!(f, "found from  cosine {cosine}")?,
-            None => writeln!(f, "found from  calibrated by each scene's scores")?,
-        }
-        self.files.iter().try_for_each(|file| file.fmt(f))?;
-        if let Some(text) = &self.text_runs_on {
-            let elsewhere = "not in this program; `slag-encoder models info --run` runs the image side";
-            let images = self.image_runs_on.as_deref().unwrap_or(elsewhere);
-            writeln!(f, "text on     {text}\nimages on   {images}")?;
-        }
-        self.batch.iter().try_for_each(|batch| writeln!(f, "batch       {batch} crops"))
     }
 }

@@ -6,11 +6,8 @@ use crate::description::{Description, DescriptionError, FILE_NAME, FileRef, read
 use crate::sam::SamDescription;
 
 /// The description of a model directory of either kind.
-#[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Described {
-    /// Image and text encoders.
     Encoders(Box<Description>),
-    /// A segmenter.
     Segmenter(Box<SamDescription>),
 }
 

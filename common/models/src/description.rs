@@ -81,13 +81,11 @@ const MAX_PATCHES_PER_SIDE: u16 = 256;
 /// Error of reading a description or the files that it names.
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
-    /// A file could not be read.
     #[error("{cause}; put the file there or correct the description")]
     Read {
         /// The operating system's error, with the path.
         cause: std::io::Error,
     },
-    /// The description is not TOML, or has missing or unknown fields.
     #[error("{}: {cause}; see the fields of {FILE_NAME} in its documentation", path.display())]
     Format {
         /// The description.
@@ -95,7 +93,6 @@ pub enum DescriptionError {
         /// The parser's error, with line and column.
         cause: Box<toml::de::Error>,
     },
-    /// The description of a text model from a store is not JSON, or has missing or unknown fields.
     #[error("{}: {cause}; use a robot program and an encoder of matching versions", path.display())]
     Json {
         /// The description.
@@ -103,34 +100,25 @@ pub enum DescriptionError {
         /// The parser's error.
         cause: serde_json::Error,
     },
-    /// A field has an invalid value.
     #[error("{}: {field} is {found}, expected {expected}; correct it", path.display())]
     Value {
         /// The description.
         path: PathBuf,
         /// The field, with its table.
         field: &'static str,
-        /// Its value.
         found: String,
-        /// The values expected.
         expected: &'static str,
     },
-    /// A file's hash is not the recorded one.
     #[error("{}: SHA-256 is {found}, expected {expected}; fetch the file again or correct the description", path.display())]
     Hash {
-        /// The file.
         path: PathBuf,
         /// The recorded hash.
         expected: String,
         /// The hash of the file.
         found: String,
     },
-    /// A file is absent and its hash is not recorded, so the encoder id cannot be computed.
     #[error("{}: absent, and {FILE_NAME} records no sha256 for it; record it or put the file there", path.display())]
-    NoHash {
-        /// The file.
-        path: PathBuf,
-    },
+    NoHash { path: PathBuf },
 }
 
 /// A model directory's description.
@@ -414,12 +402,10 @@ impl Description {
     }
 }
 
-/// Reads TOML.
 pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, DescriptionError> {
     parse_toml(path, &read_text(path)?)
 }
 
-/// Reads the text of a description.
 pub(crate) fn read_text(path: &Path) -> Result<String, DescriptionError> {
     fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })
 }

@@ -28,7 +28,6 @@ pub(crate) struct Levels {
     model: Model,
     /// `[batch][3][size_px][size_px]`, u8; reused by every batch.
     squares: DynTensor,
-    /// Bytes of a square.
     square_bytes: usize,
     scale: DynTensor,
     offset: DynTensor,

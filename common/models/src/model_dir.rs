@@ -162,14 +162,6 @@ impl ModelDir {
         }
     }
 
-    /// Returns the licence of the weights.
-    pub fn licence(&self) -> &str {
-        match &self.source {
-            Source::Colours => env!("CARGO_PKG_LICENSE"),
-            Source::Files { description, .. } => &description.licence,
-        }
-    }
-
     /// Returns the cosine from which something counts as found, if the model states one.
     pub fn threshold(&self) -> Option<f32> {
         match &self.source {
@@ -253,7 +245,6 @@ impl ModelDir {
     }
 }
 
-/// Returns a description with the hash of every file.
 fn hashed(description: &Description, root: &Path) -> Result<Description, DescriptionError> {
     let mut hashed = description.clone();
     for (_, file) in hashed.files_mut() {

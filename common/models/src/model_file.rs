@@ -15,12 +15,10 @@ pub struct ModelFile {
 }
 
 impl ModelFile {
-    /// Returns an embedded file.
     pub(crate) fn embedded(path: &Path, bytes: &'static [u8]) -> Self {
         Self { path: Path::new("(embedded)").join(path), embedded: Some(bytes) }
     }
 
-    /// Returns its bytes if it is embedded.
     pub(crate) fn embedded_bytes(&self) -> Option<&'static [u8]> {
         self.embedded
     }

@@ -58,9 +58,7 @@ pub struct Window {
     pub left_px: u64,
     /// Top edge.
     pub top_px: u64,
-    /// Width.
     pub width_px: u32,
-    /// Height.
     pub height_px: u32,
 }
 

@@ -10,7 +10,6 @@ use ort::{
 /// A device that runs models, named as in ONNX Runtime.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Provider {
-    /// The CPU.
     #[default]
     Cpu,
     /// An NVIDIA GPU.
@@ -90,7 +89,6 @@ pub(crate) fn names(providers: &[Provider]) -> String {
     providers.iter().map(|provider| provider.name()).collect::<Vec<_>>().join(", ")
 }
 
-/// A name is not a provider's.
 #[derive(Debug, thiserror::Error)]
 #[error("{found:?} is not an execution provider; use one of cpu, cuda, tensorrt, coreml, directml")]
 pub struct NoProvider {

@@ -98,9 +98,7 @@ pub(crate) struct Model {
 
 /// An input or output of a model.
 pub(crate) struct Slot {
-    /// Its name.
     pub name: String,
-    /// The type of its elements.
     pub element: TensorElementType,
     /// Its shape; -1 is any size.
     pub shape: Vec<i64>,

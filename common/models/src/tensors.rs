@@ -8,34 +8,27 @@ use safetensors::{Dtype, SafeTensors};
 /// Error of reading a tensor.
 #[derive(Debug, thiserror::Error)]
 pub enum TensorsError {
-    /// The file could not be read.
     #[error("{cause}; put the file there or correct the description")]
     Read {
         /// The operating system's error, with the path.
         cause: std::io::Error,
     },
-    /// The file is not safetensors, or is truncated.
     #[error("{}: {cause}; fetch the file again", path.display())]
     Format {
-        /// The file.
         path: PathBuf,
         /// What is wrong.
         cause: safetensors::SafeTensorError,
     },
-    /// The file has no such tensor.
     #[error("{}: no tensor {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
     Missing {
-        /// The file.
         path: PathBuf,
         /// The requested tensor.
         name: String,
         /// The tensors in the file.
         found: Vec<String>,
     },
-    /// The tensor has another type or shape.
     #[error("{}: tensor {name:?} is {dtype:?} {found:?}, expected F16 or F32 {expected}; correct the description, or fetch its files again", path.display())]
     Shape {
-        /// The file.
         path: PathBuf,
         /// The tensor.
         name: String,
@@ -46,10 +39,8 @@ pub enum TensorsError {
         /// The expected shape.
         expected: String,
     },
-    /// A number is NaN or infinite.
     #[error("{}: tensor {name:?}: element {index} is not finite; fetch the file again", path.display())]
     NotFinite {
-        /// The file.
         path: PathBuf,
         /// The tensor.
         name: String,

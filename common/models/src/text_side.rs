@@ -27,13 +27,11 @@ const REDISTRIBUTABLE: [&str; 10] = [
 /// Reasons for which a store cannot carry a text model.
 #[derive(Debug, thiserror::Error)]
 pub enum TextSideError {
-    /// Every robot has the model.
     #[error("{model} is part of every robot's program, so a store need not carry it; leave --text-model out")]
     BuiltIn {
         /// The model.
         model: String,
     },
-    /// The licence is not known to permit it.
     #[error(
         "the licence of {model} is {licence:?}, which is not known to permit passing its weights on ({}); pull the model on each robot with `slag-edge models pull`, or correct `licence` in model.toml",
         REDISTRIBUTABLE.join(", ")
@@ -41,19 +39,15 @@ pub enum TextSideError {
     Licence {
         /// The model.
         model: String,
-        /// Its licence.
         licence: String,
     },
-    /// The weights lie beside the ONNX file, which names them.
     #[error("{}: its weights lie in a file of their own, which a store cannot carry; save the model as one file", path.display())]
     SeparateWeights {
         /// The ONNX file.
         path: PathBuf,
     },
-    /// A file differs from the description, or cannot be read.
     #[error(transparent)]
     Description(#[from] DescriptionError),
-    /// The description in JSON would describe another space.
     #[error("{model}: its description does not survive as JSON ({what}); report this with the model.toml")]
     Other {
         /// The model.

@@ -4,8 +4,9 @@ use std::io::{self, Write};
 
 use clap::Args;
 use slag_models::commands::{self as model_commands, ModelsCommand};
+use slag_models::hub::Side;
 
-use super::args::{session_options, variable};
+use super::args::variable;
 use super::failure::Failure;
 use super::output::print_json;
 
@@ -21,9 +22,8 @@ pub struct ModelsArgs {
 pub fn run(args: ModelsArgs) -> Result<(), Failure> {
     let context = model_commands::Context {
         variable: &variable,
-        image: None,
+        side: Side::Text,
         ask: &|question| !args.json && model_commands::ask(question),
-        session: &session_options,
     };
     let report = model_commands::run(&args.command, &context);
     let report = report.map_err(|e| Failure::Failed("models", e.into()))?;

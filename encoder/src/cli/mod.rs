@@ -1,6 +1,7 @@
 //! The command line, a file a command: flags in, exit code out. Data goes to stdout, everything else to stderr.
 
 mod check;
+mod choices;
 pub mod common;
 pub mod devices;
 mod diff;
@@ -13,14 +14,12 @@ pub mod progress;
 #[cfg(feature = "qdrant")]
 mod push;
 mod query;
-pub mod refine;
 mod sam;
 mod serve;
 mod store;
 mod summary;
 mod target;
 mod view;
-mod views;
 
 use std::process::ExitCode;
 
@@ -28,14 +27,14 @@ use anyhow::Result;
 use clap::{Parser, Subcommand};
 use serde_json::json;
 use slag_common::error_line;
-use slag_models::ModelDir;
 use slag_models::commands::{self, ModelsCommand};
+use slag_models::hub::Side;
 
 use crate::encode::EncodeError;
 #[cfg(feature = "qdrant")]
 use crate::publish::qdrant;
 use crate::raster::devices::DeviceChoice;
-use common::{OutputArgs, print, session_options};
+use common::{OutputArgs, print};
 #[cfg(feature = "qdrant")]
 use push::PushCommand;
 
@@ -122,7 +121,7 @@ pub enum Command {
     /// Lists, verifies and tidies a store.
     #[command(subcommand)]
     Store(store::StoreCommand),
-    /// Lists, pulls, checks and shows public models.
+    /// Lists, pulls and checks public models.
     #[command(subcommand)]
     Models(ModelsCommand),
     /// Copies a store into a vector database.
@@ -159,9 +158,8 @@ pub fn run(cli: Cli) -> Exit {
 fn models(command: &ModelsCommand, json: bool) -> Result<Exit> {
     let context = commands::Context {
         variable: &|name| std::env::var_os(name),
-        image: Some(&ModelDir::image_encoder),
+        side: Side::Both,
         ask: &|question| !json && commands::ask(question),
-        session: &session_options,
     };
     let report = commands::run(command, &context)?;
     print(json, &report, &report)?;
@@ -229,7 +227,6 @@ mod tests {
             "--time-budget inf",
             "--threads 0",
             "--preset best",
-            "--background red",
         ] {
             assert!(
                 parse(&format!("slag-encoder encode --scene a.ply --views v --store s {wrong}")).is_err(),

@@ -11,7 +11,6 @@ use crate::error::ModelError;
 /// Error of pulling, finding or verifying a model.
 #[derive(Debug, thiserror::Error)]
 pub enum HubError {
-    /// The table has no such model.
     #[error("unknown model {name:?}; there are {}: choose one, or give the folder of your own model", known.join(", "))]
     Unknown {
         /// The requested name.
@@ -19,30 +18,25 @@ pub enum HubError {
         /// The known names.
         known: Vec<String>,
     },
-    /// The licence has not been accepted.
     #[error(
         "{name} is licensed under {licence} ({url}), which restricts its use{}; if you accept it, pull with \
          --accept-licence {licence}",
         if note.is_empty() { String::new() } else { format!("; note: {}", note.trim_end_matches('.')) }
     )]
     Licence {
-        /// The model.
         name: String,
-        /// Its licence.
         licence: String,
         /// Address of the licence.
         url: String,
         /// Remarks on the licence.
         note: String,
     },
-    /// No ONNX export of the weights is published.
     #[error(
         "{name}: {repository} publishes weights, but no ONNX files; make them with `{script} {}` where PyTorch and the \
          hub can be reached, then use the model by its name",
         folder.display()
     )]
     NotExported {
-        /// The model.
         name: String,
         /// Owner and name at the hub.
         repository: String,
@@ -51,40 +45,26 @@ pub enum HubError {
         /// The folder for them.
         folder: PathBuf,
     },
-    /// A segmenter has nothing for a robot.
     #[error("{name} finds masks in photos, which a robot does not do; pull it with slag-encoder")]
-    NoTextSide {
-        /// The model.
-        name: String,
-    },
-    /// The hub does not provide the files.
+    NoTextSide { name: String },
     #[error("{url}: {failure}; try again, or place these files by hand: {}", wanted.iter().map(Wanted::to_string).collect::<Vec<_>>().join("; "))]
     Unreachable {
         /// The requested address.
         url: String,
-        /// The cause.
         failure: Box<DownloadError>,
         /// The model's missing files.
         wanted: Vec<Wanted>,
     },
-    /// The model is in the table but not pulled.
     #[error("{name} is not pulled yet; run `models pull {name}`, or give the folder of your own model")]
-    NotPulled {
-        /// The model.
-        name: String,
-    },
-    /// There is no folder for models.
+    NotPulled { name: String },
     #[error(
         "neither XDG_CACHE_HOME nor HOME is an absolute path, so there is no folder for models; set one of them"
     )]
     NoFolder,
-    /// The proxy cannot be used.
     #[error("the proxy in HTTPS_PROXY: {0}; correct or unset it")]
     Proxy(#[from] DownloadFailure),
-    /// A file's hash is not the expected one.
     #[error("{}: SHA-256 is {found}, expected {expected} ({}); {advice}", path.display(), source_of(*by))]
     Hash {
-        /// The file.
         path: PathBuf,
         /// Its hash.
         found: Sha256,
@@ -95,13 +75,11 @@ pub enum HubError {
         /// Advice to the user.
         advice: &'static str,
     },
-    /// The hub advertises another hash.
     #[error(
         "{url}: the hub advertises SHA-256 {advertised}, expected {expected} ({}); do not use it, or take the \
          model out of models.lock if you trust the new one", source_of(*by)
     )]
     Advertised {
-        /// The file.
         url: String,
         /// The advertised hash.
         advertised: Sha256,
@@ -110,17 +88,14 @@ pub enum HubError {
         /// The source of the expected hash.
         by: Source,
     },
-    /// The hub serves another commit.
     #[error("{url}: the hub serves commit {found}, expected {expected}; give another --hub")]
     Revision {
-        /// The file.
         url: String,
         /// The commit served.
         found: String,
         /// The requested commit.
         expected: String,
     },
-    /// The image model's hash, part of the encoder id, is unknown.
     #[error(
         "{url}: the hub advertises no SHA-256 of the image model; pull the whole model with slag-encoder"
     )]
@@ -128,7 +103,6 @@ pub enum HubError {
         /// The image model.
         url: String,
     },
-    /// The lock cannot be read.
     #[error("{}: {cause}; correct it, or remove it and pull again", path.display())]
     Lock {
         /// The lock.
@@ -136,16 +110,12 @@ pub enum HubError {
         /// The parser's error.
         cause: serde_json::Error,
     },
-    /// The program's own table cannot be read.
     #[error("the program's table of models: {0}; this is a bug, please report it")]
     Table(#[from] Box<toml::de::Error>),
-    /// Error of a model's description.
     #[error(transparent)]
     Description(#[from] DescriptionError),
-    /// Error of opening a model.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// A local file cannot be read or written.
     #[error("{0}; free disk space, or choose another folder with XDG_CACHE_HOME")]
     Io(#[from] io::Error),
 }

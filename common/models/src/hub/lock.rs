@@ -21,11 +21,9 @@ pub struct Lock {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Accepted {
-    /// The licence.
     pub licence: String,
     /// The commit.
     pub revision: Option<String>,
-    /// Files, by path.
     pub files: BTreeMap<String, LockedFile>,
 }
 
@@ -35,7 +33,6 @@ pub struct Accepted {
 pub struct LockedFile {
     /// Its SHA-256.
     pub sha256: Sha256,
-    /// The source of the hash.
     pub hash_source: Source,
 }
 

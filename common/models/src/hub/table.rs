@@ -72,7 +72,6 @@ const FIRST_OF_TEXT: usize = 3;
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {
-    /// Its length.
     pub len_bytes: u64,
     /// Its SHA-256.
     pub sha256: Sha256,

@@ -111,8 +111,6 @@ impl Sam {
     }
 
     /// Opens the directory `dir` with a decoder for `n_prompts` at a time, which is quicker on GPUs: fewer are filled up.
-    /// # Errors
-    /// As [`Self::open`].
     pub fn open_for(
         dir: &Path,
         options: &SessionOptions,
