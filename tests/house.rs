@@ -30,7 +30,7 @@ fn the_field_agrees_with_the_independent_reference() {
     let store = dir.path().join("house");
     let models = root().join("tests/models/conse");
     // The reference's width.
-    let flags = "--preset plain --background white --min-mask-px 200 --raster-width 640 --strict";
+    let flags = "--preset plain --min-mask-px 200 --raster-width 640 --strict";
     let summary = run_json(encode_house("sparse/0", &store, flags).args(["--models", text(&models)]));
     println!("{summary:#}");
     assert_eq!(summary["n_masks"], 1423, "the reference has as many masks");

@@ -54,6 +54,9 @@ pub(super) fn lines(
     });
     let lost =
         summary.lost_views.as_ref().map_or(String::new(), |lost| format!("kept       {}\n", lost.reason));
+    let encoder = summary.encoder_before.as_ref().map_or(String::new(), |before| {
+        format!("encoder    {} in place of {before}: robots need its text model\n", summary.encoder)
+    });
     let most = most_spent(summary);
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let of_target = expected.map_or(String::new(), |e| {
@@ -71,7 +74,7 @@ pub(super) fn lines(
     format!(
         "{of_target}published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} of {} ({} resumed, {} without masks)\n{lost}{coverage}{skipped}{images_on}\
+         views      {} of {} ({} resumed, {} without masks)\n{lost}{coverage}{skipped}{encoder}{images_on}\
          masks      {} in {} regions, {} contributions\n\
          cells      {} with {} centroids\n\
          {objects}{occupancy}shards     {sizes}\n{most}\

@@ -1,44 +1,14 @@
-//! `encode --target-seconds S --target-bytes B`: the setting is picked from a measured front.
+//! `encode --target-seconds S --target-bytes B`: the choices are picked from a measured front.
 
 use std::path::PathBuf;
 
-use anyhow::{Result, anyhow};
-use clap::Args;
+use anyhow::{Context, Result, anyhow};
+use clap::{Args, FromArgMatches};
 use slag_common::ByteSize;
 
+use super::choices::ChoiceArgs;
 use crate::encode::front::{Expectation, Front, Target};
 use crate::encode::{InputSettings, count_inputs};
-
-/// Flags that a front sets, by their names in the program, so a user cannot give them beside a target.
-pub(super) const TUNED: [&str; 13] = [
-    "preset",
-    "background",
-    "weights",
-    "views_limit",
-    "view_order",
-    "mask_levels",
-    "raster_width",
-    "min_mask_px",
-    "keep_slivers",
-    "compact_error",
-    "max_components",
-    "no_objects",
-    "segmenter",
-];
-/// Flags of the refinements, which a front may set as well.
-pub(super) const REFINEMENTS: [&str; 11] = [
-    "min_region_share",
-    "min_view_share",
-    "min_weight",
-    "truncation_power",
-    "equalisation",
-    "agreement",
-    "median_steps",
-    "superpoint",
-    "coarse",
-    "object",
-    "fill",
-];
 
 /// A target instead of a preset.
 #[derive(Clone, Debug, Default, Args)]
@@ -46,10 +16,10 @@ pub(super) const REFINEMENTS: [&str; 11] = [
 pub struct TargetArgs {
     /// Picks the most accurate measured setting that is expected to take at most this many seconds. The expectation
     /// holds for the machine, models and size of photos that the front was measured with.
-    #[arg(long, value_name = "S", value_parser = parse_seconds, requires = "front", conflicts_with_all = TUNED, conflicts_with_all = REFINEMENTS)]
+    #[arg(long, value_name = "S", value_parser = parse_seconds, requires = "front", conflicts_with_all = ["choices", "segmenter"])]
     target_seconds: Option<f64>,
     /// Picks the most accurate measured setting whose compact shards are expected to have at most this many bytes.
-    #[arg(long, value_name = "BYTES", requires = "front", conflicts_with_all = TUNED, conflicts_with_all = REFINEMENTS)]
+    #[arg(long, value_name = "BYTES", requires = "front", conflicts_with_all = ["choices", "segmenter"])]
     target_bytes: Option<ByteSize>,
     /// Front to pick from: front.json, as `slag-lab bench tradeoff` writes it for your machine and scenes.
     #[arg(long, value_name = "FILE")]
@@ -64,8 +34,8 @@ fn parse_seconds(text: &str) -> Result<f64, String> {
 }
 
 impl TargetArgs {
-    /// Returns the setting that meets the target on the inputs; `None` without a target.
-    pub(super) fn choose(&self, inputs: &InputSettings) -> Result<Option<Expectation>> {
+    /// Returns the choices that meet the target on the inputs, and what is expected of them; `None` without a target.
+    pub(super) fn choose(&self, inputs: &InputSettings) -> Result<Option<(ChoiceArgs, Expectation)>> {
         let target = Target { seconds: self.target_seconds, bytes: self.target_bytes.map(|bytes| bytes.0) };
         let Some(path) = &self.front else { return Ok(None) };
         if target == Target::default() {
@@ -88,6 +58,60 @@ impl TargetArgs {
             chosen.setting.miou,
             chosen.setting.miou_spread,
         );
-        Ok(Some(chosen))
+        Ok(Some((parse_choices(&chosen.setting.flags)?, chosen)))
+    }
+}
+
+/// Parses the flags of a front's setting.
+///
+/// # Errors
+/// If one is no flag of a choice.
+fn parse_choices(flags: &str) -> Result<ChoiceArgs> {
+    let command = ChoiceArgs::augment_args(clap::Command::new("encode").no_binary_name(true));
+    command
+        .try_get_matches_from(flags.split_whitespace())
+        .and_then(|matches| ChoiceArgs::from_arg_matches(&matches))
+        .with_context(|| format!("the front's setting {flags:?} is not understood"))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+    use crate::cli::Cli;
+    use crate::encode::{EncodeSettings, ViewsLimit};
+
+    #[test]
+    fn a_setting_of_a_front_has_choices_and_nothing_else() {
+        let choices = parse_choices("--preset fast --views-limit 25% --superpoint 3").expect("understood");
+        let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        choices.apply(&mut settings);
+        assert_eq!(
+            (settings.run.views_limit, settings.aggregation.superpoint),
+            (ViewsLimit::Share(0.25), 3.0)
+        );
+        for wrong in ["--scene x", "--segmenter x", "--threads 1", "--preset nothing", "--models=x"] {
+            let message = format!("{:#}", parse_choices(wrong).expect_err("refused"));
+            assert!(message.contains(wrong), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_target_excludes_what_it_chooses() {
+        let parse = |flags: &str| {
+            let line = format!("slag-encoder encode --scene a --views b --store c {flags}");
+            Cli::command().try_get_matches_from(line.split_whitespace())
+        };
+        for flag in ["--preset fast", "--keep-slivers", "--max-components 8", "--fill true", "--segmenter x"]
+        {
+            parse(flag).expect("a flag of encode");
+            let error = parse(&format!("--front f.json --target-bytes 3MiB {flag}")).expect_err("excluded");
+            assert_eq!(error.kind(), clap::error::ErrorKind::ArgumentConflict, "{flag}");
+        }
+        parse("--front f.json --target-bytes 3MiB --threads 2").expect("no choice");
+        assert!(parse("--front f.json --target-seconds 0").is_err());
+        let without = parse("--target-seconds 60").expect_err("no front");
+        assert_eq!(without.kind(), clap::error::ErrorKind::MissingRequiredArgument);
     }
 }

@@ -1,4 +1,8 @@
-//! A cell on its way from contributions to shards.
+//! Cells on their way from contributions to shards.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use slag_common::manifest::{CellRecord, ShardRecord};
 use slag_common::photo_poses::BuiltPhotoPoses;
@@ -11,76 +15,122 @@ use crate::cells::CellSplit;
 use crate::codebook::ScoreMetricContext;
 use crate::lift::published::extra_field;
 use crate::lift::refine::Refinement;
-use crate::lift::{CellField, PartContributions, RegionTable};
+use crate::lift::{CellField, ContributionError, ContributionIndex, PartContributions, RegionTable};
 use crate::objects::SceneObjects;
 use crate::occupancy::SceneOccupancy;
 use crate::shard::{BuiltShard, CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
 use crate::store::Store;
 
-/// What all views together say about every cell.
-#[derive(Clone, Copy)]
-pub(crate) struct Merged<'a> {
-    pub(crate) table: &'a RegionTable,
+/// Makes cells of what all views together say about them.
+pub(super) struct CellMaker<'a> {
+    pub(super) scene: &'a Gaussians,
+    pub(super) split: &'a CellSplit,
+    pub(super) settings: &'a ShardSettings,
+    pub(super) encoder_id: Hash32,
+    pub(super) table: RegionTable,
+    pub(super) refinement: Refinement,
+    pub(super) objects: Option<SceneObjects>,
+    pub(super) occupancy: Option<SceneOccupancy>,
     /// What errors of scores are measured by.
-    pub(crate) score_context: &'a ScoreMetricContext,
-    pub(crate) refinement: Option<&'a Refinement>,
-    pub(crate) objects: Option<&'a SceneObjects>,
-    pub(crate) occupancy: Option<&'a SceneOccupancy>,
+    pub(super) score_context: ScoreMetricContext,
+    /// Where the photos of each cell were taken, if its shards say so.
+    pub(super) photo_poses: Option<Vec<BuiltPhotoPoses>>,
+    pub(super) store: &'a Store,
+    pub(super) context: &'a RunContext<'a>,
 }
 
-/// Makes cells.
+/// The memory for cells.
 #[derive(Clone, Copy)]
-pub(crate) struct CellMaker<'a> {
-    pub(crate) scene: &'a Gaussians,
-    pub(crate) split: &'a CellSplit,
-    pub(crate) settings: &'a ShardSettings,
-    pub(crate) encoder_id: Hash32,
-    pub(crate) merged: Merged<'a>,
-    pub(crate) store: &'a Store,
-    pub(crate) context: &'a RunContext<'a>,
+pub(super) struct CellsBudget {
+    /// Bytes for the contributions of a group of cells.
+    pub(super) group_bytes: u64,
+    /// Cells whose embeddings are held at once.
+    pub(super) n_at_once: usize,
 }
 
 /// A cell whose parts are being lifted.
-pub(crate) struct CellInWork {
-    pub(super) embeddings: CellEmbeddings,
+struct CellInWork {
+    embeddings: CellEmbeddings,
     /// Fields in the store, by name.
-    pub(super) fields: Vec<(String, Hash32)>,
-    /// Its photos, if its shards say where they were taken.
-    pub(super) photo_poses: BuiltPhotoPoses,
+    fields: Vec<(String, Hash32)>,
 }
 
 impl CellInWork {
-    pub(crate) fn empty(dim: usize) -> Self {
+    fn empty(dim: usize) -> Self {
         let embeddings = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
-        Self { embeddings, fields: Vec::new(), photo_poses: BuiltPhotoPoses::default() }
-    }
-
-    /// Makes room for the next cell; the vectors of a large cell are allocated once and used again.
-    pub(crate) fn clear(&mut self) {
-        self.embeddings.has_evidence.clear();
-        self.fields.clear();
-        self.photo_poses = BuiltPhotoPoses::default();
+        Self { embeddings, fields: Vec::new() }
     }
 }
 
 /// A cell whose shards are kept.
 #[derive(Debug)]
-pub(crate) struct FinishedCell {
-    pub(crate) record: CellRecord,
+pub(super) struct FinishedCell {
+    pub(super) record: CellRecord,
     /// As of the cell in work.
-    pub(crate) fields: Vec<(String, Hash32)>,
-    pub(crate) n_subspaces: u32,
-    pub(crate) n_without_evidence: u64,
+    pub(super) fields: Vec<(String, Hash32)>,
+    pub(super) n_subspaces: u32,
+    pub(super) n_without_evidence: u64,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
-    pub(crate) score_sums: [f64; 3],
+    pub(super) score_sums: [f64; 3],
 }
 
 impl CellMaker<'_> {
-    /// Adds the next part's embeddings to its cell's, and keeps its field.
+    /// Lifts the cells and makes their shards, several at once.
     ///
     /// # Errors
-    /// [`EncodeError`] if the field cannot be kept.
-    pub(crate) fn add_part(
+    /// [`EncodeError`]: of the first cell that failed.
+    pub(super) fn build(
+        &self,
+        index: &ContributionIndex,
+        budget: CellsBudget,
+    ) -> Result<Vec<FinishedCell>, EncodeError> {
+        let context = self.context;
+        // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
+        let free = (0..budget.n_at_once).map(|_| CellInWork::empty(self.table.dim())).collect();
+        let free = FreeCells { cells: Mutex::new(free), given_back: Condvar::new() };
+        let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
+        let has_failed = AtomicBool::new(false);
+        let is_stopped = || context.is_cancelled() || has_failed.load(Ordering::Relaxed);
+        let workers = context.workers();
+        let n_alone = workers.n_alone(self.split.cells.len(), budget.n_at_once);
+        std::thread::scope(|scope| -> Result<(), EncodeError> {
+            let mut parts = context.install(|| index.transposed_parts(&self.table, budget.group_bytes));
+            let mut next_part = || context.time("merge", || context.install(|| parts.next()));
+            let mut lent = free.take();
+            while let Some(contributions) = next_part() {
+                if is_stopped() {
+                    break;
+                }
+                let contributions = contributions?;
+                let cell_id = contributions.part.cell_id;
+                if contributions.part.locals.end < self.split.cells[cell_id as usize].gaussians.len() {
+                    // A large cell comes in parts, so that only one of them is held.
+                    context.install(|| self.add_part(contributions, &mut lent.cell))?;
+                    continue;
+                }
+                let (finished, has_failed) = (&finished, &has_failed);
+                let work = move || {
+                    if !is_stopped() {
+                        let added = self.add_part(contributions, &mut lent.cell);
+                        let result = added.and_then(|()| self.finish(cell_id, &mut lent.cell));
+                        has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
+                        locked(finished).insert(cell_id, result);
+                        context.progress().advance(1);
+                    }
+                    drop(lent);
+                };
+                scope.spawn(move || workers.run((cell_id as usize) < n_alone, work));
+                lent = free.take();
+            }
+            Ok(())
+        })?;
+        let finished = finished.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let finished = finished.into_values().collect::<Result<_, _>>()?;
+        if context.is_cancelled() { Err(ContributionError::Cancelled.into()) } else { Ok(finished) }
+    }
+
+    /// Adds the next part's embeddings to its cell's, and keeps its field.
+    fn add_part(
         &self,
         mut contributions: PartContributions,
         cell: &mut CellInWork,
@@ -93,10 +143,8 @@ impl CellMaker<'_> {
         cell.vectors.resize(len, 0.0);
         let vectors = &mut cell.vectors[part.locals.start * cell.dim..part.locals.end * cell.dim];
         let field = self.context.time("lift", || {
-            if let Some(refinement) = self.merged.refinement {
-                refinement.apply(&mut contributions, &gaussians[part.locals.clone()]);
-            }
-            CellField::new(gaussians[part.locals.clone()].to_vec(), contributions, self.merged.table, vectors)
+            self.refinement.apply(&mut contributions, &gaussians[part.locals.clone()]);
+            CellField::new(gaussians[part.locals.clone()].to_vec(), contributions, &self.table, vectors)
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
         let (hash, _) = self.context.time("write", || self.store.put_object(|out| field.write(out)))?;
@@ -105,23 +153,17 @@ impl CellMaker<'_> {
     }
 
     /// Makes a cell's codebook and shards from its embeddings, and keeps the shards.
-    ///
-    /// # Errors
-    /// [`EncodeError`] if a shard cannot be kept.
-    pub(crate) fn finish_cell(
-        &self,
-        cell_id: u32,
-        in_work: &mut CellInWork,
-    ) -> Result<FinishedCell, EncodeError> {
+    fn finish(&self, cell_id: u32, in_work: &mut CellInWork) -> Result<FinishedCell, EncodeError> {
         let cell = &self.split.cells[cell_id as usize];
-        let Self { scene, settings, encoder_id, merged, .. } = *self;
-        let Merged { score_context, objects, .. } = merged;
-        let occupancy = merged.occupancy.map(|scene| scene.cells[cell_id as usize].view());
-        let photo_poses = in_work.photo_poses.view();
-        let extras = CellExtras { objects, occupancy, photo_poses };
+        let Self { scene, settings, encoder_id, score_context, .. } = self;
+        let occupancy = self.occupancy.as_ref().map(|scene| scene.cells[cell_id as usize].view());
+        let none = BuiltPhotoPoses::default();
+        let photo_poses = self.photo_poses.as_ref().map_or(&none, |of_cells| &of_cells[cell_id as usize]);
+        let objects = self.objects.as_ref();
+        let extras = CellExtras { objects, occupancy, photo_poses: photo_poses.view() };
         let embeddings = &in_work.embeddings;
         let made = self.context.time("codebook", || {
-            ShardBuilder { scene, encoder_id, score_context, settings }
+            ShardBuilder { scene, encoder_id: *encoder_id, score_context, settings }
                 .build(cell_id, cell, embeddings, extras)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
@@ -151,4 +193,43 @@ impl CellMaker<'_> {
             score_sums: [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with],
         })
     }
+}
+
+/// Cells that are not in work.
+struct FreeCells {
+    cells: Mutex<Vec<CellInWork>>,
+    given_back: Condvar,
+}
+
+impl FreeCells {
+    /// Waits until one is free.
+    fn take(&self) -> LentCell<'_> {
+        let mut cells = locked(&self.cells);
+        loop {
+            match cells.pop() {
+                Some(cell) => return LentCell { cell, owner: self },
+                None => cells = self.given_back.wait(cells).unwrap_or_else(PoisonError::into_inner),
+            }
+        }
+    }
+}
+
+/// A cell that goes back, emptied, whatever becomes of the work.
+struct LentCell<'a> {
+    cell: CellInWork,
+    owner: &'a FreeCells,
+}
+
+impl Drop for LentCell<'_> {
+    fn drop(&mut self) {
+        let mut cell = std::mem::replace(&mut self.cell, CellInWork::empty(0));
+        cell.embeddings.has_evidence.clear();
+        cell.fields.clear();
+        locked(&self.owner.cells).push(cell);
+        self.owner.given_back.notify_one();
+    }
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -8,11 +8,9 @@ use std::path::PathBuf;
 use slag_common::manifest::{Calibration, CellRecord};
 use slag_common::{Hash32, View};
 
-use super::cell::{FinishedCell, Merged};
+use super::cell::{CellMaker, CellsBudget, FinishedCell};
 use super::context::{Phase, RunContext};
 use super::error::EncodeError;
-use super::executor::CellsToBuild;
-use super::here;
 use super::plan::Plan;
 use super::report::ViewsReport;
 use super::sink::ViewRecord;
@@ -20,11 +18,10 @@ use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
-use crate::lift::refine::{Begun, Passes, Refinement, Subject};
-use crate::lift::superpoint::Superpoints;
-use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable};
-use crate::memory;
-use crate::objects::{self, Object, ObjectsReport, SceneObjects};
+use crate::lift::refine::{PendingRefinement, Refinement};
+use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable, SceneContributions};
+use crate::memory::{self, MemoryPlan, PlannedPeak};
+use crate::objects::{self, Object, ObjectsReport};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
 use crate::store::Extras;
@@ -43,6 +40,8 @@ pub(super) struct BuiltCells {
     pub(super) objects: Option<ObjectsReport>,
     pub(super) occupancy: Option<OccupancyReport>,
     pub(super) counts: Counts,
+    /// The most memory that these steps were expected to take.
+    pub(super) planned_peak: Option<PlannedPeak>,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
     score_sums: [f64; 3],
 }
@@ -74,24 +73,100 @@ impl BuiltCells {
     }
 }
 
-/// Builds all cells and puts their objects into the store.
-///
-/// # Errors
-/// [`EncodeError`].
+/// Merges the contributions of the used views, builds all cells and puts their objects into the store.
 pub(super) fn build_cells(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
     occupancy: Option<SceneOccupancy>,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
-    let mut builder = context.install(|| {
-        let bank = text_bank(plan, context);
-        CellBuilder::open(plan, views, bank, occupancy, context)
-    })?;
-    context.progress().begin("cells", "cell", plan.inputs.split.cells.len() as u64, 0);
-    let built = builder.build(views)?;
+    let n_views = views.used.len();
+    build(plan, views, occupancy, context).map_err(|error| match error {
+        EncodeError::Contributions(ContributionError::Cancelled) => {
+            EncodeError::Interrupted { n_done: n_views, n_views }
+        }
+        error => error,
+    })
+}
+
+fn build(
+    plan: &Plan<'_>,
+    views: &DoneViews<'_>,
+    occupancy: Option<SceneOccupancy>,
+    context: &RunContext<'_>,
+) -> Result<BuiltCells, EncodeError> {
+    let Plan { inputs, store, settings, .. } = *plan;
+    let opened = context.install(|| Opened::of(plan, views, occupancy.as_ref(), context))?;
+    let Opened { index, table, score_context, photos, pass_bytes, cells: budget, planned_peak } = opened;
+    let scene = SceneContributions {
+        index: &index,
+        gaussians: &inputs.scene,
+        split: &inputs.split,
+        photos: &photos,
+        group_bytes: pass_bytes,
+        cancel: context.cancel(),
+    };
+    context.progress().begin("cells", "cell", inputs.split.cells.len() as u64, 0);
+    // Before refinement adds superpoints to the regions.
+    let counts = Counts::of(views, &index, &table);
+
+    context.begin_phase(Phase::Superpoints);
+    let begin = || context.install(|| PendingRefinement::begin(settings.aggregation, &scene, table));
+    let pending = context.time("superpoints", begin)?;
+    // From all masks alike, whatever weight they have in the refinement.
+    context.begin_phase(Phase::Objects);
+    let find = || context.install(|| objects::find(&scene, &pending, &score_context));
+    let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
+    if let Some(found) = &objects {
+        context.progress().objects(&mut found.objects.iter().map(Object::found));
+    }
+    context.begin_phase(Phase::Refine);
+    let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
+    let finish = || context.install(|| pending.finish(&scene, object_of));
+    let (table, refinement) = context.time("refine", finish)?;
+
+    let mut extras = Extras::new();
+    if settings.aggregation != Aggregation::PLAIN {
+        let record = serde_json::to_vec(&settings.aggregation).map_err(std::io::Error::from)?;
+        extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
+    }
+    let regions = context.install(|| store.put_object(|out| table.write(out)))?.0;
+    extras.insert(EXTRA_REGIONS.into(), regions);
+
+    context.begin_phase(Phase::Cells);
+    let has_poses = settings.cells.photo_poses;
+    let maker = CellMaker {
+        scene: &inputs.scene,
+        split: &inputs.split,
+        settings: &settings.cells.shards,
+        encoder_id: Hash32(plan.engines.models.encoder_id().hash()),
+        table,
+        refinement,
+        objects,
+        occupancy,
+        score_context,
+        photo_poses: has_poses.then(|| shard::photo_poses(&inputs.split, &views.used)),
+        store,
+        context,
+    };
+    let finished = maker.build(&index, budget)?;
     context.progress().end();
-    built.ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })
+    let mut n_entries = vec![0; inputs.split.cells.len()];
+    index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
+    let mut built = BuiltCells {
+        records: Vec::new(),
+        n_subspaces: Vec::new(),
+        n_entries,
+        extras,
+        n_without_evidence: 0,
+        objects: maker.objects.map(|objects| objects.report),
+        occupancy: maker.occupancy.map(|occupancy| occupancy.report),
+        counts,
+        planned_peak,
+        score_sums: [0.0; 3],
+    };
+    finished.into_iter().for_each(|cell| built.add(cell));
+    Ok(built)
 }
 
 /// Returns texts that queries are expected to be like.
@@ -104,6 +179,18 @@ fn text_bank(plan: &Plan<'_>, context: &RunContext<'_>) -> TextBank {
             TextBank::directions(models.dim())
         }
     })
+}
+
+impl Counts {
+    fn of(views: &DoneViews<'_>, index: &ContributionIndex, table: &RegionTable) -> Self {
+        Self {
+            n_views_without_masks: index.n_masks_of_view().filter(|n| *n == 0).count(),
+            n_masks: table.n_masks(),
+            n_regions: table.len(),
+            n_entries: index.n_entries(),
+            views: views_report(views, index),
+        }
+    }
 }
 
 /// Returns the cost of the used views.
@@ -120,41 +207,30 @@ fn views_report(views: &DoneViews<'_>, index: &ContributionIndex) -> ViewsReport
     }
 }
 
-/// Builds the cells of a scene whose views are all done.
-struct CellBuilder<'a> {
-    plan: &'a Plan<'a>,
-    context: &'a RunContext<'a>,
-    encoder_id: Hash32,
+/// The contributions of the used views, and the memory for the steps that go over them.
+struct Opened {
     index: ContributionIndex,
     table: RegionTable,
-    /// What errors of scores are measured by.
     score_context: ScoreMetricContext,
-    /// Bytes for the contributions that a pass of the refinement or of objects holds.
-    pass_bytes: u64,
-    /// Bytes for the contributions that are held while cells are built.
-    cells_bytes: u64,
-    /// Cells whose embeddings are held at once.
-    n_at_once: usize,
     /// Each view's masks in its photo.
     photos: Vec<Photo>,
-    occupancy: Option<SceneOccupancy>,
+    /// Bytes for the contributions that a pass of the refinement or of objects holds.
+    pass_bytes: u64,
+    cells: CellsBudget,
+    planned_peak: Option<PlannedPeak>,
 }
 
-impl<'a> CellBuilder<'a> {
-    /// Opens the contributions of the used views and checks the budget against them.
-    ///
-    /// # Errors
-    /// [`EncodeError::Contributions`], [`EncodeError::Memory`].
-    fn open(
-        plan: &'a Plan<'a>,
+impl Opened {
+    /// Opens the contributions and checks the budget against them.
+    fn of(
+        plan: &Plan<'_>,
         views: &DoneViews<'_>,
-        bank: TextBank,
-        occupancy: Option<SceneOccupancy>,
-        context: &'a RunContext<'a>,
+        occupancy: Option<&SceneOccupancy>,
+        context: &RunContext<'_>,
     ) -> Result<Self, EncodeError> {
-        let (models, job) = (plan.engines.models, &plan.job);
-        let n_gaussians: Vec<usize> =
-            plan.inputs.split.cells.iter().map(|cell| cell.gaussians.len()).collect();
+        let (models, job, split) = (plan.engines.models, &plan.job, &plan.inputs.split);
+        let bank = text_bank(plan, context);
+        let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
         let paths: Vec<PathBuf> = views.used.iter().map(|view| job.contributions_path(&view.name)).collect();
         let (index, mut table) =
             context.time("merge", || ContributionIndex::open(&paths, models.dim(), &n_gaussians))?;
@@ -171,146 +247,49 @@ impl<'a> CellBuilder<'a> {
         table.reserve(&mut memory);
         occupancy.iter().for_each(|occupancy| occupancy.reserve(&mut memory));
         index.reserve(&mut memory);
-        Refinement::reserve_regions(&mut memory, &plan.settings.aggregation, table.len());
+        let (aggregation, n_entries) = (&plan.settings.aggregation, index.n_entries());
+        Refinement::reserve_contributions(&mut memory, aggregation, table.len(), n_entries);
         if plan.settings.cells.objects {
-            objects::reserve_contributions(&mut memory, index.n_entries());
+            objects::reserve_contributions(&mut memory, n_entries);
         }
         let pass_bytes = memory.rest(index.largest_part_bytes())?;
-        let cell_bytes =
-            shard::largest_cell_bytes(&plan.inputs.split, models.dim()) + index.largest_part_bytes();
+        let cell_bytes = shard::largest_cell_bytes(split, models.dim()) + index.largest_part_bytes();
         // Cells come second: contributions that are not kept in memory are read six times. But what superpoints and objects
         // took is free again.
         let rest_bytes = memory.rest_of(memory::Phase::Cells);
         let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
         let n_more = (spare_bytes / cell_bytes.max(1)).min(context.pool().current_num_threads() as u64 - 1);
-        let cells_bytes = (rest_bytes - n_more * cell_bytes).min(pass_bytes);
+        let group_bytes = (rest_bytes - n_more * cell_bytes).min(pass_bytes);
         let score_context = context.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);
             let spread = metric.spread(table.mask_vectors());
             ScoreMetricContext { metric, bank, spread }
         });
-        let encoder_id = Hash32(models.encoder_id().hash());
         let n_at_once = 1 + n_more as usize;
-        tracing::debug!("{n_at_once} cells at once, {cell_bytes} bytes each");
-        Ok(Self {
-            plan,
-            context,
-            encoder_id,
-            index,
-            table,
-            score_context,
-            pass_bytes,
-            cells_bytes,
-            n_at_once,
-            photos,
-            occupancy,
-        })
+        let planned_peak = planned_peak(&memory, plan, &index, (pass_bytes, n_at_once));
+        let cells = CellsBudget { group_bytes, n_at_once };
+        tracing::debug!("{} cells at once, {cell_bytes} bytes each", cells.n_at_once);
+        Ok(Self { index, table, score_context, photos, pass_bytes, cells, planned_peak })
     }
+}
 
-    /// Finds the objects of the scene if the settings ask for them; `None` if cancelled, too.
-    fn objects(&self, superpoints: Option<&Superpoints>) -> Result<Option<SceneObjects>, EncodeError> {
-        if !self.plan.settings.cells.objects {
-            return Ok(None);
-        }
-        let scene = objects::Scene {
-            index: &self.index,
-            table: &self.table,
-            gaussians: &self.plan.inputs.scene,
-            split: &self.plan.inputs.split,
-            superpoints,
-            photos: &self.photos,
-            score_context: &self.score_context,
-            group_bytes: self.pass_bytes,
-            cancel: self.context.cancel(),
-        };
-        Ok(self.context.time("objects", || objects::find(&scene))?)
+/// Returns the peak that is expected of the steps from here on; `None` where the system does not tell what the process holds.
+fn planned_peak(
+    memory: &MemoryPlan,
+    plan: &Plan<'_>,
+    index: &ContributionIndex,
+    (pass_bytes, n_at_once): (u64, usize),
+) -> Option<PlannedPeak> {
+    let mut memory = memory.clone();
+    let (kept_bytes, group_bytes) = index.expected_bytes(pass_bytes, plan.settings.run.threads as u64);
+    for phase in
+        [memory::Phase::Superpoints, memory::Phase::Objects, memory::Phase::Refine, memory::Phase::Cells]
+    {
+        memory.reserve_expecting(phase, "contributions of all views", 0, kept_bytes + group_bytes);
     }
-
-    /// Returns the size of what the views found, before refinement adds superpoints to the regions.
-    fn counts(&self, views: &DoneViews<'_>) -> Counts {
-        Counts {
-            n_views_without_masks: self.index.n_views_without_masks(),
-            n_masks: self.table.n_masks(),
-            n_regions: self.table.len(),
-            n_entries: self.index.n_entries(),
-            views: views_report(views, &self.index),
-        }
-    }
-
-    /// Finds objects, refines the contributions and builds the cells; `None` if cancelled.
-    ///
-    /// # Errors
-    /// [`EncodeError`].
-    fn build(&mut self, views: &DoneViews<'_>) -> Result<Option<BuiltCells>, EncodeError> {
-        let Plan { inputs, store, settings, .. } = *self.plan;
-        let mut n_entries = vec![0; inputs.split.cells.len()];
-        self.index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
-        let mut built = BuiltCells {
-            records: Vec::new(),
-            n_subspaces: Vec::new(),
-            n_entries,
-            extras: Extras::new(),
-            n_without_evidence: 0,
-            objects: None,
-            occupancy: self.occupancy.as_ref().map(|occupancy| occupancy.report),
-            counts: self.counts(views),
-            score_sums: [0.0; 3],
-        };
-        let aggregation = settings.aggregation;
-        let passes =
-            Passes { index: &self.index, group_bytes: self.pass_bytes, cancel: self.context.cancel() };
-        let subject = Subject { scene: &inputs.scene, split: &inputs.split };
-        self.context.begin_phase(Phase::Superpoints);
-        let begun = self.context.time("superpoints", || {
-            let begin = || Refinement::begin(aggregation, passes, &mut self.table, subject, &self.photos);
-            self.context.install(begin)
-        })?;
-        if self.context.is_cancelled() {
-            return Ok(None);
-        }
-        // From all masks alike, whatever weight they have in the refinement.
-        self.context.begin_phase(Phase::Objects);
-        let superpoints = begun.as_ref().and_then(Begun::superpoints);
-        let objects = self.context.install(|| self.objects(superpoints))?;
-        if let Some(found) = &objects {
-            self.context.progress().objects(&mut found.objects.iter().map(Object::found));
-        }
-        self.context.begin_phase(Phase::Refine);
-        let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
-        let refinement = self.context.time("refine", || {
-            let finish = |begun: Begun| begun.finish(passes, &mut self.table, subject, object_of);
-            self.context.install(|| begun.map_or(Ok(None), finish))
-        })?;
-        if self.context.is_cancelled() {
-            return Ok(None);
-        }
-        if aggregation != Aggregation::PLAIN {
-            let record = serde_json::to_vec(&aggregation).map_err(std::io::Error::from)?;
-            built.extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
-        }
-        let regions = self.context.install(|| store.put_object(|out| self.table.write(out)))?.0;
-        built.extras.insert(EXTRA_REGIONS.into(), regions);
-        self.context.begin_phase(Phase::Cells);
-        let has_poses = settings.cells.photo_poses;
-        let photo_poses = has_poses.then(|| shard::photo_poses(&inputs.split, &views.used));
-        let cells = CellsToBuild {
-            plan: self.plan,
-            index: &self.index,
-            merged: Merged {
-                table: &self.table,
-                score_context: &self.score_context,
-                refinement: refinement.as_ref(),
-                objects: objects.as_ref(),
-                occupancy: self.occupancy.as_ref(),
-            },
-            photo_poses: photo_poses.as_deref(),
-            encoder_id: self.encoder_id,
-            group_bytes: self.cells_bytes,
-            n_at_once: self.n_at_once,
-        };
-        let Some(finished) = here::build_cells(&cells, self.context)? else { return Ok(None) };
-        finished.into_iter().for_each(|cell| built.add(cell));
-        built.objects = objects.map(|objects| objects.report);
-        Ok(Some(built))
-    }
+    let cells_bytes = shard::largest_cells_bytes(&plan.inputs.split, plan.engines.models.dim(), n_at_once);
+    let len_bytes = shard::expected_bytes(cells_bytes);
+    memory.reserve_expecting(memory::Phase::Cells, "cells at once", 0, len_bytes);
+    memory::give_back();
+    Some(memory.planned_peak(memory::held_bytes()?))
 }

@@ -76,9 +76,6 @@ pub(crate) struct RunContext<'a> {
 
 impl<'a> RunContext<'a> {
     /// Starts `n_threads` worker threads.
-    ///
-    /// # Errors
-    /// [`EncodeError::Threads`].
     pub(crate) fn new(
         n_threads: usize,
         progress: &'a dyn Progress,

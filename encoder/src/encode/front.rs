@@ -18,14 +18,12 @@ pub struct Front {
     pub measured_with: String,
     /// Scenes of the mean.
     pub n_scenes: usize,
-    /// The settings.
     pub settings: Vec<FrontSetting>,
 }
 
 /// A setting and its figures, means over scenes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrontSetting {
-    /// Name.
     pub name: String,
     /// Flags of `encode`.
     pub flags: String,
@@ -35,7 +33,6 @@ pub struct FrontSetting {
     pub seconds_per_view: f64,
     /// All other seconds, per million Gaussians.
     pub seconds_per_million_gaussians: f64,
-    /// Bytes per Gaussian.
     pub bytes_per_gaussian: f64,
     /// Multi-class mIoU.
     pub miou: f64,
@@ -55,7 +52,6 @@ pub struct Target {
 /// A chosen setting.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Expectation {
-    /// The setting.
     pub setting: FrontSetting,
     /// Expected seconds.
     pub seconds: f64,
@@ -66,38 +62,24 @@ pub struct Expectation {
 /// Reason why a front cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum FrontError {
-    /// The file could not be read.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// The file is no front.
     #[error("{}: {what}; expected front.json as `slag-lab bench tradeoff` writes it", path.display())]
-    Malformed {
-        /// The file.
-        path: PathBuf,
-        /// The problem.
-        what: String,
-    },
-    /// No setting meets the target.
+    Malformed { path: PathBuf, what: String },
     #[error(
         "no measured setting meets the target: the quickest, {quickest}, is expected to take {seconds:.1} s, the smallest, {smallest}, {bytes:.0} bytes; raise the target"
     )]
     OutOfReach {
         /// The quickest setting.
         quickest: String,
-        /// Its seconds.
         seconds: f64,
         /// The smallest setting.
         smallest: String,
-        /// Its bytes.
         bytes: f64,
     },
 }
 
 impl Front {
-    /// Reads a front.
-    ///
-    /// # Errors
-    /// [`FrontError`].
     pub fn read(path: &Path) -> Result<Self, FrontError> {
         Self::parse(&fs_err::read_to_string(path)?, path)
     }
@@ -119,9 +101,6 @@ impl Front {
     }
 
     /// Returns the most accurate setting that is expected to meet the target, the quicker one of equals.
-    ///
-    /// # Errors
-    /// [`FrontError::OutOfReach`].
     pub fn choose(
         &self,
         target: Target,

@@ -1,16 +1,15 @@
-//! Does the views of an encode on this machine, and the cells.
+//! Does the views of an encode on this machine.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use slag_common::View;
 
-use super::cell::{CellInWork, CellMaker, FinishedCell};
+use super::Engines;
 use super::context::RunContext;
 use super::error::EncodeError;
-use super::executor::{CellsToBuild, Executor, ViewsRun};
+use super::executor::{Executor, ViewsRun};
 use super::pipeline;
 use super::plan::Plan;
 use super::report::{LeftOut, StageReport};
@@ -21,6 +20,10 @@ use super::view::{ViewStages, Work};
 pub(super) struct Here;
 
 impl Executor for Here {
+    fn rasterizer(&self, engines: &Engines<'_>) -> String {
+        engines.rasterizer.identity()
+    }
+
     fn run_views(
         &self,
         plan: &Plan<'_>,
@@ -48,7 +51,7 @@ impl Executor for Here {
             }
             let reason = error.to_string();
             context.progress().left_out(&view.name, &reason);
-            locked(&skipped).push(view.name.clone(), reason);
+            skipped.lock().unwrap_or_else(PoisonError::into_inner).push(view.name.clone(), reason);
             Ok(())
         })?;
         let wall_secs = start.elapsed().as_secs_f64();
@@ -76,8 +79,9 @@ pub(crate) fn work_off<'v>(
     context: &RunContext<'_>,
     on_bad_view: impl Fn(&View, EncodeError) -> Result<(), EncodeError> + Sync,
 ) -> Result<Vec<StageReport>, EncodeError> {
-    let list = stages.stages();
-    let source = source.map(|(is_alone, view)| (is_alone, Work::begin(view, stages.has_photos())));
+    let list = stages.tools().stages();
+    let is_here = stages.tools().photos.is_none();
+    let source = source.map(|(is_alone, view)| (is_alone, Work::begin(view, is_here)));
     let done = pipeline::run(&list, n_threads, source, |at, (is_alone, work)| {
         let view = work.view();
         // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
@@ -92,7 +96,7 @@ pub(crate) fn work_off<'v>(
             result => result.map(|work| Some((is_alone, work?))),
         }
     });
-    stages.rotated.warn();
+    stages.warn();
     done
 }
 
@@ -108,115 +112,6 @@ impl Budget {
         let is_first = !std::mem::replace(&mut self.has_some, true);
         !is_over || is_first
     }
-}
-
-/// Lifts the cells and makes their shards, several at once; `None` if cancelled.
-///
-/// # Errors
-/// [`EncodeError`]: of the first cell that failed.
-pub(super) fn build_cells(
-    cells: &CellsToBuild<'_>,
-    context: &RunContext<'_>,
-) -> Result<Option<Vec<FinishedCell>>, EncodeError> {
-    let CellsToBuild { plan, index, merged, group_bytes, n_at_once, .. } = *cells;
-    let split = &plan.inputs.split;
-    let maker = CellMaker {
-        scene: &plan.inputs.scene,
-        split,
-        settings: &plan.settings.cells.shards,
-        encoder_id: cells.encoder_id,
-        merged,
-        store: plan.store,
-        context,
-    };
-    let dim = merged.table.dim();
-    // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
-    let free = FreeCells::new((0..n_at_once).map(|_| CellInWork::empty(dim)).collect());
-    let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
-    let has_failed = AtomicBool::new(false);
-    let is_stopped = || context.is_cancelled() || has_failed.load(Ordering::Relaxed);
-    let workers = context.workers();
-    let n_alone = workers.n_alone(split.cells.len(), n_at_once);
-    std::thread::scope(|scope| -> Result<(), EncodeError> {
-        let mut parts = context.install(|| index.transposed_parts(merged.table, group_bytes));
-        let mut next_part = || context.time("merge", || context.install(|| parts.next()));
-        let mut lent = free.take();
-        while let Some(contributions) = next_part() {
-            if is_stopped() {
-                break;
-            }
-            let contributions = contributions?;
-            let cell_id = contributions.part.cell_id;
-            let n_gaussians = split.cells[cell_id as usize].gaussians.len();
-            if contributions.part.locals.end < n_gaussians {
-                // A large cell comes in parts, so that only one of them is held.
-                context.install(|| maker.add_part(contributions, &mut lent.cell))?;
-                continue;
-            }
-            if let Some(of_cells) = cells.photo_poses {
-                lent.cell.photo_poses = of_cells[cell_id as usize].clone();
-            }
-            let (finished, has_failed) = (&finished, &has_failed);
-            let work = move || {
-                if !is_stopped() {
-                    let added = maker.add_part(contributions, &mut lent.cell);
-                    let result = added.and_then(|()| maker.finish_cell(cell_id, &mut lent.cell));
-                    has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
-                    locked(finished).insert(cell_id, result);
-                    context.progress().advance(1);
-                }
-                drop(lent);
-            };
-            scope.spawn(move || workers.run((cell_id as usize) < n_alone, work));
-            lent = free.take();
-        }
-        Ok(())
-    })?;
-    let finished = finished.into_inner().unwrap_or_else(PoisonError::into_inner);
-    let finished: Vec<FinishedCell> = finished.into_values().collect::<Result<_, _>>()?;
-    Ok((!context.is_cancelled()).then_some(finished))
-}
-
-/// Cells that are not in work.
-struct FreeCells {
-    cells: Mutex<Vec<CellInWork>>,
-    given_back: Condvar,
-}
-
-impl FreeCells {
-    fn new(cells: Vec<CellInWork>) -> Self {
-        Self { cells: Mutex::new(cells), given_back: Condvar::new() }
-    }
-
-    /// Waits until one is free.
-    fn take(&self) -> LentCell<'_> {
-        let mut cells = locked(&self.cells);
-        loop {
-            match cells.pop() {
-                Some(cell) => return LentCell { cell, owner: self },
-                None => cells = self.given_back.wait(cells).unwrap_or_else(PoisonError::into_inner),
-            }
-        }
-    }
-}
-
-/// A cell that goes back, emptied, whatever becomes of the work.
-struct LentCell<'a> {
-    cell: CellInWork,
-    owner: &'a FreeCells,
-}
-
-impl Drop for LentCell<'_> {
-    fn drop(&mut self) {
-        let mut cell = std::mem::replace(&mut self.cell, CellInWork::empty(0));
-        cell.clear();
-        locked(&self.owner.cells).push(cell);
-        self.owner.given_back.notify_one();
-    }
-}
-
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

@@ -4,10 +4,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::{Gaussians, Hash32, Intrinsics, View};
 
-use super::engines::Engines;
+use super::Engines;
 use super::error::EncodeError;
 use super::inputs::Inputs;
-use super::kept::InputsRecord;
 use super::settings::{EncodeSettings, MAX_RASTER_WIDTH_PX, ViewSettings};
 use crate::cells::PositionError;
 use crate::ingest;
@@ -16,12 +15,13 @@ use crate::segment::Segmenter;
 /// Version of the steps from masks to contributions; another number is another encode.
 const REGIONS_VERSION: u32 = 4;
 
+/// Stands for the rasterisers of a fleet: its machines have different ones.
+pub(crate) const OF_A_FLEET: &str = "fleet";
+
 /// The identities of an encode.
 pub(super) struct Identities {
     /// Hash of everything on which the contributions of all views depend.
     pub(super) of_scene: Hash32,
-    /// Its two parts.
-    pub(super) inputs: InputsRecord,
     /// `[n_views]`: hash of everything on which the contributions of a view depend, in the order of the views. That
     /// includes `of_scene`, but no other view: photos can be added and withdrawn.
     pub(super) of_view: Vec<Hash32>,
@@ -39,7 +39,8 @@ struct SceneIdentity<'a> {
     windows: &'a [u8],
     session: Session,
     segmenter: String,
-    perturbation: Option<String>,
+    /// Devices round differently; a fleet has many.
+    rasterizer: &'a str,
     scene: Hash32,
     settings: &'a ViewSettings,
     cells: CellsIdentity,
@@ -75,13 +76,12 @@ pub(super) fn identities(
     settings: &EncodeSettings,
     engines: &Engines<'_>,
     segmenter: &dyn Segmenter,
+    rasterizer: &str,
     inputs: &Inputs,
 ) -> Result<Identities, EncodeError> {
     let scene = hash_scene(&inputs.scene);
     let cells = inputs.split.deciding(settings.cells.limits);
-    let of = |scene| hash_of(&scene_identity(&settings.view, cells, engines, segmenter, scene));
-    let of_scene = of(scene)?;
-    let record = InputsRecord { scene, settings: of(Hash32([0; 32]))? };
+    let of_scene = hash_of(&scene_identity(&settings.view, cells, engines, segmenter, rasterizer, scene))?;
     let of_view = |view: &View| -> Result<Hash32, EncodeError> {
         hash_of(&ViewIdentity {
             of_scene,
@@ -93,13 +93,11 @@ pub(super) fn identities(
         })
     };
     let of_view = inputs.views.par_iter().map(of_view).collect::<Result<_, _>>()?;
-    Ok(Identities { of_scene, inputs: record, of_view })
+    Ok(Identities { of_scene, of_view })
 }
 
-/// Returns the hash of everything on which the contributions of all views depend.
-///
-/// # Errors
-/// None that is known: settings can be serialised.
+/// Returns the hash of everything on which the contributions of all views depend, done by a fleet.
+#[cfg(feature = "fleet")]
 pub(crate) fn of_scene(
     settings: &ViewSettings,
     cells: CellsIdentity,
@@ -107,7 +105,7 @@ pub(crate) fn of_scene(
     segmenter: &dyn Segmenter,
     scene: &Gaussians,
 ) -> Result<Hash32, EncodeError> {
-    hash_of(&scene_identity(settings, cells, engines, segmenter, hash_scene(scene)))
+    hash_of(&scene_identity(settings, cells, engines, segmenter, OF_A_FLEET, hash_scene(scene)))
 }
 
 fn scene_identity<'a>(
@@ -115,9 +113,10 @@ fn scene_identity<'a>(
     cells: CellsIdentity,
     engines: &Engines<'a>,
     segmenter: &dyn Segmenter,
+    rasterizer: &'a str,
     scene: Hash32,
 ) -> SceneIdentity<'a> {
-    let Engines { models, session, perturbation, .. } = engines;
+    let Engines { models, session, .. } = engines;
     SceneIdentity {
         program: env!("CARGO_PKG_VERSION"),
         regions: (REGIONS_VERSION, MAX_RASTER_WIDTH_PX),
@@ -128,7 +127,7 @@ fn scene_identity<'a>(
             n_threads: session.intra_op_threads,
         },
         segmenter: segmenter.identity(),
-        perturbation: perturbation.map(|perturbation| perturbation.identity()),
+        rasterizer,
         scene,
         settings,
         cells,
@@ -198,7 +197,20 @@ mod tests {
         change(&mut settings, &mut session);
         let models = ModelDir::colours();
         let engines = Engines::new(&models, &session, &CpuRasterizer);
-        identities(&settings, &engines, segmenter, &inputs(photo)).expect("readable").of_view[0]
+        identities(&settings, &engines, segmenter, "cpu", &inputs(photo)).expect("readable").of_view[0]
+    }
+
+    /// Views of two devices, or of a fleet, must not mix in one store.
+    #[test]
+    fn the_device_that_rasterises_counts() {
+        let settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
+        let engines = Engines::new(&models, &session, &CpuRasterizer);
+        let of = |device: &str| {
+            let (graph, inputs) = (GraphSegmenter::default(), inputs(Path::new("absent.png")));
+            identities(&settings, &engines, &graph, device, &inputs).expect("readable").of_scene
+        };
+        assert!(of("cpu") != of("NVIDIA H100 F64") && of("cpu") != of(OF_A_FLEET) && of("cpu") == of("cpu"));
     }
 
     /// Files count by content, where path and length are the same; so do masks in a single COCO file.

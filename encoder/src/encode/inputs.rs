@@ -19,9 +19,11 @@ use crate::{check, ingest};
 /// A splat of which fewer than one in so many Gaussians can be seen is damaged.
 const MIN_VISIBLE_ONE_IN: usize = 20;
 
-/// Bytes that a pixel of a photo takes until its crops are made: three as read and three without distortion, one for
-/// whether the lens shows it, four each for its depth and its segment.
+/// Bytes that a pixel of a photo takes while it is worked on: three as read and three without distortion, one for whether the
+/// lens shows it, four each for its depth and its segment.
 const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
+/// Of these, while it waits: its colours, whether the lens shows it, its depth.
+const WAITING_BYTES_PER_PX: u64 = 3 + 1 + 4;
 
 /// The inputs of an encode.
 pub(crate) struct Inputs {
@@ -85,12 +87,14 @@ pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
     memory.reserve_held(Phase::Always, "the scene", scene.len_bytes());
 }
 
-/// Reserves the photos in work: one a thread, the largest ones.
-pub(crate) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], threads: usize) {
+/// Reserves the largest photos: those that threads work on, and those that wait for a device or in a queue.
+pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work: usize, n_under_way: usize) {
     let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
     areas_px.sort_unstable_by(|a, b| b.cmp(a));
-    let in_work_px: u64 = areas_px.iter().take(threads).sum();
-    memory.reserve(Phase::Views, "photos in work", in_work_px * PHOTO_BYTES_PER_PX);
+    let (in_work, rest) = areas_px.split_at(n_in_work.min(areas_px.len()));
+    let waiting_px: u64 = rest.iter().take(n_under_way.saturating_sub(n_in_work)).sum();
+    memory.reserve(Phase::Views, "photos in work", in_work.iter().sum::<u64>() * PHOTO_BYTES_PER_PX);
+    memory.reserve(Phase::Views, "photos that wait", waiting_px * WAITING_BYTES_PER_PX);
 }
 
 /// Returns the numbers of views with a photo and of Gaussians.
@@ -180,4 +184,37 @@ fn find_views(
         return Err(EncodeError::NoViews { n_views, reason });
     }
     Ok((found, skipped))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: a photo of 400 x 300 pixels, whose file is absent, and two of 40 x 30, which their headers say, of the same
+    /// camera. Two are worked on, 15 bytes a pixel; of two more that may wait there is one, 8 bytes a pixel.
+    #[test]
+    fn photos_are_reserved_by_their_files_in_work_and_waiting() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let view = |name: &str| View {
+            name: name.into(),
+            image_path: folder.path().join(name),
+            intrinsics: slag_common::Intrinsics {
+                width_px: 400,
+                height_px: 300,
+                focal_x_px: 300.0,
+                focal_y_px: 300.0,
+                centre_x_px: 200.0,
+                centre_y_px: 150.0,
+                distortion: slag_common::Distortion::None,
+            },
+            camera_from_world: glam::DAffine3::IDENTITY,
+        };
+        for name in ["a.png", "c.png"] {
+            image::RgbImage::new(40, 30).save(folder.path().join(name)).expect("it is writable");
+        }
+        let mut memory = MemoryPlan::new(0);
+        reserve_photos(&mut memory, &["a.png", "b.png", "c.png"].map(view), 2, 4);
+        let refused = memory.rest(0).expect_err("nothing fits");
+        assert_eq!(refused.needed_bytes, 15 * (400 * 300 + 40 * 30) + 8 * 40 * 30);
+    }
 }

@@ -35,9 +35,6 @@ pub struct JobStatus {
 }
 
 /// Returns the state of the encode that a store keeps views of, if there is one. `db`: the store's catalogue, or a copy.
-///
-/// # Errors
-/// [`EncodeError::Records`].
 pub fn job_status(db: &sled::Db, store: &Path) -> Result<Option<JobStatus>, EncodeError> {
     let records = |source| EncodeError::Records { path: store.to_owned(), source };
     let tree = db.open_tree(TREE).map_err(records)?;
@@ -50,33 +47,6 @@ pub fn job_status(db: &sled::Db, store: &Path) -> Result<Option<JobStatus>, Enco
         is_published: tree.contains_key(PUBLISHED_KEY).map_err(records)?,
         step: step.map(|name| String::from_utf8_lossy(&name).into_owned()),
     }))
-}
-
-/// What a view took and left.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ViewCost {
-    /// Seconds in its stages.
-    pub secs: f64,
-    /// Bytes of its contributions.
-    pub len_bytes: u64,
-}
-
-/// Returns the costs of the views that a store keeps, by identity.
-///
-/// # Errors
-/// [`EncodeError::Records`]; a file of contributions is missing.
-pub fn view_costs(store: &Store) -> Result<Vec<ViewCost>, EncodeError> {
-    let records = |source| records_error(store, source);
-    let folder = store.job_dir()?.join(VIEWS_FOLDER);
-    let tree = store.db().open_tree(TREE).map_err(records)?;
-    let costs = tree.scan_prefix(VIEW_PREFIX).map(|entry| {
-        let (key, value) = entry.map_err(records)?;
-        let record: ViewRecord = serde_json::from_slice(&value).unwrap_or_default();
-        let id = String::from_utf8_lossy(&key[VIEW_PREFIX.len()..]).into_owned();
-        let len_bytes = fs_err::metadata(folder.join(format!("{id}.contributions")))?.len();
-        Ok(ViewCost { secs: f64::from(record.secs), len_bytes })
-    });
-    costs.collect()
 }
 
 /// The unfinished encode of a store.
@@ -170,9 +140,6 @@ impl<'a> Job<'a> {
     }
 
     /// Marks a view as done, whose files are durable.
-    ///
-    /// # Errors
-    /// [`EncodeError::Records`].
     pub(crate) fn mark_done(&self, view: &str, record: ViewRecord) -> Result<(), EncodeError> {
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
         // In one step: with a view that was not published, the job may no longer be dropped silently.

@@ -18,16 +18,13 @@ mod cell;
 mod cells;
 mod context;
 pub mod coverage;
-mod engines;
 mod error;
 mod executor;
-mod expected;
 pub mod front;
 mod here;
 mod identity;
 mod inputs;
 mod job;
-mod kept;
 mod pipeline;
 mod plan;
 mod preset;
@@ -35,31 +32,33 @@ mod publish;
 mod report;
 mod settings;
 mod sink;
-mod text_model;
 mod view;
 mod views;
 mod workers;
 
 use std::sync::atomic::AtomicBool;
 
+use slag_models::{ModelDir, SessionOptions};
+
 use crate::progress::Progress;
+use crate::raster::Rasterizer;
 use crate::store::Store;
 use context::{Phase, RunContext};
 use executor::Executor;
 
 pub use crate::memory::{MemoryError, Reservation};
-pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
 pub use inputs::count_inputs;
-pub use job::{JobStatus, ViewCost, job_status, view_costs};
-pub use kept::{LostViews, SharedGaussians};
-pub use preset::{Choices, Preset};
+pub use job::{JobStatus, job_status};
+pub use preset::Preset;
 pub use report::{
-    CellReport, EncodeSummary, GpuReport, MemoryReport, PhaseReport, SkippedView, StageReport, ViewsReport,
+    CellReport, EncodeSummary, GpuReport, LostViews, MemoryReport, PhaseReport, SkippedView, StageReport,
+    ViewsReport,
 };
 pub use settings::{
-    CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, InputSettings, Masks, OutputSettings, RasterWidth,
-    Regions, RunSettings, ViewOrder, ViewSettings, ViewsLimit,
+    CellSettings, DEFAULT_CELL_WIDTH_M, DEFAULT_MASK_LEVELS, EncodeSettings, InputSettings,
+    MAX_CELL_GAUSSIANS, Masks, OutputSettings, RasterWidth, Regions, RunSettings, ViewOrder, ViewSettings,
+    ViewsLimit,
 };
 
 /// The parts of which a fleet makes its own encode.
@@ -68,12 +67,27 @@ pub(crate) mod fleet_parts {
     pub(crate) use super::context::RunContext;
     pub(crate) use super::executor::{Executor, ViewsRun};
     pub(crate) use super::here::work_off;
-    pub(crate) use super::identity::of_scene;
-    pub(crate) use super::inputs::reserve_photos;
+    pub(crate) use super::identity::{OF_A_FLEET, of_scene};
     pub(crate) use super::plan::{Plan, segmenter_of};
     pub(crate) use super::report::LeftOut;
     pub(crate) use super::sink::{PhotoSource, ViewRecord, ViewSink};
     pub(crate) use super::view::{ViewStages, ViewTools};
+}
+
+/// What does the work of an encode.
+#[derive(Clone, Copy)]
+pub struct Engines<'a> {
+    /// Embeds crops and texts.
+    pub models: &'a ModelDir,
+    /// How ONNX Runtime runs models.
+    pub session: &'a SessionOptions,
+    pub rasterizer: &'a dyn Rasterizer,
+}
+
+impl<'a> Engines<'a> {
+    pub fn new(models: &'a ModelDir, session: &'a SessionOptions, rasterizer: &'a dyn Rasterizer) -> Self {
+        Self { models, session, rasterizer }
+    }
 }
 
 /// Encodes a scene into a store and publishes the result as its next generation.
@@ -90,9 +104,6 @@ pub fn encode(
 }
 
 /// Encodes a scene as [`encode`] does. `executor` does the views.
-///
-/// # Errors
-/// As of [`encode`].
 pub(crate) fn encode_by(
     executor: &dyn Executor,
     settings: &EncodeSettings,
@@ -106,7 +117,7 @@ pub(crate) fn encode_by(
     let store = Store::create_or_open(&settings.output.store)?;
     let inputs = inputs::Inputs::read(settings, &context)?;
     context.begin_phase(Phase::Plan);
-    let plan = plan::plan(settings, engines, &store, &inputs, &context)?;
+    let plan = plan::plan(settings, engines, &store, &inputs, executor, &context)?;
     context.begin_phase(Phase::Views);
     plan.job.begin("views")?;
     let views = views::run_views(&plan, executor, &context)?;

@@ -7,6 +7,7 @@
 
 use std::any::Any;
 use std::collections::VecDeque;
+use std::ops::RangeInclusive;
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::Instant;
@@ -23,11 +24,30 @@ pub(super) struct Stage {
     pub(super) on_cpu: bool,
 }
 
-struct State<S, T, E> {
-    source: S,
-    /// Waiting before each stage.
+/// Returns the most items that are in some stages at once, or wait between them.
+pub(super) fn most_under_way(stages: &[Stage], of: RangeInclusive<usize>, n_cores: usize) -> usize {
+    let (first, last) = (*of.start(), *of.end());
+    let is_fed_back = |at: usize| !stages[at].on_cpu && stages[at..].iter().any(|stage| stage.on_cpu);
+    if !(first..stages.len()).any(is_fed_back) {
+        // A core that has brought an item through a stage takes it through the next one.
+        return n_cores;
+    }
+    // What is in a stage has its place in the next one's queue.
+    let n_places = |at: usize| stages[at].n_slots.max(stages[at + 1].n_slots);
+    (first..last).map(n_places).sum::<usize>() + stages[last].n_slots
+}
+
+struct State<T, E> {
+    /// Waiting before each stage but the first.
     waiting: Vec<VecDeque<T>>,
     n_running: Vec<usize>,
+    /// Whether a thread asks the source.
+    is_asking: bool,
+    /// Whether the source had nothing, and no step has ended since it was asked.
+    has_no_more: bool,
+    /// Steps that have ended, and had when the source was asked.
+    n_ended: usize,
+    n_ended_when_asked: usize,
     busy_secs: Vec<f64>,
     failure: Option<Failure<E>>,
 }
@@ -37,8 +57,17 @@ enum Failure<E> {
     Panic(Box<dyn Any + Send>),
 }
 
+/// What a thread does next.
+enum Task<T> {
+    /// Asks the source for an item, and takes it through the first stage.
+    Begin,
+    /// Takes an item through a stage.
+    Step(usize, T),
+}
+
 /// Takes what `source` yields through the stages, `n_cores` at a time on the processor. A source that has nothing may have
-/// more later: it is asked again whenever a stage has room, until nothing is under way.
+/// more later: it is asked again whenever a stage has room, until nothing is under way. It may take its time: stages go on
+/// meanwhile.
 ///
 /// `step` does the work of a stage (its index) and returns what the next one takes; `None` ends an item's way.
 ///
@@ -51,46 +80,21 @@ pub(super) fn run<T: Send, E: Send>(
     step: impl Fn(usize, T) -> Result<Option<T>, E> + Sync,
 ) -> Result<Vec<StageReport>, E> {
     let start = Instant::now();
+    let pipeline = Pipeline { stages, n_cores, source: Mutex::new(source), step, changed: Condvar::new() };
     let state = Mutex::new(State {
-        source,
         waiting: stages.iter().map(|_| VecDeque::new()).collect(),
         n_running: vec![0; stages.len()],
+        is_asking: false,
+        has_no_more: false,
+        n_ended: 0,
+        n_ended_when_asked: 0,
         busy_secs: vec![0.0; stages.len()],
         failure: None,
     });
-    let changed = Condvar::new();
-    let work = || {
-        let lock = || state.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut state = lock();
-        while state.failure.is_none() {
-            let Some((stage, item)) = state.take(stages, n_cores) else {
-                // Where nothing is under way and nothing can be begun, nothing waits.
-                if state.n_running.iter().all(|n| *n == 0) {
-                    break;
-                }
-                state = changed.wait(state).unwrap_or_else(PoisonError::into_inner);
-                continue;
-            };
-            drop(state);
-            let begun = Instant::now();
-            // A panic must not leave the others waiting.
-            let result = panic::catch_unwind(AssertUnwindSafe(|| step(stage, item)));
-            state = lock();
-            state.busy_secs[stage] += begun.elapsed().as_secs_f64();
-            state.n_running[stage] -= 1;
-            match result {
-                Ok(Ok(Some(item))) if stage + 1 < stages.len() => state.waiting[stage + 1].push_back(item),
-                Ok(Ok(_)) => {}
-                Ok(Err(error)) => drop(state.failure.get_or_insert(Failure::Error(error))),
-                Err(panic) => state.failure = Some(Failure::Panic(panic)),
-            }
-            changed.notify_all();
-        }
-    };
     let n_elsewhere: usize = stages.iter().filter(|stage| !stage.on_cpu).map(|stage| stage.n_slots).sum();
     std::thread::scope(|scope| {
         for _ in 0..n_cores + n_elsewhere {
-            scope.spawn(work);
+            scope.spawn(|| pipeline.work(&state));
         }
     });
     let State { busy_secs, failure, .. } = state.into_inner().unwrap_or_else(PoisonError::into_inner);
@@ -110,9 +114,62 @@ pub(super) fn run<T: Send, E: Send>(
     Ok(stages.iter().zip(busy_secs).map(report).collect())
 }
 
-impl<S: Iterator<Item = T>, T, E> State<S, T, E> {
+struct Pipeline<'a, S, F> {
+    stages: &'a [Stage],
+    n_cores: usize,
+    source: Mutex<S>,
+    step: F,
+    changed: Condvar,
+}
+
+impl<S, F> Pipeline<'_, S, F> {
+    /// The work of one thread.
+    fn work<T, E>(&self, state: &Mutex<State<T, E>>)
+    where
+        S: Iterator<Item = T>,
+        F: Fn(usize, T) -> Result<Option<T>, E>,
+    {
+        let lock = || state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = lock();
+        while state.failure.is_none() {
+            let Some((at, task)) = state.take(self.stages, self.n_cores) else {
+                // Where nothing is under way and nothing can be begun, nothing waits.
+                if state.n_running.iter().all(|n| *n == 0) {
+                    break;
+                }
+                state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            drop(state);
+            // A panic must not leave the others waiting.
+            let done = panic::catch_unwind(AssertUnwindSafe(|| match task {
+                Task::Step(stage, item) => Some(self.timed_step(stage, item)),
+                Task::Begin => {
+                    let item = self.source.lock().unwrap_or_else(PoisonError::into_inner).next();
+                    lock().end_asking(item.is_some());
+                    self.changed.notify_all();
+                    item.map(|item| self.timed_step(0, item))
+                }
+            }));
+            state = lock();
+            state.end_step(at, done);
+            self.changed.notify_all();
+        }
+    }
+
+    fn timed_step<T, E>(&self, stage: usize, item: T) -> (f64, Result<Option<T>, E>)
+    where
+        F: Fn(usize, T) -> Result<Option<T>, E>,
+    {
+        let begun = Instant::now();
+        let result = (self.step)(stage, item);
+        (begun.elapsed().as_secs_f64(), result)
+    }
+}
+
+impl<T, E> State<T, E> {
     /// Takes the item that is furthest of those that can go on, and says into which stage.
-    fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, T)> {
+    fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, Task<T>)> {
         let on_cpu = stages.iter().zip(&self.n_running).filter(|(stage, _)| stage.on_cpu);
         let has_core = on_cpu.map(|(_, n)| n).sum::<usize>() < n_cores;
         for (at, stage) in stages.iter().enumerate().rev() {
@@ -120,15 +177,47 @@ impl<S: Iterator<Item = T>, T, E> State<S, T, E> {
             let has_room = stages.get(at + 1).is_none_or(|next| {
                 self.waiting[at + 1].len() + self.n_running[at] < stage.n_slots.max(next.n_slots)
             });
-            if self.n_running[at] < stage.n_slots && has_room && (has_core || !stage.on_cpu) {
-                let item = if at == 0 { self.source.next() } else { self.waiting[at].pop_front() };
-                if let Some(item) = item {
-                    self.n_running[at] += 1;
-                    return Some((at, item));
+            if self.n_running[at] >= stage.n_slots || !has_room || (stage.on_cpu && !has_core) {
+                continue;
+            }
+            let task = match at {
+                0 if self.is_asking || self.has_no_more => None,
+                0 => Some(Task::Begin),
+                _ => self.waiting[at].pop_front().map(|item| Task::Step(at, item)),
+            };
+            if let Some(task) = task {
+                self.n_running[at] += 1;
+                if at == 0 {
+                    (self.is_asking, self.n_ended_when_asked) = (true, self.n_ended);
                 }
+                return Some((at, task));
             }
         }
         None
+    }
+
+    fn end_asking(&mut self, has_item: bool) {
+        self.is_asking = false;
+        self.has_no_more = !has_item && self.n_ended == self.n_ended_when_asked;
+    }
+
+    /// Puts an item into the next queue, or keeps why there is none. `done`: seconds and result of the step, if the source
+    /// had an item for it.
+    fn end_step(&mut self, at: usize, done: std::thread::Result<Option<(f64, Result<Option<T>, E>)>>) {
+        self.n_running[at] -= 1;
+        let (secs, result) = match done {
+            Ok(Some(done)) => done,
+            Ok(None) => return,
+            Err(panic) => return self.failure = Some(Failure::Panic(panic)),
+        };
+        self.busy_secs[at] += secs;
+        self.n_ended += 1;
+        self.has_no_more = false;
+        match result {
+            Ok(Some(item)) if at + 1 < self.waiting.len() => self.waiting[at + 1].push_back(item),
+            Ok(_) => {}
+            Err(error) => drop(self.failure.get_or_insert(Failure::Error(error))),
+        }
     }
 }
 
@@ -249,6 +338,46 @@ mod tests {
             run(&stages, 2, source, |_, item: u32| if item == 7 { Err(item) } else { Ok(Some(item)) });
         assert_eq!(failed.expect_err("it failed"), 7);
         assert!(n_begun.load(Ordering::SeqCst) < 100);
+    }
+
+    /// Threads that wait for the source's next item end with it.
+    #[test]
+    #[should_panic(expected = "a broken source")]
+    fn a_panic_of_the_source_is_passed_on() {
+        let stages = [stage("a", 2, true), stage("b", 2, false)];
+        let source = (0..10).inspect(|item| assert!(*item != 3, "a broken source"));
+        let _ = run::<_, ()>(&stages, 2, source, |_, item| Ok(Some(item)));
+    }
+
+    /// A source that takes its time, as a queue of a fleet does, holds up no stage.
+    #[test]
+    fn stages_go_on_while_the_source_is_asked() {
+        let stages = [stage("a", 2, true), stage("b", 2, false)];
+        let (done, is_done) = mpsc::channel();
+        let (done, is_done) = (Mutex::new(done), Mutex::new(is_done));
+        let source = (0..2).inspect(|item| {
+            if *item == 1 {
+                let waited = is_done.lock().expect("not poisoned").recv_timeout(Duration::from_secs(20));
+                waited.expect("the first item did not go on meanwhile");
+            }
+        });
+        run::<_, ()>(&stages, 2, source, |at, item| {
+            if (at, item) == (1, 0) {
+                done.lock().expect("not poisoned").send(()).expect("someone listens");
+            }
+            Ok(Some(item))
+        })
+        .expect("no error");
+    }
+
+    /// By hand: cores take items all the way; with a device in between, each boundary holds as many as either side has slots.
+    #[test]
+    fn items_under_way_are_bounded() {
+        let of_cpu = [stage("a", 3, true), stage("b", 3, true), stage("disk", 1, false)];
+        assert_eq!(most_under_way(&of_cpu, 0..=1, 3), 3);
+        let of_gpu =
+            [stage("a", 3, true), stage("gpu", 12, false), stage("c", 3, true), stage("disk", 1, false)];
+        assert_eq!(most_under_way(&of_gpu, 0..=2, 3), 12 + 12 + 3);
     }
 
     #[test]

@@ -1,33 +1,50 @@
 //! The first step: everything that is read, checked and decided before the first view.
 
+use std::path::Path;
 use std::time::Instant;
 
+use glam::DVec3;
+use rayon::prelude::*;
 use slag_common::{Hash32, View};
 use slag_models::SessionOptions;
 
+use super::Engines;
 use super::context::RunContext;
 use super::coverage::{self, Coverage};
-use super::engines::Engines;
 use super::error::EncodeError;
-use super::expected;
+use super::executor::Executor;
 use super::identity;
 use super::inputs::{self, Inputs};
-use super::job::{Job, job_status};
-use super::kept::{self, InputsRecord, LostViews};
+use super::job::{Job, JobStatus, job_status};
+use super::report::LostViews;
 use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSettings};
 use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::embed::SharedEncoders;
 use crate::lift::refine::Refinement;
-use crate::memory::{self, MemoryPlan, PlannedPeak};
+use crate::memory::{self, MemoryPlan, Phase, PlannedPeak};
 use crate::objects;
-use crate::raster::project::Prepared;
+use crate::raster::PreparedScene;
 use crate::raster::{LoadedScene, RasterView};
 use crate::segment::{
     GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter,
 };
 use crate::shard;
-use crate::store::Store;
+use crate::store::{Store, StoreReader};
+
+/// Gaussians that are looked at for all views, to tell how far they see.
+const MAX_TESTS: usize = 1 << 24;
+// Measured with the embedded models, 1 to 16 threads and 0.1 to 2.1 million Gaussians.
+/// ONNX Runtime's code, as far as models use it, its environment, and what they leave behind.
+const RUNTIME_BYTES: u64 = 56 << 20;
+/// What a session takes beside its weights, and what the allocator keeps for each thread.
+const SESSION_BYTES: u64 = 4 << 20;
+/// What a GPU's driver keeps in the process, and what each view takes that is with it: copies of all that goes there and back.
+const DEVICE_BYTES: u64 = 140 << 20;
+const DEVICE_BYTES_PER_VIEW: u64 = 10 << 20;
+/// What the processor's rasteriser takes for each Gaussian in a view's frustum, most of them hidden: 110 projected and in
+/// tiles, and 200 blended for each of a fifth.
+const RASTER_BYTES_PER_VISIBLE: u64 = 150;
 
 /// What was decided.
 pub(crate) struct Plan<'a> {
@@ -40,9 +57,10 @@ pub(crate) struct Plan<'a> {
     pub(super) planned_peak: Option<PlannedPeak>,
     pub(crate) segmenter: Box<dyn Segmenter>,
     pub(crate) job: Job<'a>,
-    pub(super) inputs_record: InputsRecord,
     /// Kept views that are done anew.
     pub(super) lost_views: Option<LostViews>,
+    /// The encoder of the generation that this encode replaces, if it is another.
+    pub(super) encoder_before: Option<String>,
     pub(super) scene: Box<dyn LoadedScene + 'a>,
     /// The views to use, as numbers in the order in which they are taken.
     pub(crate) order: Vec<usize>,
@@ -68,22 +86,15 @@ impl Plan<'_> {
 }
 
 /// Checks the budget, opens segmenter and job, loads the scene and chooses the views.
-///
-/// # Errors
-/// [`EncodeError`].
 pub(super) fn plan<'a>(
     settings: &'a EncodeSettings,
     engines: &'a Engines<'a>,
     store: &'a Store,
     inputs: &'a Inputs,
+    executor: &dyn Executor,
     context: &RunContext<'_>,
 ) -> Result<Plan<'a>, EncodeError> {
-    let mut memory = memory_plan(settings, inputs, engines.models.dim());
-    if let (false, Some(preprocess)) = (engines.session.is_on_cpu(), engines.models.preprocess()) {
-        // A byte a channel, and one for the mask.
-        let square_bytes = 4 * u64::from(preprocess.size_px()).pow(2);
-        SharedEncoders::reserve(&mut memory, &settings.run.gpus, square_bytes);
-    }
+    let memory = memory_plan(settings, inputs, engines);
     memory.rest(0)?;
     if settings.output.text_model {
         // What cannot be carried is refused before the work.
@@ -93,84 +104,171 @@ pub(super) fn plan<'a>(
     if let Some(without) = segmenter.check_views(&inputs.views, settings.run.strict)? {
         tracing::warn!("{without}");
     }
+    let rasterizer = executor.rasterizer(engines);
     let ids = context.time("identity", || {
-        context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))
+        let of = || identity::identities(settings, engines, segmenter.as_ref(), &rasterizer, inputs);
+        context.install(of)
     })?;
     let id_of_view = inputs.views.iter().map(|view| view.name.clone()).zip(ids.of_view).collect();
-    let lost_views = lost_views(store, ids.of_scene, &ids.inputs, inputs, context)?;
+    let lost_views = lost_views(store, ids.of_scene)?;
     let job = Job::open(store, ids.of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
     let start = Instant::now();
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
-    let views: Vec<&View> = order.iter().map(|i| &inputs.views[*i]).collect();
-    let of_models = (engines.models.image_bytes(), engines.models.dim());
-    let of_scene = (scene.as_ref(), &views[..]);
-    context.install(|| expected::reserve(&mut memory, settings, inputs, of_scene, of_models));
-    memory::give_back();
-    let planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
-    if let Some(PlannedPeak { len_bytes, phase }) = planned_peak {
-        tracing::info!("at most about {} MB of memory, in {phase:?}", len_bytes / 1_000_000);
-    }
-    Ok(Plan {
+    let mut plan = Plan {
         settings,
         engines,
         inputs,
         store,
         memory,
-        planned_peak,
+        planned_peak: None,
         segmenter,
         job,
-        inputs_record: ids.inputs,
         lost_views,
+        encoder_before: encoder_before(settings, engines),
         scene,
         order,
         coverage,
         coverage_secs,
-    })
+    };
+    plan.reserve_views(context)?;
+    Ok(plan)
+}
+
+impl Plan<'_> {
+    /// Reserves what depends on segmenter, devices and chosen views, and plans the peak of the process.
+    fn reserve_views(&mut self, context: &RunContext<'_>) -> Result<(), EncodeError> {
+        let mut memory = self.memory.clone();
+        self.view_tools().reserve_photos(&mut memory, &self.inputs.views);
+        memory.rest(0)?;
+        expect_runtime(&mut memory, self.settings, self.engines, self.scene.as_ref());
+        if self.scene.gpus().is_none() {
+            let views: Vec<&View> = self.order.iter().map(|i| &self.inputs.views[*i]).collect();
+            let (means, n_threads) = (&self.inputs.scene.means_in_world, self.settings.run.threads);
+            let n_visible = context.install(|| n_visible_at_once(&views, means, n_threads));
+            let len_bytes = n_visible * RASTER_BYTES_PER_VISIBLE;
+            memory.reserve_expecting(Phase::Views, "views that are rasterised", 0, len_bytes);
+        }
+        memory::give_back();
+        self.planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
+        if let Some(PlannedPeak { len_bytes, phase }) = self.planned_peak {
+            let len_mb = len_bytes / 1_000_000;
+            tracing::info!(
+                "about {len_mb} MB of memory in {phase:?}, and then what the views' contributions take"
+            );
+        }
+        self.memory = memory;
+        Ok(())
+    }
+}
+
+/// Returns the encoder of the store's generation, where this encode publishes vectors of another: robots refuse them until
+/// they have its text model.
+fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<String> {
+    // A store without a generation, or with a damaged one, has none to be told of.
+    let reader = StoreReader::open(&settings.output.store).ok()?;
+    let (before, now) = (&reader.manifest().encoder, engines.models.encoder_id());
+    if before.id == Hash32(now.hash()) {
+        return None;
+    }
+    let name = settings.output.models.as_deref().unwrap_or(Path::new("the embedded ones"));
+    let then = match settings.output.text_model {
+        true => "robots fetch its text model with the scene".to_owned(),
+        false => format!(
+            "robots refuse the new generation until they are started with --models {}; encode with --text-model, and they fetch it",
+            name.display()
+        ),
+    };
+    tracing::warn!(
+        "{}: published with {:?}, this encode is by {now}: {then}",
+        settings.output.store.display(),
+        before.name
+    );
+    Some(before.name.clone())
+}
+
+/// Adds what models and devices are expected to take; nothing bounds it.
+fn expect_runtime(
+    memory: &mut MemoryPlan,
+    settings: &EncodeSettings,
+    engines: &Engines<'_>,
+    scene: &dyn LoadedScene,
+) {
+    let n_threads = settings.run.threads as u64;
+    let mut expect = |phase, purpose, len_bytes| memory.reserve_expecting(phase, purpose, 0, len_bytes);
+    if let Some(model_bytes) = engines.models.image_bytes() {
+        expect(Phase::Always, "ONNX Runtime", RUNTIME_BYTES);
+        expect(Phase::Views, "a model of each thread", n_threads * model_bytes);
+    }
+    expect(Phase::Always, "sessions and allocations of each thread", n_threads * SESSION_BYTES);
+    if let Some(gpus) = scene.gpus() {
+        expect(Phase::Always, "drivers of GPUs", gpus.n_gpus as u64 * DEVICE_BYTES);
+        expect(Phase::Views, "views on GPUs", gpus.n_views() as u64 * DEVICE_BYTES_PER_VIEW);
+    }
+}
+
+/// Returns how many Gaussians are in the frusta of views that are worked on at the same time, at most: of `n_at_once` that
+/// follow one another. Few views see far, but these hold the most, and they lie together.
+fn n_visible_at_once(views: &[&View], means_in_world: &[DVec3], n_at_once: usize) -> u64 {
+    let step = (means_in_world.len() * views.len() / MAX_TESTS).max(1);
+    let n_visible: Vec<u64> = views.par_iter().map(|view| n_before(means_in_world, step, view)).collect();
+    let n = n_at_once.clamp(1, n_visible.len().max(1));
+    let most = n_visible.windows(n).map(|views| views.iter().sum::<u64>()).max().unwrap_or(0);
+    most * step as u64
+}
+
+/// Returns how many of every `step`-th mean lie before a view.
+fn n_before(means_in_world: &[DVec3], step: usize, view: &View) -> u64 {
+    let is_before = |mean: &&DVec3| {
+        let at = view.camera_from_world.transform_point3(**mean);
+        let [x_px, y_px] = view.intrinsics.pixel_from_distorted([at.x / at.z, at.y / at.z]);
+        at.z > 0.0
+            && (0.0..f64::from(view.intrinsics.width_px)).contains(&x_px)
+            && (0.0..f64::from(view.intrinsics.height_px)).contains(&y_px)
+    };
+    means_in_world.iter().step_by(step).filter(is_before).count() as u64
 }
 
 /// Returns which kept views cannot be taken over, and says so; an encode that is unfinished is refused later, not replaced.
-fn lost_views(
-    store: &Store,
-    of_scene: Hash32,
-    record: &InputsRecord,
-    inputs: &Inputs,
-    context: &RunContext<'_>,
-) -> Result<Option<LostViews>, EncodeError> {
-    let kept = job_status(store.db(), store.dir())?.filter(|status| status.n_views > 0);
-    let Some(kept) = kept.filter(|status| status.is_published) else { return Ok(None) };
+fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, EncodeError> {
+    let kept =
+        job_status(store.db(), store.dir())?.filter(|status| status.n_views > 0 && status.is_published);
+    let Some(JobStatus { n_views, .. }) = kept else { return Ok(None) };
     if Job::is_kept(store, of_scene)? {
         return Ok(None);
     }
-    let job = store.job_dir()?;
-    let lost = context.install(|| kept::lost(&job, kept.n_views, record, &inputs.scene));
-    tracing::warn!("{}", lost.reason);
-    Ok(Some(lost))
+    let reason = format!(
+        "splat, models, device or settings of views are others than those of the {n_views} kept views, so no view is taken \
+         over: what a Gaussian contributes to a photo depends on all those before it"
+    );
+    tracing::warn!("{reason}");
+    Ok(Some(LostViews { n_views, reason }))
 }
 
-/// Reserves what is known before the first view; what depends on masks and contributions is reserved once the views
-/// are done.
-fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> MemoryPlan {
+/// Reserves what is known of scene and settings; what depends on masks and contributions is reserved once the views are
+/// done.
+fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>) -> MemoryPlan {
     let n_gaussians = inputs.scene.len();
     let mut memory = MemoryPlan::new(settings.run.memory_bytes);
     inputs::reserve(&mut memory, &inputs.scene);
     CellSplit::reserve(&mut memory, n_gaussians);
-    Prepared::reserve(&mut memory, n_gaussians);
-    inputs::reserve_photos(&mut memory, &inputs.views, settings.run.threads);
-    shard::reserve(&mut memory, &inputs.split, dim);
+    PreparedScene::reserve(&mut memory, n_gaussians);
+    shard::reserve(&mut memory, &inputs.split, engines.models.dim());
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {
         objects::reserve(&mut memory, n_gaussians, settings.aggregation.has_fine_superpoints());
+    }
+    if let (false, Some(preprocess)) = (engines.session.is_on_cpu(), engines.models.preprocess()) {
+        // A byte a channel, and one for the mask.
+        let square_bytes = 4 * u64::from(preprocess.size_px()).pow(2);
+        SharedEncoders::reserve(&mut memory, &settings.run.gpus, square_bytes);
     }
     memory
 }
 
 /// Opens the segmenter of some settings, on some GPUs.
-///
-/// # Errors
-/// [`EncodeError::NoPatches`], [`EncodeError::Segment`].
 pub(crate) fn segmenter_of(
     settings: &ViewSettings,
     gpus: &[u32],
@@ -243,7 +341,9 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
-    use slag_common::{Distortion, Gaussians, Intrinsics};
+    use crate::raster::CpuRasterizer;
+    use slag_common::Gaussians;
+    use slag_models::ModelDir;
 
     /// Superpoints take more than 204 bytes a Gaussian, once all views are done: a budget below that is refused before.
     #[test]
@@ -253,38 +353,12 @@ mod tests {
         let scene = Gaussians { means_in_world: vec![glam::DVec3::ZERO; 100_000], ..Gaussians::default() };
         let split = CellSplit::default();
         let inputs = Inputs { scene, split, views: Vec::new(), missing: Vec::new(), geo_reference: None };
+        let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
+        let engines = Engines::new(&models, &session, &CpuRasterizer);
         let refused =
-            memory_plan(&settings, &inputs, 512).rest(0).expect_err("the objects' lists come on top");
+            memory_plan(&settings, &inputs, &engines).rest(0).expect_err("the objects' lists come on top");
         assert!(refused.is_before_views && refused.parts[0].purpose.contains("superpoints"), "{refused}");
         settings.run.memory_bytes *= 2;
-        memory_plan(&settings, &inputs, 512).rest(0).expect("fits");
-    }
-
-    /// By hand: two threads hold a photo of 400 x 300 pixels, whose file is absent, and one of 40 x 30, which its header
-    /// says, of the same camera; 15 bytes a pixel.
-    #[test]
-    fn photos_in_work_are_reserved_by_their_files() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let view = |name: &str| View {
-            name: name.into(),
-            image_path: folder.path().join(name),
-            intrinsics: Intrinsics {
-                width_px: 400,
-                height_px: 300,
-                focal_x_px: 300.0,
-                focal_y_px: 300.0,
-                centre_x_px: 200.0,
-                centre_y_px: 150.0,
-                distortion: Distortion::None,
-            },
-            camera_from_world: glam::DAffine3::IDENTITY,
-        };
-        for name in ["a.png", "c.png"] {
-            image::RgbImage::new(40, 30).save(folder.path().join(name)).expect("it is writable");
-        }
-        let mut memory = MemoryPlan::new(0);
-        inputs::reserve_photos(&mut memory, &["a.png", "b.png", "c.png"].map(view), 2);
-        let refused = memory.rest(0).expect_err("nothing fits");
-        assert_eq!(refused.needed_bytes, 15 * (400 * 300 + 40 * 30));
+        memory_plan(&settings, &inputs, &engines).rest(0).expect("fits");
     }
 }

@@ -1,23 +1,25 @@
 //! The last step: the manifest is signed and becomes the store's current generation.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::time::Instant;
 
 use slag_common::Hash32;
-use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest, TextModelRecord};
+use slag_common::manifest::{
+    self, Calibration, CellRecord, EncoderRecord, Manifest, ObjectRecord, TextModelRecord,
+};
 use slag_common::shard::ScoreErrors;
+use slag_models::ModelDir;
 
 use super::cells::{BuiltCells, Counts};
 use super::context::RunContext;
 use super::error::EncodeError;
 use super::executor::Executor;
-use super::kept;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary, MemoryReport};
-use super::text_model::carry;
 use super::views::DoneViews;
 use crate::memory;
-use crate::store::ModelsRecord;
+use crate::store::{ModelsRecord, Store};
 
 /// Publishes the built cells, ends the job and returns the summary.
 ///
@@ -30,21 +32,28 @@ pub(super) fn publish(
     executor: &dyn Executor,
     context: &RunContext<'_>,
 ) -> Result<EncodeSummary, EncodeError> {
-    let n_usable = (plan.inputs.scene.len() - plan.inputs.split.n_rejected) as u64;
-    if built.n_without_evidence >= n_usable && !plan.settings.run.allow_empty {
-        return Err(EncodeError::NoEvidence);
+    let n_gaussians = plan.inputs.scene.len() - plan.inputs.split.n_rejected;
+    if built.n_without_evidence >= n_gaussians as u64 && !plan.settings.run.allow_empty {
+        let Counts { n_views_without_masks, n_masks, n_entries, .. } = built.counts;
+        let n_views = views.used.len();
+        return Err(EncodeError::NoEvidence { n_views, n_views_without_masks, n_masks, n_entries });
     }
     let generation = plan.store.next_generation()?;
-    let text_model =
-        plan.settings.output.text_model.then(|| carry(plan.store, plan.engines.models)).transpose()?;
+    let text_model = plan
+        .settings
+        .output
+        .text_model
+        .then(|| carry_text_model(plan.store, plan.engines.models))
+        .transpose()?;
     let manifest = manifest(&plan, &built, generation, text_model);
     executor.begin_publication()?;
     plan.store.publish(&manifest, &built.extras)?;
+    let planned_peak = plan.planned_peak.max(built.planned_peak);
     let mut summary = summary(&plan, &views, built, &manifest);
     // With views left to do the contributions stay: the next encode goes on from them.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
-    let (store, planned_peak) = (plan.store, plan.planned_peak);
-    if let Err(error) = tidy_up(plan, has_open, manifest.encoder.id, context) {
+    let store = plan.store;
+    if let Err(error) = tidy_up(plan, has_open, manifest.encoder.id) {
         let path = store.dir().display();
         tracing::warn!("generation {generation} is published, but {path} was not tidied up: {error}");
     }
@@ -64,24 +73,29 @@ pub(super) fn publish(
 }
 
 /// Records the models, ends the job, and removes what no generation needs.
-fn tidy_up(
-    plan: Plan<'_>,
-    has_open: bool,
-    encoder: Hash32,
-    context: &RunContext<'_>,
-) -> Result<(), EncodeError> {
+fn tidy_up(plan: Plan<'_>, has_open: bool, encoder: Hash32) -> Result<(), EncodeError> {
     let models = plan.settings.output.models.clone();
     plan.store.remember_models(&ModelsRecord { encoder, models })?;
     match plan.settings.run.keep_views || has_open {
-        true => {
-            let job = plan.store.job_dir()?;
-            context.install(|| kept::remember(&job, &plan.inputs_record, &plan.inputs.scene))?;
-            plan.job.keep_published()?;
-        }
+        true => plan.job.keep_published()?,
         false => plan.job.finish()?,
     }
     plan.store.prune()?;
     Ok(())
+}
+
+/// Writes the text side of models into a store; what is there already is kept. Robots then fetch it with the scene.
+fn carry_text_model(store: &Store, models: &ModelDir) -> Result<TextModelRecord, EncodeError> {
+    let text_side = models.text_side()?;
+    let mut files = Vec::new();
+    for file in text_side.files() {
+        let copied = store.put_object(|out| io::copy(&mut file.reader()?, out).map(drop));
+        let (hash, len_bytes) = copied?;
+        files.push(ObjectRecord { hash, len_bytes });
+    }
+    let names: Vec<_> = files.iter().map(|file| file.hash).collect();
+    let (hash, len_bytes) = store.put_bytes(&text_side.description(&names)?)?;
+    Ok(TextModelRecord { description: ObjectRecord { hash, len_bytes }, files })
 }
 
 fn manifest(
@@ -137,6 +151,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         coverage_secs: plan.coverage_secs,
         n_views_resumed: views.n_resumed,
         lost_views: plan.lost_views.clone(),
+        encoder_before: plan.encoder_before.clone(),
         n_views_without_masks,
         skipped_views: views.skipped.clone(),
         n_masks,

@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::coverage::CoverageReport;
-use super::kept::LostViews;
 use super::settings::ViewOrder;
 use crate::lanes::GpuLoad;
 use crate::memory::Phase;
@@ -43,12 +42,18 @@ impl LeftOut {
     }
 }
 
+/// Kept views that an encode cannot take over, since their splat, models or settings were others.
+#[derive(Clone, Debug, Serialize)]
+pub struct LostViews {
+    pub n_views: usize,
+    /// All this in words.
+    pub reason: String,
+}
+
 /// The size of one cell and of its shards.
 #[derive(Clone, Debug, Serialize)]
 pub struct CellReport {
-    /// The cell.
     pub cell_id: u32,
-    /// Gaussians.
     pub n_gaussians: u32,
     /// Contributions: pairs of a Gaussian and a region.
     pub n_entries: u64,
@@ -69,9 +74,7 @@ pub struct ViewsReport {
     pub view: Vec<String>,
     /// Width at which weights were rasterised, pixels.
     pub raster_width_px: Vec<u32>,
-    /// Masks.
     pub n_masks: Vec<usize>,
-    /// Regions.
     pub n_regions: Vec<usize>,
     /// Contributions: pairs of a Gaussian and a region.
     pub n_entries: Vec<u64>,
@@ -82,7 +85,6 @@ pub struct ViewsReport {
 /// The load of one stage of the views' pipeline.
 #[derive(Clone, Debug, Serialize)]
 pub struct StageReport {
-    /// The stage.
     pub stage: String,
     /// Views that it takes at once.
     pub n_slots: usize,
@@ -126,7 +128,6 @@ impl StageReport {
 pub struct PhaseReport {
     /// The part: read, plan, views, occupancy, merge, superpoints, objects, refine, cells, publish.
     pub phase: String,
-    /// Seconds.
     pub secs: f64,
     /// The most memory of the process until its end, bytes; absent where the system does not tell.
     pub peak_bytes: Option<u64>,
@@ -154,7 +155,6 @@ pub struct EncodeSummary {
     pub n_without_evidence: u64,
     /// Unusable Gaussians, which are in no cell.
     pub n_rejected: u64,
-    /// Views used.
     pub n_views: usize,
     /// Views whose photo exists.
     pub n_views_with_photo: usize,
@@ -168,6 +168,8 @@ pub struct EncodeSummary {
     pub n_views_resumed: usize,
     /// Kept views that were done anew, and why; absent where none were kept, or those could be taken over.
     pub lost_views: Option<LostViews>,
+    /// The encoder of the generation before, if it was another: robots need the text model of this one.
+    pub encoder_before: Option<String>,
     /// Views without any mask: no mask file, or no mask that is large enough.
     pub n_views_without_masks: usize,
     /// Views that were left out.
@@ -178,7 +180,6 @@ pub struct EncodeSummary {
     pub n_regions: usize,
     /// Contributions: pairs of a Gaussian and a region.
     pub n_entries: u64,
-    /// Cells.
     pub n_cells: usize,
     /// Centroids in all cells.
     pub n_centroids: u64,

@@ -12,7 +12,6 @@ use super::error::EncodeError;
 use crate::cells::{CellLimits, PositionError};
 use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
-use crate::embed::Background;
 use crate::ingest::{Activated, FrameChoice};
 use crate::lift::Aggregation;
 use crate::occupancy::OccupancySettings;
@@ -26,7 +25,9 @@ pub const DEFAULT_MASK_LEVELS: usize = 3;
 /// Widest raster where the settings do not ask for more: masks are coarser than this, and time grows with the square.
 pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
 /// Gaussians of a cell at most: shards number them with 16 bits.
-const MAX_CELL_GAUSSIANS: usize = 65_536;
+pub const MAX_CELL_GAUSSIANS: usize = 65_536;
+/// Largest width of a cell of a metric scene.
+pub const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 
 /// What to encode and how.
 #[derive(Clone, Debug)]
@@ -77,8 +78,6 @@ pub struct ViewSettings {
     pub masks: Masks,
     /// Masks with fewer pixels are left out.
     pub min_mask_px: u32,
-    /// What fills a crop outside its mask.
-    pub background: Background,
     /// Width at which weights are rasterised.
     pub raster_width: RasterWidth,
     /// Which weight is summed.
@@ -91,7 +90,7 @@ pub struct ViewSettings {
 }
 
 /// Which parts of a photo have vectors.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Regions {
     /// Masks: by a crop each and, where the image model has patches that are aligned with text, by the patches within them;
@@ -194,7 +193,6 @@ pub struct CellSettings {
 pub struct OutputSettings {
     /// The store to publish into.
     pub store: PathBuf,
-    /// Name of the scene.
     pub scene_name: String,
     /// When it is made, seconds since 1970.
     pub created_unix_secs: u64,
@@ -233,7 +231,6 @@ pub struct RunSettings {
 /// How many views are used at most.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ViewsLimit {
-    /// All.
     All,
     /// This many.
     Count(usize),
@@ -256,16 +253,17 @@ impl ViewsLimit {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum ViewOrder {
-    /// By their names.
-    Names,
-    /// Evenly spread over the names, which mostly is the order in which they were taken.
-    Nth,
     /// Those first that together show most of the scene, by a small raster of all views.
     Coverage,
+    /// By their names.
+    Names,
+    /// Evenly spread over the names.
+    Nth,
 }
 
 impl EncodeSettings {
-    /// Returns the settings to encode a splat and its photos into a store: those of the program without flags.
+    /// Returns the settings to encode a splat and its photos into a store: those of the program without flags, and of
+    /// [`Preset::Balanced`](super::Preset::Balanced).
     pub fn new(scene: PathBuf, views: PathBuf, store: PathBuf, metric: bool) -> Self {
         Self {
             inputs: InputSettings {
@@ -283,7 +281,6 @@ impl EncodeSettings {
             view: ViewSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
                 min_mask_px: 200,
-                background: Background::White,
                 raster_width: RasterWidth::Photo,
                 weights: WeightKind::Blend,
                 merges_slivers: true,
@@ -293,7 +290,7 @@ impl EncodeSettings {
             cells: CellSettings {
                 limits: CellLimits {
                     max_gaussians: MAX_CELL_GAUSSIANS,
-                    max_width: metric.then_some(25.0),
+                    max_width: metric.then_some(DEFAULT_CELL_WIDTH_M),
                     position_error: PositionError::default_for(metric),
                 },
                 shards: ShardSettings {

@@ -22,9 +22,6 @@ pub(crate) trait PhotoSource: Sync {
     fn n_at_once(&self) -> usize;
 
     /// Brings the files of a view to where the view says; returns whether the view is still to be done.
-    ///
-    /// # Errors
-    /// [`EncodeError`].
     fn fetch(&self, view: &View) -> Result<bool, EncodeError>;
 }
 
@@ -34,9 +31,6 @@ pub(crate) trait ViewSink: Sync {
     fn n_at_once(&self) -> usize;
 
     /// Keeps a view's contributions and the outlines of its masks; on return they survive a power cut.
-    ///
-    /// # Errors
-    /// [`EncodeError`].
     fn keep(
         &self,
         view: &View,

@@ -1,21 +1,25 @@
-//! The stages of one view: decode, (depth,) segment, crop, embed, raster, write.
+//! The stages of one view: (fetch,) decode, (depth,) segment, crop, embed, raster, write.
+//!
+//! Each stage is a method that takes what the one before returns.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
 use image::RgbImage;
 use slag_common::View;
 use slag_models::preprocess::Preprocess;
-use slag_models::{Crop, ImageEncoder, SessionOptions};
+use slag_models::{Crop, ImageEncoder, ModelError, SessionOptions};
 
+use super::Engines;
 use super::context::RunContext;
-use super::engines::Engines;
 use super::error::EncodeError;
-use super::pipeline::Stage;
+use super::inputs;
+use super::pipeline::{self, Stage};
 use super::settings::{Regions, ViewSettings};
 use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
-use crate::embed::{self, EmbedError, PatchUse, PhotoPatches, SharedEncoders, Surroundings};
+use crate::embed::{self, PatchUse, SharedEncoders, Surroundings};
 use crate::ingest::{self, LoadedImage, RotatedPhotos};
 use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
@@ -24,7 +28,8 @@ use crate::masks::patches::patch_masks;
 use crate::masks::regions::{absorb_slivers, partition};
 use crate::masks::windows::Windows;
 use crate::masks::{self, Mask, RegionMap};
-use crate::raster::{GpuSlots, LoadedScene, RasterError, RasterView};
+use crate::memory::MemoryPlan;
+use crate::raster::{GpuSlots, LoadedScene, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
 
 /// Width of pictures of masks for people.
@@ -55,7 +60,9 @@ pub(crate) struct ViewStages<'a> {
     encoders: Encoders,
     /// The device that runs the image model, once it is open.
     images_on: Arc<OnceLock<Option<String>>>,
-    pub(super) rotated: RotatedPhotos,
+    rotated: RotatedPhotos,
+    /// The most Gaussians of a view whose ellipses are beyond the numbers of the device.
+    n_unrepresentable: AtomicUsize,
 }
 
 /// The image encoders.
@@ -66,7 +73,7 @@ enum Encoders {
     Shared(SharedEncoders),
 }
 
-/// A view between two stages, with what the next one needs.
+/// A view between two stages.
 pub(crate) struct Work<'v> {
     view: &'v View,
     next: Next,
@@ -74,25 +81,45 @@ pub(crate) struct Work<'v> {
     secs: f32,
 }
 
+/// The next stage, with what it takes.
 #[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
 enum Next {
     Fetch,
     Decode,
-    Depth(LoadedImage),
-    Segment(LoadedImage, Option<Vec<f32>>),
-    Crop(LoadedImage, Vec<Mask>),
-    Embed(Crops, Option<PhotoPatches>, Option<Surroundings>, Partition),
-    Raster(Vec<f32>, Partition),
-    Write(ViewContributions, Vec<MaskOutline>, u32),
+    Depth(Photo),
+    Segment(Photo),
+    Crop(Segmented),
+    Embed(Cropped),
+    Raster(Embedded),
+    Write(Lifted),
+}
+
+struct Photo {
+    loaded: LoadedImage,
+    /// Of the scene, camera z per pixel; absent where the segmenter does not want it.
+    depth: Option<Vec<f32>>,
+}
+
+struct Segmented {
+    loaded: LoadedImage,
+    masks: Vec<Mask>,
+}
+
+struct Cropped {
+    crops: Crops,
+    /// Windows that the last masks are, and what the others take of them.
+    windows: Option<Surroundings>,
+    /// The photo, whose patches are embedded, too.
+    patches: Option<(Arc<RgbImage>, PatchUse)>,
+    partition: Partition,
 }
 
 /// The crops to embed.
-#[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
 enum Crops {
     /// Squares of the model's size.
     Squares(Vec<Crop>),
-    /// For a model that takes crops of any size: they are cut a batch at a time.
-    Uncut(LoadedImage, Vec<Mask>),
+    /// For a model that takes crops of any size: they are cut from the photo a batch at a time.
+    Uncut(Arc<RgbImage>, Vec<Mask>),
 }
 
 /// The regions of a view, the masks that cover each, and the outlines of masks.
@@ -105,6 +132,18 @@ struct Partition {
     weight_scale: f32,
 }
 
+struct Embedded {
+    /// `[n_masks][dim]`, unit.
+    vectors: Vec<f32>,
+    partition: Partition,
+}
+
+struct Lifted {
+    contributions: ViewContributions,
+    outlines: Vec<MaskOutline>,
+    raster_width_px: u32,
+}
+
 impl<'v> Work<'v> {
     pub(super) fn begin(view: &'v View, is_here: bool) -> Self {
         Self { view, next: if is_here { Next::Decode } else { Next::Fetch }, secs: 0.0 }
@@ -112,6 +151,49 @@ impl<'v> Work<'v> {
 
     pub(super) fn view(&self) -> &'v View {
         self.view
+    }
+}
+
+impl ViewTools<'_> {
+    /// Returns the stages, in the order in which [`ViewStages::step`] goes through them.
+    pub(super) fn stages(&self) -> Vec<Stage> {
+        let raster_slots = self.scene.gpus().map(GpuSlots::n_views);
+        let on_cpu = |name| Stage { name, n_slots: self.n_threads, on_cpu: true };
+        let on_device = |name, n_slots: Option<usize>| match n_slots {
+            Some(n_slots) => Stage { name, n_slots, on_cpu: false },
+            None => on_cpu(name),
+        };
+        let embeds_on_gpus = !self.engines.session.is_on_cpu();
+        let embed_slots = embeds_on_gpus.then(|| SharedEncoders::n_views(self.gpus));
+        let fetch = self.photos.map(|photos| on_device("fetch", Some(photos.n_at_once())));
+        let mut stages: Vec<Stage> = fetch.into_iter().chain([on_cpu("decode")]).collect();
+        if self.segmenter.wants_depth() {
+            stages.push(on_device("depth", raster_slots));
+        }
+        stages.extend([
+            on_device("segment", self.segmenter.concurrency()),
+            on_cpu("crop"),
+            on_device("embed", embed_slots),
+            on_device("raster", raster_slots),
+            on_device("write", Some(self.sink.n_at_once())),
+        ]);
+        stages
+    }
+
+    /// Returns whether photos are kept until their crops are embedded.
+    fn embeds_photos(&self) -> bool {
+        let models = self.engines.models;
+        let wants_patches = self.settings.regions != Regions::Crops && models.patches_per_side().is_some();
+        models.preprocess().is_none() || wants_patches
+    }
+
+    /// Reserves the photos in memory, in all stages and between them.
+    pub(crate) fn reserve_photos(&self, memory: &mut MemoryPlan, views: &[View]) {
+        let stages = self.stages();
+        let at = |name| stages.iter().position(|stage| stage.name == name).unwrap_or(0);
+        let last = at(if self.embeds_photos() { "embed" } else { "crop" });
+        let n_under_way = pipeline::most_under_way(&stages, at("decode")..=last, self.n_threads);
+        inputs::reserve_photos(memory, views, self.n_threads, n_under_way);
     }
 }
 
@@ -132,7 +214,19 @@ impl<'a> ViewStages<'a> {
             true => Encoders::OfViews(Mutex::default()),
             false => Encoders::Shared(SharedEncoders::new(tools.gpus, Box::new(open))),
         };
-        Self { tools, context, preprocess, encoders, images_on, rotated: RotatedPhotos::default() }
+        Self {
+            tools,
+            context,
+            preprocess,
+            encoders,
+            images_on,
+            rotated: RotatedPhotos::default(),
+            n_unrepresentable: AtomicUsize::new(0),
+        }
+    }
+
+    pub(super) fn tools(&self) -> &ViewTools<'a> {
+        &self.tools
     }
 
     /// Returns the load of each GPU by the models of a stage.
@@ -144,158 +238,117 @@ impl<'a> ViewStages<'a> {
         }
     }
 
-    /// Returns whether photos are on this machine.
-    pub(super) fn has_photos(&self) -> bool {
-        self.tools.photos.is_none()
-    }
-
     /// Returns the device that ran the image model, if it ran.
     pub(crate) fn images_on(&self) -> Option<String> {
         self.images_on.get().cloned().flatten()
     }
 
-    /// Returns the stages, in the order in which [`Self::step`] goes through them.
-    pub(super) fn stages(&self) -> Vec<Stage> {
-        let n_cores = self.tools.n_threads;
-        let raster_slots = self.tools.scene.gpus().map(GpuSlots::n_views);
-        let on_cpu = |name| Stage { name, n_slots: n_cores, on_cpu: true };
-        let on_device = |name, n_slots: Option<usize>| match n_slots {
-            Some(n_slots) => Stage { name, n_slots, on_cpu: false },
-            None => on_cpu(name),
-        };
-        let embed_slots = match &self.encoders {
-            Encoders::OfViews(_) => None,
-            Encoders::Shared(_) => Some(SharedEncoders::n_views(self.tools.gpus)),
-        };
-        let fetch = self.tools.photos.map(|photos| on_device("fetch", Some(photos.n_at_once())));
-        let mut stages: Vec<Stage> = fetch.into_iter().chain([on_cpu("decode")]).collect();
-        if self.tools.segmenter.wants_depth() {
-            stages.push(on_device("depth", raster_slots));
+    /// Warns of what views left out.
+    pub(super) fn warn(&self) {
+        self.rotated.warn();
+        let n = self.n_unrepresentable.load(Ordering::Relaxed);
+        if n > 0 {
+            tracing::warn!(
+                "up to {n} Gaussians of a view contribute nothing: their ellipses are beyond the numbers of the device; on a \
+                 GPU without f64, --device cpu draws more of them"
+            );
         }
-        stages.extend([
-            on_device("segment", self.tools.segmenter.concurrency()),
-            on_cpu("crop"),
-            on_device("embed", embed_slots),
-            on_device("raster", raster_slots),
-            on_device("write", Some(self.tools.sink.n_at_once())),
-        ]);
-        stages
     }
 
-    /// Does the work of the view's next stage.
+    /// Does the work of the view's next stage; `None` after the last.
     pub(super) fn step<'v>(&self, work: Work<'v>) -> Result<Option<Work<'v>>, EncodeError> {
-        let start = Instant::now();
-        let view = work.view;
-        let raster_failed = |source: RasterError| EncodeError::Raster { view: view.name.clone(), source };
+        let (start, view) = (Instant::now(), work.view);
         let next = match work.next {
-            Next::Fetch => {
-                if let Some(photos) = self.tools.photos
-                    && !photos.fetch(view)?
-                {
-                    return Ok(None);
-                }
-                Next::Decode
-            }
-            Next::Decode => {
-                let loaded = ingest::load_image(view)?;
-                self.rotated.add(&loaded);
-                match self.tools.segmenter.wants_depth() {
-                    true => Next::Depth(loaded),
-                    false => Next::Segment(loaded, None),
-                }
-            }
-            Next::Depth(loaded) => {
-                let width = self.tools.settings.raster_width;
-                let raster_view = raster_view(&loaded, width.base_px(loaded.view.intrinsics.width_px));
-                // A GPU waits for colours that these threads compute, rather than they for it.
-                let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
-                let drawing = self.context.install(draw).map_err(raster_failed)?;
-                let seen = drawing.depth.iter().zip(&drawing.coverage);
-                // What shows through the scene's holes is nobody's depth.
-                let seen: Vec<f32> =
-                    seen.map(|(depth, share)| if *share > 0.5 { *depth } else { 0.0 }).collect();
-                let depth = enlarge(&seen, &raster_view, &loaded);
-                Next::Segment(loaded, Some(depth))
-            }
-            Next::Segment(loaded, depth) => {
-                let pool = Some(self.context.pool());
-                let input = SegmentInput { pool, ..SegmentInput::new(&loaded, depth.as_deref()) };
-                let mut masks = self.tools.segmenter.segment(&input)?;
-                if let Some(perturbation) = self.tools.engines.perturbation {
-                    masks = perturbation.masks(&view.name, masks, loaded.image.dimensions().into());
-                }
-                masks.retain(|mask| mask.area_px >= self.tools.settings.min_mask_px);
-                let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
-                self.context.progress().segmented(&view.name, masks.len(), &draw);
-                Next::Crop(loaded, masks)
-            }
-            Next::Crop(loaded, mut masks) => {
-                let (patches, regions) = self.patches(&loaded.image, &masks);
-                let partition = self.partition(&loaded, regions.as_ref().unwrap_or(&masks));
-                let windows = self.windows(&loaded.image, &masks).map(|windows| {
-                    let of = Surroundings::of_windows(&masks, &windows);
-                    masks.extend(windows.masks());
-                    of
-                });
-                let crops = match &self.preprocess {
-                    Some(preprocess) => Crops::Squares(
-                        embed::squares(&loaded.image, &masks, self.tools.settings.background, preprocess)
-                            .map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?,
-                    ),
-                    None => Crops::Uncut(loaded, masks),
-                };
-                Next::Embed(crops, patches, windows, partition)
-            }
-            Next::Embed(crops, patches, windows, partition) => {
-                let mut vectors = self.embed(view, crops, patches.as_ref())?;
-                if let Some(windows) = windows {
-                    let dim = self.tools.engines.models.dim();
-                    let of_windows = vectors.split_off(windows.n_masks() * dim);
-                    windows.mix(&mut vectors, &of_windows, dim);
-                }
-                if let Some(perturbation) = self.tools.engines.perturbation {
-                    perturbation.vectors(&view.name, &mut vectors, self.tools.engines.models.dim());
-                }
-                Next::Raster(vectors, partition)
-            }
-            Next::Raster(vectors, partition) => {
-                let Partition { raster_view, regions, masks_of_region, outlines, weight_scale } = partition;
-                let mut weights = self
-                    .tools
-                    .scene
-                    .weights(&raster_view, &regions, self.tools.settings.weights)
-                    .map_err(raster_failed)?;
-                weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
-                let dim = self.tools.engines.models.dim();
-                let contributions =
-                    ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, self.tools.split);
-                Next::Write(contributions, outlines, raster_view.intrinsics.width_px)
-            }
-            Next::Write(contributions, outlines, raster_width_px) => {
-                let record = ViewRecord { raster_width_px, secs: work.secs };
-                self.tools.sink.keep(view, &contributions, &outlines, record)?;
-                self.context.progress().advance(1);
+            Next::Fetch => match self.tools.photos {
+                Some(photos) if !photos.fetch(view)? => return Ok(None),
+                _ => Next::Decode,
+            },
+            Next::Decode => match self.decode(view)? {
+                photo if self.tools.segmenter.wants_depth() => Next::Depth(photo),
+                photo => Next::Segment(photo),
+            },
+            Next::Depth(photo) => Next::Segment(self.add_depth(view, photo)?),
+            Next::Segment(photo) => Next::Crop(self.segment(view, photo)?),
+            Next::Crop(segmented) => Next::Embed(self.crop(view, segmented)?),
+            Next::Embed(cropped) => Next::Raster(self.embed(view, cropped)?),
+            Next::Raster(embedded) => Next::Write(self.lift(view, embedded)?),
+            Next::Write(lifted) => {
+                self.write(view, &lifted, work.secs)?;
                 return Ok(None);
             }
         };
         Ok(Some(Work { view, next, secs: work.secs + start.elapsed().as_secs_f32() }))
     }
 
-    /// Returns the patches of a photo that have vectors, and the regions that they are in place of masks.
-    fn patches(&self, photo: &RgbImage, masks: &[Mask]) -> (Option<PhotoPatches>, Option<Vec<Mask>>) {
+    fn decode(&self, view: &View) -> Result<Photo, EncodeError> {
+        let loaded = ingest::load_image(view)?;
+        self.rotated.add(&loaded);
+        Ok(Photo { loaded, depth: None })
+    }
+
+    /// Draws the depth of the scene.
+    fn add_depth(&self, view: &View, photo: Photo) -> Result<Photo, EncodeError> {
+        let loaded = photo.loaded;
+        let width = self.tools.settings.raster_width;
+        let raster_view = raster_view(&loaded, width.base_px(loaded.view.intrinsics.width_px));
+        // A GPU waits for colours that these threads compute, rather than they for it.
+        let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
+        let drawing = self
+            .context
+            .install(draw)
+            .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
+        // What shows through the scene's holes is nobody's depth.
+        let seen = drawing.depth.iter().zip(&drawing.coverage);
+        let seen: Vec<f32> = seen.map(|(depth, share)| if *share > 0.5 { *depth } else { 0.0 }).collect();
+        let depth = enlarge(&seen, &raster_view, &loaded);
+        Ok(Photo { loaded, depth: Some(depth) })
+    }
+
+    fn segment(&self, view: &View, Photo { loaded, depth }: Photo) -> Result<Segmented, EncodeError> {
+        let pool = Some(self.context.pool());
+        let input = SegmentInput { pool, ..SegmentInput::new(&loaded, depth.as_deref()) };
+        let mut masks = self.tools.segmenter.segment(&input)?;
+        masks.retain(|mask| mask.area_px >= self.tools.settings.min_mask_px);
+        let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
+        self.context.progress().segmented(&view.name, masks.len(), &draw);
+        Ok(Segmented { loaded, masks })
+    }
+
+    /// Makes the regions of a view and the crops of its masks.
+    fn crop(&self, view: &View, segmented: Segmented) -> Result<Cropped, EncodeError> {
+        let Segmented { loaded, mut masks } = segmented;
+        let (patches, regions) = self.patches(&loaded.image, &masks);
+        let partition = self.partition(&loaded, regions.as_ref().unwrap_or(&masks));
+        let windows = self.windows(&loaded.image, &masks).map(|windows| {
+            let of = Surroundings::of_windows(&masks, &windows);
+            masks.extend(windows.masks());
+            of
+        });
+        let photo = Arc::new(loaded.image);
+        let crops = match &self.preprocess {
+            Some(preprocess) => Crops::Squares(
+                embed::squares(&photo, &masks, preprocess)
+                    .map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?,
+            ),
+            None => Crops::Uncut(Arc::clone(&photo), masks),
+        };
+        let patches = patches.map(|uses| (photo, uses));
+        Ok(Cropped { crops, windows, patches, partition })
+    }
+
+    /// Returns how the patches of a photo are used, and the regions that they are in place of masks.
+    fn patches(&self, photo: &RgbImage, masks: &[Mask]) -> (Option<PatchUse>, Option<Vec<Mask>>) {
         let Some(per_side) = self.tools.engines.models.patches_per_side() else { return (None, None) };
-        let patches = |uses| Some(PhotoPatches { photo: photo.clone(), uses });
         let (width_px, height_px) = photo.dimensions();
         match self.tools.settings.regions {
-            Regions::Crops => (None, None),
-            Regions::Masks if masks.is_empty() => (None, None),
-            Regions::Masks => {
+            Regions::Masks if !masks.is_empty() => {
                 let of = Surroundings::of_patches(masks, per_side, (width_px, height_px));
-                (patches(PatchUse::Masks(of)), None)
+                (Some(PatchUse::Masks(of)), None)
             }
+            Regions::Crops | Regions::Masks => (None, None),
             Regions::Patches => {
                 let (numbers, regions) = patch_masks(per_side, width_px, height_px).into_iter().unzip();
-                (patches(PatchUse::Regions(numbers)), Some(regions))
+                (Some(PatchUse::Regions(numbers)), Some(regions))
             }
         }
     }
@@ -325,69 +378,76 @@ impl<'a> ViewStages<'a> {
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }
 
-    /// Returns a vector per mask, or per patch that is a region.
-    fn embed(
-        &self,
-        view: &View,
-        crops: Crops,
-        patches: Option<&PhotoPatches>,
-    ) -> Result<Vec<f32>, EncodeError> {
-        if patches.is_none() && matches!(&crops, Crops::Squares(crops) if crops.is_empty()) {
-            return Ok(Vec::new());
-        }
+    /// Makes a vector per mask, or per patch that is a region.
+    fn embed(&self, view: &View, cropped: Cropped) -> Result<Embedded, EncodeError> {
+        let Cropped { crops, windows, patches, partition } = cropped;
         let failed = |source| EncodeError::Embed { view: view.name.clone(), source };
-        match (&self.encoders, crops) {
-            (Encoders::OfViews(idle), crops) => {
-                let idle = || idle.lock().unwrap_or_else(PoisonError::into_inner);
-                let free = idle().pop();
-                let mut encoder = match free {
-                    Some(encoder) => encoder,
-                    None => self.tools.engines.models.image_encoder(self.tools.engines.session)?,
-                };
-                self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
-                let vectors = self.embed_with(encoder.as_mut(), &crops, patches);
-                idle().push(encoder);
-                vectors.map_err(failed)
-            }
+        let mut vectors = match (&self.encoders, crops) {
+            (_, Crops::Squares(crops)) if crops.is_empty() => Vec::new(),
             (Encoders::Shared(encoders), Crops::Squares(crops)) => {
-                let mut vectors = encoders.embed(crops).map_err(|failure| match failure {
+                encoders.embed(crops).map_err(|failure| match failure {
                     embed::Failure::Model(error) => error.into(),
                     embed::Failure::Embed(source) => failed(source),
-                })?;
-                if let Some(patches) = patches {
-                    encoders
-                        .with_encoder(|encoder| patches.add_to(&mut vectors, encoder))?
-                        .map_err(failed)?;
-                }
-                Ok(vectors)
+                })?
             }
-            (Encoders::Shared(encoders), crops) => {
-                encoders.with_encoder(|encoder| self.embed_with(encoder, &crops, patches))?.map_err(failed)
+            (_, Crops::Squares(crops)) => {
+                self.with_encoder(|encoder| embed::embed_crops(&crops, 0, encoder))?.map_err(failed)?
             }
+            (_, Crops::Uncut(photo, masks)) => self
+                .with_encoder(|encoder| embed::embed_masks(&photo, &masks, encoder, None))?
+                .map_err(failed)?,
+        };
+        if let Some((photo, patches)) = patches {
+            self.with_encoder(|encoder| patches.add_to(&photo, &mut vectors, encoder))?.map_err(failed)?;
         }
+        if let Some(windows) = windows {
+            let dim = self.tools.engines.models.dim();
+            let of_windows = vectors.split_off(windows.n_masks() * dim);
+            windows.mix(&mut vectors, &of_windows, dim);
+        }
+        Ok(Embedded { vectors, partition })
     }
 
-    fn embed_with(
-        &self,
-        encoder: &mut dyn ImageEncoder,
-        crops: &Crops,
-        patches: Option<&PhotoPatches>,
-    ) -> Result<Vec<f32>, EmbedError> {
-        let mut vectors = match crops {
-            Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder)?,
-            Crops::Uncut(loaded, masks) => {
-                let background = self.tools.settings.background;
-                embed::embed_masks(&loaded.image, masks, encoder, background, None)?
-            }
+    /// Calls `work` with an encoder of its own.
+    fn with_encoder<T>(&self, work: impl FnOnce(&mut dyn ImageEncoder) -> T) -> Result<T, ModelError> {
+        let idle = match &self.encoders {
+            Encoders::Shared(encoders) => return encoders.with_encoder(work),
+            Encoders::OfViews(idle) => || idle.lock().unwrap_or_else(PoisonError::into_inner),
         };
-        if let Some(patches) = patches {
-            patches.add_to(&mut vectors, encoder)?;
-        }
-        Ok(vectors)
+        let free = idle().pop();
+        let mut encoder = match free {
+            Some(encoder) => encoder,
+            None => self.tools.engines.models.image_encoder(self.tools.engines.session)?,
+        };
+        self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
+        let result = work(encoder.as_mut());
+        idle().push(encoder);
+        Ok(result)
+    }
+
+    /// Rasterises what each Gaussian contributes to each region.
+    fn lift(&self, view: &View, Embedded { vectors, partition }: Embedded) -> Result<Lifted, EncodeError> {
+        let Partition { raster_view, regions, masks_of_region, outlines, weight_scale } = partition;
+        let ViewTools { engines, settings, scene, split, .. } = self.tools;
+        let mut weights = scene
+            .weights(&raster_view, &regions, settings.weights)
+            .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
+        let n_unrepresentable = weights.counters.unusable.saturating_sub(split.n_rejected);
+        self.n_unrepresentable.fetch_max(n_unrepresentable, Ordering::Relaxed);
+        weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
+        let dim = engines.models.dim();
+        let contributions = ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, split);
+        Ok(Lifted { contributions, outlines, raster_width_px: raster_view.intrinsics.width_px })
+    }
+
+    fn write(&self, view: &View, lifted: &Lifted, secs: f32) -> Result<(), EncodeError> {
+        let record = ViewRecord { raster_width_px: lifted.raster_width_px, secs };
+        self.tools.sink.keep(view, &lifted.contributions, &lifted.outlines, record)?;
+        self.context.progress().advance(1);
+        Ok(())
     }
 }
 
-/// Returns the view as a raster of a width.
 fn raster_view(loaded: &LoadedImage, width_px: u32) -> RasterView {
     RasterView {
         camera_from_world: loaded.view.camera_from_world,

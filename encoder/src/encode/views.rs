@@ -71,9 +71,6 @@ pub(super) fn run_views<'a>(
 }
 
 /// Finds the free and occupied places that the used views show; `None` if the settings do not ask for them.
-///
-/// # Errors
-/// [`EncodeError::Raster`], [`EncodeError::Interrupted`].
 pub(super) fn look_around(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,

@@ -74,6 +74,10 @@ impl Coordinator {
 }
 
 impl Executor for Coordinator {
+    fn rasterizer(&self, _: &Engines<'_>) -> String {
+        crate::encode::fleet_parts::OF_A_FLEET.into()
+    }
+
     fn run_views(
         &self,
         plan: &Plan<'_>,

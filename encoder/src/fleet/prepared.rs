@@ -13,10 +13,10 @@ use super::objects;
 use super::run::Run;
 use crate::blobs::Bucket;
 use crate::cells::{self, CellSplit};
-use crate::encode::fleet_parts::{RunContext, of_scene, reserve_photos};
+use crate::encode::fleet_parts::{RunContext, ViewTools, of_scene};
 use crate::encode::{EncodeError, Engines, Masks, ViewSettings};
 use crate::memory::{MemoryPlan, Phase};
-use crate::raster::project::Prepared as PreparedScene;
+use crate::raster::PreparedScene;
 use crate::segment::Segmenter;
 
 pub(super) struct Prepared {
@@ -90,12 +90,15 @@ impl Prepared {
     }
 
     /// Checks that what the worker holds for scene and views fits into its memory.
-    pub(super) fn check_memory(&self, memory_bytes: u64, n_threads: usize) -> Result<(), FleetError> {
+    ///
+    /// # Errors
+    /// [`FleetError::Memory`].
+    pub(super) fn check_memory(&self, memory_bytes: u64, tools: &ViewTools<'_>) -> Result<(), FleetError> {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());
         CellSplit::reserve(&mut memory, self.scene.len());
         PreparedScene::reserve(&mut memory, self.scene.len());
-        reserve_photos(&mut memory, &self.views, n_threads);
+        tools.reserve_photos(&mut memory, &self.views);
         memory.rest(0)?;
         Ok(())
     }

@@ -37,24 +37,27 @@ pub(super) struct ViewWork<'a> {
 }
 
 impl ViewWork<'_> {
+    pub(super) fn tools(&self) -> ViewTools<'_> {
+        ViewTools {
+            engines: self.engines,
+            settings: &self.prepared.settings,
+            n_threads: self.n_threads,
+            gpus: self.gpus,
+            segmenter: self.segmenter,
+            scene: self.scene,
+            split: &self.prepared.split,
+            photos: Some(self),
+            sink: self,
+        }
+    }
+
     /// Does the views that there are; ends when no more are to be had at present.
     ///
     /// # Errors
     /// [`FleetError`] that lies in no view.
     pub(super) fn run(&self, context: &RunContext<'_>) -> Result<(), FleetError> {
         let prepared = self.prepared;
-        let tools = ViewTools {
-            engines: self.engines,
-            settings: &prepared.settings,
-            n_threads: self.n_threads,
-            gpus: self.gpus,
-            segmenter: self.segmenter,
-            scene: self.scene,
-            split: &prepared.split,
-            photos: Some(self),
-            sink: self,
-        };
-        let stages = ViewStages::new(tools, context);
+        let stages = ViewStages::new(self.tools(), context);
         let source = views_to_do(self.dispatcher, &prepared.views, || context.is_cancelled());
         let source = source.map(|view| (true, view));
         let reports = work_off(&stages, self.n_threads, source, context, |view, error| {

@@ -111,7 +111,6 @@ fn work_for(
     let prepared = Prepared::fetch(bucket, (run, plan), folder.path(), settings.segmenter.as_ref(), context)?;
     let segmenter = segmenter_of(&prepared.settings, &settings.gpus, engines)?;
     prepared.check(engines, segmenter.as_ref(), context)?;
-    prepared.check_memory(settings.memory_bytes, settings.n_threads)?;
     let dispatcher: Box<dyn Dispatcher> = match &settings.dispatch {
         Dispatch::Share { index, of, help_after } => Box::new(Share::new(*index, *of, *help_after)),
         Dispatch::Queue(queue) => {
@@ -131,6 +130,7 @@ fn work_for(
         gpus: &settings.gpus,
         n_done: AtomicUsize::new(0),
     };
+    prepared.check_memory(settings.memory_bytes, &work.tools())?;
     let result = while_open(&work, HeartbeatWatch::new(run, settings.patience), context);
     report.n_views += work.n_done.load(Ordering::Relaxed);
     result

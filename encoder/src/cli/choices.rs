@@ -1,0 +1,172 @@
+//! The choices of an encode that a preset makes, flags override and a measured front knows.
+
+use clap::Args;
+
+use crate::codebook::basis::MAX_COMPONENTS;
+use crate::encode::{EncodeSettings, Masks, Preset, RasterWidth, Regions, ViewOrder, ViewsLimit};
+use crate::raster::WeightKind;
+
+use super::common::parse_error;
+
+/// The choices, each the preset's where its flag is absent.
+#[derive(Clone, Debug, Default, Args)]
+#[group(id = "choices", multiple = true)]
+pub struct ChoiceArgs {
+    /// Bundle of choices; other flags override single choices.
+    #[arg(long, value_enum, default_value_t)]
+    pub preset: Preset,
+    /// Which parts of a photo get vectors: `masks`, from their crops and from what the photo shows in and around them (the
+    /// image model's patches, or windows over the photo: image.patches and image.windows in model.toml); `crops`, masks from
+    /// their crops alone; `patches`, without masks, so no objects are found [default: the preset's].
+    #[arg(long, value_enum)]
+    regions: Option<Regions>,
+    /// Weight that is summed; `falloff` is the paper's formula as printed [default: the preset's].
+    #[arg(long, value_enum)]
+    weights: Option<WeightKind>,
+    /// Number or share of the views to use: the first ones of --view-order [default: the preset's].
+    #[arg(long, value_name = "N|P%", value_parser = parse_views_limit)]
+    views_limit: Option<ViewsLimit>,
+    /// Order in which views are taken [default: coverage with a limit or a budget, else names].
+    #[arg(long, value_enum, value_name = "ORDER")]
+    view_order: Option<ViewOrder>,
+    /// Number of scales at which the built-in segmenter looks, coarsest first [default: the preset's].
+    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=4))]
+    mask_levels: Option<usize>,
+    /// Masks with fewer pixels are left out [default: the preset's].
+    #[arg(long, value_name = "PX")]
+    min_mask_px: Option<u32>,
+    /// Keeps slivers, which ragged edges of overlapping masks leave, as regions; without it they join their neighbours.
+    #[arg(long)]
+    keep_slivers: bool,
+    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024, or
+    /// `twice` for twice that width [default: the preset's].
+    #[arg(long, value_name = "photo|twice|PX", value_parser = parse_raster_width)]
+    raster_width: Option<RasterWidth>,
+    /// Skips the search for objects: masks of different views that show the same Gaussians.
+    #[arg(long)]
+    no_objects: bool,
+    /// Drops views in which a Gaussian has less than this share of its weight in its best view
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    min_view_share: Option<f32>,
+    /// Each mask counts (1 - truncation)^POWER; truncation is the share of its outline that the photo's edge cuts off
+    #[arg(long, value_name = "POWER", value_parser = amount)]
+    truncation_power: Option<f32>,
+    /// Weight of the superpoint's mean, relative to the Gaussian's own
+    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    superpoint: Option<f32>,
+    /// Weight of the larger superpoint's mean, relative to the result so far
+    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    coarse: Option<f32>,
+    /// Weight of the mean of the Gaussian's object, relative to the result so far
+    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    object: Option<f32>,
+    /// Whether Gaussians without evidence take their superpoint's mean
+    #[arg(long, value_name = "BOOL")]
+    fill: Option<bool>,
+    /// Mean error of scores that the compact profile may have, relative to the spread of scores [default: the preset's].
+    #[arg(long, value_name = "E", value_parser = parse_error)]
+    compact_error: Option<f32>,
+    /// The same for the balanced profile.
+    #[arg(long, value_name = "E", value_parser = parse_error)]
+    balanced_error: Option<f32>,
+    /// Most components of a vector in compact and balanced shards, even [default: as many as the errors need, at most 128].
+    #[arg(long, value_name = "N", value_parser = parse_components)]
+    max_components: Option<usize>,
+}
+
+fn set<T: Clone>(to: &mut T, value: &Option<T>) {
+    if let Some(value) = value {
+        *to = value.clone();
+    }
+}
+
+impl ChoiceArgs {
+    /// Makes the choices in settings that have the defaults.
+    pub(super) fn apply(&self, settings: &mut EncodeSettings) {
+        self.preset.apply(settings);
+        let EncodeSettings { view, aggregation, cells, run, .. } = settings;
+        set(&mut view.regions, &self.regions);
+        set(&mut view.weights, &self.weights);
+        set(&mut view.min_mask_px, &self.min_mask_px);
+        set(&mut view.raster_width, &self.raster_width);
+        set(&mut view.masks, &self.mask_levels.map(|n_levels| Masks::Auto { n_levels }));
+        view.merges_slivers &= !self.keep_slivers;
+        set(&mut run.views_limit, &self.views_limit);
+        let is_limited = run.views_limit != ViewsLimit::All || run.time_budget.is_some();
+        run.view_order = if is_limited { ViewOrder::Coverage } else { ViewOrder::Names };
+        set(&mut run.view_order, &self.view_order);
+        set(&mut aggregation.min_view_share, &self.min_view_share);
+        set(&mut aggregation.truncation_power, &self.truncation_power);
+        set(&mut aggregation.superpoint, &self.superpoint);
+        set(&mut aggregation.coarse, &self.coarse);
+        set(&mut aggregation.object, &self.object);
+        set(&mut aggregation.fill, &self.fill);
+        cells.objects &= !self.no_objects && view.regions.have_masks();
+        let codebook = &mut cells.shards.codebook;
+        set(&mut codebook.compact_error, &self.compact_error);
+        set(&mut codebook.balanced_error, &self.balanced_error);
+        set(&mut codebook.max_components, &self.max_components);
+    }
+}
+
+fn share(text: &str) -> Result<f32, String> {
+    amount(text).and_then(|x| if x <= 1.0 { Ok(x) } else { Err(format!("{x} is not in 0..=1")) })
+}
+
+fn amount(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    if (0.0..=1000.0).contains(&value) { Ok(value) } else { Err(format!("{value} is not in 0..=1000")) }
+}
+
+fn parse_components(text: &str) -> Result<usize, String> {
+    let is_valid = |n: &usize| (2..=MAX_COMPONENTS).contains(n) && n.is_multiple_of(2);
+    let components = text.parse().ok().filter(is_valid);
+    components.ok_or_else(|| format!("expected an even number from 2 to {MAX_COMPONENTS}"))
+}
+
+fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
+    match text {
+        "photo" => Ok(RasterWidth::Photo),
+        "twice" => Ok(RasterWidth::Twice),
+        _ => {
+            let width_px = text.parse().ok().filter(|px| (16..=8192).contains(px));
+            width_px
+                .map(RasterWidth::Px)
+                .ok_or_else(|| format!("{text:?} is none of: photo, twice, 16 to 8192 pixels"))
+        }
+    }
+}
+
+/// Parses a number of views, or a share of them in per cent.
+fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
+    let limit = match text.strip_suffix('%') {
+        Some(percent) => {
+            let share = percent.parse().ok().map(|p: f64| p / 100.0);
+            share.filter(|share| *share > 0.0 && *share <= 1.0).map(ViewsLimit::Share)
+        }
+        None => text.parse().ok().filter(|n| *n > 0).map(ViewsLimit::Count),
+    };
+    limit.ok_or_else(|| format!("{text:?} is neither a number of views nor a share, 1% to 100%"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_and_widths_are_numbers_or_words() {
+        assert_eq!(parse_views_limit("7"), Ok(ViewsLimit::Count(7)));
+        assert_eq!(parse_views_limit("12.5%"), Ok(ViewsLimit::Share(0.125)));
+        assert_eq!(parse_raster_width("photo"), Ok(RasterWidth::Photo));
+        assert_eq!(parse_raster_width("16"), Ok(RasterWidth::Px(16)));
+        assert!(parse_raster_width("8193").is_err() && parse_views_limit("-1").is_err());
+    }
+
+    #[test]
+    fn a_limit_leaves_a_view_and_takes_no_more_than_there_are() {
+        let of_36 =
+            [ViewsLimit::All, ViewsLimit::Count(99), ViewsLimit::Share(0.25), ViewsLimit::Share(0.001)];
+        assert_eq!(of_36.map(|limit| limit.of(36)), [36, 36, 9, 1]);
+        assert_eq!(ViewsLimit::Count(5).of(36), 5);
+    }
+}
