@@ -137,7 +137,7 @@ const MASKS: &[(Speed, &str, &[&str], i32, &str)] = &[
     (Slow, "m7_rgb", &[], 1, "expected ids"),
     (Slow, "m8_palette", &[], 0, ""),
     (Slow, "m9_half", &[], 1, "make the masks from the same photos"),
-    (Slow, "m10_all_background", &[], 1, "no Gaussian of the scene lies in any mask"),
+    (Slow, "m10_all_background", &[], 1, "no Gaussian has an embedding"),
     (Slow, "m10_all_background", &["--allow-empty"], 0, ""),
     (Fast, "m12_langsplat", &[], 1, "LangSplat's maps"),
     (Slow, "m13_some", &[], 0, "6 of 10 views have no masks"),

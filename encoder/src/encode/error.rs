@@ -119,7 +119,9 @@ pub enum EncodeError {
         reason: String,
     },
     #[error(
-        "no Gaussian has an embedding, so nothing is published: {n_views} views ({n_views_without_masks} without masks) have          {n_masks} masks and {n_entries} contributions; see whether masks, poses and splat fit with `slag-encoder check`, or          publish it all the same with --allow-empty"
+        "no Gaussian has an embedding, so nothing is published: {n_views} views ({n_views_without_masks} without masks) have \
+         {n_masks} masks and {n_entries} contributions; see whether masks, poses and splat fit with `slag-encoder check`, or \
+         publish it all the same with --allow-empty"
     )]
     NoEvidence { n_views: usize, n_views_without_masks: usize, n_masks: usize, n_entries: u64 },
     #[error("{}: hardly any of {n_gaussians} Gaussians can be seen (finite, positive scales, a rotation, not transparent); export the splat again", path.display())]
