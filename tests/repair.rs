@@ -12,10 +12,8 @@ fn an_encode_heals_a_store_from_kept_views() {
     run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "4"]));
     let encode = || {
         let mut command = encode_room(&room, &store);
-        let output = command
-            .args(["--models", "colours", "--device", "cpu", "--keep-views", "--json"])
-            .output()
-            .expect("runs");
+        let output =
+            command.args(["--models", "colours", "--device", "cpu", "--keep-views"]).output().expect("runs");
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(output.status.success(), "{errors}");
         (serde_json::from_slice::<serde_json::Value>(&output.stdout).expect("JSON"), errors)

@@ -8,8 +8,7 @@ use image::GrayImage;
 use slag_common::poses::SplatFrame;
 use slag_common::{View, durable, poses, splat};
 
-use super::Exit;
-use super::common::{InputArgs, print};
+use super::common::{Exit, InputArgs, print};
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
 use crate::ingest::{self, FoundFrame, LoadedImage, RotatedPhotos};
 use crate::raster::RasterView;

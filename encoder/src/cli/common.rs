@@ -1,9 +1,10 @@
-//! Shared by the commands: flags of output, models and inputs; logging, printing, interruption.
+//! Shared by the commands: exit codes; flags of output, models and inputs; logging, printing, interruption.
 
 use std::fmt::Display;
 use std::io::{IsTerminal, Write};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -21,6 +22,34 @@ use tracing_subscriber::EnvFilter;
 use crate::ingest::{Activated, FrameChoice};
 use crate::store::StoreReader;
 use crate::store::metadata::{MetadataReader, clock_unix_secs};
+
+/// How a run of the program ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exit {
+    Done,
+    /// Failed; the message says why.
+    Failed,
+    /// Done without some inputs; the summary names them.
+    Partly,
+    /// The inputs do not fit together (`check`).
+    Mismatch,
+    /// Interrupted by the user; the same command resumes.
+    Interrupted,
+}
+
+impl From<Exit> for ExitCode {
+    /// 2 is left to clap: wrong usage.
+    fn from(exit: Exit) -> Self {
+        match exit {
+            Exit::Done => 0,
+            Exit::Failed => 1,
+            Exit::Partly => 3,
+            Exit::Mismatch => 4,
+            Exit::Interrupted => 130,
+        }
+        .into()
+    }
+}
 
 /// Flags that every command has.
 #[derive(Clone, Copy, Debug, Args)]

@@ -3,8 +3,7 @@
 use anyhow::Result;
 use serde_json::json;
 
-use super::Exit;
-use super::common::print;
+use super::common::{Exit, print};
 use crate::raster::gpu::{AdapterReport, adapters};
 
 pub(super) fn run(json: bool) -> Result<Exit> {

@@ -8,8 +8,7 @@ use clap::Args;
 use slag_common::ByteSize;
 use slag_common::objects::Thing;
 
-use super::Exit;
-use super::common::print;
+use super::common::{Exit, print};
 use crate::diff::{self, Diff, Generation};
 use crate::store::{Published, StoreReader};
 

@@ -8,11 +8,10 @@ use clap::Args;
 use slag_common::shard::Profile;
 use slag_models::gpus::GpuChoice;
 
-use super::Exit;
 use super::choices::ChoiceArgs;
 use super::common::{
-    InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models, print,
-    profile_parser, warn_of_expiry,
+    Exit, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
+    print, profile_parser, warn_of_expiry,
 };
 use super::memory::{default_memory_bytes, parse_memory};
 use super::sam::SamArgs;

@@ -10,8 +10,7 @@ use clap::Args;
 use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
-use super::Exit;
-use super::common::{ModelArgs, available_threads, cancel_flag, open_models, print};
+use super::common::{Exit, ModelArgs, available_threads, cancel_flag, open_models, print};
 use super::memory::{default_memory_bytes, parse_memory};
 use crate::blobs::Bucket;
 use crate::encode::{self, EncodeSettings, EncodeSummary, Engines};

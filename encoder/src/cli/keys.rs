@@ -8,8 +8,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
 use slag_common::tuf::format_utc;
 
-use super::Exit;
-use super::common::{print, warn_of_expiry};
+use super::common::{Exit, print, warn_of_expiry};
 use crate::store::ceremony::{Change, Changed, KeysStatus, default_root_folder, sign_draft};
 use crate::store::metadata::{Metadata, MetadataReader, signing_unix_secs};
 

@@ -21,8 +21,6 @@ mod summary;
 mod target;
 mod view;
 
-use std::process::ExitCode;
-
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 use serde_json::json;
@@ -34,37 +32,10 @@ use crate::encode::EncodeError;
 #[cfg(feature = "qdrant")]
 use crate::publish::qdrant;
 use crate::raster::devices::DeviceChoice;
+pub use common::Exit;
 use common::{OutputArgs, print};
 #[cfg(feature = "qdrant")]
 use push::PushCommand;
-
-/// How a run of the program ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Exit {
-    Done,
-    /// Failed; the message says why.
-    Failed,
-    /// Done without some inputs; the summary names them.
-    Partly,
-    /// The inputs do not fit together (`check`).
-    Mismatch,
-    /// Interrupted by the user; the same command resumes.
-    Interrupted,
-}
-
-impl From<Exit> for ExitCode {
-    /// 2 is left to clap: wrong usage.
-    fn from(exit: Exit) -> Self {
-        match exit {
-            Exit::Done => 0,
-            Exit::Failed => 1,
-            Exit::Partly => 3,
-            Exit::Mismatch => 4,
-            Exit::Interrupted => 130,
-        }
-        .into()
-    }
-}
 
 /// Makes 3D Gaussian splatting scenes searchable by words.
 #[derive(Debug, Parser)]

@@ -7,8 +7,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 
-use super::Exit;
-use super::common::{print, runtime, stopped};
+use super::common::{Exit, print, runtime, stopped};
 use crate::progress::Progress;
 use crate::publish::qdrant;
 use crate::store::Store;

@@ -9,8 +9,7 @@ use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
 use slag_common::{Gaussians, npy, poses};
 
-use super::Exit;
-use super::common::{ModelArgs, print, profile_parser, text_encoder_of};
+use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
 use crate::query::{self, Hit, Scores};
 use crate::raster::RasterView;
 use crate::store::StoreReader;

@@ -8,8 +8,7 @@ use clap::Args;
 use slag_service::listen::Listen;
 use slag_service::tls::TlsFiles;
 
-use super::Exit;
-use super::common::{ModelArgs, runtime, stopped, warn_of_expiry};
+use super::common::{Exit, ModelArgs, runtime, stopped, warn_of_expiry};
 use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
 use crate::view::{self, Viewed, Viewer};

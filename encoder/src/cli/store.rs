@@ -10,8 +10,7 @@ use slag_common::Hash32;
 use slag_common::byte_size::ByteSize;
 use slag_common::tuf::format_utc;
 
-use super::Exit;
-use super::common::{print, warn_of_expiry};
+use super::common::{Exit, print, warn_of_expiry};
 use crate::encode::{JobStatus, job_status};
 use crate::progress::Progress;
 use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, signing_unix_secs};

@@ -11,8 +11,7 @@ use slag_common::{View, poses};
 use slag_service::access::AccessSettings;
 use slag_service::listen::Listen;
 
-use super::Exit;
-use super::common::{ModelArgs, parse_frame, runtime, stopped, text_encoder_of};
+use super::common::{Exit, ModelArgs, parse_frame, runtime, stopped, text_encoder_of};
 use crate::ingest::{self, FrameChoice};
 use crate::publish::serve::{self, Access};
 use crate::view::{OpenText, Splat, Viewed, Viewer, router, up_of};

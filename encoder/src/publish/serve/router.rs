@@ -23,8 +23,7 @@ use tower::load_shed::LoadShedLayer;
 use tower_http::limit::RequestBodyLimitLayer;
 use tower_http::timeout::TimeoutLayer;
 
-use super::Limits;
-use super::state::{AppState, Service, metrics};
+use super::state::{AppState, Limits, Service, metrics};
 use super::{cells, objects, problem};
 use crate::store::StoreError;
 use crate::store::metadata::TIMESTAMP_FILE;

@@ -11,16 +11,39 @@ use axum::extract::State;
 use slag_common::Hash32;
 use slag_common::manifest::{self, CellIndex, Manifest};
 use slag_common::tuf::TargetFile;
+use slag_service::listener::ConnectionLimits;
 use slag_service::metrics::{Exposition, ResponseCounts};
 use slag_service::problem::Problem;
 use tokio::sync::Semaphore;
 
-use super::Limits;
 use crate::store::{Stamp, StoreError, StoreReader};
 
 /// Pause before a manifest that did not open is read again. The fault may lie in another file or pass by
 /// itself (no file descriptors left), so the manifest's own change is not the only sign.
 const RETRY_PAUSE: Duration = Duration::from_secs(10);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limits {
+    pub connections: ConnectionLimits,
+    /// Requests in progress; further ones get 503.
+    pub n_requests: usize,
+    /// Objects being sent; further ones get 503.
+    pub n_downloads: usize,
+    /// Time until an answer must begin, else 503.
+    pub answer_timeout: Duration,
+}
+
+impl Default for Limits {
+    /// Returns bounds for a machine with a few cores: 64 downloads in pieces take 4 MiB.
+    fn default() -> Self {
+        Self {
+            connections: ConnectionLimits::default(),
+            n_requests: 128,
+            n_downloads: 64,
+            answer_timeout: Duration::from_secs(10),
+        }
+    }
+}
 
 pub(super) struct Snapshot {
     pub(super) reader: StoreReader,
