@@ -225,11 +225,9 @@ fn flags_that_the_documents_name_exist() {
 /// The command lines of the documents are those that the programs parse, with values in place of their placeholders.
 #[test]
 fn documented_commands_are_understood() {
-    let programs: [(&str, fn() -> clap::Command); 3] = [
-        ("slag-encoder", slag_encoder::cli::Cli::command),
-        ("slag-edge", slag_edge::cli::Cli::command),
-        ("slag-lab", slag_lab::cli::Cli::command),
-    ];
+    let programs =
+        [slag_encoder::cli::Cli::command, slag_edge::cli::Cli::command, slag_lab::cli::Cli::command]
+            .map(|command| (command().get_name().to_owned(), command));
     let n: usize = documents().iter().map(|(_, text)| commands(text).len()).sum();
     assert!(n > 50, "{n} commands are documented");
     check(|_, text| {

@@ -318,7 +318,7 @@ fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result
 fn is_features(line: &str) -> bool {
     let is_number = |word: &str| word.parse::<f64>().is_ok();
     line.starts_with('#')
-        || line.split_whitespace().count() % 3 == 0 && line.split_whitespace().all(is_number)
+        || line.split_whitespace().count().is_multiple_of(3) && line.split_whitespace().all(is_number)
 }
 
 fn add_image_line(

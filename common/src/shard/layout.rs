@@ -218,6 +218,9 @@ struct Checker<'a> {
     at_header: usize,
 }
 
+/// The errors of fine residuals; the ranges of their steps, scales and values.
+type FineSections = (ScoreErrors, [Range<usize>; 3]);
+
 impl Checker<'_> {
     fn has(&self, id: u32) -> bool {
         self.layout.find(id).is_some()
@@ -288,10 +291,7 @@ impl Checker<'_> {
         Ok(Some([indices, self.halves(section::EMBEDDINGS, "embeddings", n_with_evidence * dim)?]))
     }
 
-    fn fine(
-        &self,
-        n_with_evidence: usize,
-    ) -> Result<Option<(ScoreErrors, [Range<usize>; 3])>, ContainerError> {
+    fn fine(&self, n_with_evidence: usize) -> Result<Option<FineSections>, ContainerError> {
         if !self.has(section::FINE) {
             return Ok(None);
         }

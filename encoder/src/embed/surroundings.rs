@@ -4,7 +4,7 @@ use crate::masks::windows::Windows;
 use crate::masks::{Mask, patches};
 
 /// Share of a mask's vector that is the mean of patches or windows; the rest is its crop's. Chosen on the labelled house and yard
-/// (docs/accuracy.md).
+/// (docs/decisions.md).
 const SHARE_OF_PATCHES: f32 = 0.5;
 const SHARE_OF_WINDOWS: f32 = 0.35;
 

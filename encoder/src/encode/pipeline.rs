@@ -167,6 +167,9 @@ impl<S, F> Pipeline<'_, S, F> {
     }
 }
 
+/// Seconds and result of a step, if the source had an item for it.
+type StepOutcome<T, E> = Option<(f64, Result<Option<T>, E>)>;
+
 impl<T, E> State<T, E> {
     /// Takes the item that is furthest of those that can go on, and says into which stage.
     fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, Task<T>)> {
@@ -201,9 +204,8 @@ impl<T, E> State<T, E> {
         self.has_no_more = !has_item && self.n_ended == self.n_ended_when_asked;
     }
 
-    /// Puts an item into the next queue, or keeps why there is none. `done`: seconds and result of the step, if the source
-    /// had an item for it.
-    fn end_step(&mut self, at: usize, done: std::thread::Result<Option<(f64, Result<Option<T>, E>)>>) {
+    /// Puts an item into the next queue, or keeps why there is none.
+    fn end_step(&mut self, at: usize, done: std::thread::Result<StepOutcome<T, E>>) {
         self.n_running[at] -= 1;
         let (secs, result) = match done {
             Ok(Some(done)) => done,

@@ -82,7 +82,6 @@ pub(crate) struct Work<'v> {
 }
 
 /// The next stage, with what it takes.
-#[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
 enum Next {
     Fetch,
     Decode,
