@@ -14,6 +14,7 @@ pub mod frames;
 pub mod gaussians;
 pub mod hash;
 pub mod manifest;
+mod named_members;
 pub mod npy;
 pub mod npz;
 pub mod objects;

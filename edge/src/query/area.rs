@@ -13,7 +13,7 @@ use crate::score::{Ball, MAX_COORDINATE, MAX_CORNERS, Polygon};
 
 /// A ball, a box and a polygon, each optional; what lies in all of them is asked for.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default, deny_unknown_fields, remote = "Self")]
 pub struct Area {
     /// A ball.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -29,7 +29,7 @@ pub struct Area {
 
 /// A ball.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub struct AreaBall {
     /// Its centre.
     pub centre: Point,
@@ -40,13 +40,15 @@ pub struct AreaBall {
 
 /// A box, by two opposite corners.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub struct AreaBox {
     /// One corner.
     pub from: Point,
     /// The corner opposite.
     pub to: Point,
 }
+
+slag_common::named_members!(Area, AreaBall, AreaBox; Serialize);
 
 impl Area {
     /// Restricts a request to this area.

@@ -11,7 +11,7 @@ use crate::score::MAX_COORDINATE;
 
 /// A point of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "[x, y, z] in the world frame, or lat, lon and perhaps height by their names")]
 pub enum Point {
     /// In the world frame: x, y, z.
     World(#[schemars(inner(range(min = -MAX_COORDINATE, max = MAX_COORDINATE)))] [f64; 3]),
@@ -21,7 +21,7 @@ pub enum Point {
 
 /// A corner of a polygon.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "[x, y] in the world frame, or lat and lon by their names")]
 pub enum Corner {
     /// In the world frame: x, y.
     World(#[schemars(inner(range(min = -MAX_COORDINATE, max = MAX_COORDINATE)))] [f64; 2]),
@@ -31,7 +31,7 @@ pub enum Corner {
 
 /// A geographic position.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub struct LatLon {
     /// Latitude, degrees, north positive.
     #[schemars(range(min = -90, max = 90))]
@@ -43,6 +43,8 @@ pub struct LatLon {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub height: Option<f64>,
 }
+
+slag_common::named_members!(LatLon; Serialize);
 
 impl LatLon {
     fn in_world(self, parameter: &str, manifest: &Manifest) -> Result<DVec3, RequestError> {

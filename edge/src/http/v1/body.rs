@@ -19,7 +19,7 @@ pub const MAX_BODY_BYTES: usize = 1 << 20;
 
 /// What is asked for: at least one text, vector or phrase, 32 together at most. Everything else is optional.
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default, deny_unknown_fields, remote = "Self")]
 #[schemars(rename = "Ask")]
 pub struct Body {
     /// Texts for the text model; those that name a relation are understood as phrases.
@@ -65,6 +65,8 @@ pub struct Body {
     #[schemars(range(min = 1))]
     pub time_budget_ms: Option<u64>,
 }
+
+slag_common::named_members!(Body);
 
 /// A request, and the text behind each phrase that was understood.
 pub struct Understood {

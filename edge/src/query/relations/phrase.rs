@@ -17,7 +17,7 @@ pub const ASKER: [&str; 4] = ["me", "myself", "us", "here"];
 
 /// A thing, chosen by what it is, where it is, and how it compares with others of its kind.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub struct Phrase {
     /// What it is, in the text model's words; me, inside another phrase, is the asker.
     pub thing: String,
@@ -31,7 +31,7 @@ pub struct Phrase {
 
 /// Where a thing is: a relation to another thing.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub struct Place {
     /// The relation.
     pub is: Relation,
@@ -69,6 +69,8 @@ pub enum Relation {
     /// Farther from the asker than it, in the same direction.
     Behind,
 }
+
+slag_common::named_members!(Phrase, Place, Pick; Serialize);
 
 impl Relation {
     /// Every relation.
@@ -122,7 +124,7 @@ impl fmt::Display for Relation {
 
 /// Which of several things is meant.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub struct Pick {
     /// What they are compared by.
     pub by: By,
