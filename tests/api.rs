@@ -6,6 +6,7 @@ use slag_tests::*;
 
 #[test]
 fn the_python_client_asks_a_robot() {
+    judge(Path::new("python3"), "clients/python/tests/without_a_robot.py", &[]);
     let site = Site::new();
     let robot = site.robot(&[]);
     let printed =

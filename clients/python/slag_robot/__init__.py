@@ -9,6 +9,7 @@ Needs nothing but the standard library. Every position is in the frame and of th
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import urllib.error
 import urllib.parse
@@ -196,6 +197,27 @@ def relation(name: str, of: Mapping[str, Any], and_: Optional[Mapping[str, Any]]
     return made
 
 
+def _pairs(near: Optional[Point], parameters: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Writes parameters as URLs have them; `near` by its names or as x, y, z."""
+    pairs = [(name.rstrip("_"), str(value)) for name, value in parameters.items() if value is not None]
+    if isinstance(near, Mapping):
+        unknown = set(near) - {"lat", "lon", "height"}
+        if unknown or not {"lat", "lon"} <= set(near):
+            raise ValueError(f"near has {sorted(near)}, expected lat, lon and perhaps height")
+        pairs.append(("near_lat_lon", ",".join(str(near[name]) for name in ("lat", "lon", "height") if name in near)))
+    elif near is not None:
+        pairs.append(("near", ",".join(str(of_axis) for of_axis in near)))
+    return pairs
+
+
+def _is_loopback(url: str) -> bool:
+    host = urllib.parse.urlsplit(url).hostname or ""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 def _known(made: Any, members: Mapping[str, Any]) -> dict[str, Any]:
     names = {of.name for of in fields(made)}
     return {name: value for name, value in members.items() if name in names}
@@ -230,6 +252,9 @@ class Robot:
         self.url = url.rstrip("/")
         self.token = token
         self.timeout_secs = timeout_secs
+        # A proxy of the environment would take requests to this machine, and the token, to another one.
+        proxies = [urllib.request.ProxyHandler({})] if _is_loopback(self.url) else []
+        self._opener = urllib.request.build_opener(*proxies)
 
     def ask(self, **request: Any) -> Reply:
         """Asks anything that `POST /v1/query` takes: texts, vectors, phrases, region, near, limit ..."""
@@ -255,11 +280,11 @@ class Robot:
             yield from reply.results[0].answers
             offset = reply.results[0].next_offset
 
-    def objects(self, **parameters: Any) -> Iterator[dict[str, Any]]:
+    def objects(self, near: Optional[Sequence[float]] = None, **parameters: Any) -> Iterator[dict[str, Any]]:
         """Yields the things on board, page by page: near, radius, min_size, limit as `GET /v1/objects` takes
         them."""
         while True:
-            page = self._send("/v1/objects?" + urllib.parse.urlencode(parameters))
+            page = self._send("/v1/objects?" + urllib.parse.urlencode(_pairs(near, parameters)))
             yield from page["objects"]
             if page["next_after"] is None:
                 return
@@ -275,30 +300,23 @@ class Robot:
         place: dict[str, Any] = self._send("/v1/map")
         return place
 
-    def goal(self, text: Optional[str] = None, near: Optional[Sequence[float]] = None, **parameters: Any) -> Goals:
+    def goal(self, text: Optional[str] = None, near: Optional[Point] = None, **parameters: Any) -> Goals:
         """Returns places to stand near a thing: by text, or by id="o...", with radius_m, reach_m,
         sensor_height_m ..."""
-        if text is not None:
-            parameters["text"] = text
-        if near is not None:
-            parameters["near"] = ",".join(str(of_axis) for of_axis in near)
-        reply = self._send("/v1/goal?" + urllib.parse.urlencode(parameters))
+        reply = self._send("/v1/goal?" + urllib.parse.urlencode(_pairs(near, {"text": text, **parameters})))
         goals = tuple(Goal(**_known(Goal, goal)) for goal in reply["goals"])
         none = None if reply["none"] is None else Nothing(**_known(Nothing, reply["none"]))
         return Goals(reply["generation"], reply["frame"], goals, none, reply)
 
-    def floor(self, **parameters: Any) -> dict[str, Any]:
+    def floor(self, near: Optional[Point] = None, **parameters: Any) -> dict[str, Any]:
         """Returns the ground around the robot as `GET /v1/floor` describes it."""
-        ground: dict[str, Any] = self._send("/v1/floor?" + urllib.parse.urlencode(parameters))
+        ground: dict[str, Any] = self._send("/v1/floor?" + urllib.parse.urlencode(_pairs(near, parameters)))
         return ground
 
-    def changes(self, texts: Sequence[str] = (), near: Optional[Sequence[float]] = None, **parameters: Any) -> Changes:
+    def changes(self, texts: Sequence[str] = (), near: Optional[Point] = None, **parameters: Any) -> Changes:
         """Returns what changed between two generations: from_, to, radius as `GET /v1/changes` takes them.
         `texts`: kinds of things; each changed thing names the one that it is most like."""
-        pairs = [("text", text) for text in texts]
-        if near is not None:
-            pairs.append(("near", ",".join(str(of_axis) for of_axis in near)))
-        pairs += [(name.rstrip("_"), str(value)) for name, value in parameters.items()]
+        pairs = [("text", text) for text in texts] + _pairs(near, parameters)
         reply = self._send("/v1/changes?" + urllib.parse.urlencode(pairs))
         things = {name: tuple(_changed(of) for of in reply[name]) for name in ("appeared", "went")}
         moved = tuple(Moved(_changed(of["from"]), _changed(of["to"]), of["distance"]) for of in reply["moved"])
@@ -333,7 +351,7 @@ class Robot:
         if self.token is not None:
             request.add_header("Authorization", f"Bearer {self.token}")
         try:
-            return urllib.request.urlopen(request, timeout=timeout_secs)
+            return self._opener.open(request, timeout=timeout_secs)
         except urllib.error.HTTPError as error:
             with error:
                 text = error.read()

@@ -29,7 +29,12 @@ pub struct Robot {
 impl Robot {
     /// Takes the address of a robot, and the token of its `--token-file` if it has one. Nothing is asked yet.
     pub fn new(url: &str, token: Option<&str>) -> Self {
-        let config = ureq::Agent::config_builder().timeout_global(Some(TIMEOUT)).http_status_as_error(false);
+        let mut config =
+            ureq::Agent::config_builder().timeout_global(Some(TIMEOUT)).http_status_as_error(false);
+        if is_loopback(url) {
+            // A proxy of the environment would take the request, and the token, to another machine.
+            config = config.proxy(None);
+        }
         Self {
             agent: config.build().into(),
             url: url.trim_end_matches('/').to_owned(),
@@ -154,6 +159,14 @@ impl Robot {
     }
 }
 
+/// Returns whether a URL is of this machine.
+fn is_loopback(url: &str) -> bool {
+    let Ok(uri) = url.parse::<ureq::http::Uri>() else { return false };
+    let host = uri.host().unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
+    host.eq_ignore_ascii_case("localhost")
+        || host.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
+}
+
 fn texts_of(request: &Value) -> impl Iterator<Item = &str> {
     request["texts"].as_array().into_iter().flatten().filter_map(Value::as_str)
 }
@@ -169,6 +182,28 @@ fn check_texts<'a>(mut texts: impl Iterator<Item = &'a str>) -> Result<(), Robot
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn this_machine_is_asked_without_a_proxy() {
+        for url in [
+            "http://127.0.0.1:7734",
+            "http://localhost:1/",
+            "https://[::1]:7",
+            "http://LOCALHOST",
+            "http://127.9.9.9",
+        ] {
+            assert!(is_loopback(url), "{url}");
+        }
+        for url in [
+            "http://10.0.0.1:7734",
+            "http://localhost.example:1",
+            "http://robot",
+            "no url",
+            "http://[fe80::1]",
+        ] {
+            assert!(!is_loopback(url), "{url}");
+        }
+    }
 
     /// Nobody listens: a text that is too long is refused before anything is sent.
     #[test]

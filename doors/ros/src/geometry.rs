@@ -90,6 +90,12 @@ impl Rigid {
         }
     }
 
+    /// Returns the motion back: `child_from_parent`.
+    pub fn inverse(self) -> Self {
+        let rotation = self.rotation.inverse();
+        Self { rotation, translation: rotation * -self.translation }
+    }
+
     /// Moves a point.
     pub fn apply(self, point: [f64; 3]) -> [f64; 3] {
         (self.rotation * DVec3::from_array(point) + self.translation).to_array()

@@ -5,12 +5,21 @@ use std::time::Duration;
 use anyhow::{Result, anyhow};
 use ros2_client::action::{ActionClient, ActionClientQosPolicies, GoalStatusEnum};
 use ros2_client::{ActionTypeName, Name, Node, QosProfile, ServiceMapping};
+use tokio::sync::oneshot;
 use tokio::time::timeout;
 
 use crate::messages::{NavigationFeedback, NavigationGoal, NavigationResult, PoseStamped};
 
 /// Longest wait for the server to take a goal.
 const ACCEPT_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// How a goal ended.
+pub enum Ended {
+    Reached,
+    Cancelled,
+    /// Another goal took its place.
+    Replaced,
+}
 
 /// Sends goals to Nav2.
 pub struct Navigator {
@@ -40,11 +49,17 @@ impl Navigator {
         Ok(Self { client: client.map_err(|e| anyhow!("cannot use the action navigate_to_pose: {e}"))? })
     }
 
-    /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended.
+    /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended. A message of `stop` cancels the
+    /// goal; its end alone means that another goal takes its place, for which Nav2 gives this one up.
     ///
     /// # Errors
     /// No server takes the goal, or it was not reached.
-    pub async fn drive(&self, pose: PoseStamped, mut remaining: impl AsyncFnMut(f32)) -> Result<(), String> {
+    pub async fn drive(
+        &self,
+        pose: PoseStamped,
+        mut stop: oneshot::Receiver<()>,
+        mut remaining: impl AsyncFnMut(f32),
+    ) -> Result<Ended, String> {
         let goal = NavigationGoal { pose, behavior_tree: String::new() };
         let sent = timeout(ACCEPT_TIMEOUT, self.client.async_send_goal(goal)).await;
         let sent = sent.map_err(|_| "no server of /navigate_to_pose takes goals; is Nav2 running?")?;
@@ -56,6 +71,14 @@ impl Navigator {
         let mut ended = std::pin::pin!(ended);
         let (status, result) = loop {
             tokio::select! {
+                told = &mut stop => {
+                    if told.is_err() {
+                        return Ok(Ended::Replaced);
+                    }
+                    let cancelled = self.client.cancel_goal(id);
+                    cancelled.map_err(|e| format!("the goal cannot be cancelled: {e:?}"))?;
+                    return Ok(Ended::Cancelled);
+                }
                 ended = &mut ended => break ended.map_err(|e| format!("the result cannot be read: {e:?}"))?,
                 told = self.client.feedback_subscription().async_take() => match told {
                     Ok((told, _)) if told.goal_id == id => remaining(told.feedback.distance_remaining).await,
@@ -65,7 +88,7 @@ impl Navigator {
             }
         };
         match status {
-            GoalStatusEnum::Succeeded => Ok(()),
+            GoalStatusEnum::Succeeded => Ok(Ended::Reached),
             status => Err(format!("Nav2 ends the goal: {status:?}{}", result.reason())),
         }
     }

@@ -13,7 +13,7 @@ use ros2_client::{
 use rustdds::DomainParticipantBuilder;
 use serde::Serialize;
 use serde_json::{Value, json};
-use slag_robot::{Answer, PointAnswer, Robot};
+use slag_robot::{Answer, PointAnswer, Robot, RobotError};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
@@ -22,7 +22,7 @@ use crate::messages::{
     Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix, OccupancyGrid, Odometry, PointCloud2,
     PoseStamped, StandReply, StandRequest, Text, Transforms as TransformMessages,
 };
-use crate::navigation::Navigator;
+use crate::navigation::{Ended, Navigator};
 use crate::position;
 use crate::stand::{self, Body};
 use crate::transforms::Transforms;
@@ -31,6 +31,10 @@ use crate::transforms::Transforms;
 const KEPT: usize = 4;
 /// Longest pause for subscribers that do not keep up.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
+/// Longest wait until a goal is cancelled.
+const STOP_TIMEOUT: Duration = Duration::from_secs(3);
+/// Time between looks whether the robot's program answers.
+const WATCH_PERIOD: Duration = Duration::from_secs(5);
 /// Pause after a failed read, so that a broken topic does not burn the CPU.
 const READ_PAUSE: Duration = Duration::from_millis(100);
 
@@ -119,8 +123,21 @@ struct Navigation {
     navigator: Navigator,
     /// How the newest goal stands.
     state: Publisher<Text>,
-    /// Ends the following of the newest goal when it is dropped; Nav2 gives up the one before.
-    newest: Mutex<Option<oneshot::Sender<()>>>,
+    /// Cancels the newest goal with a message, and ends with that goal. If it is dropped, another goal takes its place.
+    newest: Mutex<Option<(oneshot::Sender<()>, oneshot::Receiver<()>)>>,
+}
+
+impl Navigation {
+    /// Cancels the newest goal, if it has not ended, and waits until that is sent.
+    async fn stop(&self) {
+        let newest = self.newest.lock().expect("no holder panics").take();
+        if let Some((stop, ended)) = newest
+            && stop.send(()).is_ok()
+            && tokio::time::timeout(STOP_TIMEOUT, ended).await.is_err()
+        {
+            tracing::warn!("the goal may not be cancelled: Nav2 does not answer");
+        }
+    }
 }
 
 /// The answers to a text.
@@ -188,6 +205,7 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
         robot,
         settings: settings.clone(),
     });
+    let watched = Arc::clone(&shared);
     let sensor = QosProfile::subscription_default();
 
     let texts = subscription::<Text>(&mut node, own("query")?, ("std_msgs", "String"), &volatile)?;
@@ -199,6 +217,7 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     tokio::spawn(listen(going, async move |text: Text| {
         if let Err(reason) = Arc::clone(&asked).go(text.data.clone()).await {
             tracing::warn!("{:?}: {reason}", text.data);
+            asked.stop_driving(&text.data, &reason).await;
         }
     }));
 
@@ -231,7 +250,11 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     let spinner = node.spinner().map_err(|e| anyhow!("cannot start the node: {e}"))?;
     tokio::spawn(spinner.spin());
     tracing::info!("/{} listens in domain {}", settings.name, settings.domain_id);
+    tokio::spawn(Arc::clone(&watched).watch());
     stop.await;
+    if let Some(navigation) = &watched.navigation {
+        navigation.stop().await;
+    }
     Ok(())
 }
 
@@ -357,33 +380,63 @@ impl Shared {
             publish(goal_pose, reply.pose.clone()).await;
         }
         if let Some(navigation) = &self.navigation {
-            let (newest, replaced) = oneshot::channel();
-            *navigation.newest.lock().expect("no holder panics") = Some(newest);
+            let ((stop, stopped), (ended, has_ended)) = (oneshot::channel(), oneshot::channel());
+            *navigation.newest.lock().expect("no holder panics") = Some((stop, has_ended));
             let (shared, tokio) = (Arc::clone(&self), Handle::current());
             // The streams of an action are not Send, so its task has a thread.
             std::thread::spawn(move || {
-                tokio.block_on(async {
-                    tokio::select! {
-                        _ = replaced => {}
-                        () = shared.drive(text, reply.pose) => {}
-                    }
-                });
+                let _ended: oneshot::Sender<()> = ended;
+                tokio.block_on(shared.drive(text, reply.pose, stopped));
             });
         }
         Ok(())
     }
 
     /// Sends a goal to Nav2 and publishes its progress and its end.
-    async fn drive(self: Arc<Self>, text: String, pose: PoseStamped) {
+    async fn drive(self: Arc<Self>, text: String, pose: PoseStamped, stop: oneshot::Receiver<()>) {
         let Some(Navigation { navigator, state, .. }) = &self.navigation else { return };
         let say = async |how: String| publish(state, Text { data: format!("{text}: {how}") }).await;
         let remaining = async |metres: f32| say(format!("{metres:.2} m remain")).await;
-        match navigator.drive(pose, remaining).await {
-            Ok(()) => say("reached".into()).await,
+        match navigator.drive(pose, stop, remaining).await {
+            Ok(Ended::Reached) => say("reached".into()).await,
+            Ok(Ended::Cancelled) => say("cancelled".into()).await,
+            // What replaced it tells of itself.
+            Ok(Ended::Replaced) => {}
             Err(reason) => {
                 tracing::warn!("{text:?}: {reason}");
                 say(format!("failed: {reason}")).await;
             }
+        }
+    }
+
+    /// Cancels the newest goal because a later wish has no place to stand: the robot must not drive on to what nobody asks for
+    /// any more.
+    async fn stop_driving(&self, text: &str, reason: &str) {
+        if let Some(navigation) = &self.navigation {
+            navigation.stop().await;
+            publish(&navigation.state, Text { data: format!("{text}: failed: {reason}") }).await;
+        }
+    }
+
+    /// Reports when the robot's program stops or begins to answer: topics alone are silent then.
+    async fn watch(self: Arc<Self>) {
+        let mut answered = None;
+        loop {
+            let shared = Arc::clone(&self);
+            let asked = tokio::task::spawn_blocking(move || shared.robot.place()).await;
+            let error = match asked {
+                Ok(Err(error @ RobotError::Unreachable { .. })) => Some(error),
+                _ => None,
+            };
+            if answered != Some(error.is_none()) {
+                match &error {
+                    Some(error) => tracing::error!("{error}"),
+                    None if answered.is_some() => tracing::info!("the robot's program answers again"),
+                    None => {}
+                }
+                answered = Some(error.is_none());
+            }
+            tokio::time::sleep(WATCH_PERIOD).await;
         }
     }
 

@@ -22,19 +22,22 @@ impl Transforms {
         }
     }
 
-    /// Returns the motion from a frame to one above it in the tree; `None` if they are not connected so.
+    /// Returns the motion from a frame to another; `None` if nothing connects them. They are joined at their first common
+    /// ancestor, as a static transform may make the scene a sibling of the robot's map.
     pub fn target_from(&self, target: &str, frame: &str) -> Option<Rigid> {
-        let (mut at, mut at_from_frame) = (plain(frame), Rigid::IDENTITY);
-        for _ in 0..=MAX_FRAMES {
-            if at == plain(target) {
-                return Some(at_from_frame);
-            }
-            let (parent, parent_from_at) = self.0.get(at)?;
-            at_from_frame = parent_from_at.after(at_from_frame);
-            at = parent;
-        }
-        // A circle.
-        None
+        let of_target: HashMap<&str, Rigid> = self.ancestors(target).collect();
+        self.ancestors(frame)
+            .find_map(|(name, from_frame)| Some(of_target.get(name)?.inverse().after(from_frame)))
+    }
+
+    /// Returns a frame and those above it, each with the motion from the frame to it. In a circle each is met once.
+    fn ancestors<'a>(&'a self, frame: &'a str) -> impl Iterator<Item = (&'a str, Rigid)> {
+        let first = Some((plain(frame), Rigid::IDENTITY));
+        std::iter::successors(first, |(at, at_from_frame)| {
+            let (parent, parent_from_at) = self.0.get(*at)?;
+            Some((parent.as_str(), parent_from_at.after(*at_from_frame)))
+        })
+        .take(self.0.len() + 1)
     }
 }
 
@@ -68,9 +71,13 @@ mod tests {
         frames.insert(told("/odom", "base_link", [2.0, 0.5, 0.0], [0.0, 1.0]));
         let [x, y, z] = frames.target_from("map", "base_link").expect("connected").origin();
         assert!((x - 9.5).abs() < 1e-12 && (y - 2.0).abs() < 1e-12 && z == 0.0, "{x} {y} {z}");
-        assert!(
-            frames.target_from("map", "camera").is_none() && frames.target_from("base_link", "map").is_none()
-        );
+        assert!(frames.target_from("map", "camera").is_none());
+        let back = frames.target_from("base_link", "map").expect("connected").apply([9.5, 2.0, 0.0]);
+        assert!(back.iter().all(|c| c.abs() < 1e-12), "{back:?}");
+        // As docs/ros.md asks for it: a static transform from the map to the scene makes them siblings.
+        frames.insert(told("map", "scene", [1.0, 2.0, 0.0], [0.0, 1.0]));
+        let [x, y, z] = frames.target_from("scene", "base_link").expect("connected").origin();
+        assert!((x - 8.5).abs() < 1e-12 && y.abs() < 1e-12 && z == 0.0, "{x} {y} {z}");
     }
 
     #[test]
