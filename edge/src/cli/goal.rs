@@ -36,6 +36,9 @@ pub struct GoalArgs {
     /// Highest step that it climbs.
     #[arg(long, value_name = "M", default_value_t = 0.1)]
     pub step_m: f64,
+    /// Steepest ground that it drives on: rise for each metre of way.
+    #[arg(long, value_name = "RATIO", default_value_t = 0.5)]
+    pub slope: f64,
     /// How far around it ground is looked at.
     #[arg(long, value_name = "M", default_value_t = 20.0)]
     pub range_m: f64,
@@ -70,6 +73,7 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
         sensor_height_m: args.sensor_height_m,
         height_m: args.height_m,
         step_m: args.step_m,
+        slope: args.slope,
         range_m: args.range_m,
         min_visible: args.min_visible,
         limit: args.limit,
@@ -80,7 +84,7 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
     if let Some(path) = &args.map {
-        let map = goal::floor_map(&engine, &request).map_err(failure)?;
+        let map = goal::floor_map(&engine, &request, &Budget::default()).map_err(failure)?;
         map.write_pgm(std::io::BufWriter::new(fs_err::File::create(path)?))?;
     }
     let reply = goal::find(&engine, &request, &Budget::default()).map_err(failure)?;

@@ -54,6 +54,7 @@ pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) 
     let looked_at = |candidates: Vec<Candidate>| -> Vec<Look> {
         let of_piece = |piece: &[Candidate]| {
             let mut hints = [sight::Hint::NONE; SAMPLES];
+            let piece = if around.goes_on() { piece } else { &[] };
             piece.iter().filter_map(|of| look(around, request, &target, &mut hints, *of)).collect::<Vec<_>>()
         };
         candidates.par_chunks(NEIGHBOURS).flat_map_iter(of_piece).collect()

@@ -136,10 +136,10 @@ mod tests {
     #[test]
     fn the_upper_side_of_a_drop_is_an_obstacle() {
         let floors = [1, 2, 3, 6, 6, 6].map(Floor::At).to_vec();
-        assert_eq!(obstacles(&Ground { floors, n_y: 6 }, 2), [false, false, false, true, false, false]);
+        assert_eq!(obstacles(&Ground::of(floors, 6), 2), [false, false, false, true, false, false]);
         let floors =
             vec![Floor::At(5), Floor::Unknown, Floor::At(9), Floor::At(1), Floor::Blocked, Floor::At(1)];
         // Two rows of three: the drops are along x.
-        assert_eq!(obstacles(&Ground { floors, n_y: 3 }, 2), [true, true, true, false, true, false]);
+        assert_eq!(obstacles(&Ground::of(floors, 3), 2), [true, true, true, false, true, false]);
     }
 }

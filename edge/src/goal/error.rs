@@ -1,6 +1,7 @@
 //! Why a request has no reply.
 
 use crate::query::{QueryError, RequestError};
+use crate::score::{OverBudget, ScoreError};
 
 /// Why a request has no reply.
 #[derive(Debug, thiserror::Error)]
@@ -27,6 +28,10 @@ impl From<RequestError> for GoalError {
 }
 
 impl GoalError {
+    pub(super) fn spent(error: OverBudget) -> Self {
+        Self::Query(ScoreError::from(error).into())
+    }
+
     /// Returns the stable name of the error's kind, for programs.
     pub fn kind(&self) -> &'static str {
         match self {

@@ -37,21 +37,26 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
             return Ok(reply);
         }
     };
-    let seen = Surroundings::look(&snapshot, request, near)?;
+    let seen = Surroundings::look(&snapshot, request, near, budget)?;
     let voxel = seen.space.window.voxel;
     let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, voxel, near);
     let Some(start) = seen.start(near, request.radius_m) else {
         let detail = format!(
-            "within {START_M} m of [{:.2}, {:.2}], where the robot is taken to be, no known ground is {} m clear",
-            near.x, near.y, request.radius_m
+            "within {START_M} m of [{:.2}, {:.2}, {:.2}], where the robot is taken to be, no known ground at that height is {} m \
+             clear",
+            near.x, near.y, near.z, request.radius_m
         );
         reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });
         return Ok(reply);
     };
     let mut around = seen.around(start);
     for (id, thing) in things {
-        let points = engine.object_points(&snapshot, id, MAX_POINTS);
-        match choose(&mut around, request, &points) {
+        let points = engine.object_points(&snapshot, id, MAX_POINTS, budget);
+        budget.check().map_err(GoalError::spent)?;
+        let chosen = choose(&mut around, request, &points);
+        // What looks end early for.
+        budget.check().map_err(GoalError::spent)?;
+        match chosen {
             Ok(mut goals) => {
                 for goal in &mut goals {
                     goal.geographic =
@@ -97,7 +102,7 @@ fn things(
 ) -> Result<Result<Things, String>, GoalError> {
     let text = match &request.target {
         GoalTarget::Object(id) => {
-            let Some(object) = engine.object(snapshot, *id) else {
+            let Some(object) = engine.object(snapshot, *id, budget)? else {
                 let generation = snapshot.manifest.generation;
                 return Ok(Err(format!("generation {generation} has no object {} on board", public_id(*id))));
             };

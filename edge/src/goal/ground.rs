@@ -1,4 +1,4 @@
-//! The ground: in each column of voxels the lowest surface with headroom.
+//! The ground: from the surface that the robot stands on, in each column of voxels the surface that continues it.
 
 use rayon::prelude::*;
 use slag_common::occupancy::BLOCK_EDGE;
@@ -29,9 +29,19 @@ pub struct Ground {
     pub floors: Vec<Floor>,
     /// Cells along y.
     pub n_y: usize,
+    /// `[n_x][n_y]`: surfaces with headroom; bit z is the surface whose highest voxel is z.
+    surfaces: Vec<u128>,
 }
 
+/// Half the way over which a slope is measured, metres.
+const SLOPE_REACH_M: f64 = 0.5;
+
 impl Ground {
+    #[cfg(test)]
+    pub fn of(floors: Vec<Floor>, n_y: usize) -> Self {
+        Self { surfaces: vec![0; floors.len()], floors, n_y }
+    }
+
     /// Finds the ground. `headroom`: free voxels that must lie above, 1 to 128. Columns without ground are obstacles where their
     /// lowest surface is higher than a `step`, in voxels, or another one lies within the headroom above it: what is higher, such
     /// as a ceiling, is in no robot's way.
@@ -40,21 +50,104 @@ impl Ground {
         let [n_columns_x, n_columns_y] = space.window.n;
         let n_y = n_columns_y * edge;
         let mut floors = vec![Floor::Unknown; n_columns_x * edge * n_y];
+        let mut surfaces = vec![0u128; floors.len()];
         // A piece for each x of the columns: four rows of cells.
-        floors.par_chunks_mut(edge * n_y).enumerate().for_each(|(x, rows)| {
-            let mut last = (0, 0, Floor::Unknown);
+        let rows = floors.par_chunks_mut(edge * n_y).zip(surfaces.par_chunks_mut(edge * n_y));
+        rows.enumerate().for_each(|(x, (rows, of_rows))| {
+            let mut last = (0, 0, (Floor::Unknown, 0));
             for y in 0..n_columns_y {
                 let voxels = voxels_of(space.column(x * n_columns_y + y));
                 for (cell, [occupied, free]) in voxels.into_iter().enumerate() {
                     // Most columns of voxels are as the one before.
                     if (occupied ^ last.0) | (free ^ last.1) != 0 {
-                        last = (occupied, free, floor(occupied, free, headroom, step));
+                        let surfaces = surfaces_of(occupied, free, headroom);
+                        last = (occupied, free, (floor(occupied, surfaces, headroom, step), surfaces));
                     }
-                    rows[cell / edge * n_y + y * edge + cell % edge] = last.2;
+                    let at = cell / edge * n_y + y * edge + cell % edge;
+                    (rows[at], of_rows[at]) = last.2;
                 }
             }
         });
-        Self { floors, n_y }
+        Self { floors, n_y, surfaces }
+    }
+
+    /// Returns the highest surface of a cell that is at most at this height.
+    pub fn surface_below(&self, cell: usize, height: i32) -> Option<u8> {
+        let n = u32::try_from(height.checked_add(1)?).ok()?;
+        let below = self.surfaces[cell] & low_bits(n.min(128));
+        below.checked_ilog2().map(|z| z as u8)
+    }
+
+    /// Continues a surface from a cell: whatever a robot that climbs `step` voxels gets to over neighbours is ground at that
+    /// height, even if the column has a lower surface, such as the furniture of the storey below.
+    /// Returns which cells.
+    pub fn continue_from(&mut self, cell: usize, z: u8, step: u8) -> Vec<bool> {
+        let (n_y, n) = (self.n_y, self.floors.len());
+        let mut is_met = vec![false; n];
+        (self.floors[cell], is_met[cell]) = (Floor::At(z), true);
+        let mut border = std::collections::VecDeque::from([(cell, z)]);
+        while let Some((cell, z)) = border.pop_front() {
+            let y = cell % n_y;
+            let beside = [
+                cell.checked_sub(n_y),
+                Some(cell + n_y).filter(|to| *to < n),
+                cell.checked_sub(1).filter(|_| y > 0),
+                Some(cell + 1).filter(|_| y + 1 < n_y),
+            ];
+            for to in beside.into_iter().flatten() {
+                // If this neighbour is too high or too low for it, another may be near enough.
+                if let Some(z) = self.nearest_surface(to, z, step).filter(|_| !is_met[to]) {
+                    (self.floors[to], is_met[to]) = (Floor::At(z), true);
+                    border.push_back((to, z));
+                }
+            }
+        }
+        is_met
+    }
+
+    /// Returns the surface of a cell that is nearest to a height, at most a step away; of two the lower one.
+    fn nearest_surface(&self, cell: usize, z: u8, step: u8) -> Option<u8> {
+        let surfaces = self.surfaces[cell];
+        let has = |z: Option<u8>| z.filter(|z| *z < 128 && surfaces >> z & 1 == 1);
+        (0..=step).find_map(|d| has(z.checked_sub(d)).or_else(|| has(z.checked_add(d))))
+    }
+
+    /// Makes ground that is too steep for the robot an obstacle: where the ground rises or falls along a line by more than
+    /// `slope` times its length and a step besides, over at most a metre. Lines end at higher steps.
+    pub fn block_slopes(&mut self, slope: f64, step: u8, voxel: f64) {
+        let (n_y, floors) = (self.n_y, &self.floors);
+        let n_x = floors.len() / n_y.max(1);
+        let reach = (SLOPE_REACH_M / voxel).round().max(1.0) as usize;
+        let height = |x: usize, y: usize| match floors[x * n_y + y] {
+            Floor::At(z) => Some(i32::from(z)),
+            _ => None,
+        };
+        // The cells along a line and the height at its end.
+        let walk = |x: usize, y: usize, z: i32, (dx, dy): (isize, isize)| {
+            let mut end = (0usize, z);
+            for n in 1..=reach {
+                let to = |at: usize, d: isize| at.checked_add_signed(d * n as isize);
+                let (Some(x), Some(y)) = (to(x, dx), to(y, dy)) else { break };
+                let next = if x < n_x && y < n_y { height(x, y) } else { None };
+                let Some(next) = next.filter(|next| next.abs_diff(end.1) <= u32::from(step)) else { break };
+                end = (n, next);
+            }
+            end
+        };
+        let is_steep = |cell: usize| {
+            let (x, y) = (cell / n_y, cell % n_y);
+            let Some(z) = height(x, y) else { return false };
+            [(1, 0), (0, 1), (1, 1), (1, -1)].into_iter().any(|(dx, dy)| {
+                let (ahead, behind) = (walk(x, y, z, (dx, dy)), walk(x, y, z, (-dx, -dy)));
+                let diagonal = if dx * dy == 0 { 1.0 } else { std::f64::consts::SQRT_2 };
+                let allowed = slope * diagonal * (ahead.0 + behind.0) as f64 + f64::from(step);
+                f64::from(ahead.1.abs_diff(behind.1)) > allowed
+            })
+        };
+        let steep: Vec<bool> = (0..floors.len()).into_par_iter().map(is_steep).collect();
+        for (floor, _) in self.floors.iter_mut().zip(steep).filter(|(_, steep)| *steep) {
+            *floor = Floor::Blocked;
+        }
     }
 }
 
@@ -89,17 +182,26 @@ fn low_bits(n: u32) -> u128 {
     1u128.checked_shl(n).map_or(!0, |bit| bit - 1)
 }
 
-fn floor(occupied: u128, free: u128, headroom: u32, step: u32) -> Floor {
-    if occupied == 0 {
-        return Floor::Unknown;
-    }
-    let mut tops = occupied & !(occupied >> 1);
+/// Returns the surfaces with headroom above.
+fn surfaces_of(occupied: u128, free: u128, headroom: u32) -> u128 {
+    let (mut surfaces, mut tops) = (0, occupied & !(occupied >> 1));
     while tops != 0 {
         let z = tops.trailing_zeros();
         if !(free >> z >> 1) & low_bits(headroom) == 0 {
-            return Floor::At(z as u8);
+            surfaces |= 1 << z;
         }
         tops &= tops - 1;
+    }
+    surfaces
+}
+
+/// Returns the lowest surface, or whether a column without one is in the way.
+fn floor(occupied: u128, surfaces: u128, headroom: u32, step: u32) -> Floor {
+    if occupied == 0 {
+        return Floor::Unknown;
+    }
+    if surfaces != 0 {
+        return Floor::At(surfaces.trailing_zeros() as u8);
     }
     let from_lowest = occupied >> occupied.trailing_zeros();
     let thickness = from_lowest.trailing_ones();
@@ -112,6 +214,10 @@ mod tests {
     use slag_math::random::Random;
 
     use super::*;
+
+    fn floor(occupied: u128, free: u128, headroom: u32, step: u32) -> Floor {
+        super::floor(occupied, surfaces_of(occupied, free, headroom), headroom, step)
+    }
 
     /// Oracle: the definition, voxel by voxel.
     #[test]
@@ -154,5 +260,36 @@ mod tests {
         assert_eq!(floor(0b11111 << 3, 0, 10, 2), Floor::Blocked);
         assert_eq!(floor(!0, 0, 128, 100), Floor::Blocked);
         assert_eq!(floor(1 | 1 << 127, 0, 128, 1), Floor::Blocked);
+    }
+
+    /// By hand: a row of cells with a floor at 5 and, in the third, a surface at 1 below it, such as a table of the storey below.
+    #[test]
+    fn ground_continues_at_the_robots_height() {
+        let mut ground = Ground {
+            floors: vec![Floor::At(5), Floor::At(5), Floor::At(1), Floor::At(6), Floor::At(9)],
+            n_y: 5,
+            surfaces: vec![1 << 5, 1 << 5, 1 << 1 | 1 << 5, 1 << 6, 1 << 9],
+        };
+        assert_eq!([3, 5, 200].map(|z| ground.surface_below(2, z)), [Some(1), Some(5), Some(5)]);
+        assert_eq!(ground.surface_below(2, -1), None);
+        ground.continue_from(0, 5, 1);
+        assert_eq!(ground.floors, [5, 5, 5, 6, 9].map(Floor::At));
+    }
+
+    /// By hand: rows that rise by a voxel each cell, each second, each third; a wall beside a floor is no slope.
+    #[test]
+    fn slopes_are_measured_over_their_length() {
+        let blocked = |heights: &[u8], slope: f64| {
+            let floors: Vec<Floor> = heights.iter().map(|z| Floor::At(*z)).collect();
+            let mut ground = Ground { n_y: floors.len(), surfaces: vec![0; floors.len()], floors };
+            ground.block_slopes(slope, 1, 0.05);
+            ground.floors.iter().filter(|floor| **floor == Floor::Blocked).count()
+        };
+        let rising = |run: u8| (0..30).map(|i| i / run).collect::<Vec<u8>>();
+        assert!(blocked(&rising(1), 0.5) > 25, "45 degrees");
+        assert_eq!([blocked(&rising(2), 0.55), blocked(&rising(3), 0.5)], [0, 0]);
+        assert!(blocked(&rising(2), 0.3) > 20);
+        let wall: Vec<u8> = [vec![0; 15], vec![20; 15]].concat();
+        assert_eq!(blocked(&wall, 0.1), 0);
     }
 }

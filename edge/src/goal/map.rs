@@ -10,6 +10,7 @@ use super::paths::Paths;
 use super::request::GoalRequest;
 use super::surroundings::Surroundings;
 use crate::query::Engine;
+use crate::score::Budget;
 
 /// What a cell of a floor map is to a robot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,17 +42,18 @@ pub struct FloorMap {
 ///
 /// # Errors
 /// [`GoalError`].
-pub fn floor_map(engine: &Engine, request: &GoalRequest) -> Result<FloorMap, GoalError> {
+pub fn floor_map(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<FloorMap, GoalError> {
     request.check()?;
     let snapshot = engine.snapshot()?;
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
-    let seen = Surroundings::look(&snapshot, request, near)?;
+    let seen = Surroundings::look(&snapshot, request, near, budget)?;
     let start = seen.start(near, request.radius_m);
     let paths = start.map(|start| {
         let mut paths = Paths::from(start, &seen.is_safe, &seen.ground, seen.step);
         paths.find(0..seen.is_safe.len());
         paths
     });
+    budget.check().map_err(GoalError::spent)?;
     let window = &seen.space.window;
     let [n_x, n_y] = window.cells();
     let place = |x: usize, y: usize| {

@@ -170,7 +170,7 @@ mod tests {
                 let floors: Vec<Floor> = (0..n).map(|_| Floor::At(random.below(4u8))).collect();
                 let is_safe: Vec<bool> = (0..n).map(|_| random.unit() < 0.8).collect();
                 let Some(start) = is_safe.iter().position(|safe| *safe) else { continue };
-                let ground = Ground { floors: floors.clone(), n_y };
+                let ground = Ground::of(floors.clone(), n_y);
                 let mut found = Paths::from(start, &is_safe, &ground, 1);
                 let mut expected = vec![f64::INFINITY; n];
                 expected[start] = 0.0;

@@ -14,6 +14,8 @@ pub const SENSOR_HEIGHT_M: [f64; 2] = [0.05, 2.3];
 pub const HEIGHT_M: [f64; 2] = [0.05, 2.4];
 /// Least and largest step.
 pub const STEP_M: [f64; 2] = [0.0, 0.5];
+/// Least and largest slope.
+pub const SLOPE: [f64; 2] = [0.02, 5.0];
 /// Least and largest range.
 pub const RANGE_M: [f64; 2] = [1.0, 50.0];
 /// Least and largest share that must be visible.
@@ -47,6 +49,8 @@ pub struct GoalRequest {
     pub height_m: Option<f64>,
     /// Highest step that it climbs.
     pub step_m: f64,
+    /// Steepest ground that it drives on, rise for each metre of way; a step is allowed besides.
+    pub slope: f64,
     /// How far around the robot ground is looked at.
     pub range_m: f64,
     /// Least share of the thing's Gaussians that the sensor must see.
@@ -66,6 +70,7 @@ impl GoalRequest {
             sensor_height_m: 0.4,
             height_m: None,
             step_m: 0.1,
+            slope: 0.5,
             range_m: 20.0,
             min_visible: 0.02,
             limit: 3,
@@ -88,6 +93,7 @@ impl GoalRequest {
             ("sensor_height_m", self.sensor_height_m, SENSOR_HEIGHT_M),
             ("height_m", self.height(), [self.sensor_height_m, HEIGHT_M[1]]),
             ("step_m", self.step_m, STEP_M),
+            ("slope", self.slope, SLOPE),
             ("range_m", self.range_m, RANGE_M),
             ("min_visible", self.min_visible, MIN_VISIBLE),
         ];

@@ -247,6 +247,7 @@ mod tests {
 
     use super::*;
     use crate::goal::space::Window;
+    use crate::score::Budget;
 
     /// Oracle: the states of two shards' voxels, and every point beside every voxel, at hand or not.
     #[test]
@@ -261,7 +262,7 @@ mod tests {
         };
         let packed = [false, true].map(|odd| BuiltOccupancy::pack(0.1, 0.1, 2, &of_shard(odd)));
         let shards = [packed[0].view(), packed[1].view()];
-        let space = Space::gather(window, &shards).expect("few blocks");
+        let space = Space::gather(window, &shards, &Budget::default()).expect("few blocks");
         let n = window.cells().map(|n| n as i32);
         // Also a thing that reaches out of the window.
         for (centre, reach_m) in [(0.0, 0.0), (0.2, 0.3), (-1.2, 0.2), (0.0, 9.0)] {
@@ -294,7 +295,7 @@ mod tests {
         let mut mostly_free = || (0..4).fold(0, |free, _| free | random.bits());
         let blocks: Vec<Block> = all.map(|at| Block { at, occupied: 0, free: mostly_free() }).collect();
         let packed = BuiltOccupancy::pack(0.1, 0.1, 2, &blocks);
-        let space = Space::gather(window, &[packed.view()]).expect("few blocks");
+        let space = Space::gather(window, &[packed.view()], &Budget::default()).expect("few blocks");
         let (mut n_seen, mut n_hidden, mut n_at_once) = (0, 0, 0);
         for _ in 0..40 {
             let mut somewhere = |far: f64| DVec3::from([0; 3].map(|_| random.between(-far, far)));

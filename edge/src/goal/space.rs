@@ -3,6 +3,8 @@
 use glam::DVec3;
 use slag_common::occupancy::{BLOCK_EDGE, Occupancy};
 
+use crate::score::Budget;
+
 /// Blocks of a column at most: its voxels are the bits of a `u128`.
 pub const COLUMN_BLOCKS: i32 = 32;
 /// How far below the robot ground may lie, metres.
@@ -93,8 +95,8 @@ pub struct Space {
 impl Space {
     /// Gathers the blocks of a window from the shards' occupancies; those with voxels of another size are left out.
     ///
-    /// Returns `None` if they are more than 8 million.
-    pub fn gather(window: Window, occupancies: &[Occupancy<'_>]) -> Option<Self> {
+    /// Returns `None` if they are more than 8 million, or the budget is spent.
+    pub fn gather(window: Window, occupancies: &[Occupancy<'_>], budget: &Budget) -> Option<Self> {
         let of_lattice = || occupancies.iter().filter(|of| of.header.voxel == window.voxel);
         let n_columns = window.n[0] * window.n[1];
         let mut starts = vec![0u32; n_columns + 1];
@@ -106,7 +108,7 @@ impl Space {
                 n_blocks <= MAX_BLOCKS
             });
         }
-        if n_blocks > MAX_BLOCKS {
+        if n_blocks > MAX_BLOCKS || !budget.take(n_blocks * size_of::<Stacked>()) {
             return None;
         }
         (0..n_columns).for_each(|column| starts[column + 1] += starts[column]);

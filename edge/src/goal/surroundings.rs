@@ -10,6 +10,7 @@ use super::paths::Paths;
 use super::request::GoalRequest;
 use super::space::{Space, Window};
 use crate::query::RequestError;
+use crate::score::Budget;
 use crate::store::Snapshot;
 
 /// Farthest place, metres, from which the way may begin where the robot's own place is not known to be free.
@@ -17,18 +18,29 @@ pub const START_M: f64 = 0.5;
 /// Most cells of a map: 50 m around the robot in voxels of 5 cm, and some 100 MB.
 const MAX_CELLS: f64 = 4.2e6;
 
+/// Most height of what the request says of the robot above the ground that it stands on, metres: its sensor's, say.
+const MAX_HEIGHT_M: f64 = 1.5;
+/// Bytes for a cell, in all steps together.
+const CELL_BYTES: usize = 36;
+
 /// What is known of the places around a robot.
 pub struct Around<'a> {
     pub space: &'a Space,
     pub ground: &'a Ground,
     pub paths: Paths,
     clearance: &'a Clearance,
+    budget: &'a Budget,
 }
 
 impl Around<'_> {
     /// Returns the distance of a cell to the nearest obstacle, metres.
     pub fn clearance(&self, cell: usize) -> f64 {
         f64::from(self.clearance.squared(cell)).sqrt() * self.space.window.voxel
+    }
+
+    /// Returns whether the budget lasts.
+    pub fn goes_on(&self) -> bool {
+        self.budget.goes_on()
     }
 
     /// Returns the height of the ground of a cell, world frame.
@@ -44,33 +56,73 @@ impl Around<'_> {
 }
 
 /// The ground, and what the robot must keep clear of.
-pub(super) struct Surroundings {
+pub(super) struct Surroundings<'a> {
     pub(super) space: Space,
     pub(super) ground: Ground,
+    /// By cell: whether its ground continues the surface that the robot stands on.
+    is_continued: Vec<bool>,
     pub(super) clearance: Clearance,
     pub(super) is_safe: Vec<bool>,
     /// Highest step, voxels.
     pub(super) step: u8,
+    budget: &'a Budget,
 }
 
-impl Surroundings {
-    /// Looks at the places around a robot.
+/// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`] away. If the request
+/// says where the robot is, its height counts: a table top above it is none, nor is the floor of the storey below.
+fn own_surface(window: &Window, ground: &Ground, request: &GoalRequest, near: DVec3) -> Option<(usize, u8)> {
+    let height = |offset: f64| window.voxel_of(near + DVec3::Z * offset)[2];
+    let highest = height(request.step_m + SURFACE_DEPTH * window.voxel) - 1;
+    let lowest = height(-MAX_HEIGHT_M) - 1;
+    let surface = |cell: usize| match (request.near, ground.floors[cell]) {
+        (Some(_), _) => ground.surface_below(cell, highest).filter(|z| i32::from(*z) >= lowest),
+        (None, Floor::At(z)) => Some(z),
+        (None, _) => None,
+    };
+    let found = cells_within(window, near, START_M)
+        .filter_map(|(cell, distance)| Some((cell, distance, surface(cell)?)));
+    let nearest = found.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
+    nearest.map(|(cell, _, z)| (cell, z))
+}
+
+/// Returns the cells with their middle about this near to a point, seen from above, and their distances.
+fn cells_within(window: &Window, near: DVec3, reach: f64) -> impl Iterator<Item = (usize, f64)> {
+    let n = (reach / window.voxel).ceil() as i32;
+    let around =
+        (-n..=n).flat_map(move |x| (-n..=n).map(move |y| DVec3::new(f64::from(x), f64::from(y), 0.0)));
+    let cells = around.filter_map(move |offset| window.cell_of(near + offset * window.voxel));
+    let with_distance = cells.map(move |cell| {
+        let [x, y] = window.centre_of(cell);
+        (cell, (x - near.x).hypot(y - near.y))
+    });
+    with_distance.filter(move |(_, distance)| *distance <= reach + window.voxel)
+}
+
+impl<'a> Surroundings<'a> {
+    /// Looks at the places around a robot, which is at the request's `near`, or `centre` without one.
     ///
     /// # Errors
-    /// [`GoalError::NoOccupancy`]; a range with too many places.
-    pub(super) fn look(snapshot: &Snapshot, request: &GoalRequest, near: DVec3) -> Result<Self, GoalError> {
+    /// [`GoalError::NoOccupancy`]; a range with too many places; a step that the voxels do not tell from none; the budget.
+    pub(super) fn look(
+        snapshot: &Snapshot,
+        request: &GoalRequest,
+        centre: DVec3,
+        budget: &'a Budget,
+    ) -> Result<Self, GoalError> {
         let occupancies: Vec<Occupancy<'_>> =
             snapshot.shards.iter().filter_map(|shard| shard.occupancy()).collect();
-        Self::of(&occupancies, request, near)
+        Self::of(&occupancies, request, centre, budget)
     }
 
     /// Looks at the places of some occupancies, as [`Self::look`] does.
     pub(super) fn of(
         occupancies: &[Occupancy<'_>],
         request: &GoalRequest,
-        near: DVec3,
+        centre: DVec3,
+        budget: &'a Budget,
     ) -> Result<Self, GoalError> {
         let voxel = occupancies.first().ok_or(GoalError::NoOccupancy)?.header.voxel;
+        let near = request.near.unwrap_or(centre);
         let most_m = MAX_CELLS.sqrt() / 2.0 * voxel;
         let too_far = |most: String| RequestError::new("range_m", &request.range_m.to_string(), most);
         if request.range_m > most_m {
@@ -78,41 +130,53 @@ impl Surroundings {
                 too_far(format!("at most {most_m:.1}, as the scene's voxels are {voxel} m wide")).into()
             );
         }
+        // Heights of surfaces are known to half a voxel, so a difference of n voxels may be n and a half high, and level ground
+        // may differ by one.
+        let least_m = 1.5 * voxel;
+        if request.step_m < least_m - 1e-9 {
+            let expected = format!(
+                "at least {least_m:.3}, as the scene's voxels are {voxel} m high and smaller steps do not show in them"
+            );
+            return Err(RequestError::new("step_m", &request.step_m.to_string(), expected).into());
+        }
+        let step = (request.step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
         let window = Window::around(near, request.range_m, voxel);
-        let space = Space::gather(window, occupancies)
+        budget.take(window.cells().iter().product::<usize>() * CELL_BYTES);
+        budget.check().map_err(GoalError::spent)?;
+        let gathered = Space::gather(window, occupancies, budget);
+        budget.check().map_err(GoalError::spent)?;
+        let space = gathered
             .ok_or_else(|| too_far("a smaller range: there are more than 8 million blocks".into()))?;
         // A column has 128 voxels, so no higher robot has headroom.
         let headroom = (request.height() / voxel).ceil().clamp(1.0, 128.0) as u32;
-        // Heights of surfaces are known to half a voxel, so a difference of n voxels may be n and a half high.
-        let step = (request.step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
-        let ground = Ground::find(&space, headroom, u32::from(step));
+        let mut ground = Ground::find(&space, headroom, u32::from(step));
+        let is_continued = match own_surface(&space.window, &ground, request, near) {
+            Some((cell, z)) => ground.continue_from(cell, z, step),
+            None => vec![false; ground.floors.len()],
+        };
+        ground.block_slopes(request.slope, step, voxel);
+        budget.check().map_err(GoalError::spent)?;
         let obstacles = clearance::obstacles(&ground, step);
         let clearance = Clearance::new(&obstacles, ground.n_y);
         let least = (request.radius_m / voxel).powi(2).ceil() as u32;
         let is_safe = clearance.at_least(least.max(1));
-        Ok(Self { space, ground, clearance, is_safe, step })
+        budget.check().map_err(GoalError::spent)?;
+        Ok(Self { space, ground, is_continued, clearance, is_safe, step, budget })
     }
 
     /// Begins the ways from a safe cell.
     pub(super) fn around(&self, start: usize) -> Around<'_> {
         let paths = Paths::from(start, &self.is_safe, &self.ground, self.step);
-        Around { space: &self.space, ground: &self.ground, paths, clearance: &self.clearance }
+        let (space, ground, clearance) = (&self.space, &self.ground, &self.clearance);
+        Around { space, ground, paths, clearance, budget: self.budget }
     }
 
-    /// Returns the safe cell nearest to the robot, at most [`START_M`] or its radius away.
+    /// Returns the safe cell nearest to the robot on the ground that it stands on, at most [`START_M`] or its radius away.
     pub(super) fn start(&self, near: DVec3, radius_m: f64) -> Option<usize> {
-        let window = &self.space.window;
-        let distance = |cell: usize| {
-            let [x, y] = window.centre_of(cell);
-            (x - near.x).hypot(y - near.y)
-        };
-        let reach = START_M.max(radius_m);
-        let n = (reach / window.voxel).ceil() as i32;
-        let around =
-            (-n..=n).flat_map(|x| (-n..=n).map(move |y| DVec3::new(f64::from(x), f64::from(y), 0.0)));
-        let cells = around.filter_map(|offset| window.cell_of(near + offset * window.voxel));
-        cells
-            .filter(|cell| self.is_safe[*cell] && distance(*cell) <= reach + window.voxel)
-            .min_by(|a, b| distance(*a).total_cmp(&distance(*b)).then(a.cmp(b)))
+        let cells = cells_within(&self.space.window, near, START_M.max(radius_m));
+        let nearest = cells
+            .filter(|(cell, _)| self.is_safe[*cell] && self.is_continued[*cell])
+            .min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
+        nearest.map(|(cell, _)| cell)
     }
 }

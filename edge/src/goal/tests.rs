@@ -1,9 +1,12 @@
+use std::time::Duration;
+
 use glam::DVec3;
 use slag_common::occupancy::{Block, BuiltOccupancy};
 
 use super::choose::choose;
 use super::surroundings::Surroundings;
 use super::*;
+use crate::score::{Budget, Pool};
 
 const VOXEL: f64 = 0.05;
 
@@ -17,12 +20,20 @@ enum At {
 
 /// Packs a world of 6 by 6 by 1.6 m: the state of a voxel is that of its centre.
 fn packed(world: impl Fn(DVec3) -> At) -> BuiltOccupancy {
+    packed_in(VOXEL, -0.4, world)
+}
+
+/// Packs it in voxels of another size, from a lower corner on.
+fn packed_in(voxel_m: f64, low: f64, world: impl Fn(DVec3) -> At) -> BuiltOccupancy {
     let mut blocks = Vec::new();
-    for at in (-2..32).flat_map(|x| (-2..32).flat_map(move |y| (-2..8).map(move |z| [x, y, z]))) {
+    let block = |metres: f64| (metres / (4.0 * voxel_m)).round() as i32;
+    let (sides, heights) = (block(-0.4)..block(6.4), block(low)..block(1.6));
+    let columns = sides.clone().flat_map(|x| sides.clone().map(move |y| [x, y]));
+    for at in columns.flat_map(|[x, y]| heights.clone().map(move |z| [x, y, z])) {
         let mut block = Block { at, occupied: 0, free: 0 };
         for bit in 0..64i32 {
             let voxel = [4 * at[0] + bit / 16, 4 * at[1] + bit / 4 % 4, 4 * at[2] + bit % 4];
-            match world((DVec3::from(voxel.map(f64::from)) + 0.5) * VOXEL) {
+            match world((DVec3::from(voxel.map(f64::from)) + 0.5) * voxel_m) {
                 At::Free => block.free |= 1 << bit,
                 At::Solid => block.occupied |= 1 << bit,
                 At::Unseen => {}
@@ -30,7 +41,7 @@ fn packed(world: impl Fn(DVec3) -> At) -> BuiltOccupancy {
         }
         blocks.push(block);
     }
-    BuiltOccupancy::pack(VOXEL, 0.1, 2, &blocks)
+    BuiltOccupancy::pack(voxel_m, 0.1, 2, &blocks)
 }
 
 fn inside(point: DVec3, low: [f64; 3], high: [f64; 3]) -> bool {
@@ -64,7 +75,8 @@ fn stand(
     near: DVec3,
     points: &[DVec3],
 ) -> Result<Vec<Goal>, NoGoal> {
-    let seen = Surroundings::of(&[world.view()], request, near).expect("places are known");
+    let (request, budget) = (&GoalRequest { near: Some(near), ..request.clone() }, Budget::default());
+    let seen = Surroundings::of(&[world.view()], request, near, &budget).expect("places are known");
     let start = seen.start(near, request.radius_m).ok_or(NoGoal::UnknownGround)?;
     choose(&mut seen.around(start), request, points)
 }
@@ -268,6 +280,93 @@ fn tables_are_driven_under_or_around() {
     assert_eq!(goals_with(&world, &high), Err(NoGoal::Unreachable));
 }
 
+/// The robot is told to be a little inside a coffee table, by its edge: its top is ground with room above, and nearer than the
+/// floor, but the robot's height is that of the floor.
+#[test]
+fn the_robots_height_decides_where_it_stands() {
+    let table = |p: DVec3| inside(p, [1.0, 2.4, 0.0], [1.9, 3.6, 0.35]).then_some(At::Solid);
+    let world = packed(hall(table));
+    let request = GoalRequest::new(GoalTarget::Object(1));
+    let poses = |z: f64| stand(&world, &request, DVec3::new(1.1, 3.0, z), &points());
+    for goal in poses(0.0).expect("from the floor beside it") {
+        assert!(goal.position_in_world.z.abs() < 0.1, "{goal:?}");
+    }
+    assert_eq!(poses(0.35), Err(NoGoal::Unreachable), "no way leads off the table");
+    let deep = stand(&world, &request, DVec3::new(1.45, 3.0, 0.0), &points());
+    assert_eq!(deep, Err(NoGoal::UnknownGround), "no floor is near enough");
+}
+
+/// A storey 2.8 m below, whose cupboards and tables are within the window.
+#[test]
+fn the_storey_below_is_not_the_ground() {
+    let upper = hall(|_| None);
+    let below = |p: DVec3| match () {
+        () if p.z < -2.9 || !inside(p, [0.0, 0.0, -9.0], [6.0, 6.0, 9.0]) => At::Unseen,
+        () if p.z < -2.8 || p.z > -0.3 => At::Solid,
+        () if inside(p, [1.5, 0.0, -2.8], [2.2, 6.0, -1.6]) => At::Solid,
+        () if inside(p, [2.4, 2.4, -2.8], [3.6, 3.6, -2.1]) => At::Solid,
+        () => At::Free,
+    };
+    let world = packed_in(VOXEL, -3.2, |p| if p.z < -0.1 { below(p) } else { upper(p) });
+    let request = GoalRequest { limit: 5, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let found = stand(&world, &request, START, &points()).expect("poses");
+    assert_eq!(Ok(found), goals(|_| None), "as without a storey below");
+    // From below, the cupboard is in the way; the thing itself is upstairs.
+    let found = stand(&world, &request, START.with_z(-2.8), &points());
+    assert!(found.is_err(), "{found:?}");
+}
+
+#[test]
+fn steep_ramps_are_not_driven() {
+    // A ridge across the hall, by its slope.
+    let ridge = |slope: f64| {
+        move |p: DVec3| (p.z < (0.9 - (p.x - 1.8).abs() * 1.0).max(0.0) * slope).then_some(At::Solid)
+    };
+    goals(ridge(0.3)).expect("over a gentle one");
+    assert_eq!(goals(ridge(1.0)), Err(NoGoal::Unreachable), "45 degrees");
+    let world = packed(hall(ridge(1.0)));
+    let able = GoalRequest { slope: 1.2, ..GoalRequest::new(GoalTarget::Object(1)) };
+    goals_with(&world, &able).expect("a robot that climbs");
+}
+
+/// What voxels cannot keep is refused: a step that does not show in them.
+#[test]
+fn steps_below_the_voxels_are_refused() {
+    let refused = |voxel: f64, step_m: f64| {
+        let world = packed_in(voxel, -4.0 * voxel, hall(|_| None));
+        let request = GoalRequest { step_m, ..GoalRequest::new(GoalTarget::Object(1)) };
+        let budget = Budget::default();
+        let seen = Surroundings::of(&[world.view()], &request, START, &budget);
+        seen.err().map(|error| error.to_string())
+    };
+    for (voxel, step_m) in [(0.05, 0.0), (0.05, 0.05), (0.05, 0.07), (0.1, 0.1), (0.5, 0.0), (0.5, 0.5)] {
+        let error = refused(voxel, step_m).expect("refused");
+        assert!(error.contains("step_m") && error.contains("at least"), "{voxel} {step_m}: {error}");
+    }
+    for (voxel, step_m) in [(0.05, 0.075), (0.05, 0.1), (0.1, 0.15)] {
+        assert_eq!(refused(voxel, step_m), None, "{voxel} {step_m}");
+    }
+    // In voxels of 10 cm the same hall has poses.
+    let world = packed_in(0.1, -0.4, hall(|_| None));
+    let request = GoalRequest { step_m: 0.15, ..GoalRequest::new(GoalTarget::Object(1)) };
+    goals_with(&world, &request).expect("poses");
+}
+
+/// Memory and time are checked before and while places are looked at.
+#[test]
+fn places_are_looked_at_within_a_budget() {
+    let world = packed(hall(|_| None));
+    let request = GoalRequest { near: Some(START), ..GoalRequest::new(GoalTarget::Object(1)) };
+    let pool = Pool::new(u64::MAX);
+    let look = |bytes: u64, time: Duration| {
+        let budget = Budget::new(bytes, time, &pool);
+        Surroundings::of(&[world.view()], &request, START, &budget).err().map(|error| error.kind())
+    };
+    let hour = Duration::from_secs(3600);
+    assert_eq!([look(1 << 20, hour), look(1 << 28, Duration::ZERO)], [Some("over-budget"); 2]);
+    assert_eq!((look(1 << 28, hour), pool.used_bytes()), (None, 0));
+}
+
 #[test]
 fn requests_out_of_range_name_the_parameter() {
     let refused = |change: &dyn Fn(&mut GoalRequest)| {
@@ -281,6 +380,7 @@ fn requests_out_of_range_name_the_parameter() {
     assert_eq!(refused(&|r| r.height_m = Some(0.2)), "height_m");
     assert_eq!(refused(&|r| r.sensor_height_m = 2.4), "sensor_height_m");
     assert_eq!(refused(&|r| r.step_m = -0.1), "step_m");
+    assert_eq!(refused(&|r| r.slope = 0.0), "slope");
     assert_eq!(refused(&|r| r.range_m = 51.0), "range_m");
     assert_eq!(refused(&|r| r.min_visible = 0.0), "min_visible");
     assert_eq!(refused(&|r| r.limit = 0), "limit");

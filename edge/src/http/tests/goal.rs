@@ -47,7 +47,7 @@ async fn poses_or_reasons_are_given() {
     let shards = room_with(Some(&places()));
     let service = Service::new(Some(&shards), Settings::default());
     // The mug on the floor is seen; that on the table is too high for the sensor, and is named as missed or comes second.
-    let (status, _, body) = service.get("/v1/goal?id=o0000000000000002&near=2,3,0").await;
+    let (status, _, body) = service.get("/v1/goal?id=o0000000000000002&near=2,3,0&step_m=0.15").await;
     assert_eq!(status, StatusCode::OK, "{body:#}");
     is_as_described("/v1/goal", &body);
     let goal = &body["goals"][0];
@@ -57,24 +57,25 @@ async fn poses_or_reasons_are_given() {
     assert!((0.3..0.9).contains(&distance), "{body:#}");
     let yaw = goal["yaw_rad"].as_f64().expect("a number");
     assert!((yaw - (0.45 - y).atan2(3.05 - x)).abs() < 0.2, "{body:#}");
-    let (_, _, high) = service.get("/v1/goal?id=o0000000000000001&near=2,3,0").await;
+    let (_, _, high) = service.get("/v1/goal?id=o0000000000000001&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &high);
     assert_eq!(
         (&high["none"]["kind"], high["goals"].as_array().map(Vec::len)),
         (&json!("not-visible"), Some(0))
     );
-    let (_, _, over) =
-        service.get("/v1/goal?id=o0000000000000001&near=2,3,0&sensor_height_m=1.2&reach_m=1").await;
+    let (_, _, over) = service
+        .get("/v1/goal?id=o0000000000000001&near=2,3,0&step_m=0.15&sensor_height_m=1.2&reach_m=1")
+        .await;
     assert!(over["goals"][0]["visible_share"].as_f64() > Some(0.1), "{over:#}");
     // By text: of both mugs the one that is seen.
-    let (_, _, text) = service.get("/v1/goal?text=0&near=2,3,0").await;
+    let (_, _, text) = service.get("/v1/goal?text=0&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &text);
     assert_eq!(text["thing"]["id"], "o0000000000000002", "{text:#}");
-    let (_, _, none) = service.get("/v1/goal?text=2&near=2,3,0").await;
+    let (_, _, none) = service.get("/v1/goal?text=2&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &none);
     assert_eq!(none["none"]["kind"], "no-such-thing", "{none:#}");
     // A robot beyond the known ground.
-    let (_, _, away) = service.get("/v1/goal?text=0&near=20,3,0").await;
+    let (_, _, away) = service.get("/v1/goal?text=0&near=20,3,0&step_m=0.15").await;
     assert_eq!(away["none"]["kind"], "unknown-ground", "{away:#}");
     let (status, _, body) = service.get("/v1/goal?near=2,3,0").await;
     assert_eq!((status, &body["parameter"]), (StatusCode::BAD_REQUEST, &json!("text")));
@@ -85,7 +86,7 @@ async fn poses_or_reasons_are_given() {
 async fn the_floor_is_mapped() {
     let shards = room_with(Some(&places()));
     let service = Service::new(Some(&shards), Settings::default());
-    let (_, _, body) = service.get("/v1/floor?near=2,3,0&range_m=6&radius_m=0.2").await;
+    let (_, _, body) = service.get("/v1/floor?near=2,3,0&step_m=0.15&range_m=6&radius_m=0.2").await;
     is_as_described("/v1/floor", &body);
     let runs = body["runs"].as_str().expect("text");
     let mut n = std::collections::BTreeMap::<char, usize>::new();
@@ -108,7 +109,7 @@ async fn the_floor_is_mapped() {
 #[tokio::test]
 async fn scenes_without_places_say_so() {
     let service = Service::new(Some(&room_with(None)), Settings::default());
-    for path in ["/v1/goal?text=0&near=2,3,0", "/v1/floor"] {
+    for path in ["/v1/goal?text=0&near=2,3,0&step_m=0.15", "/v1/floor"] {
         let (status, _, body) = service.get(path).await;
         assert_eq!(status, StatusCode::CONFLICT, "{body:#}");
         assert!(body["type"].as_str().is_some_and(|kind| kind.ends_with("no-occupancy")), "{body:#}");

@@ -16,8 +16,9 @@ use super::params::{self, Pairs, lat_lon, number};
 use crate::goal::{self, FloorMap, GoalError, GoalReply, GoalRequest, GoalTarget, Place, request};
 use crate::http::app::App;
 use crate::http::forms;
-use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
+use crate::http::problem::{parameter_problem, query_problem};
 use crate::query::{FRAME, Point, RequestError, object_id, parse_point};
+use crate::score::Budget;
 
 /// Returns the parameters of `/v1/goal`.
 pub fn parameters() -> Vec<Parameter> {
@@ -55,6 +56,13 @@ pub fn floor_parameters() -> Vec<Parameter> {
             .or(usual.sensor_height_m),
         length("height_m", "0.5", "height of the robot (default: 0.1 above the sensor)", request::HEIGHT_M),
         length("step_m", "0.1", "highest step that it climbs", request::STEP_M).or(usual.step_m),
+        Parameter::new::<f64>(
+            "slope",
+            "0.4",
+            "steepest ground that it drives on: rise for each metre of way",
+        )
+        .within(request::SLOPE[0], request::SLOPE[1])
+        .or(usual.slope),
         length("range_m", "20", "how far around it ground is looked at", request::RANGE_M).or(usual.range_m),
     ]
 }
@@ -75,7 +83,7 @@ pub async fn goal(
         let refused = RequestError::new("text", "nothing", "the thing to go to, or its id as id");
         return Err(parameter_problem(refused));
     }
-    answer(&app, near, request, |app, request| goal::find(&app.engine, request, &app.query_budget())).await
+    answer(&app, near, request, |app, request, budget| goal::find(&app.engine, request, budget)).await
 }
 
 pub async fn floor(
@@ -85,9 +93,9 @@ pub async fn floor(
     let pairs = params::pairs(pairs)?;
     params::check_names(&pairs, &floor_parameters()).map_err(parameter_problem)?;
     let (request, near) = parse(&pairs).map_err(parameter_problem)?;
-    answer(&app, near, request, |app, request| {
+    answer(&app, near, request, |app, request, budget| {
         let generation = app.engine.snapshot()?.manifest.generation;
-        Ok(Floor::new(generation, &goal::floor_map(&app.engine, request)?))
+        Ok(Floor::new(generation, &goal::floor_map(&app.engine, request, budget)?))
     })
     .await
 }
@@ -96,23 +104,18 @@ async fn answer<T: Send + 'static>(
     app: &Arc<App>,
     near: Option<Point>,
     mut request: GoalRequest,
-    work: impl FnOnce(&App, &GoalRequest) -> Result<T, GoalError> + Send + 'static,
+    work: impl FnOnce(&App, &GoalRequest, &Budget) -> Result<T, GoalError> + Send + 'static,
 ) -> Result<Json<T>, Problem> {
-    let limit = app.settings.query_timeout;
-    let permit =
-        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
-    let answering = app.blocking(move |app| {
-        let _permit = permit;
-        app.reload_if_stale();
+    let answering = app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
         let in_world = |near: Point| near.in_world("near", &snapshot.manifest);
         request.near = match near {
             Some(near) => Some(in_world(near).map_err(parameter_problem)?),
             None => app.last_position(&snapshot.manifest),
         };
-        work(app, &request).map(Json).map_err(problem)
+        work(app, &request, budget).map(Json).map_err(problem)
     });
-    tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))?
+    answering.await
 }
 
 fn problem(error: GoalError) -> Problem {
@@ -183,6 +186,7 @@ fn parse(pairs: &[(String, String)]) -> Result<(GoalRequest, Option<Point>), Req
             "sensor_height_m" => request.sensor_height_m = metres()?,
             "height_m" => request.height_m = Some(metres()?),
             "step_m" => request.step_m = metres()?,
+            "slope" => request.slope = metres()?,
             "range_m" => request.range_m = metres()?,
             "min_visible" => request.min_visible = metres()?,
             "limit" => request.limit = number(name, value, "a whole number")?,
