@@ -2,10 +2,12 @@
 
 use std::collections::HashMap;
 use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -16,6 +18,10 @@ use slag_models::{InferenceError, ModelDir, ModelError, SessionOptions, TextEnco
 pub const MAX_TEXT_BYTES: usize = 512;
 /// Texts that may wait for the encoder; at about 30 ms each, more would time out anyway.
 const MAX_WAITING: usize = 64;
+/// Pause before a text model that panicked is opened again, where that failed.
+const REOPEN_PAUSE: Duration = Duration::from_secs(1);
+/// Words that name nothing.
+const ARTICLES: [&str; 3] = ["the", "a", "an"];
 /// Cached vectors (2 MB at 512 components).
 const MAX_CACHED: usize = 1024;
 
@@ -29,7 +35,7 @@ pub enum TextError {
     #[error("{MAX_WAITING} texts are already waiting for the text model; ask again in a second")]
     Busy,
     /// The encoder's thread has stopped.
-    #[error("the text model has stopped; see the log and restart the program")]
+    #[error("the text model has stopped, and starts again by itself if it can; the log has the cause")]
     Stopped,
 }
 
@@ -69,8 +75,12 @@ pub struct TextService {
     jobs: Option<SyncSender<Job>>,
     thread: Option<JoinHandle<()>>,
     cache: Mutex<Cache>,
-    has_stopped: AtomicBool,
+    /// Whether the encoder runs: it has panicked otherwise, and was not opened again yet.
+    is_alive: Arc<AtomicBool>,
 }
+
+/// Opens the encoder again.
+type Reopen = Box<dyn FnMut() -> Result<Box<dyn TextEncoder>, ModelError> + Send>;
 
 impl TextService {
     /// Opens the text encoder of a model folder.
@@ -80,24 +90,36 @@ impl TextService {
         let id = models.encoder_id();
         let info =
             EncoderInfo { name: id.name.clone(), id: Hash32(id.hash()), dim: id.dim, execution_provider };
-        Ok(Self::start(info, encoder)?)
+        let (models, options) = (models.clone(), options.clone());
+        Ok(Self::start_with(info, encoder, Some(Box::new(move || models.text_encoder(&options))))?)
     }
 
-    /// Starts the thread that owns an encoder.
+    /// Starts the thread that owns an encoder, which cannot be opened again.
     ///
     /// # Errors
     /// The thread does not start.
     pub fn start(info: EncoderInfo, encoder: Box<dyn TextEncoder>) -> io::Result<Self> {
+        Self::start_with(info, encoder, None)
+    }
+
+    fn start_with(
+        info: EncoderInfo,
+        encoder: Box<dyn TextEncoder>,
+        reopen: Option<Reopen>,
+    ) -> io::Result<Self> {
         let (jobs, waiting) = sync_channel(MAX_WAITING);
         let vocabulary = encoder.vocabulary().unwrap_or_default().to_vec();
-        let thread = std::thread::Builder::new().name("text-model".into()).spawn(|| run(encoder, waiting))?;
+        let is_alive = Arc::new(AtomicBool::new(true));
+        let told = Arc::clone(&is_alive);
+        let run = move || run(encoder, reopen, &waiting, &told);
+        let thread = std::thread::Builder::new().name("text-model".into()).spawn(run)?;
         Ok(Self {
             info,
             vocabulary,
             jobs: Some(jobs),
             thread: Some(thread),
             cache: Mutex::default(),
-            has_stopped: AtomicBool::new(false),
+            is_alive,
         })
     }
 
@@ -111,19 +133,14 @@ impl TextService {
         &self.vocabulary
     }
 
-    /// Returns whether the encoder's thread has answered every request.
+    /// Returns whether the encoder runs.
     pub fn is_alive(&self) -> bool {
-        !self.has_stopped.load(Ordering::Relaxed)
-    }
-
-    fn stopped(&self) -> TextError {
-        self.has_stopped.store(true, Ordering::Relaxed);
-        TextError::Stopped
+        self.is_alive.load(Ordering::Relaxed)
     }
 
     /// Returns a text's vector, `[dim]`, unit length. Blocks while other texts are encoded.
     pub fn encode(&self, text: &str) -> Result<Arc<[f32]>, TextError> {
-        let key = text.split_whitespace().collect::<Vec<_>>().join(" ");
+        let key = words_of(text).ok_or(InferenceError::EmptyText)?;
         if let Some(vector) = self.cache().get(&key) {
             return Ok(vector);
         }
@@ -131,9 +148,9 @@ impl TextService {
         let jobs = self.jobs.as_ref().ok_or(TextError::Stopped)?;
         jobs.try_send(Job { text: key.clone(), reply }).map_err(|e| match e {
             TrySendError::Full(_) => TextError::Busy,
-            TrySendError::Disconnected(_) => self.stopped(),
+            TrySendError::Disconnected(_) => TextError::Stopped,
         })?;
-        let vector: Arc<[f32]> = answer.recv().map_err(|_| self.stopped())??.into();
+        let vector: Arc<[f32]> = answer.recv().map_err(|_| TextError::Stopped)??.into();
         self.cache().put(key, Arc::clone(&vector));
         Ok(vector)
     }
@@ -154,11 +171,59 @@ impl Drop for TextService {
     }
 }
 
-fn run(mut encoder: Box<dyn TextEncoder>, jobs: Receiver<Job>) {
-    for job in jobs {
-        // The asker may have given up meanwhile.
-        drop(job.reply.send(encoder.encode(&job.text)));
+/// Encodes texts until nobody can ask. An encoder that panics is opened again; until it is, `is_alive` says so and askers hear
+/// at once that it has stopped.
+fn run(
+    mut encoder: Box<dyn TextEncoder>,
+    mut reopen: Option<Reopen>,
+    jobs: &Receiver<Job>,
+    is_alive: &AtomicBool,
+) {
+    while let Ok(Job { text, reply }) = jobs.recv() {
+        // What a panic leaves half done is dropped with the encoder.
+        if let Ok(encoded) = catch_unwind(AssertUnwindSafe(|| encoder.encode(&text))) {
+            // The asker may have given up meanwhile.
+            drop(reply.send(encoded));
+            continue;
+        }
+        is_alive.store(false, Ordering::Relaxed);
+        tracing::error!("the text model panicked");
+        drop(reply);
+        let Some(reopen) = &mut reopen else { return };
+        encoder = loop {
+            match reopen() {
+                Ok(encoder) => break encoder,
+                Err(error) => tracing::error!("the text model does not open again: {error}"),
+            }
+            // Those who ask in the pause are refused when their jobs are dropped.
+            match jobs.recv_timeout(REOPEN_PAUSE) {
+                Ok(job) => drop(job),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return,
+            }
+        };
+        is_alive.store(true, Ordering::Relaxed);
     }
+}
+
+/// Returns the words of a text, with a space between them; `None` if no word is left. Articles alone are none, and signs
+/// around words count for nothing: emoji, quotation marks, question marks, invisible characters.
+fn words_of(text: &str) -> Option<String> {
+    let is_invisible = |c: &char| matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{2060}'..='\u{2064}' | '\u{fe00}'..='\u{fe0f}' | '\u{feff}');
+    let visible: String = text.chars().filter(|c| !is_invisible(c)).collect();
+    // A sign within a word, as in "t-shirt", belongs to it; emoji divide words.
+    let is_between = |c: char| c.is_whitespace() || !(c.is_ascii() || c.is_alphanumeric() || is_mark(c));
+    let words = visible
+        .split(is_between)
+        .map(|word| word.trim_matches(|c: char| !(c.is_alphanumeric() || is_mark(c))));
+    let words: Vec<&str> = words.filter(|word| !word.is_empty()).collect();
+    let is_article = |word: &&str| ARTICLES.iter().any(|article| word.eq_ignore_ascii_case(article));
+    (!words.iter().all(is_article)).then(|| words.join(" "))
+}
+
+/// Returns whether a character is a combining mark, or an apostrophe of typographers, and so part of a word.
+fn is_mark(c: char) -> bool {
+    matches!(c, '\u{300}'..='\u{36f}' | '\u{2019}')
 }
 
 /// The vectors of recent texts.
@@ -265,6 +330,39 @@ mod tests {
             (cosine(&chair, &chair) - 1.0).abs() < 1e-4 && cosine(&chair, &stool) > cosine(&chair, &tree)
         );
         assert_eq!(phrases.info().execution_provider, "none");
+    }
+
+    /// Signs beside words count for nothing; without words there is nothing to look for.
+    #[test]
+    fn only_words_count() {
+        let (service, n_encoded) = axes_service(3, Default::default());
+        for text in ["1", " 1 ?", "\"1\"", "1!!!", "🪑 1", "1🪑", "\u{200b}1\u{feff}", "(1)..", "1 %"] {
+            assert_eq!(*service.encode(text).expect(text), [0.0, 1.0, 0.0], "{text}");
+        }
+        assert_eq!(n_encoded.load(std::sync::atomic::Ordering::SeqCst), 1);
+        for text in ["", "?", "%", "..", "!!!", "\"", "🪑🪑", "\u{200b}", "the", "An ?", "a the"] {
+            let refused = service.encode(text);
+            assert!(matches!(refused, Err(TextError::Encode(InferenceError::EmptyText))), "{text}");
+        }
+        assert_eq!(words_of("a man’s T-shirt, size 3.5").as_deref(), Some("a man’s T-shirt size 3.5"));
+        assert_eq!(words_of("чашка на столе").as_deref(), Some("чашка на столе"));
+    }
+
+    /// A model that panics is opened again; meanwhile it is not alive.
+    #[test]
+    fn a_dead_model_is_opened_again() {
+        let (opens, opened) = sync_channel::<()>(2);
+        let reopen: Reopen = Box::new(move || {
+            // Only once it is told to.
+            opened.recv().expect("told");
+            Ok(Box::new(Axes::new(2)))
+        });
+        let encoder = Box::new(Axes::new(2));
+        let service = TextService::start_with(Axes::info(2), encoder, Some(reopen)).expect("a thread");
+        assert!(matches!(service.encode("panic"), Err(TextError::Stopped)));
+        assert!(!service.is_alive());
+        opens.send(()).expect("listens");
+        assert!(service.encode("1").is_ok() && service.is_alive());
     }
 
     /// A model that panics stops the service; every later call fails at once.

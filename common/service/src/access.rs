@@ -87,12 +87,14 @@ pub struct Access {
     hosts: Option<Vec<String>>,
     origins: Vec<String>,
     writes: Writes,
+    /// Paths that change nothing, whatever the method.
+    reads: Vec<&'static str>,
 }
 
 /// The checks of a service on a loopback address, without settings.
 impl Default for Access {
     fn default() -> Self {
-        Self { hosts: Some(Vec::new()), origins: Vec::new(), writes: Writes::All }
+        Self { hosts: Some(Vec::new()), origins: Vec::new(), writes: Writes::All, reads: Vec::new() }
     }
 }
 
@@ -124,13 +126,18 @@ impl Access {
         // A Unix socket has no name that could be rebound.
         let hosts = matches!(listen, Listen::Tcp(_))
             .then(|| settings.hosts.iter().map(|host| host.to_ascii_lowercase()).collect());
-        Ok(Self { hosts, origins, writes })
+        Ok(Self { hosts, origins, writes, reads: Vec::new() })
     }
 
     /// Lets clients call this machine by any name: for a service that holds nothing which a page could not fetch
     /// itself.
     pub fn with_any_host(self) -> Self {
         Self { hosts: None, ..self }
+    }
+
+    /// Admits requests to these paths as reads, whatever their method.
+    pub fn with_reads(self, reads: Vec<&'static str>) -> Self {
+        Self { reads, ..self }
     }
 
     /// Returns whether anybody may write.
@@ -150,7 +157,8 @@ impl Access {
             self.check_host(host)?;
         }
         self.check_origin(headers, host)?;
-        if matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS) {
+        let is_read = matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS);
+        if is_read || self.reads.contains(&request.uri().path()) {
             return Ok(());
         }
         self.check_token(headers)

@@ -16,6 +16,41 @@ use crate::tls::{Tls, TlsError, TlsFiles};
 /// What a Unix socket's address begins with.
 const UNIX: &str = "unix:";
 
+/// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a connection of its own: its
+/// accept loop, its threads and its routes work. Of TLS, any answer to what is no handshake will do. It does not return while
+/// the service is silent.
+pub async fn answers(url: &str) -> bool {
+    let asked = match (url.strip_prefix(UNIX), url.split_once("://")) {
+        #[cfg(unix)]
+        (Some(path), _) => match tokio::net::UnixStream::connect(path).await {
+            Ok(stream) => ask_for_health(stream).await,
+            Err(error) => Err(error),
+        },
+        (_, Some((_, address))) => {
+            // A service that listens everywhere is reached through the loopback.
+            let address = address.replace("0.0.0.0:", "127.0.0.1:").replace("[::]:", "[::1]:");
+            match tokio::net::TcpStream::connect(address).await {
+                Ok(stream) => ask_for_health(stream).await,
+                Err(error) => Err(error),
+            }
+        }
+        _ => return false,
+    };
+    asked.is_ok_and(|answer| match url.starts_with("https") {
+        true => !answer.is_empty(),
+        false => answer.starts_with(b"HTTP/1.1 200"),
+    })
+}
+
+async fn ask_for_health(mut stream: impl Stream) -> io::Result<Vec<u8>> {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+    stream.write_all(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n").await?;
+    let mut answer = Vec::new();
+    stream.take(1 << 12).read_to_end(&mut answer).await?;
+    Ok(answer)
+}
+
 /// Where a service listens.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Listen {
@@ -221,6 +256,23 @@ mod tests {
         for bad in ["", "nowhere", "127.0.0.1", "localhost:7734", "unix:", "/run/slag.sock"] {
             assert!(local(bad).is_err(), "{bad}");
         }
+    }
+
+    /// Bound is not alive: the accept loop must answer.
+    #[tokio::test]
+    async fn only_a_service_that_accepts_answers() {
+        let listen: Listen = "0.0.0.0:0".parse().expect("an address");
+        let listener = bind(&listen).await.expect("binds");
+        let url = listener.url().expect("an address");
+        let wait = std::time::Duration::from_millis(200);
+        assert!(tokio::time::timeout(wait, answers(&url)).await.is_err(), "nobody accepts");
+        let router = axum::Router::new().route("/healthz", axum::routing::get(async || "alive"));
+        let limits = crate::listener::ConnectionLimits::default();
+        let served = tokio::spawn(crate::listener::serve(router, listener, limits, std::future::pending()));
+        assert!(tokio::time::timeout(10 * wait, answers(&url)).await.expect("in time"));
+        served.abort();
+        let _ = served.await;
+        assert!(!answers(&url).await, "nobody listens");
     }
 
     #[cfg(unix)]

@@ -107,11 +107,14 @@ fn operation(route: &Route, of_all: &[(u16, &'static str)], problem: &Value, sch
     };
     route.errors.iter().chain(of_all).for_each(|(status, description)| refuse(*status, description));
     if let Some(body) = route.body {
-        operation["security"] = json!([{}, { "token": [] }]);
+        if !route.reads {
+            operation["security"] = json!([{}, { "token": [] }]);
+        }
         let schema = schemas.of_request(body);
         operation["requestBody"] =
             json!({ "required": true, "content": { "application/json": { "schema": schema } } });
-        OF_BODIES.iter().for_each(|(status, description)| refuse(*status, description));
+        let of_bodies = OF_BODIES.iter().filter(|(status, _)| *status != 401 || !route.reads);
+        of_bodies.for_each(|(status, description)| refuse(*status, description));
     } else if route.parameters.iter().any(|parameter| parameter.place != Place::Header) {
         refuse(400, "A parameter is invalid.");
     }

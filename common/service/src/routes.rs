@@ -141,6 +141,8 @@ pub struct Route {
     pub details: Option<&'static str>,
     /// Parameters.
     pub parameters: Vec<Parameter>,
+    /// Whether it changes nothing although its method is POST, so that it needs no token.
+    pub reads: bool,
     /// Statuses and meanings of its own errors.
     pub errors: Vec<(u16, &'static str)>,
     pub(crate) body: Option<SchemaOf>,
@@ -175,9 +177,9 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         handler: MethodRouter<S, Infallible>,
     ) -> Self {
         self.router = self.router.route(path, handler);
-        let (details, parameters, errors, body) = (None, Vec::new(), Vec::new(), None);
+        let (details, parameters, errors, body, reads) = (None, Vec::new(), Vec::new(), None, false);
         let replies = D::replies;
-        self.table.push(Route { method, path, summary, details, parameters, errors, body, replies });
+        self.table.push(Route { method, path, summary, details, parameters, reads, errors, body, replies });
         self
     }
 
@@ -216,6 +218,12 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
     /// Describes the parameters of the route added last.
     pub fn parameters(mut self, parameters: impl IntoIterator<Item = Parameter>) -> Self {
         self.last(|route| route.parameters.extend(parameters));
+        self
+    }
+
+    /// Says that the route added last changes nothing although its method is POST: it is admitted as GET is.
+    pub fn reads(mut self) -> Self {
+        self.last(|route| route.reads = true);
         self
     }
 

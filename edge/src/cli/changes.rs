@@ -3,6 +3,7 @@
 use std::io::Write;
 
 use crate::query::{ChangedThing, ChangesError, ChangesReply, ChangesRequest, MovedThing};
+use crate::score::Budget;
 use clap::Args;
 
 use super::args::{CacheArgs, ModelArgs, engine};
@@ -32,7 +33,7 @@ pub fn run(args: ChangesArgs) -> Result<(), Failure> {
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
     let request = ChangesRequest { from: args.from, to: args.to, ball: None, texts: args.texts };
-    let reply = engine.changes(&request).map_err(|error| match error {
+    let reply = engine.changes(&request, &Budget::default()).map_err(|error| match error {
         ChangesError::Query(error) => error.into(),
         other => Failure::Failed(other.kind(), other.into()),
     })?;

@@ -12,7 +12,7 @@ use crate::store::StoreError;
 use anyhow::anyhow;
 use clap::Args;
 use slag_service::access::{Access, AccessSettings};
-use slag_service::listen::{Listen, bind};
+use slag_service::listen::{Listen, answers, bind};
 use slag_service::stop::stop_signal;
 use slag_service::tls::TlsFiles;
 
@@ -93,8 +93,8 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         }
         Err(error) => tracing::warn!("no scene is loaded: {}", crate::error_line(&error)),
     }
-    if let Ok(snapshot) = engine.snapshot()
-        && let Err(error) = engine.check_encoder(&snapshot)
+    if let Ok(on_board) = engine.on_board()
+        && let Err(error) = on_board.check()
     {
         tracing::warn!("{error}");
     }
@@ -112,7 +112,8 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         let listener = bind(&args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
         let listener = listener.with_tls(tls);
         // For scripts that let the system choose a port.
-        writeln!(io::stdout(), "listening on {}", listener.url()?)?;
+        let url = listener.url()?;
+        writeln!(io::stdout(), "listening on {url}")?;
         let following = args.follow.is_some().then(Arc::<Following>::default);
         let app = App::following(engine, settings, following.clone());
         let follower = match following {
@@ -126,8 +127,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         };
         let scrub = scrub_in_background(&app, args.scrub_secs)?;
         supervisor::tell(News::Ready);
-        let asked = Arc::clone(&app);
-        tokio::spawn(async move { supervisor::pulse(|| http::is_alive(Arc::clone(&asked))).await });
+        tokio::spawn(async move { supervisor::pulse(|| answers(&url)).await });
         let stop = async {
             stop.await;
             supervisor::tell(News::Stopping);

@@ -1,7 +1,7 @@
 //! The service's state.
 
 use std::collections::BTreeSet;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -12,10 +12,11 @@ use slag_service::problem::Problem;
 use tokio::sync::{Semaphore, watch};
 
 use super::metrics::Metrics;
+use super::problem::{out_of_time, overloaded, timeout};
 use super::settings::Settings;
 use crate::fetch::follow::Following;
 use crate::query::Engine;
-use crate::score::{Budget, Pool};
+use crate::score::{Budget, OverBudget, Pool};
 
 /// The service's state.
 pub struct App {
@@ -31,7 +32,8 @@ pub struct App {
     pub(super) listeners: Arc<Semaphore>,
     /// Whether the service stops: what never ends by itself ends then.
     pub(super) stopping: watch::Sender<bool>,
-    is_reloading: AtomicBool,
+    /// Held while a generation is loaded.
+    loading: Mutex<()>,
     /// Unreadable shards for which a fetch was asked.
     asked: Mutex<BTreeSet<Hash32>>,
     n_reload_attempts: watch::Sender<u64>,
@@ -54,23 +56,12 @@ impl App {
             settings,
             metrics: Metrics::default(),
             following,
-            is_reloading: AtomicBool::new(false),
+            loading: Mutex::default(),
             asked: Mutex::default(),
             n_reload_attempts: watch::Sender::new(0),
         };
         app.ask_for_unreadable();
         Arc::new(app)
-    }
-
-    /// Returns what a query that begins now may use.
-    pub(super) fn query_budget(&self) -> Budget {
-        self.query_budget_within(None)
-    }
-
-    /// Returns what a query that begins now may use, and less time if it asks for less.
-    pub(super) fn query_budget_within(&self, time: Option<Duration>) -> Budget {
-        let time = time.map_or(self.settings.query_timeout, |time| time.min(self.settings.query_timeout));
-        Budget::new(self.settings.query_bytes, time, &self.query_memory)
     }
 
     /// Returns where the robot was last, if it is followed and the scene knows the place.
@@ -83,31 +74,46 @@ impl App {
         self.n_reload_attempts.subscribe()
     }
 
-    /// Starts loading in the background if the cache changed and no load is in progress. One `stat` call.
+    /// Loads another generation if the cache changed (one `stat` call): in the background, so that the one on board answers
+    /// meanwhile, or at once where none is on board. Blocks for the latter alone.
     pub(super) fn reload_if_stale(self: &Arc<Self>) {
-        if !self.engine.is_stale() || self.is_reloading.swap(true, Ordering::AcqRel) {
+        if !self.engine.is_stale() {
+            return;
+        }
+        if self.engine.snapshot().is_err() {
+            let _loading = self.loading.lock().unwrap_or_else(PoisonError::into_inner);
+            // Another thread may have loaded it meanwhile.
+            if self.engine.is_stale() {
+                self.reload();
+            }
+            return;
+        }
+        // Another thread loads already.
+        if self.loading.try_lock().is_err() {
             return;
         }
         let app = Arc::clone(self);
-        tokio::task::spawn_blocking(move || app.reload());
+        tokio::task::spawn_blocking(move || {
+            if let Ok(_loading) = app.loading.try_lock() {
+                app.reload();
+            }
+        });
     }
 
-    /// Loads the generation of the latest fetch, unless a load is in progress. Blocks; queries do not wait.
+    /// Loads the generation of the latest fetch, after a load in progress. Blocks; queries do not wait.
     pub fn reload_now(&self) {
-        if !self.is_reloading.swap(true, Ordering::AcqRel) {
-            self.reload();
-        }
+        let _loading = self.loading.lock().unwrap_or_else(PoisonError::into_inner);
+        self.reload();
     }
 
     fn reload(&self) {
-        /// Ends the attempt even if it panics: otherwise no later one would begin.
+        /// Counts the attempt even if it panics.
         struct Attempt<'a>(&'a App);
         impl Drop for Attempt<'_> {
             fn drop(&mut self) {
                 if std::thread::panicking() {
                     self.0.metrics.reload_failures.fetch_add(1, Ordering::Relaxed);
                 }
-                self.0.is_reloading.store(false, Ordering::Release);
                 self.0.n_reload_attempts.send_modify(|n| *n += 1);
             }
         }
@@ -143,5 +149,31 @@ impl App {
     ) -> Result<T, Problem> {
         let app = Arc::clone(self);
         tokio::task::spawn_blocking(move || work(&app)).await.unwrap_or_else(|e| Err(Problem::internal(e)))
+    }
+
+    /// Runs work within the limits of a query, on the newest generation: one permit of those for queries in progress, which
+    /// ends with the work, and a budget of memory and time. `time`: the most that the client gives it.
+    pub(super) async fn within_limits<T: Send + 'static>(
+        self: &Arc<Self>,
+        time: Option<Duration>,
+        work: impl FnOnce(&Arc<Self>, &Budget) -> Result<T, Problem> + Send + 'static,
+    ) -> Result<T, Problem> {
+        let permit = Arc::clone(&self.permits).try_acquire_owned();
+        let permit = permit.map_err(|_| overloaded(self.settings.max_queries))?;
+        let given = time.filter(|time| *time < self.settings.query_timeout);
+        let limit = given.unwrap_or(self.settings.query_timeout);
+        let budget = Budget::new(self.settings.query_bytes, limit, &self.query_memory);
+        let working = self.blocking(move |app| {
+            // Held until the work is done, even if the client has given up.
+            let _permit = permit;
+            app.reload_if_stale();
+            let done = work(app, &budget);
+            match (given, budget.check()) {
+                (Some(given), Err(OverBudget::Time { .. })) if done.is_err() => Err(out_of_time(given)),
+                _ => done,
+            }
+        });
+        let late = |_| given.map_or_else(|| timeout(limit), out_of_time);
+        tokio::time::timeout(limit, working).await.map_err(late)?
     }
 }

@@ -17,7 +17,7 @@ mod v1;
 pub use app::App;
 pub use follower::{RESTARTS, keep_following};
 pub use query::parse_query;
-pub use router::{is_alive, serve};
+pub use router::serve;
 pub use scrub::keep_scrubbing;
 pub use settings::Settings;
 

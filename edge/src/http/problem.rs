@@ -31,6 +31,10 @@ pub const TEXTS: [(u16, &str); 2] = [
     (409, "The text model does not fit the scene."),
     (422, "The text model does not know the words, or the answer needs more memory or time than its budget."),
 ];
+/// Error of whatever a client may give a time.
+pub const TIME_BUDGET: (u16, &str) = (504, "The time that the request gives is spent.");
+/// Error of whatever needs more memory or time than its budget.
+pub const BUDGET: (u16, &str) = (422, "The answer needs more memory or time than its budget.");
 /// Error of whatever needs to know which places are free.
 pub const NO_PLACES: (u16, &str) =
     (409, "No shard on board says which places are free, or the scene has no objects.");
@@ -81,6 +85,15 @@ pub fn too_many_listeners(limit: usize) -> Problem {
 pub fn timeout(limit: Duration) -> Problem {
     let detail = format!("no answer within {} s; ask for a smaller radius, or again", limit.as_secs_f64());
     Problem::timeout(detail, RETRY_SECS)
+}
+
+/// The time that the client itself gives its question is spent; asking again does not help.
+pub fn out_of_time(given: Duration) -> Problem {
+    let detail = format!(
+        "no answer within the {} s that the request gives; give it more, or ask for a smaller region",
+        given.as_secs_f64()
+    );
+    Problem::new(StatusCode::GATEWAY_TIMEOUT, "time-budget", "Time budget spent", detail)
 }
 
 /// The service does not follow a robot.

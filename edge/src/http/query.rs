@@ -19,7 +19,7 @@ use tokio::sync::mpsc::{Receiver, Sender, channel};
 
 use super::app::App;
 use super::params;
-use super::problem::{overloaded, parameter_problem, query_problem, timeout};
+use super::problem::{parameter_problem, query_problem};
 use crate::query::{AnswersOrBatch, Format, QueryRequest, RequestError};
 
 /// Pieces made ahead of the client.
@@ -64,30 +64,24 @@ async fn answer(
     let Query(pairs) = pairs.map_err(|e| parameter_problem(no_pairs(&e.body_text())))?;
     let (request, format) = params::parse(&pairs, headers).map_err(parameter_problem)?;
     request.check().map_err(parameter_problem)?;
-    let permit =
-        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
-    let budget = app.query_budget();
-    let answering = app.blocking(move |app| {
-        app.reload_if_stale();
-        let reply = app.engine.answer(&request, &budget).map_err(query_problem)?;
+    let answering = app.within_limits(None, move |app, budget| {
+        let reply = app.engine.answer(&request, budget).map_err(query_problem)?;
         let n_empty = reply.answers.iter().filter(|answers| answers.answers.is_empty()).count();
         app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
         let mut pieces = reply.pieces(format).peekable();
         let first = pieces.next().transpose().map_err(Problem::internal)?.unwrap_or_default();
         let is_whole = pieces.peek().is_none();
-        // The permit is held until the work is done, even if the client has given up.
-        Ok((first, (!is_whole).then_some((pieces, permit, budget))))
+        // What the answers take counts until they are sent.
+        Ok((first, (!is_whole).then(|| (pieces, budget.clone()))))
     });
-    let limit = app.settings.query_timeout;
-    let (first, rest) = tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))??;
+    let (first, rest) = answering.await?;
     let body = match rest {
         None => Body::from(first),
-        Some((pieces, permit, budget)) => {
+        Some((pieces, budget)) => {
             let (sender, receiver) = channel(PIECES_AHEAD);
             let deadline = app.settings.stream_timeout;
             tokio::spawn(async move {
-                // What the answers take counts until they are sent.
-                let _held = (permit, budget);
+                let _held = budget;
                 send_all(first, pieces, sender, deadline).await;
             });
             Body::new(Pieces { receiver, is_complete: false })
@@ -128,7 +122,7 @@ enum Message {
 
 /// Sends the pieces, each made off the async threads once the client took those before.
 ///
-/// It gives up at the deadline: a slow or silent client holds neither a permit nor the answers for longer.
+/// It gives up at the deadline: a slow or silent client does not hold the answers for longer.
 async fn send_all(
     first: Vec<u8>,
     pieces: impl Iterator<Item = io::Result<Vec<u8>>> + Send + 'static,

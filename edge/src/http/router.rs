@@ -4,14 +4,11 @@ use std::io;
 use std::sync::Arc;
 
 use axum::Router;
-use axum::body::Body;
-use axum::http::{Request, StatusCode};
 use slag_service::listen::Listener;
 use slag_service::listener;
 use slag_service::openapi::About;
 use slag_service::request::observed;
 use slag_service::routes::{Route, Routes};
-use tower::ServiceExt;
 
 use super::app::App;
 use super::problem::{Members, SCENE, TEXTS};
@@ -71,16 +68,11 @@ pub(super) fn described() -> (Router<Arc<App>>, Vec<Route>) {
 
 /// Returns the service, without a listener.
 pub(super) fn router(app: Arc<App>) -> Router {
-    let (responses, access) = (Arc::clone(&app.metrics.responses), app.settings.access.clone());
-    let (router, _) = described();
+    let (router, table) = described();
+    let reads = table.iter().filter(|route| route.reads).map(|route| route.path).collect();
+    let (responses, access) =
+        (Arc::clone(&app.metrics.responses), app.settings.access.clone().with_reads(reads));
     observed(router.merge(slag_view::router()).with_state(app), responses, access)
-}
-
-/// Returns whether the service answers `GET /healthz` to itself: its threads, its routes and their limits work.
-pub async fn is_alive(app: Arc<App>) -> bool {
-    let Ok(request) = Request::get("/healthz").body(Body::empty()) else { return false };
-    let answered = router(app).oneshot(request).await;
-    answered.is_ok_and(|response| response.status() == StatusCode::OK)
 }
 
 /// Serves until `stop` completes, then lets requests in progress finish within the drain deadline.

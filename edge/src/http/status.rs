@@ -43,9 +43,9 @@ pub struct ServiceStatus {
 pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem> {
     app.blocking(|app| {
         app.reload_if_stale();
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        app.engine.check_encoder(&snapshot).map_err(query_problem)?;
-        if !app.engine.text_is_alive() {
+        let on_board = app.engine.on_board().map_err(query_problem)?;
+        on_board.check().map_err(query_problem)?;
+        if !on_board.text_is_alive() {
             return Err(Problem::internal("the text model has stopped"));
         }
         match app.following.as_ref().and_then(|following| following.failure()) {
@@ -59,19 +59,18 @@ pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem>
 pub async fn status(State(app): State<Arc<App>>) -> Result<Json<ServiceStatus>, Problem> {
     app.blocking(|app| {
         app.reload_if_stale();
-        let snapshot = app.engine.snapshot();
-        let error = snapshot.as_ref().map_or_else(
-            |e| Some(e.to_string()),
-            |snapshot| app.engine.check_encoder(snapshot).err().map(|e| e.to_string()),
-        );
+        let on_board = app.engine.on_board();
+        let error = on_board
+            .as_ref()
+            .map_or_else(|e| Some(e.to_string()), |on_board| on_board.check().err().map(|e| e.to_string()));
         let accepted = accepted(app.engine.cache());
         let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
         // A scene that may be outdated still answers: an old map is better than none, if the client can tell.
         let is_expired = expires_unix_secs.is_some_and(|expires| expires <= crate::now_unix_secs());
         let pinned_scene = accepted.and_then(|accepted| accepted.scene);
         let following = app.following.as_ref().map(|following| following.status());
-        let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
-        let is_ready = error.is_none() && app.engine.text_is_alive();
+        let scene = on_board.as_ref().ok().map(|on_board| Status::of(&on_board.snapshot));
+        let is_ready = error.is_none() && on_board.as_ref().is_ok_and(|on_board| on_board.text_is_alive());
         let version = env!("CARGO_PKG_VERSION");
         let text_model = app.engine.encoder().clone();
         Ok(Json(ServiceStatus {

@@ -137,6 +137,9 @@ async fn refusals_are_problem_details() {
         ("/query", 400, "text"),
         ("/query?text=", 400, "text"),
         ("/query?text=%20%09", 400, "text"),
+        ("/query?text=%3F", 400, "text"),
+        ("/query?text=the", 400, "text"),
+        ("/query?text=0&negatives=!!!", 400, "negatives"),
         ("/query?text=%00%01%1b", 400, "text"),
         (&long, 400, "text"),
         ("/query?text=0&threshold=NaN", 400, "threshold"),
@@ -212,6 +215,27 @@ async fn without_a_scene_it_lives_but_is_not_ready() {
     }
     let (status, _, body) = service.get("/status").await;
     assert_eq!((status, &body["is_ready"], &body["scene"]), (StatusCode::OK, &false.into(), &Value::Null));
+}
+
+/// The first question after the first fetch is answered, as the log promises.
+#[tokio::test]
+async fn the_first_scene_is_served_at_once() {
+    let service = Service::new(None, Settings::default());
+    assert_eq!(service.get("/query?text=0").await.0, StatusCode::SERVICE_UNAVAILABLE);
+    write_cache(service.dir.path(), &chair(None), 1);
+    let (status, _, body) = service.get("/query?text=0").await;
+    assert_eq!((status, &body["generation"]), (StatusCode::OK, &1.into()), "{body}");
+}
+
+/// The time that a client gives is its own: asking again does not help, as it does where the service is slow.
+#[tokio::test]
+async fn a_clients_own_time_is_its_own() {
+    let service = Service::with_chair();
+    let (status, headers, body) = service.get("/v1/query?text=wait&time_budget_ms=1").await;
+    assert_eq!((status.as_u16(), &body["type"]), (504, &"urn:slag:problem:time-budget".into()), "{body}");
+    assert!(!headers.contains_key("retry-after"));
+    open_gate(&service.gate);
+    assert_eq!(service.get("/v1/query?text=0&time_budget_ms=60000").await.0, StatusCode::OK);
 }
 
 #[tokio::test]

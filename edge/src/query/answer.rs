@@ -14,7 +14,9 @@ use super::request::{AnswerKind, DEFAULT_LIMIT, QueryRequest};
 use super::scale::Scale;
 use super::scene::{Scene, alignment, default_voxel};
 use super::threshold::ThresholdSource;
-use crate::score::{Budget, Hit, ObjectScores, Question, Region, ScoreError, Scratch, Search, score_objects};
+use crate::score::{
+    Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Scratch, Search, score_objects,
+};
 use crate::store::{BadCell, cell_of};
 use slag_common::manifest::Manifest;
 
@@ -39,8 +41,15 @@ pub fn answer(
     });
     if kind == AnswerKind::Objects {
         let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
-        let answer = |((text, question), scored)| answer_objects(scene, text, question, scored, request);
-        return Ok(asked.zip(&scored).map(answer).collect());
+        let budget = scratch.budget();
+        let answer = |((text, question), scored)| {
+            let used_bytes = budget.used_bytes();
+            let answers = answer_objects(scene, text, question, scored, budget, request);
+            budget.check()?;
+            budget.give_back_to(used_bytes, answers.answers.len_bytes());
+            Ok(answers)
+        };
+        return asked.zip(&scored).map(answer).collect();
     }
     let searches = Search::batch(scratch, scene.shards, questions, request.region(), request.precision)?;
     let budget = scratch.budget();
@@ -60,6 +69,7 @@ fn answer_objects(
     text: &str,
     question: &Question,
     scored: &ObjectScores,
+    budget: &Budget,
     request: &QueryRequest,
 ) -> Answers {
     let (manifest, scale, region) = (scene.manifest, Scale::of(question), request.region());
@@ -71,10 +81,13 @@ fn answer_objects(
     let key = |object: &FoundObject<'_>| (scale.shown(object.score), object.extent().position_in_world);
     let order = Order::new(scale.base(calibration), manifest, request);
     let ranked = order.rank(found, key);
+    // Members are runs, at most one for each Gaussian; their positions are needed for the box.
+    let of_gaussian = size_of::<DVec3>() + if request.members { size_of::<Run>() } else { 0 };
     // Describes only the objects that are returned.
-    let described = ranked.into_par_iter().map(|ranked| {
+    let described = ranked.into_par_iter().filter_map(|ranked| {
+        let bytes = ranked.found.n_gaussians as usize * of_gaussian + size_of::<ClusterAnswer>();
         let score = scale.shown(ranked.found.score);
-        object_answer(scene, ranked, score, &region, request.members)
+        budget.take(bytes).then(|| object_answer(scene, ranked, score, &region, request.members))
     });
     let found = Found::Clusters(described.collect());
     let best = objects::best(&scored.scores);

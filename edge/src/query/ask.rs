@@ -19,6 +19,9 @@ use std::sync::Arc;
 /// Most answers in a page, over all questions.
 pub const MAX_PAGE: usize = MAX_CLUSTERS;
 
+/// Memory for the candidates of a thing: 256 of a kilobyte.
+const CANDIDATES_BYTES: usize = 256 << 10;
+
 /// What is looked for.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -138,8 +141,9 @@ impl Engine {
     /// # Errors
     /// [`QueryError`].
     pub fn ask(&self, ask: &Ask, budget: &Budget) -> Result<AskReply, QueryError> {
-        let snapshot = self.snapshot()?;
-        self.check_encoder(&snapshot)?;
+        let on_board = self.on_board()?;
+        on_board.check()?;
+        let snapshot = &on_board.snapshot;
         let manifest = &snapshot.manifest;
         let mut request = QueryRequest { near: None, bounds: None, ..ask.request.clone() };
         request.texts = ask.asked.iter().map(label).collect();
@@ -150,7 +154,7 @@ impl Engine {
         request.check()?;
         // One more than the page, so that the reply can say whether there are others.
         request.limit = request.limit.map(|limit| limit + 1);
-        let negatives = self.encode_negatives(&request)?;
+        let negatives = on_board.encode_negatives(&request)?;
         let question = |vector: Arc<[f32]>| Question { vector, negatives: negatives.clone() };
         let viewer =
             request.near.map(|position_in_world| Viewer { position_in_world, heading_rad: ask.heading_rad });
@@ -158,13 +162,16 @@ impl Engine {
         let (mut plain, mut places) = (Vec::new(), Vec::new());
         for (at, asked) in ask.asked.iter().enumerate() {
             let vector = match asked {
-                Asked::Text(text) => self.encode_text(text)?,
+                Asked::Text(text) => on_board.encode(text)?,
                 Asked::Vector(vector) => unit(vector).unwrap_or_default().into(),
                 Asked::Phrase(phrase) => {
                     let things = phrase.things();
-                    let questions = things.iter().map(|thing| Ok(question(self.encode_text(thing)?)));
+                    let questions = things.iter().map(|thing| Ok(question(on_board.encode(thing)?)));
                     let questions = questions.collect::<Result<Vec<_>, QueryError>>()?;
-                    let related = self.on_scene(&snapshot, budget, |_, scene| {
+                    let scores = snapshot.objects.len() * size_of::<f32>();
+                    budget.take(things.len() * (scores + CANDIDATES_BYTES));
+                    budget.check().map_err(crate::score::ScoreError::from)?;
+                    let related = self.on_scene(snapshot, budget, |_, scene| {
                         related(scene, phrase, &questions, viewer.as_ref(), &request)
                     })?;
                     budget.check().map_err(crate::score::ScoreError::from)?;
@@ -179,12 +186,12 @@ impl Engine {
             let texts = places.iter().map(|at| request.texts[*at].clone()).collect();
             let request = QueryRequest { texts, ..request.clone() };
             let work = |scratch: &mut Scratch, scene: &Scene<'_>| answer(scratch, scene, &plain, &request);
-            let answers = self.on_scene(&snapshot, budget, work)?;
+            let answers = self.on_scene(snapshot, budget, work)?;
             for (at, answers) in places.into_iter().zip(answers) {
                 outcomes[at] = Some(Outcome::Plain(answers));
             }
         }
-        let reply = Reply { snapshot, near: request.near, answers: Vec::new() };
+        let reply = Reply { near: request.near, answers: Vec::new(), snapshot: on_board.snapshot };
         Ok(AskReply { reply, outcomes: outcomes.into_iter().flatten().collect() })
     }
 }

@@ -10,6 +10,7 @@ use slag_common::objects::{self, Moved, Thing, public_id};
 use super::engine::{Engine, QueryError};
 use super::frame::{FRAME, UNITS, unit};
 use super::request::RequestError;
+use crate::score::{Budget, ScoreError};
 use crate::store::history::{self, Record};
 use crate::store::{EdgeCache, Snapshot};
 
@@ -183,27 +184,33 @@ impl Engine {
     ///
     /// # Errors
     /// [`ChangesError`]. That nothing is remembered yet is a reply.
-    pub fn changes(&self, request: &ChangesRequest) -> Result<ChangesReply, ChangesError> {
-        let snapshot = self.snapshot()?;
+    pub fn changes(&self, request: &ChangesRequest, budget: &Budget) -> Result<ChangesReply, ChangesError> {
+        let on_board = self.on_board()?;
+        let snapshot = &on_board.snapshot;
         let manifest = &snapshot.manifest;
         if !request.texts.is_empty() {
-            self.check_encoder(&snapshot)?;
+            on_board.check()?;
         }
-        let texts = request.texts.iter().map(|text| Ok((text.clone(), self.encode_text(text)?.to_vec())));
+        let texts = request.texts.iter().map(|text| Ok((text.clone(), on_board.encode(text)?.to_vec())));
         let words = Words(texts.collect::<Result<_, QueryError>>()?);
+        // Two records, and the reply.
+        let of_thing =
+            size_of::<Thing>() + size_of::<ChangedThing>() + size_of::<f64>() * manifest.encoder.dim as usize;
+        budget.take(2 * of_thing * snapshot.objects.len());
+        let spent = |error| QueryError::from(ScoreError::from(error));
+        budget.check().map_err(spent)?;
         let generations = known(self.cache(), manifest);
-        let to =
-            generation(self.cache(), &snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
+        let to = generation(self.cache(), snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
         let from = match request.from {
             Some(from) if from >= to.generation => {
                 let expected = format!("less than {}, the generation to compare with", to.generation);
                 let error = RequestError::new("from", &from.to_string(), expected);
                 return Err(QueryError::from(error).into());
             }
-            Some(from) => Some(generation(self.cache(), &snapshot, from, &generations)?),
+            Some(from) => Some(generation(self.cache(), snapshot, from, &generations)?),
             None => {
                 let before = generations.iter().rev().find(|of| **of < to.generation);
-                before.map(|of| generation(self.cache(), &snapshot, *of, &generations)).transpose()?
+                before.map(|of| generation(self.cache(), snapshot, *of, &generations)).transpose()?
             }
         };
         if let Some(from) = &from
@@ -211,6 +218,7 @@ impl Engine {
         {
             return Err(ChangesError::Encoders { from: from.generation, to: to.generation });
         }
+        budget.check().map_err(spent)?;
         Ok(reply(from, to, manifest, generations, request, &words))
     }
 }

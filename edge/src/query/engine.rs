@@ -90,6 +90,57 @@ struct Loaded {
     failed_at: Option<Instant>,
 }
 
+/// A generation, and the text model that was in use with it: a reload replaces both at once, and a question must not take the
+/// vectors of one model to the scene of another.
+pub struct OnBoard {
+    pub snapshot: Arc<Snapshot>,
+    text: Arc<TextService>,
+}
+
+impl OnBoard {
+    /// Checks that text model and scene use the same embedding space.
+    ///
+    /// # Errors
+    /// [`QueryError::EncoderMismatch`].
+    pub fn check(&self) -> Result<(), QueryError> {
+        let (models, scene) = (self.text.info(), &self.snapshot.manifest.encoder);
+        if models.id == scene.id {
+            return Ok(());
+        }
+        Err(QueryError::EncoderMismatch {
+            models_name: models.name.clone(),
+            models_id: models.id,
+            scene_name: scene.name.clone(),
+            scene_id: scene.id,
+        })
+    }
+
+    /// Returns whether the text model runs.
+    pub fn text_is_alive(&self) -> bool {
+        self.text.is_alive()
+    }
+
+    /// Returns the words that the text model knows; none if it takes any text.
+    pub(super) fn vocabulary(&self) -> &[String] {
+        self.text.vocabulary()
+    }
+
+    /// Returns the vector of a text.
+    ///
+    /// # Errors
+    /// It is longer than a text may be, or unknown to the model.
+    pub(super) fn encode(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
+        check_text("text", text)?;
+        Ok(self.text.encode(text)?)
+    }
+
+    /// Returns the vectors of a request's negatives.
+    pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {
+        let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
+        negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)
+    }
+}
+
 /// Opens the text model that a scene carries; one that does not open is logged.
 fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
     carried::open(cache, manifest, options).unwrap_or_else(|error| {
@@ -146,16 +197,6 @@ impl Engine {
         Arc::clone(&self.loaded.read().unwrap_or_else(PoisonError::into_inner).text)
     }
 
-    /// Returns the words that the text model knows; none if it takes any text.
-    pub(super) fn vocabulary(&self) -> Vec<String> {
-        self.text().vocabulary().to_vec()
-    }
-
-    /// Returns whether the text model runs.
-    pub fn text_is_alive(&self) -> bool {
-        self.text().is_alive()
-    }
-
     /// Returns whether the cache's `current` differs from the one loaded (one `stat` call), or loading it
     /// failed a while ago.
     pub fn is_stale(&self) -> bool {
@@ -210,21 +251,14 @@ impl Engine {
         loaded.snapshot.clone().ok_or(QueryError::NoScene)
     }
 
-    /// Checks that text model and scene use the same embedding space.
+    /// Returns the loaded generation and the text model that came into use with it.
     ///
     /// # Errors
-    /// [`QueryError::EncoderMismatch`].
-    pub fn check_encoder(&self, snapshot: &Snapshot) -> Result<(), QueryError> {
-        let (models, scene) = (self.encoder(), &snapshot.manifest.encoder);
-        if models.id == scene.id {
-            return Ok(());
-        }
-        Err(QueryError::EncoderMismatch {
-            models_name: models.name.clone(),
-            models_id: models.id,
-            scene_name: scene.name.clone(),
-            scene_id: scene.id,
-        })
+    /// [`QueryError::NoScene`].
+    pub fn on_board(&self) -> Result<OnBoard, QueryError> {
+        let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
+        let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
+        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text) })
     }
 
     /// Answers a request from the loaded generation. Blocks for milliseconds of computing, at most as long as the budget
@@ -234,32 +268,15 @@ impl Engine {
     /// [`QueryError`].
     pub fn answer(&self, request: &QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
         request.check()?;
-        let snapshot = self.snapshot()?;
-        self.check_encoder(&snapshot)?;
-        let negatives = self.encode_negatives(request)?;
-        let model = self.text();
+        let on_board = self.on_board()?;
+        on_board.check()?;
+        let negatives = on_board.encode_negatives(request)?;
         let question =
-            |text: &String| Ok(Question { vector: model.encode(text)?, negatives: negatives.clone() });
-        let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, TextError>>()?;
+            |text: &String| Ok(Question { vector: on_board.encode(text)?, negatives: negatives.clone() });
+        let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, QueryError>>()?;
         let work = |scratch: &mut Scratch, scene: &Scene<'_>| answer(scratch, scene, &questions, request);
-        let answers = self.on_scene(&snapshot, budget, work)?;
-        Ok(Reply { snapshot, near: request.near, answers })
-    }
-
-    /// Returns the vector of a text.
-    ///
-    /// # Errors
-    /// It is longer than a text may be, or unknown to the model.
-    pub(super) fn encode_text(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
-        check_text("text", text)?;
-        Ok(self.text().encode(text)?)
-    }
-
-    /// Returns the vectors of a request's negatives.
-    pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {
-        let model = self.text();
-        let negatives = request.negatives.phrases().into_iter().map(|phrase| model.encode(phrase));
-        negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)
+        let answers = self.on_scene(&on_board.snapshot, budget, work)?;
+        Ok(Reply { snapshot: on_board.snapshot, near: request.near, answers })
     }
 
     /// Runs work on a generation, with buffers of earlier answers.

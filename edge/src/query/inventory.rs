@@ -9,13 +9,13 @@ use slag_common::frames::{Aabb, Geographic};
 
 use super::answers::Evidence;
 use super::cluster::{Grouping, cluster};
-use super::engine::Engine;
+use super::engine::{Engine, QueryError};
 use super::extent::Extent;
 use super::frame::{FRAME, UNITS, unit};
 use super::objects::{self, FoundObject};
 use super::oriented::OrientedBox;
 use super::scene::{Scene, alignment, default_voxel};
-use crate::score::{Budget, Region, Run};
+use crate::score::{Budget, Region, Run, ScoreError};
 use crate::store::Snapshot;
 
 /// The form of an object's id.
@@ -95,25 +95,59 @@ pub fn object_id(text: &str) -> Option<u64> {
 
 impl Engine {
     /// Returns the objects of a generation that pass a filter, by id, at most `limit`.
-    pub fn objects(&self, snapshot: &Snapshot, filter: &ObjectFilter, limit: usize) -> ObjectPage {
-        self.on_scene(snapshot, &Budget::default(), |_, scene| page(scene, filter, limit))
+    ///
+    /// # Errors
+    /// The budget is spent.
+    pub fn objects(
+        &self,
+        snapshot: &Snapshot,
+        filter: &ObjectFilter,
+        limit: usize,
+        budget: &Budget,
+    ) -> Result<ObjectPage, QueryError> {
+        budget.take(limit.min(snapshot.objects.len()) * size_of::<ObjectOnBoard>());
+        let page = self.on_scene(snapshot, budget, |_, scene| page(scene, filter, limit, budget));
+        budget.check().map_err(ScoreError::from)?;
+        Ok(page)
     }
 
     /// Returns an object of a generation.
-    pub fn object(&self, snapshot: &Snapshot, id: u64) -> Option<ObjectOnBoard> {
-        self.on_scene(snapshot, &Budget::default(), |_, scene| Some(describe(scene, number_of(scene, id)?)))
+    ///
+    /// # Errors
+    /// The budget is spent.
+    pub fn object(
+        &self,
+        snapshot: &Snapshot,
+        id: u64,
+        budget: &Budget,
+    ) -> Result<Option<ObjectOnBoard>, QueryError> {
+        let found = self.on_scene(snapshot, budget, |_, scene| {
+            let object = number_of(scene, id)?;
+            take_points(scene, object, budget).then(|| describe(scene, object))
+        });
+        budget.check().map_err(ScoreError::from)?;
+        Ok(found)
     }
 
     /// Returns the positions of Gaussians of an object on board, evenly spread over their order, at most `limit`: those of its
     /// largest cluster, inside the cluster's box. Objects have stray Gaussians, too, some nearly as many as their own.
-    pub fn object_points(&self, snapshot: &Snapshot, id: u64, limit: usize) -> Vec<DVec3> {
-        self.on_scene(snapshot, &Budget::default(), |_, scene| {
+    pub fn object_points(&self, snapshot: &Snapshot, id: u64, limit: usize, budget: &Budget) -> Vec<DVec3> {
+        self.on_scene(snapshot, budget, |_, scene| {
             let Some(object) = number_of(scene, id) else { return Vec::new() };
+            if !take_points(scene, object, budget) {
+                return Vec::new();
+            }
             let points: Vec<DVec3> = largest_cluster(scene, object);
             let step = points.len().div_ceil(limit.max(1)).max(1);
             points.into_iter().step_by(step).collect()
         })
     }
+}
+
+/// Takes the memory that the positions of an object's Gaussians need; returns whether the work may go on.
+fn take_points(scene: &Scene<'_>, object: usize, budget: &Budget) -> bool {
+    let n_gaussians = objects::count_in(scene, object, &Region::default());
+    budget.take(n_gaussians as usize * size_of::<DVec3>())
 }
 
 pub(super) fn largest_cluster(scene: &Scene<'_>, object: usize) -> Vec<DVec3> {
@@ -145,7 +179,7 @@ fn number_of(scene: &Scene<'_>, id: u64) -> Option<usize> {
     (low < scene.index.len() && objects::record(scene, low).id == id).then_some(low)
 }
 
-fn page(scene: &Scene<'_>, filter: &ObjectFilter, limit: usize) -> ObjectPage {
+fn page(scene: &Scene<'_>, filter: &ObjectFilter, limit: usize, budget: &Budget) -> ObjectPage {
     let passes = |object: &usize| {
         let record = objects::record(scene, *object);
         filter.ball.is_none_or(|(centre, radius)| record.position().distance(centre) <= radius)
@@ -154,7 +188,14 @@ fn page(scene: &Scene<'_>, filter: &ObjectFilter, limit: usize) -> ObjectPage {
     let all: Vec<usize> = (0..scene.index.len()).filter(passes).collect();
     let is_after = |object: &usize| filter.after.is_none_or(|id| objects::record(scene, *object).id > id);
     let mut rest = all.iter().copied().filter(is_after);
-    let objects: Vec<ObjectOnBoard> = rest.by_ref().take(limit).map(|at| describe(scene, at)).collect();
+    // Positions are needed for one at a time.
+    let described = |at: usize| {
+        let used_bytes = budget.used_bytes();
+        let described = take_points(scene, at, budget).then(|| describe(scene, at));
+        budget.give_back_to(used_bytes, 0);
+        described
+    };
+    let objects: Vec<ObjectOnBoard> = rest.by_ref().take(limit).map_while(described).collect();
     let next_after = rest.next().and_then(|_| objects.last()).map(|last| last.id.clone());
     let manifest = scene.manifest;
     ObjectPage {

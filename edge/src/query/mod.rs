@@ -42,7 +42,7 @@ pub use changes::{
     ChangedThing, ChangesError, ChangesReply, ChangesRequest, ComparedGeneration, Likeness, MovedThing,
     NotCompared,
 };
-pub use engine::{Engine, QueryError};
+pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
 pub use frame::{FRAME, UNITS, unit};
 pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOnBoard, ObjectPage, object_id};

@@ -10,7 +10,7 @@ use slag_view::{
     Words, cell_message,
 };
 
-use super::engine::{Engine, QueryError};
+use super::engine::{Engine, OnBoard, QueryError};
 use super::map::MapStatus;
 use super::objects;
 use super::request::{Negatives, QueryRequest};
@@ -39,10 +39,17 @@ impl Engine {
     pub fn view(
         &self,
         robot_in_world: impl Fn(&Snapshot) -> Option<DVec3>,
+        budget: &Budget,
     ) -> Result<Description, QueryError> {
-        let snapshot = self.snapshot()?;
-        let map = MapStatus::of(&snapshot, 0, None);
-        let on_board = map.cells.iter().map(|cell| Cell {
+        let on_board = self.on_board()?;
+        let snapshot = &on_board.snapshot;
+        let photos = snapshot.shards.iter().filter_map(|shard| shard.photo_poses());
+        let n_photos: usize = photos.map(|photos| photos.iter().count()).sum();
+        budget.take(n_photos * size_of::<Photo>() + snapshot.manifest.cells.len() * size_of::<Cell>());
+        budget.check().map_err(ScoreError::from)?;
+        let can_ask = on_board.check().is_ok();
+        let map = MapStatus::of(snapshot, 0, None);
+        let known = map.cells.iter().map(|cell| Cell {
             cell: cell.cell_id,
             n_gaussians: cell.n_gaussians,
             state: if cell.generation == map.generation { CellState::OnBoard } else { CellState::Stale },
@@ -56,7 +63,7 @@ impl Engine {
             generation: map.generation,
             box_m: slag_view::Corners { min: cell.box_min_in_world, max: cell.box_max_in_world },
         });
-        let mut cells: Vec<Cell> = on_board.chain(missing).collect();
+        let mut cells: Vec<Cell> = known.chain(missing).collect();
         cells.sort_by_key(|cell| cell.cell);
         let photos = snapshot.shards.iter().flat_map(|shard| {
             let origin = DVec3::from(shard.view().header.origin_in_world);
@@ -70,11 +77,11 @@ impl Engine {
             up: Vec3::Z,
             metric: snapshot.manifest.metric,
             geographic: map.geo_reference.is_some(),
-            can_ask: self.check_encoder(&snapshot).is_ok(),
+            can_ask,
             cells,
             views: photos.collect(),
             fetched: Some(Fetched { centre_m: map.centre_in_world, radius_m: map.radius }),
-            position_m: robot_in_world(&snapshot),
+            position_m: robot_in_world(snapshot),
         })
     }
 
@@ -108,14 +115,15 @@ impl Engine {
     /// # Errors
     /// [`QueryError`].
     pub fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
-        let snapshot = self.snapshot()?;
-        self.check_encoder(&snapshot)?;
-        let vocabulary = self.vocabulary();
+        let on_board = self.on_board()?;
+        on_board.check()?;
+        let snapshot = &on_board.snapshot;
+        let vocabulary = on_board.vocabulary();
         let takes_any = vocabulary.is_empty();
         let (known, is_complete) = match takes_any {
-            true => self.everyday_vectors()?,
+            true => everyday_vectors(&on_board)?,
             false => {
-                let vector = |word: &String| Ok((word.clone(), self.encode_text(word)?));
+                let vector = |word: &String| Ok((word.clone(), on_board.encode(word)?));
                 let known = vocabulary.iter().take(Words::MAX).map(vector);
                 (known.collect::<Result<Vec<_>, QueryError>>()?, true)
             }
@@ -125,8 +133,9 @@ impl Engine {
             let question =
                 |(_, vector): &WordVector| Question { vector: Arc::clone(vector), negatives: Vec::new() };
             let questions: Vec<Question> = known.iter().map(question).collect();
+            budget.take(questions.len() * snapshot.objects.len() * size_of::<f32>());
             budget.check().map_err(ScoreError::from)?;
-            let scored = self.on_scene(&snapshot, budget, |_, scene| {
+            let scored = self.on_scene(snapshot, budget, |_, scene| {
                 let encoder = &scene.manifest.encoder;
                 let calibration = encoder.calibration.and(objects::calibration(scene.objects));
                 let (threshold, _) = calibrated_threshold(encoder.default_threshold, calibration);
@@ -141,17 +150,6 @@ impl Engine {
         Ok(Words::new(snapshot.manifest.generation, words, is_complete))
     }
 
-    /// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a while for
-    /// each, and encodes some more at the next request.
-    fn everyday_vectors(&self) -> Result<(Vec<WordVector>, bool), QueryError> {
-        let (vectors, is_complete) = Words::encode(everyday_words(), |word| match self.encode_text(word) {
-            Ok(vector) => Ok(Some((word.to_owned(), vector))),
-            Err(QueryError::Text(TextError::Encode(_))) => Ok(None),
-            Err(error) => Err(error),
-        })?;
-        Ok((vectors.into_iter().flatten().collect(), is_complete))
-    }
-
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.
     ///
     /// # Errors
@@ -164,16 +162,28 @@ impl Engine {
     ) -> Result<Vec<u8>, QueryError> {
         let request = QueryRequest { negatives, ..QueryRequest::new(text) };
         request.check()?;
-        let snapshot = self.snapshot()?;
-        self.check_encoder(&snapshot)?;
+        let on_board = self.on_board()?;
+        on_board.check()?;
+        let snapshot = &on_board.snapshot;
         let question =
-            Question { vector: self.encode_text(text)?, negatives: self.encode_negatives(&request)? };
+            Question { vector: on_board.encode(text)?, negatives: on_board.encode_negatives(&request)? };
         let generation = snapshot.manifest.generation;
-        let message = self.on_scene(&snapshot, budget, |scratch, scene| {
+        let message = self.on_scene(snapshot, budget, |scratch, scene| {
             scores_message(scratch, scene.shards, &question, generation)
         });
         Ok(message?)
     }
+}
+
+/// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a while for
+/// each, and encodes some more at the next request.
+fn everyday_vectors(on_board: &OnBoard) -> Result<(Vec<WordVector>, bool), QueryError> {
+    let (vectors, is_complete) = Words::encode(everyday_words(), |word| match on_board.encode(word) {
+        Ok(vector) => Ok(Some((word.to_owned(), vector))),
+        Err(QueryError::Text(TextError::Encode(_))) => Ok(None),
+        Err(error) => Err(error),
+    })?;
+    Ok((vectors.into_iter().flatten().collect(), is_complete))
 }
 
 fn scores_message(

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use slag_common::Hash32;
 use slag_edge::query::{ChangesError, ChangesReply, ChangesRequest, Engine};
+use slag_edge::score::Budget;
 use slag_edge::store::history;
 
 use super::faults::text_service;
@@ -33,7 +34,7 @@ fn after() -> Published {
 fn changes(robot: &Robot, from: Option<u64>) -> Result<ChangesReply, ChangesError> {
     let engine = Engine::new(robot.cache.clone(), text_service());
     engine.reload().expect("a whole generation");
-    engine.changes(&ChangesRequest { from, ..ChangesRequest::default() })
+    engine.changes(&ChangesRequest { from, ..ChangesRequest::default() }, &Budget::default())
 }
 
 /// Returns the ids that appeared, that went, and that things had and have which moved.

@@ -102,6 +102,61 @@ async fn web_pages_neither_write_nor_read() {
     assert_eq!(ask(&app, "POST", "/position", &[json, ("origin", "http://127.0.0.1:7734")]).await.0, 202);
 }
 
+/// A question in JSON changes nothing: it is admitted as GET is, with and without a token.
+#[tokio::test]
+async fn questions_in_json_are_reads() {
+    let service = Service::with_chair();
+    let file = service.dir.path().join("token");
+    fs_err::write(&file, "0123456789abcdef0123").expect("written");
+    let with_token = AccessSettings { token_file: Some(file), ..AccessSettings::default() };
+    let json = [("content-type", "application/json")];
+    for (listen, settings, refused) in
+        [("127.0.0.1:7734", with_token, 401), ("0.0.0.0:7734", AccessSettings::default(), 403)]
+    {
+        let access = Access::new(&listen.parse().expect("an address"), settings).expect("sound");
+        let (app, _) = following_app(&service, access);
+        assert_eq!(ask(&app, "POST", "/position", &json).await.0, refused, "{listen}");
+        // The body is a position: it is read, and refused for what it says.
+        assert_eq!(ask(&app, "POST", "/v1/query", &json).await.0, 400, "{listen}");
+        let foreign = [json[0], ("origin", "https://evil.example")];
+        assert_eq!(ask(&app, "POST", "/v1/query", &foreign).await.0, 403, "{listen}");
+    }
+}
+
+/// Every route that is described either answers in a size that the cells on board bound, or charges what it allocates.
+#[tokio::test]
+async fn every_route_keeps_within_its_budget() {
+    let shards = super::v1::room_with(Some(&super::goal::places()));
+    let settings = Settings { query_bytes: 1, ..Settings::default() };
+    let service = Service::new(Some(&shards), settings);
+    let bounded =
+        ["/", "/healthz", "/metrics", "/openapi.json", "/readyz", "/status", "/v1/events", "/v1/map"];
+    let api = super::openapi::description();
+    for (path, methods) in api["paths"].as_object().expect("paths") {
+        if methods.get("get").is_none() || bounded.contains(&path.as_str()) {
+            continue;
+        }
+        let uri = match path.as_str() {
+            "/query" => "/query?text=0&format=ply",
+            "/v1/query" => "/v1/query?text=0",
+            "/v1/objects/{id}" => "/v1/objects/o0000000000000001",
+            "/v1/goal" => "/v1/goal?text=0&near=2,3,0&step_m=0.15",
+            "/v1/floor" => "/v1/floor?near=2,3,0&step_m=0.15",
+            "/v1/view/scores" => "/v1/view/scores?text=0",
+            "/v1/view/cells/{id}" => "/v1/view/cells/1",
+            known @ ("/v1/objects" | "/v1/changes" | "/v1/view" | "/v1/view/words") => known,
+            other => panic!("{other} is new: does it charge what it allocates?"),
+        };
+        let (status, _, body) = service.get(uri).await;
+        let kind = body["type"].as_str().unwrap_or_default();
+        assert_eq!((status.as_u16(), kind), (422, "urn:slag:problem:over-budget"), "{uri}: {body}");
+    }
+    for query in ["text=0&kind=clusters", "text=0&kind=gaussians", "text=0+near+the+1"] {
+        let (status, _, body) = service.get(&format!("/v1/query?{query}")).await;
+        assert_eq!(status.as_u16(), 422, "{query}: {body}");
+    }
+}
+
 #[tokio::test]
 async fn an_origin_that_was_given_may_ask_and_read() {
     let service = Service::with_chair();

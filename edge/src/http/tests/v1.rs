@@ -280,6 +280,39 @@ async fn long_and_deep_questions_are_refused() {
     }
 }
 
+/// An array in the place of an object would be read in the order of its members: GeoJSON has longitude first.
+#[tokio::test]
+async fn members_have_names() {
+    let service = Service::new(Some(&room()), Settings::default());
+    let near = |near: Value| json!({"texts": ["0"], "near": near});
+    let region = |region: Value| json!({"texts": ["0"], "region": region});
+    let phrase = |phrase: Value| json!({"phrases": [phrase]});
+    for body in [
+        near(json!([3, 3])),
+        near(json!([8.54, 47.37, 400, 1])),
+        near(json!([])),
+        region(json!({"polygon": [[0, 0, 5], [1, 0, 5], [1, 1, 5]]})),
+        region(json!({"ball": [[0, 0, 0], 1]})),
+        region(json!({"ball": {"centre": [47, 8], "radius": 1}})),
+        region(json!({"box": [[0, 0, 0], [1, 1, 1]]})),
+        region(json!([null, null, []])),
+        phrase(json!(["0"])),
+        phrase(json!({"thing": "0", "pick": ["largest"]})),
+        phrase(json!({"thing": "0", "relation": ["on", {"thing": "1"}]})),
+        phrase(json!({"thing": "0", "relation": {"is": "on", "of": ["1"]}})),
+        json!([["0"]]),
+    ] {
+        let (status, _, reply) = post(&service, &body).await;
+        assert_eq!(
+            (status, &reply["parameter"]),
+            (StatusCode::BAD_REQUEST, &json!("body")),
+            "{body}: {reply}"
+        );
+    }
+    let (status, _, reply) = post(&service, &near(json!([3, 3, 0]))).await;
+    assert_eq!(status, StatusCode::OK, "{reply}");
+}
+
 #[tokio::test]
 async fn things_on_board_are_listed_in_pages() {
     let service = Service::new(Some(&room()), Settings::default());

@@ -12,7 +12,7 @@ use slag_service::routes::Parameter;
 use super::params::{self, Pairs, lat_lon, number};
 use crate::http::app::App;
 use crate::http::forms;
-use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
+use crate::http::problem::{parameter_problem, query_problem};
 use crate::query::{ChangesError, ChangesReply, ChangesRequest, MAX_TEXTS, Point, RequestError, parse_point};
 
 /// Returns the parameters of `/v1/changes`.
@@ -37,18 +37,13 @@ pub async fn changes(
     pairs: Result<Pairs, QueryRejection>,
 ) -> Result<Json<ChangesReply>, Problem> {
     let (mut request, near, radius) = parse(&params::pairs(pairs)?).map_err(parameter_problem)?;
-    let limit = app.settings.query_timeout;
-    let permit =
-        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
-    let answering = app.blocking(move |app| {
-        let _permit = permit;
-        app.reload_if_stale();
+    let answering = app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
         let near = near.map(|near| near.in_world("near", &snapshot.manifest)).transpose();
         request.ball = near.map_err(parameter_problem)?.zip(radius);
-        app.engine.changes(&request).map(Json).map_err(problem)
+        app.engine.changes(&request, budget).map(Json).map_err(problem)
     });
-    tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))?
+    answering.await
 }
 
 fn problem(error: ChangesError) -> Problem {

@@ -39,7 +39,11 @@ pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> 
         let mut told = Told::default();
         let mut quiet = Duration::ZERO;
         loop {
-            app.reload_if_stale();
+            // It may open files.
+            let looked = app.blocking(|app| Ok(app.reload_if_stale())).await;
+            if looked.is_err() {
+                return;
+            }
             let mut text = told.news(&app);
             if text.is_empty() && quiet >= KEEP_ALIVE {
                 text.push_str(": still here\n\n");

@@ -16,7 +16,7 @@ use std::sync::Arc;
 use slag_service::routes::{Parameter, Routes};
 
 use super::app::App;
-use super::problem::{NO_PLACES, SCENE, TEXTS};
+use super::problem::{BUDGET, NO_PLACES, SCENE, TEXTS, TIME_BUDGET};
 use crate::query::OBJECT_ID;
 
 /// Adds the routes.
@@ -30,21 +30,25 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .parameters(params::query_parameters())
         .errors(&SCENE)
         .errors(&TEXTS)
+        .errors(&[TIME_BUDGET])
         .post::<body::Body, _, _>(
             "/v1/query",
             "the same, asked in JSON: texts, vectors, phrases, areas",
             body::MAX_BODY_BYTES,
             query::post,
         )
+        .reads()
         .errors(&SCENE)
         .errors(&TEXTS)
+        .errors(&[TIME_BUDGET])
         .get("/v1/objects", "all things on board, by id, in pages", objects::list)
         .parameters(objects::parameters())
         .errors(&SCENE)
+        .errors(&[BUDGET])
         .get("/v1/objects/{id}", "one thing on board", objects::one)
         .parameters([Parameter::of_path::<String>("id", "o and 16 hex digits").of_form(OBJECT_ID)])
         .errors(&SCENE)
-        .errors(&[(404, "No such thing is on board.")])
+        .errors(&[(404, "No such thing is on board."), BUDGET])
         .get("/v1/map", "the area on board, its age, and what is missing", map::map)
         .errors(&SCENE)
         .get("/v1/changes", "things that appeared, went or moved between two generations", changes::changes)
@@ -53,7 +57,7 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .errors(&[
             (404, "The robot does not remember a generation."),
             (409, "The generations were encoded with different models, or have no objects."),
-            (422, "The text model does not know the words."),
+            TEXTS[1],
         ])
         .get("/v1/goal", "places to stand near a thing: reached, clear, and in sight of it", goal::goal)
         .parameters(goal::parameters())
@@ -62,7 +66,7 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .get("/v1/floor", "the ground around the robot: unknown, obstacle, ground, reached", goal::floor)
         .parameters(goal::floor_parameters())
         .errors(&SCENE)
-        .errors(&[NO_PLACES]);
+        .errors(&[NO_PLACES, BUDGET]);
     to.get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
         .details(
             "At first the present state. event: generation, with scene, generation, frame, n_cells, n_objects and n_bad_cells, or null without a scene; event: following, as the member following of /status. The stream ends when the service stops.",
@@ -78,6 +82,7 @@ fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         view::describe,
     )
     .errors(&SCENE)
+    .errors(&[BUDGET])
     .get("/v1/view/scores", "the score of every Gaussian on board, a byte each, in binary", view::scores)
     .details(
         "Little-endian: the bytes SLGS, version 1 (u32), least and largest score (f32 each), number of cells and generation (u32 each); for each cell its id and number of Gaussians (u32 each); then a byte b for each Gaussian: 0 if no view shows it, else its centroid's score is least + b / 255 * (largest - least). With negatives, scores are relevancies.",
@@ -100,6 +105,6 @@ fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
     .errors(&SCENE)
     .errors(&[
         (404, "The cell is not on board, or another generation is."),
-        (422, "The answer needs more than the budget."),
+        BUDGET,
     ])
 }

@@ -39,10 +39,9 @@ pub async fn list(
     pairs: Result<Pairs, QueryRejection>,
 ) -> Result<Json<ObjectPage>, Problem> {
     let (filter, limit) = parse(&params::pairs(pairs)?).map_err(parameter_problem)?;
-    app.blocking(move |app| {
-        app.reload_if_stale();
+    app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        Ok(Json(app.engine.objects(&snapshot, &filter, limit)))
+        app.engine.objects(&snapshot, &filter, limit, budget).map(Json).map_err(query_problem)
     })
     .await
 }
@@ -53,10 +52,10 @@ pub async fn one(
 ) -> Result<Json<ObjectOnBoard>, Problem> {
     let refused = || parameter_problem(RequestError::new("id", &id, "o and 16 hex digits"));
     let wanted = object_id(&id).ok_or_else(refused)?;
-    app.blocking(move |app| {
-        app.reload_if_stale();
+    app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let Some(object) = app.engine.object(&snapshot, wanted) else {
+        let found = app.engine.object(&snapshot, wanted, budget).map_err(query_problem)?;
+        let Some(object) = found else {
             let detail = format!(
                 "generation {} has no object {id} on board; GET /v1/objects lists those it has",
                 snapshot.manifest.generation

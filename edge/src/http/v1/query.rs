@@ -16,7 +16,7 @@ use super::body::{Body, Understood};
 use super::params::{self, Pairs};
 use super::reply::{Described, Replied};
 use crate::http::app::App;
-use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
+use crate::http::problem::{parameter_problem, query_problem};
 use crate::query::Asked;
 
 /// A reply, written where it was computed.
@@ -46,17 +46,10 @@ async fn answer_within(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Ve
     let body = body?;
     // Before time runs: a budget of nothing is refused, not overrun.
     let time_budget = body.time_budget().map_err(parameter_problem)?;
-    let limit = time_budget.map_or(app.settings.query_timeout, |time| time.min(app.settings.query_timeout));
-    let permit =
-        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
-    let answering = app.blocking(move |app| {
-        // Held until the work is done, even if the client has given up.
-        let _permit = permit;
-        app.reload_if_stale();
+    let answering = app.within_limits(time_budget, move |app, budget| {
         let has_objects = !app.engine.snapshot().map_err(query_problem)?.objects.is_empty();
         let Understood { ask, questions } = body.understand(has_objects).map_err(parameter_problem)?;
-        let budget = app.query_budget_within(time_budget);
-        let found = app.engine.ask(&ask, &budget).map_err(query_problem)?;
+        let found = app.engine.ask(&ask, budget).map_err(query_problem)?;
         let n_empty = found.outcomes.iter().filter(|outcome| outcome.is_empty()).count();
         app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
         let results = questions.into_iter().zip(&ask.asked).zip(&found.outcomes);
@@ -69,5 +62,5 @@ async fn answer_within(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Ve
         });
         serde_json::to_vec(&Replied::new(&found.reply, results.collect())).map_err(Problem::internal)
     });
-    tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))?
+    answering.await
 }

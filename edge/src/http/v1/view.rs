@@ -15,7 +15,7 @@ use super::body;
 use super::params::{self, Pairs, number};
 use crate::http::app::App;
 use crate::http::forms;
-use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
+use crate::http::problem::{parameter_problem, query_problem};
 use crate::query::{Negatives, QueryError, RequestError};
 use crate::score::Budget;
 
@@ -43,10 +43,9 @@ pub fn cell_parameters() -> [Parameter; 2] {
 }
 
 pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, Problem> {
-    app.blocking(|app| {
-        app.reload_if_stale();
+    app.within_limits(None, |app, budget| {
         let posted = app.following.as_ref().and_then(|following| following.status().position);
-        let described = app.engine.view(|snapshot| posted?.in_world(&snapshot.manifest).ok());
+        let described = app.engine.view(|snapshot| posted?.in_world(&snapshot.manifest).ok(), budget);
         described.map(Json).map_err(query_problem)
     })
     .await
@@ -70,7 +69,8 @@ pub async fn cell(
 }
 
 pub async fn words(State(app): State<Arc<App>>) -> Result<Json<Words>, Problem> {
-    within_limits(&app, |app, budget| app.engine.view_words(budget).map_err(query_problem)).await.map(Json)
+    app.within_limits(None, |app, budget| app.engine.view_words(budget).map(Json).map_err(query_problem))
+        .await
 }
 
 /// Makes a message within the limits of a query.
@@ -78,7 +78,7 @@ async fn message(
     app: &Arc<App>,
     make: impl FnOnce(&App, &Budget) -> Result<Option<Vec<u8>>, QueryError> + Send + 'static,
 ) -> Result<As<Binary>, Problem> {
-    let making = within_limits(app, move |app, budget| {
+    let making = app.within_limits(None, move |app, budget| {
         let made = make(app, budget).map_err(query_problem)?;
         made.ok_or_else(|| {
             let detail =
@@ -87,23 +87,6 @@ async fn message(
         })
     });
     Ok(As::new(([(header::CONTENT_TYPE, "application/octet-stream")], making.await?)))
-}
-
-/// Runs work within the limits of a query.
-async fn within_limits<T: Send + 'static>(
-    app: &Arc<App>,
-    work: impl FnOnce(&App, &Budget) -> Result<T, Problem> + Send + 'static,
-) -> Result<T, Problem> {
-    let permit =
-        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
-    let making = app.blocking(move |app| {
-        // Held until the work is done, even if the client has given up.
-        let _permit = permit;
-        app.reload_if_stale();
-        work(app, &app.query_budget())
-    });
-    let limit = app.settings.query_timeout;
-    tokio::time::timeout(limit, making).await.map_err(|_| timeout(limit))?
 }
 
 fn parse_scores(pairs: &[(String, String)]) -> Result<(String, Negatives), RequestError> {
