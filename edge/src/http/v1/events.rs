@@ -40,7 +40,12 @@ pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> 
         let mut quiet = Duration::ZERO;
         loop {
             // It may open files.
-            let looked = app.blocking(|app| Ok(app.reload_if_stale())).await;
+            let looked = app
+                .blocking(|app| {
+                    app.reload_if_stale();
+                    Ok(())
+                })
+                .await;
             if looked.is_err() {
                 return;
             }
