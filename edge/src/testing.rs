@@ -40,7 +40,6 @@ pub struct TestShard {
     pub has_exact_centroids: bool,
     /// Whether the shard has the indices in the input splat file whatever its profile.
     pub has_packed_indices: bool,
-    /// Members by centroid.
     pub centroids: Vec<Vec<Member>>,
     /// Gaussians without a centroid, after the centroids'.
     pub without_evidence: Vec<[u16; 3]>,

@@ -12,7 +12,6 @@ mod services;
 
 /// A decoder to fuzz.
 pub struct Target {
-    /// Its name.
     pub name: &'static str,
     /// Decodes the bytes and returns whether they were accepted. It must neither panic nor take memory out of proportion.
     pub run: fn(&[u8]) -> bool,

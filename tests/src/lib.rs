@@ -48,7 +48,6 @@ pub fn program(name: &str) -> PathBuf {
     folder.join(name)
 }
 
-/// Returns a command of the encoder.
 pub fn encoder(args: &[&str]) -> Command {
     command("slag-encoder", args)
 }
@@ -117,7 +116,6 @@ pub fn fetch(from: &str, cache: &Path) -> Command {
     command
 }
 
-/// Reads a file of JSON.
 pub fn read_json(path: &Path) -> Value {
     serde_json::from_slice(&fs_err::read(path).expect("the file is there")).expect("JSON")
 }
@@ -129,7 +127,6 @@ pub fn encode_quickly(room: &Path, store: &Path) -> Command {
     command
 }
 
-/// Copies a folder with all that is in it.
 pub fn copy_dir(from: &Path, to: &Path) {
     fs_err::create_dir_all(to).expect("made");
     for entry in fs_err::read_dir(from).expect("there") {

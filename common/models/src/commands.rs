@@ -148,8 +148,6 @@ pub fn ask(question: &str) -> bool {
 }
 
 /// Runs `command`.
-/// # Errors
-/// [`HubError`].
 pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, HubError> {
     let mut options = options(context.variable).ok_or(HubError::NoFolder)?;
     if let ModelsCommand::Pull(PullArgs { hub, .. }) = command {

@@ -29,7 +29,6 @@ const REDISTRIBUTABLE: [&str; 10] = [
 pub enum TextSideError {
     #[error("{model} is part of every robot's program, so a store need not carry it; leave --text-model out")]
     BuiltIn {
-        /// The model.
         model: String,
     },
     #[error(
@@ -37,7 +36,6 @@ pub enum TextSideError {
         REDISTRIBUTABLE.join(", ")
     )]
     Licence {
-        /// The model.
         model: String,
         licence: String,
     },
@@ -50,7 +48,6 @@ pub enum TextSideError {
     Description(#[from] DescriptionError),
     #[error("{model}: its description does not survive as JSON ({what}); report this with the model.toml")]
     Other {
-        /// The model.
         model: String,
         /// What differs.
         what: String,

@@ -43,7 +43,6 @@ pub enum AccessError {
     /// The token's file cannot be read.
     #[error("the token file {} cannot be read: {cause}; write a token of at least {MIN_TOKEN_CHARS} characters into it", path.display())]
     Unreadable {
-        /// The file.
         path: PathBuf,
         /// The system's error.
         cause: io::Error,
@@ -54,7 +53,6 @@ pub enum AccessError {
         path.display()
     )]
     Token {
-        /// The file.
         path: PathBuf,
         /// What it holds; not the token.
         found: String,
@@ -112,9 +110,6 @@ impl Access {
     /// Makes the checks of a service that listens on `listen`.
     ///
     /// Writes need the token if there is one; beyond this machine they are refused if there is none.
-    ///
-    /// # Errors
-    /// [`AccessError`].
     pub fn new(listen: &Listen, settings: AccessSettings) -> Result<Self, AccessError> {
         let writes = match settings.token_file {
             Some(path) => Writes::Token(read_token(&path)?),

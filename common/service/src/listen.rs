@@ -70,9 +70,6 @@ impl Listen {
     }
 
     /// Reads the certificate of a service that listens here, if it has one.
-    ///
-    /// # Errors
-    /// [`TlsError`].
     pub fn tls(&self, files: Option<TlsFiles>) -> Result<Option<Tls>, TlsError> {
         match (self, files) {
             (_, None) => Ok(None),
@@ -115,7 +112,6 @@ impl fmt::Display for Listen {
 #[derive(Debug, thiserror::Error)]
 #[error("cannot listen on {address}: {cause}; choose another address, port or path")]
 pub struct ListenError {
-    /// The address.
     pub address: Listen,
     /// The system's error.
     pub cause: io::Error,
@@ -148,9 +144,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
 /// Starts listening. A Unix socket that a dead process left behind is replaced; the new one is open to this user and
 /// group only.
-///
-/// # Errors
-/// [`ListenError`].
 pub async fn bind(listen: &Listen) -> Result<Listener, ListenError> {
     let bound = match listen {
         Listen::Tcp(address) => TcpListener::bind(address).await.map(Socket::Tcp),

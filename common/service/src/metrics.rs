@@ -58,7 +58,6 @@ pub struct Exposition {
 }
 
 impl Exposition {
-    /// Its media type.
     pub const MEDIA_TYPE: &str = "text/plain; version=0.0.4";
 
     /// Starts a text whose metrics' names begin with `prefix` and an underscore.

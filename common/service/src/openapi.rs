@@ -19,9 +19,7 @@ use crate::routes::{Parameter, Place, Route, Routes, help};
 pub struct About {
     /// Name of the program.
     pub name: &'static str,
-    /// Its version.
     pub version: &'static str,
-    /// Its license.
     pub license: &'static str,
     /// Its job: first line of the help text.
     pub summary: &'static str,
@@ -161,7 +159,6 @@ const OF_BODIES: [(u16, &str); 6] = [
     (415, "The body is not said to be application/json."),
 ];
 
-/// Returns a summary as a sentence.
 pub(crate) fn sentence(summary: &str) -> String {
     let mut letters = summary.chars();
     letters.next().map(|first| format!("{}{}.", first.to_uppercase(), letters.as_str())).unwrap_or_default()

@@ -15,7 +15,6 @@ pub type SchemaOf = fn(&mut SchemaGenerator) -> Schema;
 
 /// A successful reply.
 pub struct Reply {
-    /// Its status.
     pub status: StatusCode,
     /// Media types of the body, each with its schema; empty: no body.
     pub content: Vec<(&'static str, Schema)>,
@@ -103,7 +102,6 @@ impl<D: Described> Described for As<D> {
 
 /// A handler that says what it returns.
 pub trait Answering<T> {
-    /// What it returns.
     type Answer: Described;
 }
 

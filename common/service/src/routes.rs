@@ -24,7 +24,6 @@ const SUMMARY_COLUMN: usize = 36;
 pub enum Place {
     /// In the query string.
     Query,
-    /// In the path.
     Path,
     /// Among the headers.
     Header,
@@ -44,7 +43,6 @@ impl Place {
 /// A parameter of a route.
 #[derive(Clone, Debug)]
 pub struct Parameter {
-    /// Name.
     pub name: &'static str,
     /// A valid value, or its form.
     pub example: &'static str,
@@ -128,7 +126,6 @@ impl Parameter {
     }
 }
 
-/// A route.
 #[derive(Clone, Debug)]
 pub struct Route {
     /// Method; a GET route takes HEAD as well.
@@ -139,7 +136,6 @@ pub struct Route {
     pub summary: &'static str,
     /// More about it, for the description.
     pub details: Option<&'static str>,
-    /// Parameters.
     pub parameters: Vec<Parameter>,
     /// Whether it changes nothing although its method is POST, so that it needs no token.
     pub reads: bool,

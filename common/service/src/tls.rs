@@ -32,7 +32,6 @@ pub enum TlsError {
     /// The file cannot be read, or does not hold the PEM that is expected.
     #[error("{}: {cause}, expected {expected} in PEM", path.display())]
     File {
-        /// The file.
         path: PathBuf,
         /// What it should hold.
         expected: &'static str,
@@ -81,9 +80,6 @@ impl fmt::Debug for Tls {
 
 impl Tls {
     /// Reads a certificate and its key.
-    ///
-    /// # Errors
-    /// [`TlsError`].
     pub fn open(files: TlsFiles) -> Result<Self, TlsError> {
         let provider = Arc::new(ring::default_provider());
         let stamps = stamps_of(&files);

@@ -15,9 +15,6 @@ impl Manifest {
     }
 
     /// Reads the JSON text. Whose it is, the metadata says that names it as a target.
-    ///
-    /// # Errors
-    /// [`ManifestError`].
     pub fn parse(bytes: &[u8]) -> Result<Self, ManifestError> {
         if bytes.len() as u64 > MAX_BYTES {
             return Err(ManifestError::TooLong { len_bytes: bytes.len() as u64 });

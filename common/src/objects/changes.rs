@@ -29,7 +29,6 @@ const MAX_CANDIDATES: usize = 32;
 pub struct Moved {
     /// As it was.
     pub from: Thing,
-    /// As it is.
     pub to: Thing,
     /// Between the positions, world units.
     pub distance: f64,

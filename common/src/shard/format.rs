@@ -92,7 +92,6 @@ pub struct ScoreErrors {
 #[repr(C)]
 pub struct ShardHeader {
     pub cell_id: u32,
-    /// Gaussians, N.
     pub n_gaussians: u32,
     /// Centroids of the codebook, K.
     pub n_centroids: u32,

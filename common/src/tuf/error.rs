@@ -26,7 +26,6 @@ pub enum TufError {
         "{role} metadata: version {found}, expected {expected}: files of different states are mixed; fetch again"
     )]
     Version { role: String, expected: u64, found: u64 },
-    /// Expired.
     #[error("{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder {}` there, and check its clock", if role == "root" { "keys renew" } else { "store refresh" })]
     Expired { role: String, expired: String, now: String },
     /// Length or hash is not as stated.

@@ -19,7 +19,6 @@ pub struct Head {
     /// Kind of metadata.
     #[serde(rename = "_type")]
     pub kind: String,
-    /// Version of the specification.
     pub spec_version: String,
     /// Version of the metadata, from 1.
     pub version: u64,
@@ -50,7 +49,6 @@ pub struct Envelope {
 /// Metadata whose form is checked; its signatures are checked by [`SignedMetadata::check_signatures`].
 #[derive(Clone, Debug)]
 pub struct SignedMetadata<T> {
-    /// The head.
     pub head: Head,
     /// Seconds since 1970 from which it is refused.
     pub expires_unix_secs: u64,

@@ -49,7 +49,6 @@ impl Owner {
         Root { consistent_snapshot: true, keys, roles }
     }
 
-    /// Signs a root with keys of its own and others.
     pub fn sign_root(&self, version: u64, expires: u64, others: &[SigningKey]) -> Vec<u8> {
         let signers: Vec<&SigningKey> = self.root.iter().chain(others).collect();
         sign(version, expires, &self.root_body(), &signers)

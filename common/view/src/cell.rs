@@ -10,7 +10,6 @@ const MAGIC: [u8; 4] = *b"SLGG";
 const VERSION: u32 = 1;
 /// Bytes before the columns.
 pub const CELL_HEAD_BYTES: usize = 32;
-/// Bytes of a Gaussian.
 pub const GAUSSIAN_BYTES: usize = 16;
 /// Colour and opacity of Gaussians whose appearance is not known; the page shades them by height.
 const PLAIN: [u8; 4] = [160, 160, 160, 230];
@@ -64,7 +63,6 @@ pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>, ste
 pub struct Step(usize);
 
 impl Step {
-    /// All.
     pub const ALL: Self = Self(1);
     /// The largest step.
     pub const MAX: usize = 1 << 16;

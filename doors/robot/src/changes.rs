@@ -56,7 +56,6 @@ pub struct Changed {
 /// The text that a thing is most like.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Like {
-    /// The text.
     pub text: String,
     /// Their cosine.
     pub score: f32,
@@ -67,7 +66,6 @@ pub struct Like {
 pub struct Moved {
     /// As it was.
     pub from: Changed,
-    /// As it is.
     pub to: Changed,
     /// Between the positions.
     pub distance: f64,

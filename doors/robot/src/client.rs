@@ -43,18 +43,12 @@ impl Robot {
     }
 
     /// Asks what `POST /v1/query` takes.
-    ///
-    /// # Errors
-    /// [`RobotError`].
     pub fn ask(&self, request: &Value) -> Result<Reply, RobotError> {
         check_texts(texts_of(request))?;
         self.post("/v1/query", request)
     }
 
     /// Asks what `POST /v1/query` takes, for the Gaussians that match.
-    ///
-    /// # Errors
-    /// [`RobotError`].
     pub fn ask_points(&self, request: &Value) -> Result<Reply<PointAnswer>, RobotError> {
         let mut request = request.clone();
         request["kind"] = json!("gaussians");
@@ -63,17 +57,11 @@ impl Robot {
     }
 
     /// Returns what is on board.
-    ///
-    /// # Errors
-    /// [`RobotError`].
     pub fn place(&self) -> Result<Place, RobotError> {
         self.get("/v1/map")
     }
 
     /// Returns the number of things on board, or of those in a ball.
-    ///
-    /// # Errors
-    /// [`RobotError`].
     pub fn n_objects(&self, ball: Option<([f64; 3], f64)>) -> Result<u64, RobotError> {
         let filter = ball.map(|([x, y, z], radius)| format!("&near={x},{y},{z}&radius={radius}"));
         let path = format!("/v1/objects?limit=1{}", filter.unwrap_or_default());
@@ -82,25 +70,16 @@ impl Robot {
     }
 
     /// Returns places to stand, by the parameters of `GET /v1/goal`.
-    ///
-    /// # Errors
-    /// [`RobotError`].
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<Goals, RobotError> {
         self.get_with("/v1/goal", parameters)
     }
 
     /// Returns what changed between two generations, by the parameters of `GET /v1/changes`.
-    ///
-    /// # Errors
-    /// [`RobotError`].
     pub fn changes(&self, parameters: &[(&str, String)]) -> Result<Changes, RobotError> {
         self.get_with("/v1/changes", parameters)
     }
 
     /// Returns the ground around the robot, by the parameters of `GET /v1/floor`.
-    ///
-    /// # Errors
-    /// [`RobotError`].
     pub fn floor(&self, parameters: &[(&str, String)]) -> Result<Floor, RobotError> {
         self.get_with("/v1/floor", parameters)
     }

@@ -22,7 +22,6 @@ pub struct Goals {
 /// The thing that the poses are near.
 #[derive(Clone, Debug, Deserialize)]
 pub struct GoalThing {
-    /// Its id.
     pub id: String,
     /// Its middle.
     pub position_in_world: [f64; 3],
@@ -31,7 +30,6 @@ pub struct GoalThing {
 /// A pose: the ground below the robot's middle; x forward, y left, z up.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Goal {
-    /// Where.
     pub position_in_world: [f64; 3],
     /// The same on the earth, where the scene is geo-referenced.
     pub geographic: Option<Geographic>,

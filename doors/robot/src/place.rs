@@ -34,7 +34,6 @@ pub struct Place {
 /// A piece of space.
 #[derive(Clone, Copy, Debug, Deserialize)]
 pub struct Cell {
-    /// Its box.
     #[serde(flatten)]
     pub bounds: Box3,
     /// Whether the robot wanted it and could not fetch it; of missing cells only.

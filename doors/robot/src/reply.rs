@@ -111,6 +111,5 @@ pub struct Witness {
     pub thing: String,
     /// Its id; absent for the asker.
     pub id: Option<String>,
-    /// Where it is.
     pub position_in_world: [f64; 3],
 }

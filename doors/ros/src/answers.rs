@@ -26,7 +26,6 @@ const TEXT_COLOR: Color = Color { r: 1.0, g: 1.0, b: 1.0, a: 1.0 };
 /// Boxes of one leaf of a surface are flat; viewers refuse markers without extent.
 const MIN_EDGE_M: f64 = 0.01;
 
-/// Returns a header.
 pub fn header(frame_id: &str) -> Header {
     Header { stamp: Time::now(), frame_id: frame_id.to_owned() }
 }
@@ -57,7 +56,6 @@ pub fn goal_pose(header: &Header, goal: &Goal) -> PoseStamped {
     PoseStamped { header: header.clone(), pose }
 }
 
-/// Returns where the best answer is.
 pub fn best_pose(header: &Header, answers: &[Answer]) -> Option<PoseStamped> {
     answers.first().map(|best| PoseStamped { header: header.clone(), pose: pose(best) })
 }

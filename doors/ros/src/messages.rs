@@ -71,7 +71,6 @@ messages! {
     OccupancyGrid { header: Header, info: MapMetaData, data: Vec<i8> }
     /// Goal of `nav2_msgs/NavigateToPose`.
     NavigationGoal { pose: PoseStamped, behavior_tree: String }
-    /// Its feedback.
     NavigationFeedback {
         current_pose: PoseStamped, navigation_time: Duration, estimated_time_remaining: Duration,
         number_of_recoveries: i16, distance_remaining: f32,

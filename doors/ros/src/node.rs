@@ -63,7 +63,6 @@ pub enum Middleware {
 /// Where places to stand are sent to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GoalSink {
-    /// Nowhere.
     Nowhere,
     /// To the topic `/goal_pose`.
     Topic,

@@ -32,7 +32,6 @@ pub enum ConfigError {
     /// The file cannot be read.
     #[error("the configuration {} cannot be read: {cause}", path.display())]
     Unreadable {
-        /// The file.
         path: PathBuf,
         /// The system's error.
         cause: io::Error,

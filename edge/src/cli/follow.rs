@@ -33,7 +33,6 @@ pub struct FollowArgs {
 }
 
 impl FollowArgs {
-    /// Returns the settings for a radius.
     pub fn settings(&self, radius: f64) -> Result<FollowSettings, Failure> {
         let margin = self.margin.unwrap_or(if radius > 0.0 { radius / 4.0 } else { 1.0 });
         if !(margin > 0.0 && margin.is_finite()) {

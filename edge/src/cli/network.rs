@@ -9,7 +9,6 @@ use crate::store::EdgeCache;
 
 use super::failure::Failure;
 
-/// Fetches once.
 pub fn fetch_once(
     cache: &EdgeCache,
     request: &FetchRequest,

@@ -9,7 +9,6 @@ use slag_common::ByteSize;
 use super::failure::Failure;
 use super::output::print_pairs;
 
-/// Prints the report of a fetch.
 pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     let tally = |t: &Tally| format!("{} shards, {} bytes", t.n_shards, t.bytes);
     let trust = match (report.root_version, report.is_first_contact) {

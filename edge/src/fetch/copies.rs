@@ -58,7 +58,6 @@ impl Copies {
         Self { dir }
     }
 
-    /// Returns the folder.
     pub fn dir(&self) -> &Path {
         &self.dir
     }

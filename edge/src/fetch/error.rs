@@ -103,7 +103,6 @@ pub enum FetchError {
     #[error("{n_shards} shards ({bytes} bytes) are not on board; fetch with network")]
     Offline {
         n_shards: usize,
-        /// Their bytes.
         bytes: u64,
     },
     /// The disk has too little space for the download.

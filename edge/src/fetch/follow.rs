@@ -59,7 +59,6 @@ impl Default for FollowSettings {
 /// What to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
-    /// Fetch.
     Fetch,
     /// A fetch is due, but not before this time.
     NotBefore(Duration),
@@ -195,7 +194,6 @@ impl Following {
         self.changed.notify_all();
     }
 
-    /// Returns the status.
     pub fn status(&self) -> FollowStatus {
         self.lock().status.clone()
     }

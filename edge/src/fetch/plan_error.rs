@@ -20,7 +20,6 @@ pub enum PlanError {
     /// The scene has no geo-reference.
     #[error("scene {scene:?} has no geo-reference; give the position as x, y, z in its world frame")]
     NoGeoReference {
-        /// The scene.
         scene: String,
     },
     /// No cell is within the radius.
@@ -28,7 +27,6 @@ pub enum PlanError {
         "scene {scene:?} has no cell within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or increase the radius"
     )]
     NoCells {
-        /// The scene.
         scene: String,
         /// Centre of the search.
         centre_in_world: DVec3,
@@ -40,7 +38,6 @@ pub enum PlanError {
     /// The store has no shard of this profile.
     #[error("cell {cell_id} has no {profile} shard; it has: {available}; fetch one of those profiles")]
     NoProfile {
-        /// The cell.
         cell_id: u32,
         /// Profile asked for.
         profile: Profile,

@@ -56,7 +56,6 @@ impl Clearance {
         Self { along_y, n_y }
     }
 
-    /// Returns whether a cell is an obstacle.
     pub fn is_obstacle(&self, cell: usize) -> bool {
         self.along_y[cell] == 0
     }

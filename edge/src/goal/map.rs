@@ -39,9 +39,6 @@ pub struct FloorMap {
 }
 
 /// Maps the ground around a robot; the request's thing counts for nothing.
-///
-/// # Errors
-/// [`GoalError`].
 pub fn floor_map(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<FloorMap, GoalError> {
     request.check()?;
     let snapshot = engine.snapshot()?;

@@ -84,7 +84,6 @@ impl Window {
 
 /// The blocks of a window.
 pub struct Space {
-    /// The window.
     pub window: Window,
     /// `[columns + 1]`: where each column's blocks start.
     starts: Vec<u32>,

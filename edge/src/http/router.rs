@@ -24,7 +24,6 @@ pub(super) const ABOUT: About = About {
     errors: &[],
 };
 
-/// Returns the routes.
 fn routes() -> Routes<Arc<App>> {
     v1::routes(Routes::default())
         .get("/query", "objects, clusters or Gaussians that match texts, best first", query::query)

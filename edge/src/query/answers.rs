@@ -113,7 +113,6 @@ enum AnyAnswer {
 /// Answers of either kind.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Found {
-    /// Clusters.
     Clusters(Vec<ClusterAnswer>),
     /// Gaussians; [`GaussianAnswer::new`] describes one.
     Gaussians(Vec<Hit>),

@@ -41,7 +41,6 @@ pub struct Ask {
     pub asked: Vec<Asked>,
     /// Everything else; its texts and its area count for nothing. Its limit is that of a page.
     pub request: QueryRequest,
-    /// The area.
     pub area: Area,
     /// The asker's position; answers carry their distance from it, and nearer ones rank higher.
     pub near: Option<Point>,
@@ -137,9 +136,6 @@ impl Ask {
 impl Engine {
     /// Answers several questions from the loaded generation. Blocks for milliseconds of computing, at most as long as the
     /// budget says.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn ask(&self, ask: &Ask, budget: &Budget) -> Result<AskReply, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
@@ -216,7 +212,6 @@ impl Outcome {
     }
 }
 
-/// Answers a phrase.
 fn related(
     scene: &Scene<'_>,
     phrase: &Phrase,

@@ -48,11 +48,9 @@ pub enum QueryError {
     EncoderMismatch {
         /// Name of the text model's space.
         models_name: String,
-        /// Its id.
         models_id: Hash32,
         /// Name of the scene's space.
         scene_name: String,
-        /// Its id.
         scene_id: Hash32,
     },
     /// The shards cannot be scored.
@@ -183,7 +181,6 @@ impl Engine {
         Ok(Self { carried: Some(options), ..Self::new(cache, text) })
     }
 
-    /// Returns the cache.
     pub fn cache(&self) -> &EdgeCache {
         &self.cache
     }
@@ -207,9 +204,6 @@ impl Engine {
 
     /// Opens the cache's current generation and makes it the one in use; questions in progress keep theirs.
     /// If it does not open, the previous one stays in use. A text model that the scene carries comes into use with it.
-    ///
-    /// # Errors
-    /// [`StoreError`].
     pub fn reload(&self) -> Result<(), StoreError> {
         let tried = self.cache.current_stat().ok().flatten();
         let before = self.snapshot().ok();
@@ -263,9 +257,6 @@ impl Engine {
 
     /// Answers a request from the loaded generation. Blocks for milliseconds of computing, at most as long as the budget
     /// says.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn answer(&self, request: &QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
         request.check()?;
         let on_board = self.on_board()?;

@@ -35,7 +35,6 @@ impl Format {
         }
     }
 
-    /// Returns its media type.
     pub fn media_type(self) -> &'static str {
         match self {
             Self::Json => "application/json",

@@ -88,7 +88,6 @@ pub fn matching<'a>(
     reaching.filter_map(found).collect()
 }
 
-/// Returns the record of an object.
 pub fn record<'a>(scene: &Scene<'a>, object: usize) -> &'a ObjectRecord {
     let first = scene.index.parts(object)[0];
     &of_part(scene, first).records[first.number as usize]

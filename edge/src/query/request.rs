@@ -31,7 +31,6 @@ pub const DEFAULT_MIN_COUNT: u64 = 10;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{parameter}: found {found}, expected {expected}")]
 pub struct RequestError {
-    /// The parameter.
     pub parameter: String,
     /// The value found.
     pub found: String,
@@ -104,7 +103,6 @@ pub enum Negatives {
 }
 
 impl Negatives {
-    /// Returns the phrases.
     pub fn phrases(&self) -> Vec<&str> {
         match self {
             Self::None => Vec::new(),

@@ -24,7 +24,6 @@ pub struct Scene<'a> {
     pub objects: &'a [Option<Objects<'a>>],
     /// Index of the objects over all shards.
     pub index: &'a ObjectIndex,
-    /// Their manifest.
     pub manifest: &'a Manifest,
     /// Centre and radius of the last fetch.
     pub fetched: (DVec3, f64),

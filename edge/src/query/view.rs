@@ -28,7 +28,6 @@ const PROGRAM: &str = "slag-edge";
 /// Words that are scored at a time: bounds the scores in memory.
 const WORDS_TOGETHER: usize = 64;
 
-/// A word and its vector.
 type WordVector = (String, Arc<[f32]>);
 
 impl Engine {
@@ -87,9 +86,6 @@ impl Engine {
 
     /// Returns the message of a cell's Gaussians, all or every few, or nothing if the cell is not on board or of another generation than
     /// `generation`, where that is given.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn view_cell(
         &self,
         cell_id: u32,
@@ -111,9 +107,6 @@ impl Engine {
 
     /// Returns the words that the text model knows, each with the number of objects on board that it finds; of a model that
     /// takes any text, everyday words that find something.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
@@ -151,9 +144,6 @@ impl Engine {
     }
 
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.
-    ///
-    /// # Errors
-    /// [`QueryError`].
     pub fn view_scores(
         &self,
         text: &str,

@@ -6,7 +6,6 @@ use super::budget::OverBudget;
 /// refused, because computations with them would overflow.
 pub const MAX_COORDINATE: f64 = 1e9;
 
-/// Errors of scoring.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ScoreError {
     /// The question needs more than its budget.

@@ -78,7 +78,6 @@ impl EdgeCache {
         Self { dir: dir.into(), files }
     }
 
-    /// Returns the folder.
     pub fn dir(&self) -> &Path {
         &self.dir
     }

@@ -35,7 +35,6 @@ pub enum StoreError {
     #[error("{path}: content has hash {found}, expected {expected}; fetch again, which replaces it", path = path.display())]
     Hash {
         path: PathBuf,
-        /// Hash expected.
         expected: Hash32,
         /// Hash of the content.
         found: Hash32,

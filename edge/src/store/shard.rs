@@ -60,7 +60,6 @@ impl OpenShard {
         self.cell.shards.get(&profile).map(|shard| shard.hash)
     }
 
-    /// Returns its length.
     pub fn len_bytes(&self) -> u64 {
         self.bytes.len() as u64
     }

@@ -36,7 +36,6 @@ use sim::SimFiles;
 /// Fetches with short timeouts and few retries.
 #[derive(Clone)]
 struct Robot {
-    /// Its own, where it has one.
     _dir: Option<Arc<tempfile::TempDir>>,
     cache: EdgeCache,
     request: FetchRequest,

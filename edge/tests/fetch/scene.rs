@@ -168,7 +168,6 @@ impl Published {
         self.manifest.cells[cell_id as usize].shards[&profile].hash
     }
 
-    /// Returns the first root.
     pub fn first_root(&self) -> Vec<u8> {
         self.metadata["1.root.json"].clone()
     }

@@ -28,7 +28,6 @@ pub enum Fault {
     RetryAfter(u16, u64),
     /// Delays the answer.
     Delay(Duration),
-    /// Redirects.
     Redirect(String),
     /// Sends the body and then continues for ever, in chunks.
     Endless,

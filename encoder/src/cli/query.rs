@@ -14,7 +14,6 @@ use crate::query::{self, Hit, Scores};
 use crate::raster::RasterView;
 use crate::store::StoreReader;
 
-/// Largest width of a picture.
 const MAX_PICTURE_WIDTH_PX: u32 = 1600;
 
 /// `query`.

@@ -117,7 +117,6 @@ impl ResidualCode {
         self
     }
 
-    /// Returns the number of subspaces.
     pub fn n_subspaces(&self) -> usize {
         self.subspace_starts.len() - 1
     }

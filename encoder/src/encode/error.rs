@@ -28,7 +28,6 @@ pub enum EncodeError {
         "{model} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out"
     )]
     NoPatches {
-        /// The model.
         model: String,
     },
     #[error("--text-model: {0}")]
@@ -133,7 +132,6 @@ pub enum EncodeError {
     /// A view has no pose, and `strict` is set.
     #[error("view {view} has no pose: {reason}; remove it from the poses, or leave out --strict")]
     NoPose {
-        /// The view.
         view: String,
         /// What its pose is.
         reason: String,

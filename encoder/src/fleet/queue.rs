@@ -36,7 +36,6 @@ const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 pub(crate) struct QueueSettings {
     /// `nats://HOST:PORT` or `tls://HOST:PORT`, several with commas.
     pub(crate) url: String,
-    /// A credentials file.
     pub(crate) credentials: Option<PathBuf>,
     /// A file with the seed of an nkey.
     pub(crate) nkey: Option<PathBuf>,

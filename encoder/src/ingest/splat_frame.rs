@@ -14,7 +14,6 @@ pub enum FrameChoice {
     Auto,
     /// Nowhere: splat and poses have one frame.
     None,
-    /// By this file.
     File(PathBuf),
 }
 
@@ -37,9 +36,7 @@ impl Activated {
 /// A file that states the splat's frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FoundFrame {
-    /// The file.
     pub path: PathBuf,
-    /// What it states of the given poses.
     pub stated: SplatFromPoses,
 }
 

@@ -14,12 +14,10 @@ pub struct BoxPx {
 }
 
 impl BoxPx {
-    /// Returns the width in pixels.
     pub fn width_px(&self) -> u32 {
         self.x1 - self.x0
     }
 
-    /// Returns the height in pixels.
     pub fn height_px(&self) -> u32 {
         self.y1 - self.y0
     }

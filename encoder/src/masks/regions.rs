@@ -11,9 +11,7 @@ pub const NO_REGION: u32 = u32::MAX;
 /// The partition of a view by its masks: the pixels of a region lie in the same masks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionMap {
-    /// Width, pixels.
     pub width_px: u32,
-    /// Height, pixels.
     pub height_px: u32,
     /// Region of each pixel, row-major; [`NO_REGION`] outside all masks.
     pub region_of_pixel: Vec<u32>,
@@ -147,7 +145,6 @@ pub fn absorb_slivers(map: &mut RegionMap, masks_of_region: &mut Vec<Vec<u32>>) 
     *masks_of_region = masks_of_number;
 }
 
-/// Returns for each region whether it is a sliver.
 fn slivers(
     map: &RegionMap,
     masks_of_region: &[Vec<u32>],

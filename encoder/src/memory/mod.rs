@@ -36,7 +36,6 @@ const PHASES: [Phase; 5] = [Phase::Views, Phase::Superpoints, Phase::Objects, Ph
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reservation {
     pub purpose: &'static str,
-    /// Bytes, at most.
     pub len_bytes: u64,
     phase: Phase,
     /// Bytes that are expected beyond what the process holds when its peak is planned.

@@ -24,7 +24,6 @@ pub struct GpuRasterizer {
     none: Infallible,
 }
 
-/// Returns no adapter.
 pub fn adapters() -> Vec<Adapter> {
     Vec::new()
 }

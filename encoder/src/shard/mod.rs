@@ -103,7 +103,6 @@ pub fn expected_bytes(len_bytes: u64) -> u64 {
 /// What a cell's shards carry besides Gaussians and their embeddings.
 #[derive(Clone, Copy, Default)]
 pub struct CellExtras<'a> {
-    /// The objects of the scene, if it has any.
     pub objects: Option<&'a SceneObjects>,
     /// The free and occupied places of the cell, if they were asked for.
     pub occupancy: Option<Occupancy<'a>>,

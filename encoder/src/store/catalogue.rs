@@ -31,7 +31,6 @@ pub(crate) struct GenerationRecord {
     /// When it was made, seconds since 1970.
     pub(crate) created_unix_secs: u64,
     pub(crate) n_cells: usize,
-    /// Number of Gaussians in them.
     pub(crate) n_gaussians: u64,
 }
 

@@ -9,7 +9,6 @@ use slag_encoder::raster::{RasterView, ViewWeights, WeightKind};
 use super::backends::{Backend, backends};
 use super::oracle;
 
-/// The kind of weight.
 pub const KINDS: [WeightKind; 2] = [WeightKind::Blend, WeightKind::Falloff];
 
 /// Rows with Gaussians at equal depths or on a cut, where the last bit of f32 decides.

@@ -26,7 +26,6 @@ pub fn is_nightly() -> bool {
     std::env::var_os("SLAG_NIGHTLY").is_some()
 }
 
-/// Returns the root of the workspace.
 pub fn workspace_root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
 }

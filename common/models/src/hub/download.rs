@@ -38,7 +38,6 @@ pub(super) struct Advertised {
     pub len_bytes: Option<u64>,
 }
 
-/// Returns a client for the hub.
 pub(super) fn client(options: &HubOptions) -> Result<Client<'static>, DownloadFailure> {
     let proxy = options.proxy.as_deref().map(ureq::Proxy::new).transpose()?;
     let limits = NetworkLimits {

@@ -42,7 +42,6 @@ pub enum HubError {
         repository: String,
         /// The script that makes the files.
         script: String,
-        /// The folder for them.
         folder: PathBuf,
     },
     #[error("{name} finds masks in photos, which a robot does not do; pull it with slag-encoder")]

@@ -13,7 +13,6 @@ pub struct Table {
     /// Address of the hub.
     pub hub: String,
     layout: BTreeMap<String, Layout>,
-    /// The models.
     #[serde(rename = "model")]
     pub models: Vec<Entry>,
 }

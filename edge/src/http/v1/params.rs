@@ -65,7 +65,6 @@ pub fn negative() -> Parameter {
         .repeated(MAX_NEGATIVES)
 }
 
-/// Returns the pairs of a query string.
 pub fn pairs(pairs: Result<Pairs, QueryRejection>) -> Result<Vec<(String, String)>, Problem> {
     let refused = |e: QueryRejection| {
         parameter_problem(RequestError::new("query string", &e.body_text(), "name=value pairs"))

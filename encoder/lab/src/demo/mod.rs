@@ -66,7 +66,6 @@ pub struct Demo {
 pub struct DemoReport {
     /// A picture of each answer, and a map of the scene from above with the cells that the robot fetched.
     pub pictures: [PathBuf; 2],
-    /// Summary of the encode.
     pub encode: EncodeSummary,
     /// Bytes that the robot downloaded.
     pub downloaded_bytes: u64,

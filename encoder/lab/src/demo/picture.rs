@@ -30,9 +30,6 @@ pub(super) struct Panel<'a> {
 }
 
 /// Draws the panels, left to right, top to bottom.
-///
-/// # Errors
-/// [`RasterError`].
 pub(super) fn answers(
     scene: &Gaussians,
     views: &[RasterView],

@@ -5,7 +5,6 @@ use slag_math::random::Xorshift;
 /// A parsed expression.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Expression {
-    /// A number.
     Number(f64),
     /// A variable, by its index among the names.
     Variable(usize),

@@ -46,7 +46,6 @@ pub enum GrammarError {
     /// A line is malformed.
     #[error("{}:{line}: {reason}", path.display())]
     Line {
-        /// The file.
         path: PathBuf,
         /// The line, from 1.
         line: usize,
@@ -99,7 +98,6 @@ pub struct Noun {
     pub words: Vec<String>,
     /// Kinds of thing that it belongs to.
     pub kinds: Vec<String>,
-    /// Scenes and places where it is found.
     pub found: Vec<(SceneKind, Place)>,
     paints: Vec<PaintRule>,
     variables: Vec<Choice>,
@@ -156,9 +154,6 @@ pub struct Object {
 }
 
 /// Returns the nouns of a folder of object files, or the built-in ones, sorted by name.
-///
-/// # Errors
-/// [`GrammarError`].
 pub fn nouns(folder: Option<&Path>) -> Result<Vec<Noun>, GrammarError> {
     let mut texts: Vec<(PathBuf, String)> = match folder {
         None => OBJECTS

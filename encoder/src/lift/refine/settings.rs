@@ -61,7 +61,6 @@ impl Aggregation {
         self.n_scales() + usize::from(self.object > 0.0)
     }
 
-    /// Returns the number of scales of superpoints.
     pub(super) fn n_scales(&self) -> usize {
         usize::from(self.has_fine_superpoints()) + usize::from(self.coarse > 0.0)
     }

@@ -24,7 +24,6 @@ impl Stages {
         Self { buffers, groups: HashMap::new() }
     }
 
-    /// Projects the Gaussians of a chunk.
     pub fn project(
         &self,
         device: &Device,

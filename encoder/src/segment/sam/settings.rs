@@ -11,7 +11,6 @@ pub enum SamLevels {
     Merged,
     /// The largest.
     Whole,
-    /// The one between.
     Part,
     /// The smallest.
     Subpart,

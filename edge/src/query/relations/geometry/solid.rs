@@ -12,7 +12,6 @@ const PIECE: f64 = 0.6;
 /// An upright box in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Solid {
-    /// Its centre.
     pub centre: DVec3,
     /// Half its edges; the first two are along `along` and to its left.
     pub half: DVec3,
@@ -53,7 +52,6 @@ impl Solid {
         self.centre.z + self.half.z
     }
 
-    /// Returns its height.
     pub fn height(&self) -> f64 {
         2.0 * self.half.z
     }
