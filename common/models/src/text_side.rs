@@ -28,17 +28,12 @@ const REDISTRIBUTABLE: [&str; 10] = [
 #[derive(Debug, thiserror::Error)]
 pub enum TextSideError {
     #[error("{model} is part of every robot's program, so a store need not carry it; leave --text-model out")]
-    BuiltIn {
-        model: String,
-    },
+    BuiltIn { model: String },
     #[error(
         "the licence of {model} is {licence:?}, which is not known to permit passing its weights on ({}); pull the model on each robot with `slag-edge models pull`, or correct `licence` in model.toml",
         REDISTRIBUTABLE.join(", ")
     )]
-    Licence {
-        model: String,
-        licence: String,
-    },
+    Licence { model: String, licence: String },
     #[error("{}: its weights lie in a file of their own, which a store cannot carry; save the model as one file", path.display())]
     SeparateWeights {
         /// The ONNX file.

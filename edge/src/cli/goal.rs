@@ -33,9 +33,9 @@ pub struct GoalArgs {
     /// Height of the robot [default: 0.1 above the sensor].
     #[arg(long, value_name = "M")]
     pub height_m: Option<f64>,
-    /// Highest step that it climbs.
-    #[arg(long, value_name = "M", default_value_t = 0.1)]
-    pub step_m: f64,
+    /// Highest step that it climbs, 1.5 of the scene's voxels or more [default: 0.1, or 0.15 with voxels of 0.1 m].
+    #[arg(long, value_name = "M")]
+    pub step_m: Option<f64>,
     /// Steepest ground that it drives on: rise for each metre of way.
     #[arg(long, value_name = "RATIO", default_value_t = 0.5)]
     pub slope: f64,

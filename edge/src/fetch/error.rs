@@ -101,10 +101,7 @@ pub enum FetchError {
     Plan(#[from] PlanError),
     /// Shards are missing, and the network may not be used.
     #[error("{n_shards} shards ({bytes} bytes) are not on board; fetch with network")]
-    Offline {
-        n_shards: usize,
-        bytes: u64,
-    },
+    Offline { n_shards: usize, bytes: u64 },
     /// The disk has too little space for the download.
     #[error(
         "{path}: {free_bytes} bytes are free, the fetch needs {needed_bytes}; free some space, or fetch a smaller radius", path = path.display()

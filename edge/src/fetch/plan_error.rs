@@ -19,9 +19,7 @@ pub enum PlanError {
     },
     /// The scene has no geo-reference.
     #[error("scene {scene:?} has no geo-reference; give the position as x, y, z in its world frame")]
-    NoGeoReference {
-        scene: String,
-    },
+    NoGeoReference { scene: String },
     /// No cell is within the radius.
     #[error(
         "scene {scene:?} has no cell within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or increase the radius"

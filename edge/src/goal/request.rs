@@ -14,6 +14,9 @@ pub const SENSOR_HEIGHT_M: [f64; 2] = [0.05, 2.3];
 pub const HEIGHT_M: [f64; 2] = [0.05, 2.4];
 /// Least and largest step.
 pub const STEP_M: [f64; 2] = [0.0, 0.5];
+/// Least step that shows in a scene, in its voxels: heights of surfaces are known to half a voxel, so a difference of n voxels
+/// may be n and a half high, and level ground may differ by one.
+pub(super) const LEAST_STEP_VOXELS: f64 = 1.5;
 /// Least and largest slope.
 pub const SLOPE: [f64; 2] = [0.02, 5.0];
 /// Least and largest range.
@@ -47,8 +50,8 @@ pub struct GoalRequest {
     pub sensor_height_m: f64,
     /// Height of the robot; 0.1 m above the sensor if absent.
     pub height_m: Option<f64>,
-    /// Highest step that it climbs.
-    pub step_m: f64,
+    /// Highest step that it climbs; see [`GoalRequest::step_m`] if absent.
+    pub step_m: Option<f64>,
     /// Steepest ground that it drives on, rise for each metre of way; a step is allowed besides.
     pub slope: f64,
     /// How far around the robot ground is looked at.
@@ -69,12 +72,18 @@ impl GoalRequest {
             reach_m: 0.8,
             sensor_height_m: 0.4,
             height_m: None,
-            step_m: 0.1,
+            step_m: None,
             slope: 0.5,
             range_m: 20.0,
             min_visible: 0.02,
             limit: 3,
         }
+    }
+
+    /// Returns the highest step that the robot climbs, in a scene with voxels of edge `voxel`, metres. By default 0.1 m, or
+    /// up to 0.15 m where lower steps do not show in the voxels.
+    pub fn step_m(&self, voxel: f64) -> f64 {
+        self.step_m.unwrap_or((LEAST_STEP_VOXELS * voxel).clamp(0.1, 0.15))
     }
 
     /// Returns the robot's height.
@@ -92,7 +101,7 @@ impl GoalRequest {
             ("reach_m", self.reach_m, REACH_M),
             ("sensor_height_m", self.sensor_height_m, SENSOR_HEIGHT_M),
             ("height_m", self.height(), [self.sensor_height_m, HEIGHT_M[1]]),
-            ("step_m", self.step_m, STEP_M),
+            ("step_m", self.step_m.unwrap_or(STEP_M[0]), STEP_M),
             ("slope", self.slope, SLOPE),
             ("range_m", self.range_m, RANGE_M),
             ("min_visible", self.min_visible, MIN_VISIBLE),

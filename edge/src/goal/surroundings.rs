@@ -7,7 +7,7 @@ use super::clearance::{self, Clearance};
 use super::error::GoalError;
 use super::ground::{Floor, Ground, SURFACE_DEPTH};
 use super::paths::Paths;
-use super::request::GoalRequest;
+use super::request::{GoalRequest, LEAST_STEP_VOXELS};
 use super::space::{Space, Window};
 use crate::query::RequestError;
 use crate::score::Budget;
@@ -72,7 +72,7 @@ pub(super) struct Surroundings<'a> {
 /// says where the robot is, its height counts: a table top above it is none, nor is the floor of the storey below.
 fn own_surface(window: &Window, ground: &Ground, request: &GoalRequest, near: DVec3) -> Option<(usize, u8)> {
     let height = |offset: f64| window.voxel_of(near + DVec3::Z * offset)[2];
-    let highest = height(request.step_m + SURFACE_DEPTH * window.voxel) - 1;
+    let highest = height(request.step_m(window.voxel) + SURFACE_DEPTH * window.voxel) - 1;
     let lowest = height(-MAX_HEIGHT_M) - 1;
     let surface = |cell: usize| match (request.near, ground.floors[cell]) {
         (Some(_), _) => ground.surface_below(cell, highest).filter(|z| i32::from(*z) >= lowest),
@@ -130,16 +130,14 @@ impl<'a> Surroundings<'a> {
                 too_far(format!("at most {most_m:.1}, as the scene's voxels are {voxel} m wide")).into()
             );
         }
-        // Heights of surfaces are known to half a voxel, so a difference of n voxels may be n and a half high, and level ground
-        // may differ by one.
-        let least_m = 1.5 * voxel;
-        if request.step_m < least_m - 1e-9 {
+        let (step_m, least_m) = (request.step_m(voxel), LEAST_STEP_VOXELS * voxel);
+        if step_m < least_m - 1e-9 {
             let expected = format!(
                 "at least {least_m:.3}, as the scene's voxels are {voxel} m high and smaller steps do not show in them"
             );
-            return Err(RequestError::new("step_m", &request.step_m.to_string(), expected).into());
+            return Err(RequestError::new("step_m", &step_m.to_string(), expected).into());
         }
-        let step = (request.step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
+        let step = (step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
         let window = Window::around(near, request.range_m, voxel);
         budget.take(window.cells().iter().product::<usize>() * CELL_BYTES);
         budget.check().map_err(GoalError::spent)?;

@@ -263,7 +263,7 @@ fn steps_and_slopes_count() {
     goals(threshold(0.05)).expect("poses");
     assert_eq!(goals(threshold(0.15)), Err(NoGoal::Unreachable));
     let world = packed(hall(threshold(0.15)));
-    let request = GoalRequest { step_m: 0.2, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = GoalRequest { step_m: Some(0.2), ..GoalRequest::new(GoalTarget::Object(1)) };
     goals_with(&world, &request).expect("a robot that climbs 20 cm");
     // A slope that is reached by a ramp on both sides.
     let hill = |p: DVec3| (p.z < (0.5 - (p.x - 1.8).abs()).max(0.0) * 0.6).then_some(At::Solid);
@@ -332,7 +332,7 @@ fn steep_ramps_are_not_driven() {
 /// What voxels cannot keep is refused: a step that does not show in them.
 #[test]
 fn steps_below_the_voxels_are_refused() {
-    let refused = |voxel: f64, step_m: f64| {
+    let refused = |voxel: f64, step_m: Option<f64>| {
         let world = packed_in(voxel, -4.0 * voxel, hall(|_| None));
         let request = GoalRequest { step_m, ..GoalRequest::new(GoalTarget::Object(1)) };
         let budget = Budget::default();
@@ -340,15 +340,18 @@ fn steps_below_the_voxels_are_refused() {
         seen.err().map(|error| error.to_string())
     };
     for (voxel, step_m) in [(0.05, 0.0), (0.05, 0.05), (0.05, 0.07), (0.1, 0.1), (0.5, 0.0), (0.5, 0.5)] {
-        let error = refused(voxel, step_m).expect("refused");
+        let error = refused(voxel, Some(step_m)).expect("refused");
         assert!(error.contains("step_m") && error.contains("at least"), "{voxel} {step_m}: {error}");
     }
     for (voxel, step_m) in [(0.05, 0.075), (0.05, 0.1), (0.1, 0.15)] {
-        assert_eq!(refused(voxel, step_m), None, "{voxel} {step_m}");
+        assert_eq!(refused(voxel, Some(step_m)), None, "{voxel} {step_m}");
     }
+    // The default fits voxels up to 10 cm.
+    assert_eq!([0.02, 0.05, 0.1].map(|voxel| refused(voxel, None)), [None, None, None]);
+    assert!(refused(0.2, None).is_some());
     // In voxels of 10 cm the same hall has poses.
     let world = packed_in(0.1, -0.4, hall(|_| None));
-    let request = GoalRequest { step_m: 0.15, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = GoalRequest { step_m: Some(0.15), ..GoalRequest::new(GoalTarget::Object(1)) };
     goals_with(&world, &request).expect("poses");
 }
 
@@ -379,7 +382,7 @@ fn requests_out_of_range_name_the_parameter() {
     assert_eq!(refused(&|r| r.reach_m = f64::NAN), "reach_m");
     assert_eq!(refused(&|r| r.height_m = Some(0.2)), "height_m");
     assert_eq!(refused(&|r| r.sensor_height_m = 2.4), "sensor_height_m");
-    assert_eq!(refused(&|r| r.step_m = -0.1), "step_m");
+    assert_eq!(refused(&|r| r.step_m = Some(-0.1)), "step_m");
     assert_eq!(refused(&|r| r.slope = 0.0), "slope");
     assert_eq!(refused(&|r| r.range_m = 51.0), "range_m");
     assert_eq!(refused(&|r| r.min_visible = 0.0), "min_visible");

@@ -27,9 +27,7 @@ pub enum EncodeError {
     #[error(
         "{model} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out"
     )]
-    NoPatches {
-        model: String,
-    },
+    NoPatches { model: String },
     #[error("--text-model: {0}")]
     TextModel(#[from] TextSideError),
     #[error("cannot start {n_threads} threads: {source}; use fewer with --threads")]

@@ -55,7 +55,12 @@ pub fn floor_parameters() -> Vec<Parameter> {
         length("sensor_height_m", "0.4", "height of its sensor above the ground", request::SENSOR_HEIGHT_M)
             .or(usual.sensor_height_m),
         length("height_m", "0.5", "height of the robot (default: 0.1 above the sensor)", request::HEIGHT_M),
-        length("step_m", "0.1", "highest step that it climbs", request::STEP_M).or(usual.step_m),
+        length(
+            "step_m",
+            "0.1",
+            "highest step that it climbs, 1.5 of the scene's voxels or more (default: 0.1, or 0.15 with voxels of 0.1 m)",
+            request::STEP_M,
+        ),
         Parameter::new::<f64>(
             "slope",
             "0.4",
@@ -185,7 +190,7 @@ fn parse(pairs: &[(String, String)]) -> Result<(GoalRequest, Option<Point>), Req
             "reach_m" => request.reach_m = metres()?,
             "sensor_height_m" => request.sensor_height_m = metres()?,
             "height_m" => request.height_m = Some(metres()?),
-            "step_m" => request.step_m = metres()?,
+            "step_m" => request.step_m = Some(metres()?),
             "slope" => request.slope = metres()?,
             "range_m" => request.range_m = metres()?,
             "min_visible" => request.min_visible = metres()?,
