@@ -1,7 +1,8 @@
 //! Inputs as people have them: what `check` and `encode` make of files of kinds that people report trouble with.
 //!
-//! `../shared/cases` makes the inputs, small changes of the labelled house. A row says what a command does with one: its exit
-//! code and words of what it prints. The ordinary run does the rows marked `fast`; `cargo test -- --ignored` does all.
+//! `../shared/cases` makes the inputs, small changes of the labelled house. A row says what a command does with
+//! one: its exit code and words of what it prints. The ordinary run does the rows marked `fast`; `cargo test --
+//! --ignored` does all.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -201,7 +202,8 @@ fn encode(scene: &Path, views: &Path, masks: &Path, store: &Path) -> Command {
     command
 }
 
-/// The largest distance of a stored position from its Gaussian, of those near the house, and the largest error stated.
+/// The largest distance of a stored position from its Gaussian, of those near the house, and the largest error
+/// stated.
 fn position_errors(store: &Path, splat: &Path) -> (f64, f64) {
     let scene = splat::read(splat, &ReadOptions::default()).expect("reads");
     let reader = StoreReader::open(store).expect("a published store");

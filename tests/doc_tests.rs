@@ -222,7 +222,8 @@ fn flags_that_the_documents_name_exist() {
     });
 }
 
-/// The command lines of the documents are those that the programs parse, with values in place of their placeholders.
+/// The command lines of the documents are those that the programs parse, with values in place of their
+/// placeholders.
 #[test]
 fn documented_commands_are_understood() {
     let programs =
@@ -281,8 +282,8 @@ fn functions() -> BTreeSet<String> {
     found
 }
 
-/// Returns the names of tests in a text: words in backquotes with a `::`, or of at least four parts (`a_b_c_d`). Names of
-/// columns and fields are shorter.
+/// Returns the names of tests in a text: words in backquotes with a `::`, or of at least four parts (`a_b_c_d`).
+/// Names of columns and fields are shorter.
 fn tests_named(text: &str) -> Vec<&str> {
     let is_name = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == ':';
     let words = text.split('`').skip(1).step_by(2);

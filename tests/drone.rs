@@ -34,8 +34,8 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let n_cells = summary["n_cells"].as_u64().expect("a count");
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
 
-    // A point on the ground near the middle, and the same point in degrees. Oracle: an ENU library's figures for the
-    // origin of geo.json.
+    // A point on the ground near the middle, and the same point in degrees. Oracle: an ENU library's figures for
+    // the origin of geo.json.
     let origin = server.get("/v1/cells?x=0&y=0&z=2&radius=30");
     let nearby = origin["cells"].as_array().expect("cells").len() as u64;
     assert!(0 < nearby && nearby < n_cells, "{nearby} of {n_cells} cells");

@@ -17,8 +17,8 @@ fn encoded(store: &Path, profiles: &str) -> Gaussians {
     splat::read(&generated(&ROOM).join("scene.ply"), &ReadOptions { with_sh_rest: true }).expect("reads")
 }
 
-/// Asserts that each point's input index is that of the splat's Gaussian nearest to it, found by comparing with all.
-/// Where two Gaussians are as near as the error of positions, either may be meant. Returns the indices.
+/// Asserts that each point's input index is that of the splat's Gaussian nearest to it, found by comparing with
+/// all. Where two Gaussians are as near as the error of positions, either may be meant. Returns the indices.
 fn assert_nearest(points: &[[f64; 4]], scene: &Gaussians) -> Vec<u32> {
     let error = 1.01 * POSITION_ERROR.parse::<f64>().expect("a number");
     let mut n_ambiguous = 0;

@@ -1,5 +1,5 @@
-//! Runs every fuzz target on seeds, on what fuzzing guided by coverage found (`fuzz/corpus`), and on thousands of seeded mutations of
-//! both.
+//! Runs every fuzz target on seeds, on what fuzzing guided by coverage found (`fuzz/corpus`), and on thousands of
+//! seeded mutations of both.
 //!
 //! `SLAG_FUZZ_SECS` sets the seconds per target, instead of a fixed number of mutations.
 

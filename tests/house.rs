@@ -20,8 +20,9 @@ fn encode_house(views: &str, store: &Path, flags: &str) -> std::process::Command
     command
 }
 
-/// Encodes the house with its given masks and the ConSE encoder, and compares total weights, embeddings, and each word's
-/// AUC and IoU. The tolerances are the reference's own, because crops, resizing and runtime versions differ slightly.
+/// Encodes the house with its given masks and the ConSE encoder, and compares total weights, embeddings, and each
+/// word's AUC and IoU. The tolerances are the reference's own, because crops, resizing and runtime versions differ
+/// slightly.
 #[needs_shared]
 #[test]
 fn the_field_agrees_with_the_independent_reference() {
@@ -39,8 +40,9 @@ fn the_field_agrees_with_the_independent_reference() {
     check_words(&house, &store, &models);
 }
 
-/// A model that wants windows over the photo gets them: vectors turn, as far as a share of 0.35 can turn them, and their number is that of the masks.
-/// Oracle: unit vectors a and b give |0.65 a + 0.35 b| >= 0.3, and an angle to a of at most asin(0.35 / 0.65).
+/// A model that wants windows over the photo gets them: vectors turn, as far as a share of 0.35 can turn them, and
+/// their number is that of the masks. Oracle: unit vectors a and b give |0.65 a + 0.35 b| >= 0.3, and an angle to
+/// a of at most asin(0.35 / 0.65).
 #[needs_shared]
 #[test]
 fn masks_take_a_share_of_windows() {
@@ -68,8 +70,8 @@ fn masks_take_a_share_of_windows() {
     assert!(!cosines.is_empty() && cosines.iter().all(|cosine| (least - 1e-3..0.9999).contains(cosine)));
 }
 
-/// The GPU's field equals the CPU's within the bound of docs/numerics.md: contributions differ only at pixels across a cut,
-/// together by less than a 50,000th. A machine without a GPU uses a software adapter.
+/// The GPU's field equals the CPU's within the bound of docs/numerics.md: contributions differ only at pixels
+/// across a cut, together by less than a 50,000th. A machine without a GPU uses a software adapter.
 #[needs_shared]
 #[test]
 fn a_gpu_gives_the_field_of_the_cpu() {

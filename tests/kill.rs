@@ -36,8 +36,8 @@ fn killed_encodes_resume_and_show_nothing_half() {
     let encode_time = start.elapsed();
     let expected = content(&whole);
 
-    // Kills come within the first half of the time, so that several hit each store. A finished store is replaced by a
-    // new one.
+    // Kills come within the first half of the time, so that several hit each store. A finished store is replaced
+    // by a new one.
     let mut random = Random::new(7);
     let (mut n_kills, mut n_stores, mut n_resumed) = (0, 0, 0);
     while n_kills < n_wanted {

@@ -1,7 +1,7 @@
 //! Dependencies point one way: the layers of ARCHITECTURE.md, and no circle between files of a crate.
 //!
-//! Every path in the source is resolved to the file that defines the item, through re-exports; so a `mod.rs` that only
-//! declares and re-exports its children depends on none of them. Tests (`#[cfg(test)]`) do not count.
+//! Every path in the source is resolved to the file that defines the item, through re-exports; so a `mod.rs` that
+//! only declares and re-exports its children depends on none of them. Tests (`#[cfg(test)]`) do not count.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -1,5 +1,5 @@
-//! Poisons every field of a scene in every way: unusable Gaussians are rejected and counted, and the store holds finite
-//! numbers only.
+//! Poisons every field of a scene in every way: unusable Gaussians are rejected and counted, and the store holds
+//! finite numbers only.
 
 use std::collections::BTreeSet;
 use std::path::Path;

@@ -60,8 +60,8 @@ fn python_tuf_verifies(python: &Path, dir: &Path, store: &Path, service: &Servic
     assert_eq!(verified(&path, "forged"), "refused: UnsignedMetadataError");
 }
 
-/// A robot of the real program in front of a repository that python-tuf signs: attacks are refused for their own reasons,
-/// and what comes after each is followed.
+/// A robot of the real program in front of a repository that python-tuf signs: attacks are refused for their own
+/// reasons, and what comes after each is followed.
 fn a_robot_follows_python_tuf(python: &Path, dir: &Path, store: &Path, service: &Service) {
     let (published, cache) = (dir.join("published"), dir.join("cache"));
     fs_err::create_dir(&published).expect("made");

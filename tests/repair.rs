@@ -1,4 +1,5 @@
-//! A store that rots: another encode writes its files anew, from the views that are kept, and its catalogue from the files.
+//! A store that rots: another encode writes its files anew, from the views that are kept, and its catalogue from
+//! the files.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -46,7 +47,8 @@ fn an_encode_heals_a_store_from_kept_views() {
     fs_err::write(path(&a_field(&store)), b"").expect("written");
     let bad = json("verify").1["bad"].as_array().cloned().expect("a list");
     assert_eq!(bad.len(), 4, "{bad:?}");
-    // The database, the metadata and the list of fields rot as well, and a folder holds what is none of the store's.
+    // The database, the metadata and the list of fields rot as well, and a folder holds what is none of the
+    // store's.
     for entry in fs_err::read_dir(store.join("db")).expect("there") {
         let path = entry.expect("readable").path();
         if path.is_file() {

@@ -16,8 +16,8 @@ fn the_demo_answers_rightly() {
     }
 }
 
-/// Evaluates the embedded encoders on shapes, and pairs of noun and colour, that they never saw. Their card has all
-/// figures, by the same command.
+/// Evaluates the embedded encoders on shapes, and pairs of noun and colour, that they never saw. Their card has
+/// all figures, by the same command.
 #[nightly("evaluates 30 scenes")]
 #[test]
 fn the_embedded_encoders_tell_things() {
@@ -101,8 +101,8 @@ fn the_robots_service_answers() {
     panic!("the service did not take up the new generation");
 }
 
-/// Views without masks, a mask of one pixel, a view that sees nothing, and missing or damaged photos are normal input: they
-/// are counted and named, and left out where necessary.
+/// Views without masks, a mask of one pixel, a view that sees nothing, and missing or damaged photos are normal
+/// input: they are counted and named, and left out where necessary.
 #[test]
 fn odd_views_are_counted_not_fatal() {
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -1,5 +1,5 @@
-//! Encodes with masks from SAM. The model is tiny and its weights are random, so its masks mean nothing; the code path is
-//! the real one.
+//! Encodes with masks from SAM. The model is tiny and its weights are random, so its masks mean nothing; the code
+//! path is the real one.
 
 use std::path::Path;
 
@@ -7,8 +7,8 @@ use serde_json::Value;
 use slag_common::poses;
 use slag_tests::*;
 
-/// Photos with damaged data are left out and named; the store does not depend on threads; a model directory of another kind
-/// is refused in one message.
+/// Photos with damaged data are left out and named; the store does not depend on threads; a model directory of
+/// another kind is refused in one message.
 #[needs_shared]
 #[test]
 fn sam_finds_masks_the_same_for_any_number_of_threads() {

@@ -1,5 +1,5 @@
-//! Both services against their own descriptions: schemathesis makes requests from `/openapi.json`, valid and invalid ones, and
-//! holds status, type and schema of every answer against it.
+//! Both services against their own descriptions: schemathesis makes requests from `/openapi.json`, valid and
+//! invalid ones, and holds status, type and schema of every answer against it.
 
 use std::process::Command;
 

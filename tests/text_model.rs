@@ -1,4 +1,5 @@
-//! A store that carries the text side of its encoder: robots fetch it with the scene and need no models of their own.
+//! A store that carries the text side of its encoder: robots fetch it with the scene and need no models of their
+//! own.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;

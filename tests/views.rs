@@ -70,8 +70,8 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert_eq!(content(&dir.path().join("kept")), expected);
 }
 
-/// A finer raster gives views no more weight, and the summary states the cost of views and cells. Threads and resuming change
-/// nothing.
+/// A finer raster gives views no more weight, and the summary states the cost of views and cells. Threads and
+/// resuming change nothing.
 #[test]
 fn what_was_spent_is_reported() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -121,8 +121,8 @@ fn what_was_spent_is_reported() {
     assert!((ratio - 1.0).abs() < 0.01, "{ratio}");
 }
 
-/// Photos of a second flight come in and one goes: only new views are done, and the bytes are those of an encode of
-/// all photos from the beginning. Masks of the new photos lie beside the old ones.
+/// Photos of a second flight come in and one goes: only new views are done, and the bytes are those of an encode
+/// of all photos from the beginning. Masks of the new photos lie beside the old ones.
 #[test]
 fn photos_are_added_and_withdrawn() {
     let dir = tempfile::tempdir().expect("a temporary folder");

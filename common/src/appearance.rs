@@ -1,5 +1,5 @@
-//! A Gaussian's appearance in ten bytes: colour and opacity, size, rotation. Renderers of splats take these bytes as they
-//! are, so a page draws a cell without decoding it. The byte table is in `docs/formats.md`.
+//! A Gaussian's appearance in ten bytes: colour and opacity, size, rotation. Renderers of splats take these bytes
+//! as they are, so a page draws a cell without decoding it. The byte table is in `docs/formats.md`.
 
 use std::f32::consts::PI;
 
@@ -66,7 +66,8 @@ fn unit_code(value: f32) -> u8 {
     (value * LARGEST).round() as u8
 }
 
-/// Returns the byte of a standard deviation, world units: 0 for 0, else `1 + 254 * (ln size + 12) / 21`, rounded and clamped to
+/// Returns the byte of a standard deviation, world units: 0 for 0, else `1 + 254 * (ln size + 12) / 21`, rounded
+/// and clamped to
 /// 1..=255. Sizes from 6e-6 to 8,000 are off by at most 4.3 %.
 pub fn size_code(size: f32) -> u8 {
     if size <= 0.0 || size.is_nan() {
@@ -85,8 +86,8 @@ pub fn larger_size_code(code: u8, times: f32) -> u8 {
     code.saturating_add(steps.round() as u8)
 }
 
-/// Returns the bytes of a rotation (unit quaternion): its axis in the octahedral map (Meyer et al. 2010), two bytes, and its
-/// angle from 0 to pi, one byte. The decoded rotation is off by at most 1.9 degrees.
+/// Returns the bytes of a rotation (unit quaternion): its axis in the octahedral map (Meyer et al. 2010), two
+/// bytes, and its angle from 0 to pi, one byte. The decoded rotation is off by at most 1.9 degrees.
 pub fn rotation_code([w, x, y, z]: [f32; 4]) -> [u8; 3] {
     // q and -q are one rotation; the one with w >= 0 turns by at most pi.
     let sign = if w < 0.0 { -1.0 } else { 1.0 };

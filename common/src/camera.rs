@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 pub enum Distortion {
     /// An ideal pinhole.
     None,
-    /// Brown-Conrady as in OpenCV and COLMAP (SIMPLE_RADIAL, RADIAL, OPENCV): radial `k1 k2 k3`, tangential `p1 p2`.
+    /// Brown-Conrady as in OpenCV and COLMAP (SIMPLE_RADIAL, RADIAL, OPENCV): radial `k1 k2 k3`, tangential `p1
+    /// p2`.
     Brown {
         /// Radial coefficients of r^2, r^4, r^6.
         k: [f64; 3],
@@ -77,8 +78,8 @@ impl Distortion {
         }
     }
 
-    /// Returns whether the tangential terms fold the image over at an ideal normalised point: the determinant of the
-    /// derivative of [`Self::distort`] is not positive, so that another direction has the same pixel.
+    /// Returns whether the tangential terms fold the image over at an ideal normalised point: the determinant of
+    /// the derivative of [`Self::distort`] is not positive, so that another direction has the same pixel.
     pub fn folds_at(&self, [x, y]: [f64; 2]) -> bool {
         let Self::Brown { k: [k1, k2, k3], p: [p1, p2] } = *self else { return false };
         let r2 = x * x + y * y;
@@ -93,8 +94,8 @@ impl Distortion {
 
     /// Returns the normalised radius up to which the radial part grows with the radius.
     ///
-    /// Beyond it the polynomial folds back and maps a second direction to the same pixel; such directions have no image.
-    /// [`Self::folds_at`] is the criterion for tangential terms.
+    /// Beyond it the polynomial folds back and maps a second direction to the same pixel; such directions have no
+    /// image. [`Self::folds_at`] is the criterion for tangential terms.
     pub fn monotonic_radius(&self) -> f64 {
         match *self {
             Self::None => MAX_NORMALISED_RADIUS,
@@ -114,8 +115,8 @@ impl Distortion {
     }
 }
 
-/// Returns the ascending points of `low..high` at which a polynomial (coefficients from the constant term up) changes
-/// sign; there is at most one between two roots of its derivative.
+/// Returns the ascending points of `low..high` at which a polynomial (coefficients from the constant term up)
+/// changes sign; there is at most one between two roots of its derivative.
 fn roots_between(coefficients: &[f64], low: f64, high: f64) -> Vec<f64> {
     if coefficients.len() < 2 {
         return Vec::new();

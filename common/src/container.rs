@@ -1,5 +1,5 @@
-//! The container of all binary files: checksummed sections, little-endian and 64-byte aligned, so that a mapped file is
-//! used without parsing. The byte table is in `docs/formats.md`.
+//! The container of all binary files: checksummed sections, little-endian and 64-byte aligned, so that a mapped
+//! file is used without parsing. The byte table is in `docs/formats.md`.
 
 use std::io::{self, Write};
 use std::ops::Range;

@@ -17,7 +17,8 @@ pub enum Access {
     Private,
 }
 
-/// Replaces a file through `PATH.part`: after a crash it has either its complete old content or its complete new one.
+/// Replaces a file through `PATH.part`: after a crash it has either its complete old content or its complete new
+/// one.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
@@ -28,7 +29,8 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace(part, path, bytes, Access::Shared)
 }
 
-/// Replaces the content of `path` by `bytes` through `part`, which must not exist and must be on the same file system.
+/// Replaces the content of `path` by `bytes` through `part`, which must not exist and must be on the same file
+/// system.
 pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Result<()> {
     let mut options = fs_err::OpenOptions::new();
     options.write(true).create_new(true);

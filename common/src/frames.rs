@@ -46,8 +46,8 @@ impl Geographic {
         )
     }
 
-    /// Returns the geographic position of an ECEF point, by Bowring's formula iterated until the latitude is constant (two
-    /// or three rounds; accurate to well below a millimetre).
+    /// Returns the geographic position of an ECEF point, by Bowring's formula iterated until the latitude is
+    /// constant (two or three rounds; accurate to well below a millimetre).
     pub fn from_ecef_m(ecef_m: DVec3) -> Self {
         let e2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING);
         let p = ecef_m.x.hypot(ecef_m.y);

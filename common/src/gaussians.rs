@@ -83,7 +83,8 @@ impl Gaussians {
         }
     }
 
-    /// Returns whether a Gaussian can be drawn: finite fields, a mean within the range of f32, a rotation of unit length.
+    /// Returns whether a Gaussian can be drawn: finite fields, a mean within the range of f32, a rotation of unit
+    /// length.
     ///
     /// Readers keep unusable rows, so that indices stay those of the file; stages skip and count them.
     pub fn is_usable(&self, index: usize) -> bool {
@@ -95,7 +96,8 @@ impl Gaussians {
             && self.sh_dc[index].iter().all(|c| c.is_finite())
     }
 
-    /// Undoes the decoding of values that a file had decoded already: scales instead of logarithms, opacities instead of logits.
+    /// Undoes the decoding of values that a file had decoded already: scales instead of logarithms, opacities
+    /// instead of logits.
     pub fn deactivate(&mut self, scales: bool, opacities: bool) {
         if scales {
             self.scales.iter_mut().flatten().for_each(|scale| *scale = scale.ln().max(0.0));

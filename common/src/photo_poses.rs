@@ -1,5 +1,5 @@
-//! Where a scene's photos were taken, so that a page can draw their cameras: poses, not pictures. The byte table is in
-//! `docs/formats.md`.
+//! Where a scene's photos were taken, so that a page can draw their cameras: poses, not pictures. The byte table
+//! is in `docs/formats.md`.
 
 use std::ops::Range;
 
@@ -69,8 +69,8 @@ pub struct BuiltPhotoPoses {
 }
 
 impl BuiltPhotoPoses {
-    /// Adds a photo to those of a shard with this origin. A name that readers would refuse is replaced by none: it is for
-    /// people alone.
+    /// Adds a photo to those of a shard with this origin. A name that readers would refuse is replaced by none: it
+    /// is for people alone.
     pub fn push(&mut self, origin: DVec3, view: &View) {
         let world_from_camera = view.camera_from_world.inverse();
         let rotation = glam::DQuat::from_mat3(&world_from_camera.matrix3).normalize().as_quat();

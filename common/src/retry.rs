@@ -1,7 +1,7 @@
 //! Repeated attempts: how many, and the pauses between them.
 //!
-//! Not the crate `backon`: its count cannot begin anew after progress, which resumed downloads need, and the pauses here
-//! belong to the caller, who ends them when cancelled or waits as long as the server asks.
+//! Not the crate `backon`: its count cannot begin anew after progress, which resumed downloads need, and the
+//! pauses here belong to the caller, who ends them when cancelled or waits as long as the server asks.
 
 use std::time::Duration;
 
@@ -35,8 +35,8 @@ impl Retries {
         Self { backoff, max_attempts, n_failures: 0 }
     }
 
-    /// Counts a failed attempt; one that made progress is the first of a new count. Returns the pause before the next
-    /// attempt, or `None` if none is left.
+    /// Counts a failed attempt; one that made progress is the first of a new count. Returns the pause before the
+    /// next attempt, or `None` if none is left.
     pub fn failed(&mut self, made_progress: bool) -> Option<Duration> {
         self.n_failures = if made_progress { 1 } else { self.n_failures.saturating_add(1) };
         (self.n_failures < self.max_attempts).then(|| self.backoff.after(self.n_failures))

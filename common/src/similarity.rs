@@ -52,7 +52,8 @@ impl Similarity {
         Self { scale, rotation, translation: -(rotation * self.translation * scale) }
     }
 
-    /// Returns the camera of this transform's target frame that sees what `camera_from_source` sees of the source frame.
+    /// Returns the camera of this transform's target frame that sees what `camera_from_source` sees of the source
+    /// frame.
     ///
     /// Depths are in units of the target frame; pictures are the same.
     pub fn camera_from_target(&self, camera_from_source: DAffine3) -> DAffine3 {

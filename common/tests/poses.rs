@@ -66,8 +66,8 @@ fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
     }
 }
 
-/// Oracle: the same 96 poses as world from camera in OpenGL axes and as camera from world in OpenCV axes, both written
-/// by the scene's generator.
+/// Oracle: the same 96 poses as world from camera in OpenGL axes and as camera from world in OpenCV axes, both
+/// written by the scene's generator.
 #[needs_shared]
 #[test]
 fn house_transforms_and_colmap_agree() {
@@ -208,7 +208,8 @@ fn colmap_errors_have_place_and_fault() {
     assert!(matches!(read_files(&[("cameras.txt", b"")]), Err(PoseError::NotFound { .. })));
 }
 
-/// Lines of features may be missing, and names may have any number of words; images without a pose are left out and named.
+/// Lines of features may be missing, and names may have any number of words; images without a pose are left out
+/// and named.
 #[test]
 fn every_image_of_a_model_is_read_or_named() {
     const CAMERA: &str = "\u{feff}1 PINHOLE 64 48 50 50 32 24\r\n";

@@ -1,4 +1,5 @@
-//! Damaged pose files give an error or a valid result, never a panic or an allocation out of proportion to the file.
+//! Damaged pose files give an error or a valid result, never a panic or an allocation out of proportion to the
+//! file.
 
 use slag_common::poses::{self, PoseError};
 use slag_math::random::Random;

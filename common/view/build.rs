@@ -18,7 +18,8 @@ fn files_under(folder: &Path, found: &mut Vec<PathBuf>) {
 fn main() {
     let dist = Path::new(&std::env::var("CARGO_MANIFEST_DIR").expect("set by cargo")).join("dist");
     let out = PathBuf::from(std::env::var("OUT_DIR").expect("set by cargo"));
-    // Cargo would take a folder that is missing for one that changed; `scripts/build-page.sh` touches this file instead.
+    // Cargo would take a folder that is missing for one that changed; `scripts/build-page.sh` touches this file
+    // instead.
     println!("cargo::rerun-if-changed=build.rs");
     let mut paths = Vec::new();
     if std::env::var_os("CARGO_FEATURE_PAGE").is_some() && dist.is_dir() {

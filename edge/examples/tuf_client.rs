@@ -3,7 +3,8 @@
 //!
 //!     pytest tuf_conformance --entrypoint "target/debug/examples/tuf_client"
 //!
-//! The suite signs with ECDSA keys by default; our repositories have Ed25519 keys, so its `new_signer` must choose those.
+//! The suite signs with ECDSA keys by default; our repositories have Ed25519 keys, so its `new_signer` must choose
+//! those.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -171,8 +171,8 @@ impl Drop for TextService {
     }
 }
 
-/// Encodes texts until nobody can ask. An encoder that panics is opened again; until it is, `is_alive` says so and askers hear
-/// at once that it has stopped.
+/// Encodes texts until nobody can ask. An encoder that panics is opened again; until it is, `is_alive` says so and
+/// askers hear at once that it has stopped.
 fn run(
     mut encoder: Box<dyn TextEncoder>,
     mut reopen: Option<Reopen>,
@@ -206,8 +206,8 @@ fn run(
     }
 }
 
-/// Returns the words of a text, with a space between them; `None` if no word is left. Articles alone are none, and signs
-/// around words count for nothing: emoji, quotation marks, question marks, invisible characters.
+/// Returns the words of a text, with a space between them; `None` if no word is left. Articles alone are none, and
+/// signs around words count for nothing: emoji, quotation marks, question marks, invisible characters.
 fn words_of(text: &str) -> Option<String> {
     let is_invisible = |c: &char| matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{2060}'..='\u{2064}' | '\u{fe00}'..='\u{fe0f}' | '\u{feff}');
     let visible: String = text.chars().filter(|c| !is_invisible(c)).collect();

@@ -25,7 +25,8 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     painted(&positions, 40)
 }
 
-/// Returns the manifest and the one shard of a scene whose first Gaussians are red and the others blue; positions in millimetres.
+/// Returns the manifest and the one shard of a scene whose first Gaussians are red and the others blue; positions
+/// in millimetres.
 fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
     let text =
         TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
@@ -53,7 +54,8 @@ fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
     (manifest.to_bytes(), shard)
 }
 
-/// Serves the manifest, the metadata and the shard of a store from a thread for as long as the tests run; returns its address.
+/// Serves the manifest, the metadata and the shard of a store from a thread for as long as the tests run; returns
+/// its address.
 fn store(listed: Vec<u8>, shard: Vec<u8>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = format!("http://{}", listener.local_addr().expect("an address"));
@@ -307,8 +309,8 @@ fn a_robot_is_followed_by_its_service() {
     assert!(stop(serving).contains("fetched 1 shards of generation 3"));
 }
 
-/// A page that was there when the shard was checked and mapped, and is not any more: the program ends once, its next start does
-/// not answer from that shard, and the next fetch brings it again.
+/// A page that was there when the shard was checked and mapped, and is not any more: the program ends once, its
+/// next start does not answer from that shard, and the next fetch brings it again.
 #[test]
 #[cfg(target_os = "linux")]
 fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
@@ -352,7 +354,8 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
     assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
 }
 
-/// Far more queries than the service can answer: some are answered quickly, the others are refused, and memory stays.
+/// Far more queries than the service can answer: some are answered quickly, the others are refused, and memory
+/// stays.
 #[test]
 fn overload_is_turned_away_and_memory_stays() {
     const N_CLIENTS: usize = 160;
@@ -469,7 +472,8 @@ fn the_memory_attack_stays_within_the_budget() {
         );
     }
     assert!(n_answered > 0);
-    // Four queries' worth, and twice as much again for what is not counted: text models, stacks, what the allocator keeps.
+    // Four queries' worth, and twice as much again for what is not counted: text models, stacks, what the
+    // allocator keeps.
     assert!(grown < 12 * QUERY_BYTES, "{grown}");
 }
 

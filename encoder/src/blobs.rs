@@ -1,7 +1,7 @@
 //! A bucket: a shared folder or an object store, with conditional puts.
 //!
-//! Keys are relative to the prefix that the URL names. All calls block; they are made from threads of the program, never
-//! from those of the bucket's own runtime.
+//! Keys are relative to the prefix that the URL names. All calls block; they are made from threads of the program,
+//! never from those of the bucket's own runtime.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -50,8 +50,8 @@ pub(crate) struct Bucket {
 }
 
 impl Bucket {
-    /// Opens the bucket that a URL, or the path of a folder, names. `variables`: of the environment, where object stores
-    /// have their credentials.
+    /// Opens the bucket that a URL, or the path of a folder, names. `variables`: of the environment, where object
+    /// stores have their credentials.
     ///
     /// # Errors
     /// [`BlobError::Address`]; the bucket itself is first asked by a request.
@@ -157,14 +157,14 @@ impl Bucket {
         }
     }
 
-    /// Puts an object unless there is one; returns whether there was none. If the answer is lost, the put is made again
-    /// and may find its own object; where it matters who put it, use [`Self::claim`].
+    /// Puts an object unless there is one; returns whether there was none. If the answer is lost, the put is made
+    /// again and may find its own object; where it matters who put it, use [`Self::claim`].
     pub(crate) fn put_new(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         self.put_with(key, bytes.into(), PutMode::Create)
     }
 
-    /// Puts an object unless there is one; returns whether the one that is there has these bytes, which only the caller would
-    /// put.
+    /// Puts an object unless there is one; returns whether the one that is there has these bytes, which only the
+    /// caller would put.
     pub(crate) fn claim(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         let bytes = bytes.into();
         Ok(self.put_new(key, bytes.clone())? || self.require(key)? == bytes)
@@ -192,7 +192,8 @@ impl Bucket {
 
 /// Makes a request, and again where the network broke it off after it was sent.
 ///
-/// The client does so itself, but not with a conditional put, which may find its own object: see [`Bucket::claim`].
+/// The client does so itself, but not with a conditional put, which may find its own object: see
+/// [`Bucket::claim`].
 async fn answered<T, F>(request: impl Fn() -> F) -> object_store::Result<T>
 where
     F: Future<Output = object_store::Result<T>>,

@@ -12,16 +12,16 @@ use crate::memory::{MemoryPlan, Phase};
 /// Marks a Gaussian that no cell holds in [`CellSplit::cell_of_gaussian`].
 pub const NO_CELL: u32 = u32::MAX;
 
-/// Extent of a Gaussian in standard deviations: 99.7 % of its mass along an axis, and a tenth less than the 3.33 at which a
-/// rasteriser drops an opaque one.
+/// Extent of a Gaussian in standard deviations: 99.7 % of its mass along an axis, and a tenth less than the 3.33
+/// at which a rasteriser drops an opaque one.
 const EXTENT_SIGMAS: f64 = 3.0;
 
-/// A cell with fewer Gaussians is not cut for its width alone: otherwise each stray Gaussian far from the scene would
-/// become a cell.
+/// A cell with fewer Gaussians is not cut for its width alone: otherwise each stray Gaussian far from the scene
+/// would become a cell.
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
-/// Most cells that are cut only because positions must be exact. More means that the error is finer than the scene's
-/// coordinates; each cell is a file of some kilobytes.
+/// Most cells that are cut only because positions must be exact. More means that the error is finer than the
+/// scene's coordinates; each cell is a file of some kilobytes.
 pub const MAX_CELLS_FOR_PRECISION: usize = 4096;
 
 /// Largest error of a position, per axis.
@@ -73,7 +73,8 @@ impl CellLimits {
     }
 }
 
-/// The places that a cell's positions are rounded to: multiples of `step` from the smallest corner of the means' box.
+/// The places that a cell's positions are rounded to: multiples of `step` from the smallest corner of the means'
+/// box.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PositionGrid {
     /// World units; 0 along a flat axis.
@@ -109,8 +110,8 @@ fn step(size: f64, bits: u8) -> f64 {
     size / ((1u64 << bits) - 1).max(1) as f64
 }
 
-/// Returns the bits of each axis, 32 in all, that make the coarsest step as fine as possible; `None` for the bits that mark
-/// another form.
+/// Returns the bits of each axis, 32 in all, that make the coarsest step as fine as possible; `None` for the bits
+/// that mark another form.
 fn packed_bits(size: [f64; 3]) -> Option<[u8; 3]> {
     let mut bits = [0u8; 3];
     loop {
@@ -175,8 +176,8 @@ impl CellSplit {
 /// Gaussians from which the halves of a box are worth a thread each.
 const MIN_GAUSSIANS_TO_SHARE: usize = 1 << 13;
 
-/// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis; a box that is too wide, or too wide
-/// for exact positions, in the middle of it. The result depends only on the Gaussians and the limits.
+/// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis; a box that is too wide,
+/// or too wide for exact positions, in the middle of it. The result depends only on the Gaussians and the limits.
 pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
     let indices = (0..scene.len() as u32).into_par_iter();
     let mut indices: Vec<u32> = indices.filter(|i| scene.is_usable(*i as usize)).collect();
@@ -197,7 +198,8 @@ pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
 
 /// What becomes of a part of the scene.
 enum Next {
-    /// Cut before this many Gaussians of the part, which is in order; `for_precision`: only exact positions ask for it.
+    /// Cut before this many Gaussians of the part, which is in order; `for_precision`: only exact positions ask
+    /// for it.
     Cut {
         at: usize,
         for_precision: bool,

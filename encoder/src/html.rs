@@ -1,5 +1,5 @@
-//! A page of results in one file: headings, tables and pictures inline, no scripts, nothing from elsewhere. It opens from a
-//! disk, an e-mail or a web server alike.
+//! A page of results in one file: headings, tables and pictures inline, no scripts, nothing from elsewhere. It
+//! opens from a disk, an e-mail or a web server alike.
 
 use std::fmt::Write as _;
 
@@ -100,8 +100,8 @@ impl Page {
         }
     }
 
-    /// Adds a result as its JSON has it: what is single as one table, then a table for each list of records and each record of
-    /// columns, under its name.
+    /// Adds a result as its JSON has it: what is single as one table, then a table for each list of records and
+    /// each record of columns, under its name.
     pub fn value(&mut self, value: &Value) {
         let Some(members) = value.as_object() else { return self.plain(&shown(value)) };
         let is_single = |value: &&Value| !is_list_of_records(value) && !is_of_columns(value);

@@ -1,6 +1,8 @@
-//! Opened models that GPUs share out: each GPU has a few, its lanes, and work goes to the GPU with the most free ones.
+//! Opened models that GPUs share out: each GPU has a few, its lanes, and work goes to the GPU with the most free
+//! ones.
 //!
-//! While one lane of a GPU computes, another copies. The load of a GPU is the time in which any of its lanes is at work.
+//! While one lane of a GPU computes, another copies. The load of a GPU is the time in which any of its lanes is at
+//! work.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -140,7 +142,8 @@ impl<T> Drop for Lane<'_, T> {
 mod tests {
     use super::*;
 
-    /// Two GPUs of two lanes: work alternates between them, a fifth piece waits, and a GPU is busy while one lane is.
+    /// Two GPUs of two lanes: work alternates between them, a fifth piece waits, and a GPU is busy while one lane
+    /// is.
     #[test]
     fn work_goes_to_the_gpu_with_the_most_free_lanes() {
         let lanes = Lanes::new([(4, vec!['a', 'b']), (7, vec!['c', 'd'])]);

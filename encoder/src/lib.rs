@@ -1,7 +1,7 @@
 //! The cloud side of SLAG as a library: one module per stage of the pipeline.
 //!
-//! [`encode::encode`] runs all stages. This example encodes a generated room, with the encoder and the segmenter that
-//! need no ONNX Runtime:
+//! [`encode::encode`] runs all stages. This example encodes a generated room, with the encoder and the segmenter
+//! that need no ONNX Runtime:
 //!
 //! ```
 //! use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};

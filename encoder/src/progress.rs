@@ -15,8 +15,8 @@ pub trait Progress: Sync {
     fn end(&self);
     /// Tells what an encode is going to do: its views, and its cells.
     fn plan(&self, _views: &[&View], _cells: &[Aabb]) {}
-    /// Tells that a photo has masks. `draw` draws them over the photo, reduced; it takes milliseconds, so only receivers that
-    /// show the picture call it.
+    /// Tells that a photo has masks. `draw` draws them over the photo, reduced; it takes milliseconds, so only
+    /// receivers that show the picture call it.
     fn segmented(&self, _view: &str, _n_masks: usize, _draw: &dyn Fn() -> RgbImage) {}
     fn left_out(&self, _view: &str, _reason: &str) {}
     /// Tells the things that were found.

@@ -123,8 +123,8 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
     Ok(scores)
 }
 
-/// Share of the object's score in those of its Gaussians. On generated scenes anything up to a third changed little, and
-/// objects alone were worse; on the labelled house, with given masks, more was better.
+/// Share of the object's score in those of its Gaussians. On generated scenes anything up to a third changed
+/// little, and objects alone were worse; on the labelled house, with given masks, more was better.
 const OBJECT_SHARE: f32 = 0.3;
 
 /// Returns the score, or the threshold of scores, of a Gaussian in an object.
@@ -209,8 +209,8 @@ impl PublishedObjects {
         cosines.chunks_exact(self.n_vectors).map(object_score).collect()
     }
 
-    /// Mixes the object's score into that of each of its Gaussians: the thing is judged as a whole, and where its shape is wrong
-    /// the Gaussian's own score still decides.
+    /// Mixes the object's score into that of each of its Gaussians: the thing is judged as a whole, and where its
+    /// shape is wrong the Gaussian's own score still decides.
     pub fn overlay(&self, of_objects: &[f32], cosines: &mut [f32]) {
         let of_gaussians = cosines.iter_mut().zip(&self.object_of).filter(|(_, object)| **object != NONE);
         of_gaussians.for_each(|(cosine, object)| {

@@ -1,4 +1,5 @@
-//! Damages the encoder's own files and the geo-reference in 1,000 ways each: they are refused with the reason, without a panic.
+//! Damages the encoder's own files and the geo-reference in 1,000 ways each: they are refused with the reason,
+//! without a panic.
 
 use std::path::Path;
 

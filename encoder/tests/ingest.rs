@@ -36,8 +36,8 @@ fn pattern([u, v]: [f64; 2]) -> [f64; 3] {
     [128.0 + 100.0 * (u / 9.0).sin(), 128.0 + 100.0 * (v / 11.0).cos(), 128.0 + 0.5 * (u - v)]
 }
 
-/// Finds the ideal point of a distorted one by Newton's method with a numeric derivative. Oracle of the tests below: the
-/// code itself only distorts.
+/// Finds the ideal point of a distorted one by Newton's method with a numeric derivative. Oracle of the tests
+/// below: the code itself only distorts.
 fn invert(distortion: Distortion, [x, y]: [f64; 2]) -> [f64; 2] {
     let mut ideal = [x, y];
     for _ in 0..50 {
@@ -259,8 +259,8 @@ fn geo_reference() {
     );
 }
 
-/// Oracle: the derivative by differences. Strong tangential terms fold the image over; such pixels have no image, and the
-/// lenses of real cameras do not fold.
+/// Oracle: the derivative by differences. Strong tangential terms fold the image over; such pixels have no image,
+/// and the lenses of real cameras do not fold.
 #[test]
 fn pixels_where_a_lens_folds_have_no_image() {
     for (p, folds) in [([0.4, -0.3], true), ([0.003, -0.002], false)] {
@@ -284,7 +284,8 @@ fn pixels_where_a_lens_folds_have_no_image() {
     }
 }
 
-/// An EXIF orientation is applied where only the turned photo fits its camera; transparent pixels are outside of the photo.
+/// An EXIF orientation is applied where only the turned photo fits its camera; transparent pixels are outside of
+/// the photo.
 #[test]
 fn turned_and_transparent_photos() {
     let dir = tempfile::tempdir().unwrap();

@@ -87,8 +87,8 @@ impl Seen {
         ((0..DIM).map(component).collect(), total)
     }
 
-    /// Returns the errors of the total weight (relative), of the mean length, of the unit embedding and of its cosine with a
-    /// query, the last two times the mean length; `None` if there is no evidence.
+    /// Returns the errors of the total weight (relative), of the mean length, of the unit embedding and of its
+    /// cosine with a query, the last two times the mean length; `None` if there is no evidence.
     fn errors(&self, query: &[f64]) -> Option<[f64; 4]> {
         let (field, table) = self.field();
         let (mean, total) = self.truth();
@@ -263,7 +263,8 @@ fn one_shard(vectors: &[Vec<f32>], means: Vec<DVec3>) -> AlignedBytes {
     exact_shard(&scene, cell, &CellEmbeddings { dim: DIM, vectors: embeddings, has_evidence }).0
 }
 
-/// Gaussians lie by centroid, then along the Morton curve; those without evidence come last. Oracle: bits interleaved one by one.
+/// Gaussians lie by centroid, then along the Morton curve; those without evidence come last. Oracle: bits
+/// interleaved one by one.
 #[test]
 fn gaussians_are_in_the_order_of_the_format() {
     let random = &mut Random::new(6);
@@ -295,8 +296,8 @@ fn gaussians_are_in_the_order_of_the_format() {
     assert!(indices[n_with..].iter().all(|index| index % 10 == 0));
 }
 
-/// Components from 1 down to 1e-12 are stored as f16: the error is half a step of 2^-11, below 2^-14 of 2^-24, and the
-/// smallest become zero.
+/// Components from 1 down to 1e-12 are stored as f16: the error is half a step of 2^-11, below 2^-14 of 2^-24, and
+/// the smallest become zero.
 #[test]
 fn embeddings_stored_as_f16() {
     let random = &mut Random::new(4);
@@ -337,8 +338,8 @@ fn embeddings_stored_as_f16() {
     assert!(worst_step <= 1.0 && worst_vector <= 5e-4, "{worst_step} {worst_vector}");
 }
 
-/// Strays at any distance, scenes at any distance, Gaussians of any size: no stored position is farther from its mean than was
-/// asked for, nor than the manifest states.
+/// Strays at any distance, scenes at any distance, Gaussians of any size: no stored position is farther from its
+/// mean than was asked for, nor than the manifest states.
 #[test]
 fn positions_keep_their_error_with_strays() {
     let random = &mut Random::new(11);

@@ -1,4 +1,5 @@
-//! An encode works on threads of its own. This is the only test of its program: rayon's global pool belongs to the process.
+//! An encode works on threads of its own. This is the only test of its program: rayon's global pool belongs to the
+//! process.
 
 use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
 use slag_encoder::{progress::Silent, raster::CpuRasterizer, segment::SamSettings};

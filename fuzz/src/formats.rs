@@ -43,7 +43,8 @@ fn in_file(name: &str, data: &[u8], work: impl FnOnce(&Path) -> bool) -> bool {
     })
 }
 
-/// Returns the bytes with correct checksums of the container's sections and head, as a hostile writer can compute them.
+/// Returns the bytes with correct checksums of the container's sections and head, as a hostile writer can compute
+/// them.
 fn with_checksums(data: &[u8]) -> Vec<u8> {
     let mut bytes = data.to_vec();
     let Some(n) = bytes.get(12..16).map(|n| u32::from_le_bytes([n[0], n[1], n[2], n[3]]) as usize) else {

@@ -42,7 +42,8 @@ const V1_BODIES: &[&str] = &[
     r#"{"texts":["a"],"kind":"clusters","voxel":0.5,"negatives":["b","c"],"region":{"ball":{"centre":[1,2,3],"radius":9},"box":{"from":[0,0,0],"to":[9,9,9]},"polygon":[[0,0],[9,0],[9,9]]}}"#,
 ];
 
-/// Writes the cache of a robot with a scene of one cell with objects, in the space of [`ENCODER`] and of three components.
+/// Writes the cache of a robot with a scene of one cell with objects, in the space of [`ENCODER`] and of three
+/// components.
 pub fn write_scene(folder: &Path) {
     let bytes = shard(true);
     let mut manifest = Manifest::parse(&manifest()).expect("a manifest");

@@ -82,7 +82,8 @@ pub fn v1(data: &[u8]) -> bool {
     http_request(&[head.as_bytes(), data].concat())
 }
 
-/// The bytes of a connection to the robot's service: whatever they are, no handler panics, and the service answers on.
+/// The bytes of a connection to the robot's service: whatever they are, no handler panics, and the service answers
+/// on.
 pub fn http_request(data: &[u8]) -> bool {
     let mut stream = UnixStream::connect(service()).expect("the service listens");
     // A request that is not whole gets no answer for seconds.

@@ -1,4 +1,5 @@
-//! Seeded faults: any part of a fleet is killed, stands still, is cut off, or comes back with nothing, and the bytes stay the same.
+//! Seeded faults: any part of a fleet is killed, stands still, is cut off, or comes back with nothing, and the
+//! bytes stay the same.
 
 use std::fmt;
 use std::time::Duration;
@@ -124,8 +125,8 @@ fn run_with_faults(seed: u64) -> Faults {
             _ => {}
         }
     }
-    // Workers that ended because a run was published, or failed because the server was away, are replaced: they are a
-    // scheduler's business.
+    // Workers that ended because a run was published, or failed because the server was away, are replaced: they
+    // are a scheduler's business.
     while coordinator.is_running() {
         for (which, worker) in workers.iter_mut().enumerate() {
             if !worker.is_running() {

@@ -39,8 +39,8 @@ fn a_folder_and_shares_conform() {
     conforms(&Shares { scene, bucket });
 }
 
-/// Folders for photos in work go with their workers, or when the next one begins; workers of other models and versions are
-/// refused.
+/// Folders for photos in work go with their workers, or when the next one begins; workers of other models and
+/// versions are refused.
 #[test]
 fn workers_leave_nothing_and_do_not_mix() {
     let scene = Scene::new();

@@ -1,5 +1,5 @@
-//! A fleet whose queue, bucket, coordinator and workers are hosts of their own, with a network between them that delays and
-//! loses packets and is cut: `hosts.py`.
+//! A fleet whose queue, bucket, coordinator and workers are hosts of their own, with a network between them that
+//! delays and loses packets and is cut: `hosts.py`.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, ChildStdout, Command, Stdio};
@@ -78,8 +78,8 @@ impl Drop for Hosts {
     }
 }
 
-/// Real TCP, packet by packet: all ways are slow and lose packets, one worker is cut off for longer than the queue waits for
-/// it, and the bytes are those of one process.
+/// Real TCP, packet by packet: all ways are slow and lose packets, one worker is cut off for longer than the queue
+/// waits for it, and the bytes are those of one process.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn slow_lossy_and_cut_networks_between_hosts_give_the_same_bytes() {

@@ -107,8 +107,8 @@ fn a_folder_and_a_queue_conform() {
     conforms(&fleet);
 }
 
-/// One worker is killed, one stands still for longer than the queue waits for it and goes on; the server is killed in the
-/// middle and comes back with nothing.
+/// One worker is killed, one stands still for longer than the queue waits for it and goes on; the server is killed
+/// in the middle and comes back with nothing.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
@@ -135,8 +135,8 @@ fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
     fleet.scene.assert_same("store");
 }
 
-/// Views that a worker took down with it are given up once they were handed out too often: they are named, and the encode
-/// is one of the others. Without the queue's limit they are done by the next encode.
+/// Views that a worker took down with it are given up once they were handed out too often: they are named, and the
+/// encode is one of the others. Without the queue's limit they are done by the next encode.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn views_that_end_workers_are_given_up_and_named() {

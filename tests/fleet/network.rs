@@ -1,6 +1,7 @@
 //! The network between a worker and the queue, as a proxy on loopback: delay, loss and partitions.
 //!
-//! TCP hides a lost packet as a wait for its retransmission, and a partition as silence until it ends; so does the proxy.
+//! TCP hides a lost packet as a wait for its retransmission, and a partition as silence until it ends; so does the
+//! proxy.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};

@@ -67,7 +67,8 @@ impl Secured {
     }
 }
 
-/// Each role does its work with its key; a worker's key fills no queue, an unknown key and an unknown authority do nothing.
+/// Each role does its work with its key; a worker's key fills no queue, an unknown key and an unknown authority do
+/// nothing.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn each_role_has_its_key_and_no_more() {
@@ -88,7 +89,8 @@ fn each_role_has_its_key_and_no_more() {
     stranger.args(["--fleet", &format!("tls://127.0.0.1:{}", fleet.port)]);
     refused(stranger, "certificate");
 
-    // The server does not answer what the key may not ask; the coordinator says so and tries again until somebody stops it.
+    // The server does not answer what the key may not ask; the coordinator says so and tries again until somebody
+    // stops it.
     let mut weak = Running::start(&mut fleet.coordinator("worker.nk"));
     std::thread::sleep(std::time::Duration::from_secs(7));
     weak.signal("INT");

@@ -31,7 +31,8 @@ impl Scene {
     fn room() -> &'static (PathBuf, Vec<u8>) {
         static ROOM: OnceLock<(PathBuf, Vec<u8>)> = OnceLock::new();
         ROOM.get_or_init(|| {
-            // Beside the built programs: nothing is dropped at a program's end. Seeded faults may run as several programs.
+            // Beside the built programs: nothing is dropped at a program's end. Seeded faults may run as several
+            // programs.
             let seed = std::env::var("SLAG_FAULT_SEED").unwrap_or_default();
             let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fleet{seed}"));
             if dir.exists() {
@@ -178,7 +179,8 @@ pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     panic!("{what}: not after a minute");
 }
 
-/// Starts a server that Python's packages bring; returns it once it listens on its port. Nobody reads what it prints.
+/// Starts a server that Python's packages bring; returns it once it listens on its port. Nobody reads what it
+/// prints.
 pub fn start_server(name: &str, port: u16, args: &[&str]) -> Running {
     let mut command = Command::new(python_with("tests/fleet").with_file_name(name));
     let server = Running::start_quiet(command.args(args).stdin(Stdio::null()));

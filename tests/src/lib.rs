@@ -25,8 +25,8 @@ pub fn root() -> PathBuf {
 
 /// Returns a program of the project, built as the tests are.
 ///
-/// `./test.sh` builds all programs before the tests, and says so by `SLAG_PROGRAMS_ARE_BUILT`. Without that variable they
-/// are built first: a part of the tests may run alone.
+/// `./test.sh` builds all programs before the tests, and says so by `SLAG_PROGRAMS_ARE_BUILT`. Without that
+/// variable they are built first: a part of the tests may run alone.
 pub fn program(name: &str) -> PathBuf {
     static BUILT: OnceLock<PathBuf> = OnceLock::new();
     let folder = BUILT.get_or_init(|| {

@@ -28,8 +28,8 @@ pub fn encoded_into(store: &Path, scene: &[&str], flags: &[&str]) {
     copy_dir(&encoded(scene, flags), store);
 }
 
-/// Returns the folder that `make` fills, unless this or another test program has filled it for the same kind, key and
-/// programs. It lies beside the programs; what other programs made is removed.
+/// Returns the folder that `make` fills, unless this or another test program has filled it for the same kind, key
+/// and programs. It lies beside the programs; what other programs made is removed.
 pub fn made(kind: &str, key: &[&str], make: impl FnOnce(&Path)) -> PathBuf {
     static MADE: OnceLock<PathBuf> = OnceLock::new();
     let folder = MADE.get_or_init(|| {

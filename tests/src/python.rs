@@ -6,7 +6,8 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::{program, root, run};
 
-/// Returns the Python of an environment that holds the packages of `FOLDER/requirements.txt`, a folder of the project.
+/// Returns the Python of an environment that holds the packages of `FOLDER/requirements.txt`, a folder of the
+/// project.
 ///
 /// The environment lies beside the built programs and is made anew when the requirements change.
 ///

@@ -5,12 +5,13 @@
 pub enum SmallPivots {
     /// The square of a pivot is raised to this value, above 0: every pivot is positive.
     Raise(f64),
-    /// A pivot is 0, and so is its column, unless its square exceeds this share of the diagonal element: the row depends
-    /// on those before.
+    /// A pivot is 0, and so is its column, unless its square exceeds this share of the diagonal element: the row
+    /// depends on those before.
     Drop(f64),
 }
 
-/// Returns the lower triangle L with L L' = `matrix`, zeros above, row by row (Golub and Van Loan, Matrix Computations,
+/// Returns the lower triangle L with L L' = `matrix`, zeros above, row by row (Golub and Van Loan, Matrix
+/// Computations,
 /// 4.2). Of the matrix `[n][n]` only the lower triangle is read.
 pub fn cholesky(mut matrix: Vec<f64>, n: usize, small: SmallPivots) -> Vec<f64> {
     for i in 0..n {

@@ -1,11 +1,12 @@
-//! The exact squared Euclidean distance of each cell of a grid to the nearest source (Felzenszwalb and Huttenlocher,
-//! "Distance Transforms of Sampled Functions", Theory of Computing 8, 2012): rows first, then lower envelopes of parabolas
-//! along columns. The two steps are apart so that callers may share rows between threads.
+//! The exact squared Euclidean distance of each cell of a grid to the nearest source (Felzenszwalb and
+//! Huttenlocher, "Distance Transforms of Sampled Functions", Theory of Computing 8, 2012): rows first, then lower
+//! envelopes of parabolas along columns. The two steps are apart so that callers may share rows between threads.
 
 /// Stands for a row or grid without a source.
 pub const FAR: u32 = u32::MAX;
 
-/// Writes the squared distance of each cell of a row to the nearest source of the row, in cells; [`FAR`] without a source.
+/// Writes the squared distance of each cell of a row to the nearest source of the row, in cells; [`FAR`] without a
+/// source.
 ///
 /// # Panics
 /// If `out` is not as long as the row, or the row has more than 65,535 cells.
@@ -63,7 +64,8 @@ impl Envelope {
     }
 }
 
-/// Returns the squared distance of each cell of a grid, row-major, to the nearest source, in cells; [`FAR`] if there is none.
+/// Returns the squared distance of each cell of a grid, row-major, to the nearest source, in cells; [`FAR`] if
+/// there is none.
 pub fn squared_distances(is_source: &[bool], width: usize) -> Vec<u32> {
     let height = is_source.len().checked_div(width).unwrap_or(0);
     let mut rows = vec![0; is_source.len()];

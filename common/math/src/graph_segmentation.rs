@@ -1,10 +1,11 @@
-//! Graph-based segmentation (Felzenszwalb and Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2),
-//! 2004): components of any weighted graph, grown over edges of ascending weight.
+//! Graph-based segmentation (Felzenszwalb and Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV
+//! 59(2), 2004): components of any weighted graph, grown over edges of ascending weight.
 //!
-//! Edges are decided one after the other, but few of them join anything. Those that cannot are dropped by all threads
-//! before, block by block: their ends are in one component already, or an end's component refuses even the lightest edge of
-//! the block. Both stay so whatever is joined in between: components only grow, and one that refuses an edge refuses all
-//! heavier ones, so that it is never joined again. The result is that of deciding each edge in turn.
+//! Edges are decided one after the other, but few of them join anything. Those that cannot are dropped by all
+//! threads before, block by block: their ends are in one component already, or an end's component refuses even the
+//! lightest edge of the block. Both stay so whatever is joined in between: components only grow, and one that
+//! refuses an edge refuses all heavier ones, so that it is never joined again. The result is that of deciding each
+//! edge in turn.
 
 use rayon::prelude::*;
 
@@ -16,8 +17,8 @@ const BLOCK: usize = 1 << 17;
 /// Components of a graph while they grow.
 ///
 /// The caller visits the edges in ascending order of weight and calls [`Self::join_if_similar`] for each, or
-/// [`Self::join_all_similar`] for all; a second visit with [`Self::join_if_small`] or [`Self::join_all_small`] removes
-/// components that are too small.
+/// [`Self::join_all_similar`] for all; a second visit with [`Self::join_if_small`] or [`Self::join_all_small`]
+/// removes components that are too small.
 #[derive(Clone, Debug)]
 pub struct Components {
     sets: UnionFind,

@@ -1,5 +1,5 @@
-//! The nearest neighbours of all points of a set, by a k-d tree (Bentley, "Multidimensional Binary Search Trees Used for
-//! Associative Searching", CACM 18(9), 1975).
+//! The nearest neighbours of all points of a set, by a k-d tree (Bentley, "Multidimensional Binary Search Trees
+//! Used for Associative Searching", CACM 18(9), 1975).
 
 use rayon::prelude::*;
 
@@ -27,8 +27,8 @@ pub struct Neighbours {
 }
 
 impl Neighbours {
-    /// Finds the `n_neighbours` nearest others of each point. Of two at the same distance, the one with the lower number
-    /// is nearer, so the result does not depend on threads or on the tree. Coordinates must be finite.
+    /// Finds the `n_neighbours` nearest others of each point. Of two at the same distance, the one with the lower
+    /// number is nearer, so the result does not depend on threads or on the tree. Coordinates must be finite.
     pub fn new(points: &[[f64; 3]], n_neighbours: usize) -> Self {
         let mut items: Vec<Item> = points.iter().copied().zip(0..).collect();
         let mut axes = vec![0; items.len()];
@@ -72,7 +72,8 @@ struct Tree<'a> {
     axes: &'a [u8],
 }
 
-/// Orders points so that in each range the middle one divides the others along the longest side of the range's box.
+/// Orders points so that in each range the middle one divides the others along the longest side of the range's
+/// box.
 fn sort(items: &mut [Item], axes: &mut [u8]) {
     if items.len() <= LEAF_POINTS {
         return;
@@ -102,7 +103,8 @@ fn sort(items: &mut [Item], axes: &mut [u8]) {
 }
 
 impl Tree<'_> {
-    /// Adds what is nearer in a range than the farthest of `nearest`, which holds (squared distance, number), ascending.
+    /// Adds what is nearer in a range than the farthest of `nearest`, which holds (squared distance, number),
+    /// ascending.
     fn search(&self, from: usize, to: usize, item: &Item, n: usize, nearest: &mut Vec<(f64, u32)>) {
         if to - from <= LEAF_POINTS {
             self.items[from..to].iter().for_each(|other| consider(item, other, n, nearest));
@@ -115,8 +117,8 @@ impl Tree<'_> {
         let (near, far) = if beyond < 0.0 { (below, above) } else { (above, below) };
         self.search(near.0, near.1, item, n, nearest);
         consider(item, &self.items[middle], n, nearest);
-        // Rounding is monotone: no point beyond the plane has a smaller squared distance than the plane. An equal one
-        // may have a lower number.
+        // Rounding is monotone: no point beyond the plane has a smaller squared distance than the plane. An equal
+        // one may have a lower number.
         if nearest.len() < n || nearest.last().is_some_and(|last| beyond * beyond <= last.0) {
             self.search(far.0, far.1, item, n, nearest);
         }

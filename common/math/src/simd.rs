@@ -1,7 +1,7 @@
 //! Instruction sets, detected once and chosen at run time.
 //!
-//! A kernel is written once, as [`Work`] over a trait of vector operations: [`pulp::Simd`], or a trait of its own crate
-//! that has an implementation for each instruction set.
+//! A kernel is written once, as [`Work`] over a trait of vector operations: [`pulp::Simd`], or a trait of its own
+//! crate that has an implementation for each instruction set.
 
 use std::sync::LazyLock;
 

@@ -48,7 +48,8 @@ impl Ordered for u64 {
     }
 }
 
-/// Returns a quantile of values, which it reorders; `None` without any. `per_mille`: its share in thousandths, at most
+/// Returns a quantile of values, which it reorders; `None` without any. `per_mille`: its share in thousandths, at
+/// most
 /// 1000. Shares are integers, because a rounded share could fall on the neighbouring place.
 pub fn quantile<T: Ordered>(values: &mut [T], per_mille: usize, rank: Rank) -> Option<T> {
     let place = rank.place(values.len(), per_mille);
@@ -60,8 +61,8 @@ pub fn median<T: Ordered>(values: &mut [T]) -> Option<T> {
     quantile(values, 500, Rank::After)
 }
 
-/// Returns the least and largest of the values that remain without the lowest and highest `trimmed` share, at most a half;
-/// `None` without any. It reorders the values.
+/// Returns the least and largest of the values that remain without the lowest and highest `trimmed` share, at most
+/// a half; `None` without any. It reorders the values.
 pub fn trimmed_range<T: Ordered>(values: &mut [T], trimmed: f64) -> Option<(T, T)> {
     let cut = (trimmed * values.len().checked_sub(1)? as f64) as usize;
     let (_, low, above) = values.select_nth_unstable_by(cut, T::order);

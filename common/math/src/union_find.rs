@@ -1,5 +1,5 @@
-//! Disjoint sets with path halving (Tarjan and van Leeuwen, "Worst-case Analysis of Set Union Algorithms", JACM 31(2),
-//! 1984).
+//! Disjoint sets with path halving (Tarjan and van Leeuwen, "Worst-case Analysis of Set Union Algorithms", JACM
+//! 31(2), 1984).
 
 /// The number of an item that [`UnionFind::number`] was not asked about.
 pub const NOT_NUMBERED: u32 = u32::MAX;

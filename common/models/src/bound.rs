@@ -1,5 +1,5 @@
-//! Runs a model with its tensors bound to memory: inputs of the next model stay on the GPU, and other outputs go to
-//! page-locked memory, to which a GPU copies at the full speed of its link.
+//! Runs a model with its tensors bound to memory: inputs of the next model stay on the GPU, and other outputs go
+//! to page-locked memory, to which a GPU copies at the full speed of its link.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -20,8 +20,8 @@ pub(crate) enum Place {
     Device,
 }
 
-/// Runs of large models that a GPU has at once: the second one fills the gaps before and after the first. More take no less
-/// time in all, and each then ends late.
+/// Runs of large models that a GPU has at once: the second one fills the gaps before and after the first. More
+/// take no less time in all, and each then ends late.
 const RUNS_AT_ONCE: usize = 2;
 
 /// The turns of a GPU: whoever has one runs a large model there.
@@ -60,7 +60,8 @@ impl Drop for Turn<'_> {
 }
 
 impl Model {
-    /// Runs the model on `inputs` and returns the given outputs, each where it is wanted. Other outputs are not computed.
+    /// Runs the model on `inputs` and returns the given outputs, each where it is wanted. Other outputs are not
+    /// computed.
     pub(crate) fn run_bound(
         &mut self,
         memory: &DeviceMemory,
@@ -77,7 +78,8 @@ impl Model {
         outputs: &[(&str, Place)],
     ) -> ort::Result<Vec<DynTensor>> {
         let session = self.session_mut();
-        // A new binding each time: a bound output is otherwise overwritten by the next run, while its reader has it.
+        // A new binding each time: a bound output is otherwise overwritten by the next run, while its reader has
+        // it.
         let mut binding = session.create_binding()?;
         for (name, value) in inputs {
             binding.bind_input(*name, *value)?;

@@ -86,8 +86,9 @@ impl Boundaries {
     }
 }
 
-/// Returns what the model sees of depth at each pixel: half the logarithm of depth over the median depth, its slopes to
-/// the right and down, and 1. The first and last are 0 where depth is unknown, and a slope where it is unknown at either end.
+/// Returns what the model sees of depth at each pixel: half the logarithm of depth over the median depth, its
+/// slopes to the right and down, and 1. The first and last are 0 where depth is unknown, and a slope where it is
+/// unknown at either end.
 ///
 /// None of these changes with the scene's scale. `depth_m`: `[height][width_px]`.
 fn depth_channels(depth_m: &[f32], width_px: usize) -> Vec<[f32; 4]> {
@@ -123,7 +124,8 @@ fn depth_channels(depth_m: &[f32], width_px: usize) -> Vec<[f32; 4]> {
 mod tests {
     use super::*;
 
-    /// Depth grows by a hundredth a column, so that the logarithm's slope over four columns is 0.04; worked out by hand.
+    /// Depth grows by a hundredth a column, so that the logarithm's slope over four columns is 0.04; worked out by
+    /// hand.
     #[test]
     fn depth_is_seen_as_slopes_whatever_its_scale() {
         for scale in [1.0, 300.0] {

@@ -1,10 +1,10 @@
 //! Text cleaning that OpenAI's CLIP applies before its tokenizer; `tokenizer.json` files leave it out.
 //!
-//! Does what ftfy and `html.unescape` do to ordinary input: replaces character references, UTF-8 read as Windows-1252,
-//! curly quotes, ligatures and full-width forms, removes control characters, and collapses spaces.
+//! Does what ftfy and `html.unescape` do to ordinary input: replaces character references, UTF-8 read as
+//! Windows-1252, curly quotes, ligatures and full-width forms, removes control characters, and collapses spaces.
 //!
-//! The crate `html-escape` is not used: its table of over 2,000 names would add some 0.2 MB to the robot's program, and
-//! it leaves references to control characters in the text.
+//! The crate `html-escape` is not used: its table of over 2,000 names would add some 0.2 MB to the robot's
+//! program, and it leaves references to control characters in the text.
 
 /// Returns `text` cleaned, trimmed, with single spaces.
 pub fn clean(text: &str) -> String {

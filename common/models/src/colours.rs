@@ -277,8 +277,8 @@ fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let towards_after = ramp((hue_deg - from) / (to - from), 0.25, 0.75);
     for (hue, share) in [(before, 1.0 - towards_after), (after, towards_after)] {
         let share = lit * chromatic * share;
-        // Names of the same hue when dark, dull or light. They depend on the highlight, not the pixel, so colours in
-        // shade keep their name.
+        // Names of the same hue when dark, dull or light. They depend on the highlight, not the pixel, so colours
+        // in shade keep their name.
         let (other, part) = match hue {
             Colour::Red => {
                 let pink = ramp(highlight, 0.68, 0.78) * (1.0 - ramp(saturation, 0.2, 0.3));

@@ -34,8 +34,8 @@ pub struct PullArgs {
     /// Names from `models list`.
     #[arg(required = true)]
     names: Vec<String>,
-    /// Accepts a licence that restricts the use of a model, by its name; without it, the terminal asks. Licences that
-    /// do not restrict use are shown and need no consent.
+    /// Accepts a licence that restricts the use of a model, by its name; without it, the terminal asks. Licences
+    /// that do not restrict use are shown and need no consent.
     #[arg(long, visible_alias = "accept-license", value_name = "LICENCE")]
     accept_licence: Vec<String>,
     /// Address of a mirror of the hub.
@@ -66,8 +66,8 @@ pub struct RunArgs {
 }
 
 impl RunArgs {
-    /// Returns the session options, with `default_threads` unless the user sets a number; `beside`: folders to search
-    /// for the runtime.
+    /// Returns the session options, with `default_threads` unless the user sets a number; `beside`: folders to
+    /// search for the runtime.
     /// # Errors
     /// [`SessionError::NoRuntime`] if the user's library does not exist.
     pub fn session_options(
@@ -113,8 +113,8 @@ pub fn resolve(
     }
 }
 
-/// Opens the model of `--models`: the embedded encoders by default, [`ModelDir::colours`] by that name, else a folder or
-/// a pulled model.
+/// Opens the model of `--models`: the embedded encoders by default, [`ModelDir::colours`] by that name, else a
+/// folder or a pulled model.
 /// # Errors
 /// As [`resolve`] and [`ModelDir::open`].
 pub fn open(
@@ -128,8 +128,8 @@ pub fn open(
     })
 }
 
-/// Returns the folders that may hold ONNX Runtime, for the program `exe`: its own, `lib/slag` of its prefix, and the build
-/// folder above it.
+/// Returns the folders that may hold ONNX Runtime, for the program `exe`: its own, `lib/slag` of its prefix, and
+/// the build folder above it.
 pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
     let built = Path::new("onnxruntime").join(std::env::consts::ARCH);
     let above = exe.ancestors().skip(1).take(3);

@@ -179,8 +179,8 @@ pub struct ImageDescription {
     /// Crops in a run; default: measured.
     #[serde(skip_serializing)]
     pub batch: Option<u16>,
-    /// Sizes of the windows over a photo that masks take a share of, for a model that learnt from whole photos: the photo's
-    /// edge over the window's. Not used where the model has patches.
+    /// Sizes of the windows over a photo that masks take a share of, for a model that learnt from whole photos:
+    /// the photo's edge over the window's. Not used where the model has patches.
     #[serde(default, skip_serializing)]
     pub windows: Vec<u8>,
     /// The vectors of patches, if the model has them.

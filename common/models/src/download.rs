@@ -269,8 +269,8 @@ impl<'a> Client<'a> {
         })
     }
 
-    /// Downloads a file piece by piece, and resumes what an earlier attempt left. A server or proxy that answers a range
-    /// wrongly is asked for the whole file from then on.
+    /// Downloads a file piece by piece, and resumes what an earlier attempt left. A server or proxy that answers a
+    /// range wrongly is asked for the whole file from then on.
     pub fn large(&self, url: &str, part: &dyn Part, expected: Expected) -> Result<(), DownloadError> {
         if matches!(expected, Expected::Exactly(bytes) if part.len_bytes()? > bytes) {
             part.discard()?;

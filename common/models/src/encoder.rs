@@ -21,14 +21,14 @@ pub trait ImageEncoder: Send {
     /// [`InferenceError`] if a crop is empty or the model fails.
     fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError>;
 
-    /// Returns the patches along each side of the square over which photos are stretched for [`Self::encode_patches`];
-    /// `None` if the encoder has no vectors of patches.
+    /// Returns the patches along each side of the square over which photos are stretched for
+    /// [`Self::encode_patches`]; `None` if the encoder has no vectors of patches.
     fn patches_per_side(&self) -> Option<u32> {
         None
     }
 
-    /// Encodes the patches of a whole photo: `[patches_per_side^2][dim]`, unit vectors, row by row; `None` if the encoder has
-    /// no vectors of patches.
+    /// Encodes the patches of a whole photo: `[patches_per_side^2][dim]`, unit vectors, row by row; `None` if the
+    /// encoder has no vectors of patches.
     /// # Errors
     /// [`InferenceError`] if the photo is empty or the model fails.
     fn encode_patches(&mut self, _photo: &RgbImage) -> Result<Option<Vec<f32>>, InferenceError> {
@@ -65,7 +65,8 @@ pub trait TextEncoder: Send {
     }
 }
 
-/// Scales `vector` to unit length, computing in f64. Returns false and leaves it unchanged if it is zero or not finite.
+/// Scales `vector` to unit length, computing in f64. Returns false and leaves it unchanged if it is zero or not
+/// finite.
 pub(crate) fn normalise(vector: &mut [f32]) -> bool {
     let norm = vector.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>().sqrt();
     let usable = norm.is_finite() && norm > 0.0;

@@ -13,14 +13,14 @@ pub struct EncoderId {
     pub name: String,
     /// Components of a vector.
     pub dim: u32,
-    /// The description of the model as JSON, with the SHA-256 of each file in place of its path and without the fields
-    /// that do not affect vectors; empty for the built-in stand-in.
+    /// The description of the model as JSON, with the SHA-256 of each file in place of its path and without the
+    /// fields that do not affect vectors; empty for the built-in stand-in.
     pub definition: String,
 }
 
 impl EncoderId {
-    /// Returns the SHA-256 of the id's canonical form: `slag-encoder-id 2`, a line feed, then the JSON array of name,
-    /// dim and definition (a string) without spaces.
+    /// Returns the SHA-256 of the id's canonical form: `slag-encoder-id 2`, a line feed, then the JSON array of
+    /// name, dim and definition (a string) without spaces.
     pub fn hash(&self) -> [u8; 32] {
         let mut hasher = Sha256::new();
         hasher.update(b"slag-encoder-id 2\n");

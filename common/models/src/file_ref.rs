@@ -14,8 +14,8 @@ pub struct FileRef {
     pub path: PathBuf,
     /// Its SHA-256.
     pub sha256: Option<Sha256>,
-    /// The weights of an ONNX file that keeps them in a file of its own (`.onnx_data`), which it names relative to its
-    /// own folder.
+    /// The weights of an ONNX file that keeps them in a file of its own (`.onnx_data`), which it names relative to
+    /// its own folder.
     #[serde(default)]
     pub data: Option<Box<FileRef>>,
 }

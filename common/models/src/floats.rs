@@ -70,8 +70,9 @@ mod page_locked {
 
     pub(super) fn read<T: PrimitiveTensorElementType>(tensor: &DynTensor) -> Option<&[T]> {
         let n = tensor.shape().num_elements();
-        // SAFETY: cudaHostAlloc maps the memory for the processor, the runtime has allocated as many elements of T as the
-        // shape says, and nothing writes to them while the tensor is borrowed: runs that fill it have ended.
+        // SAFETY: cudaHostAlloc maps the memory for the processor, the runtime has allocated as many elements of T
+        // as the shape says, and nothing writes to them while the tensor is borrowed: runs that fill it have
+        // ended.
         is_of::<T>(tensor).then(|| unsafe { std::slice::from_raw_parts(tensor.data_ptr().cast::<T>(), n) })
     }
 

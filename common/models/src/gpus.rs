@@ -23,7 +23,8 @@ pub enum GpuChoice {
 }
 
 impl GpuChoice {
-    /// Returns the numbers of the chosen GPUs, at least one. Without an NVIDIA provider it is 0, which then means nothing.
+    /// Returns the numbers of the chosen GPUs, at least one. Without an NVIDIA provider it is 0, which then means
+    /// nothing.
     pub fn numbers(&self, options: &SessionOptions) -> Vec<u32> {
         match self {
             Self::Numbers(numbers) => numbers.clone(),

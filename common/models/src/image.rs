@@ -26,7 +26,8 @@ const UNIT_TOLERANCE: f64 = 1e-3;
 /// Batch size for models whose vectors depend on it: a constant, so that vectors are the same on every machine.
 const FIXED_BATCH: usize = 16;
 
-/// Batch size on a GPU, unless the description says otherwise: CLIP ViT-B/32 gains nothing from larger ones on an H100.
+/// Batch size on a GPU, unless the description says otherwise: CLIP ViT-B/32 gains nothing from larger ones on an
+/// H100.
 const GPU_BATCH: usize = 256;
 
 /// Share of the time per crop that doubling the batch must save to be worth its memory.
@@ -34,12 +35,12 @@ const WORTHWHILE: f64 = 0.05;
 
 /// An image encoder that runs an ONNX file.
 ///
-/// On an NVIDIA GPU, squares go to the GPU as bytes and batches have one shape: the last places of a batch that is not
-/// full are computed, too, so that a crop's vector is the same however many others come with it.
+/// On an NVIDIA GPU, squares go to the GPU as bytes and batches have one shape: the last places of a batch that is
+/// not full are computed, too, so that a crop's vector is the same however many others come with it.
 ///
-/// On other devices, if the description states no batch size, the fastest of 1, 2, 4, 8, 16 and 32 is measured once a process, among
-/// those that leave a crop's vector bit for bit the same. Models whose vectors depend on the rest of the batch
-/// (8-bit ones with scales computed at run time) always get 16.
+/// On other devices, if the description states no batch size, the fastest of 1, 2, 4, 8, 16 and 32 is measured
+/// once a process, among those that leave a crop's vector bit for bit the same. Models whose vectors depend on the
+/// rest of the batch (8-bit ones with scales computed at run time) always get 16.
 #[derive(Debug)]
 pub struct OnnxImageEncoder {
     name: String,

@@ -56,8 +56,9 @@ impl Levels {
         Ok(Self { squares, square_bytes: (3 * size * size) as usize, model, scale, offset })
     }
 
-    /// Returns the pixel values of a whole batch, `[batch][3][size_px][size_px]`, on the GPU. Places beyond `squares` have
-    /// any values: every batch has one shape, so that a vector does not depend on how many others are computed with it.
+    /// Returns the pixel values of a whole batch, `[batch][3][size_px][size_px]`, on the GPU. Places beyond
+    /// `squares` have any values: every batch has one shape, so that a vector does not depend on how many others
+    /// are computed with it.
     pub(crate) fn values<'a>(
         &mut self,
         memory: &DeviceMemory,
@@ -100,8 +101,8 @@ mod tests {
     use crate::floats::Floats;
     use crate::preprocess::{Filter, Resize};
 
-    /// Oracle: the table of values by level, which the processor's way uses. In 16 bits a value of up to 4 is off by half
-    /// a unit in its last place (0.001), and so are scale times level and offset.
+    /// Oracle: the table of values by level, which the processor's way uses. In 16 bits a value of up to 4 is off
+    /// by half a unit in its last place (0.001), and so are scale times level and offset.
     #[test]
     fn levels_become_the_pixel_values_of_the_table() {
         let preprocess = Preprocess::new(

@@ -103,9 +103,9 @@ impl ModelDir {
         Self::with(Documented { document: embedded::DESCRIPTION.to_owned(), description }, Files::Embedded)
     }
 
-    /// Opens the text side that a store carries. `description`: [`TextSide::description`]; `path`: of the description, for
-    /// messages; `folder`: where its files lie, by their hashes. Their content is compared with the description when the
-    /// encoder is opened.
+    /// Opens the text side that a store carries. `description`: [`TextSide::description`]; `path`: of the
+    /// description, for messages; `folder`: where its files lie, by their hashes. Their content is compared with
+    /// the description when the encoder is opened.
     /// # Errors
     /// [`ModelError::Description`] if the description is invalid.
     pub fn carried(description: &[u8], path: &Path, folder: &Path) -> Result<Self, ModelError> {
@@ -188,7 +188,8 @@ impl ModelDir {
         }
     }
 
-    /// Returns the sizes of windows of a photo that masks take a share of; none if the model should see things alone.
+    /// Returns the sizes of windows of a photo that masks take a share of; none if the model should see things
+    /// alone.
     pub fn windows(&self) -> &[u8] {
         match &self.source {
             Source::Colours => &[],
@@ -211,7 +212,8 @@ impl ModelDir {
         Ok(Box::new(encoder))
     }
 
-    /// Returns the bytes of the image model's files; `None` if it needs none. Files that are absent count as empty.
+    /// Returns the bytes of the image model's files; `None` if it needs none. Files that are absent count as
+    /// empty.
     pub fn image_bytes(&self) -> Option<u64> {
         let Source::Files { files, description, .. } = &self.source else { return None };
         let Files::Folder(root) = files else { return Some(embedded::IMAGE.len() as u64) };

@@ -72,8 +72,8 @@ impl Provider {
     }
 }
 
-/// Returns CUDA's settings. Convolutions are chosen by rule, not by timing them: the same ones every time, and quicker ones
-/// for CLIP's patches on an H100.
+/// Returns CUDA's settings. Convolutions are chosen by rule, not by timing them: the same ones every time, and
+/// quicker ones for CLIP's patches on an H100.
 fn cuda(gpu: i32) -> ep::CUDA {
     ep::CUDA::default().with_device_id(gpu).with_conv_algorithm_search(ConvAlgorithmSearch::Heuristic)
 }

@@ -34,8 +34,8 @@ pub struct SessionOptions {
     pub runtime: PathBuf,
     /// Threads within one run. For small models, 1 and several sessions in parallel is fastest.
     pub intra_op_threads: usize,
-    /// The devices to run on, in order of preference. Without the CPU in the list, it is an error if none of them can
-    /// be used.
+    /// The devices to run on, in order of preference. Without the CPU in the list, it is an error if none of them
+    /// can be used.
     pub providers: Vec<Provider>,
     /// The GPU to run on, as CUDA numbers them.
     pub gpu: u32,
@@ -109,7 +109,8 @@ impl Model {
         Self::open_sized(file, options, None)
     }
 
-    /// Opens the model for one size of a named dimension: all that follows from it is computed now, not in every run.
+    /// Opens the model for one size of a named dimension: all that follows from it is computed now, not in every
+    /// run.
     pub(crate) fn open_sized(
         file: &ModelFile,
         options: &SessionOptions,
@@ -256,8 +257,8 @@ impl Model {
         self.expect("input", self.session.inputs(), name.into(), element, shape)
     }
 
-    /// Returns output `name` (`None`: the only one that fits) if it gives `element`, with f16 accepted for f32, and
-    /// `shape`, where -1 is any size.
+    /// Returns output `name` (`None`: the only one that fits) if it gives `element`, with f16 accepted for f32,
+    /// and `shape`, where -1 is any size.
     pub(crate) fn expect_output<'a>(
         &self,
         name: impl Into<Option<&'a str>>,

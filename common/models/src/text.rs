@@ -25,8 +25,8 @@ pub struct Tokens {
 }
 
 impl Tokens {
-    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last of them `end_token_id` if there is
-    /// one.
+    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last of them `end_token_id`
+    /// if there is one.
     /// # Errors
     /// [`TokenizerError`] if the file is not a tokenizer, or ends texts with another token.
     pub fn open(
@@ -200,7 +200,8 @@ impl TextEncoder for OnnxTextEncoder {
     }
 }
 
-/// Replaces `vector` v by normalize(normalize(v) - centre), both `[dim]`; returns false if that is zero or not finite.
+/// Replaces `vector` v by normalize(normalize(v) - centre), both `[dim]`; returns false if that is zero or not
+/// finite.
 pub(crate) fn centred(vector: &mut [f32], centre: Option<&[f32]>) -> bool {
     if !normalise(vector) {
         return false;

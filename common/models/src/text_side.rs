@@ -1,5 +1,5 @@
-//! The text side of a model as a store carries it to robots: files that are named by their content, and a description in JSON
-//! that names them so.
+//! The text side of a model as a store carries it to robots: files that are named by their content, and a
+//! description in JSON that names them so.
 
 use std::path::PathBuf;
 
@@ -77,15 +77,16 @@ fn pointer(role: &str) -> &'static str {
     }
 }
 
-/// Returns whether a licence expression is known to permit redistribution: every part of it joined by AND, or any joined by OR.
+/// Returns whether a licence expression is known to permit redistribution: every part of it joined by AND, or any
+/// joined by OR.
 fn may_be_passed_on(licence: &str) -> bool {
     let is_known = |name: &str| REDISTRIBUTABLE.contains(&name.trim_matches(['(', ')', ' ']));
     licence.split(" OR ").any(|part| part.split(" AND ").all(is_known))
 }
 
 impl TextSide {
-    /// Takes a description apart. `document`: its TOML text; `hashed`: what it parses to, with the hash of every file;
-    /// `open`: returns a file of it after comparing its hash.
+    /// Takes a description apart. `document`: its TOML text; `hashed`: what it parses to, with the hash of every
+    /// file; `open`: returns a file of it after comparing its hash.
     pub(crate) fn new(
         id: &EncoderId,
         document: &str,

@@ -1,5 +1,5 @@
-//! Vectors of patches against tensors recorded with PyTorch (`tests/models/dense_tiny/export.py`), and texts without an end
-//! token.
+//! Vectors of patches against tensors recorded with PyTorch (`tests/models/dense_tiny/export.py`), and texts
+//! without an end token.
 
 use crate::common::{array, image, made, max_difference, model_dir, options, unit};
 use slag_models::{Crop, ModelDir};
@@ -52,7 +52,8 @@ fn wrong_patches_are_named() {
     assert!(message.contains("patches") && message.contains("patch_embeddings"), "{message}");
 }
 
-/// The made tokenizer ends texts with token 1; without `end_token_id`, ids are as they come, and lower case is a choice.
+/// The made tokenizer ends texts with token 1; without `end_token_id`, ids are as they come, and lower case is a
+/// choice.
 #[test]
 fn texts_need_no_end_token_and_may_be_lowered() {
     let tokenizer = made::tokenizer(&made::VOCABULARY).replace(r#"{"type":"Lowercase"},"#, "");

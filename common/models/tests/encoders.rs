@@ -1,5 +1,5 @@
-//! Encoders with the variations of CLIP and SigLIP exports: element types, masks, padding, unnamed outputs, batches.
-//! The models are generated here; the expected vectors are computed from their tables in f64.
+//! Encoders with the variations of CLIP and SigLIP exports: element types, masks, padding, unnamed outputs,
+//! batches. The models are generated here; the expected vectors are computed from their tables in f64.
 
 use crate::common::made::{
     DESCRIPTION, DIM, SIZE_PX, TextKind, VOCABULARY, WEIGHTS, image_graph, row, text_graph, tokenizer, write,

@@ -14,8 +14,8 @@ fn open() -> Sam {
     Sam::open(&model_dir("sam2_tiny"), &options()).expect("it opens")
 }
 
-/// The largest difference between every `step`th row and column of `found`, `[planes][rows][columns]`, and the recorded
-/// `expected`.
+/// The largest difference between every `step`th row and column of `found`, `[planes][rows][columns]`, and the
+/// recorded `expected`.
 fn max_difference(found: &[f32], columns: usize, step: usize, expected: &[f32]) -> f64 {
     let rows = found.chunks_exact(columns).enumerate();
     let taken = rows.filter(|(row, _)| row % step == 0).flat_map(|(_, row)| row.iter().step_by(step));

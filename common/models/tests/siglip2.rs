@@ -1,5 +1,5 @@
-//! SigLIP 2's two sides as `models pull` describes them, against transformers and PyTorch (`tests/models/siglip2_tiny/export.py`):
-//! preprocessing, tokens with their end and padding, vectors.
+//! SigLIP 2's two sides as `models pull` describes them, against transformers and PyTorch
+//! (`tests/models/siglip2_tiny/export.py`): preprocessing, tokens with their end and padding, vectors.
 
 use std::path::Path;
 

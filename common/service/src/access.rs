@@ -1,11 +1,11 @@
 //! Who may ask: checks of `Host`, `Origin` and bearer tokens, and CORS.
 //!
-//! A browser on the robot's network runs pages of strangers. Such a page can send requests to the robot, and by DNS
-//! rebinding it can read the answers: its own name then resolves to the robot's address. Three checks stop that. The
-//! `Host` must be an IP address, `localhost` or a name that was given: a stranger's page always sends its own name.
-//! A foreign `Origin` (RFC 6454) is refused unless it was given, and so is a request that the browser itself marks as
-//! another site's (`Sec-Fetch-Site`). Writes take JSON only ([`crate::routes`]), which a page cannot post to another
-//! origin without asking first (CORS), and that is off unless an origin was given.
+//! A browser on the robot's network runs pages of strangers. Such a page can send requests to the robot, and by
+//! DNS rebinding it can read the answers: its own name then resolves to the robot's address. Three checks stop
+//! that. The `Host` must be an IP address, `localhost` or a name that was given: a stranger's page always sends
+//! its own name. A foreign `Origin` (RFC 6454) is refused unless it was given, and so is a request that the
+//! browser itself marks as another site's (`Sec-Fetch-Site`). Writes take JSON only ([`crate::routes`]), which a
+//! page cannot post to another origin without asking first (CORS), and that is off unless an origin was given.
 
 use std::io;
 use std::net::IpAddr;

@@ -111,8 +111,8 @@ fn too_slow(error: &axum::Error) -> Option<TooSlow> {
     None
 }
 
-/// Checks that a body is said to be JSON. Forms and plain text, which a page of any origin can post without asking,
-/// are thus refused.
+/// Checks that a body is said to be JSON. Forms and plain text, which a page of any origin can post without
+/// asking, are thus refused.
 ///
 /// # Errors
 /// 415.

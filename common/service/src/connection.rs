@@ -13,9 +13,9 @@ const PROGRESS_BYTES: usize = 64 << 10;
 
 /// A stream that fails once sending made no progress for `stall_timeout`.
 ///
-/// Without progress, a client idles, drips its request or does not read its answer: one deadline bounds
-/// all three. Received bytes do not move the deadline, so a request of any length must arrive within it. A write that
-/// is taken whole is progress; of partial ones, every 64 KiB, so that a client that reads a byte at a time does not
+/// Without progress, a client idles, drips its request or does not read its answer: one deadline bounds all three.
+/// Received bytes do not move the deadline, so a request of any length must arrive within it. A write that is
+/// taken whole is progress; of partial ones, every 64 KiB, so that a client that reads a byte at a time does not
 /// hold its connection.
 pub struct Stalling<S> {
     stream: S,

@@ -11,8 +11,9 @@
 //! | route | [`routes`] | path and method; type and length of a request body, and time for it |
 //! | handler | the service's own | parameters, admission of expensive work, the answer |
 //!
-//! [`openapi`] describes routes and their types for programs, [`replies`] what handlers return, [`listen`] has the addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
-//! Prometheus' text format, [`stop`] waits for the signals to stop.
+//! [`openapi`] describes routes and their types for programs, [`replies`] what handlers return, [`listen`] has the
+//! addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags,
+//! [`metrics`] writes Prometheus' text format, [`stop`] waits for the signals to stop.
 
 pub mod access;
 mod body;

@@ -16,9 +16,9 @@ use crate::tls::{Tls, TlsError, TlsFiles};
 /// What a Unix socket's address begins with.
 const UNIX: &str = "unix:";
 
-/// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a connection of its own: its
-/// accept loop, its threads and its routes work. Of TLS, any answer to what is no handshake will do. It does not return while
-/// the service is silent.
+/// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a connection of its
+/// own: its accept loop, its threads and its routes work. Of TLS, any answer to what is no handshake will do. It
+/// does not return while the service is silent.
 pub async fn answers(url: &str) -> bool {
     let asked = match (url.strip_prefix(UNIX), url.split_once("://")) {
         #[cfg(unix)]
@@ -142,8 +142,8 @@ pub(crate) trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
 
 impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
-/// Starts listening. A Unix socket that a dead process left behind is replaced; the new one is open to this user and
-/// group only.
+/// Starts listening. A Unix socket that a dead process left behind is replaced; the new one is open to this user
+/// and group only.
 pub async fn bind(listen: &Listen) -> Result<Listener, ListenError> {
     let bound = match listen {
         Listen::Tcp(address) => TcpListener::bind(address).await.map(Socket::Tcp),

@@ -1,4 +1,5 @@
-//! The accept loop: a bounded number of connections, deadlines for their requests and answers, a stop with a deadline.
+//! The accept loop: a bounded number of connections, deadlines for their requests and answers, a stop with a
+//! deadline.
 
 use std::io;
 use std::time::Duration;
@@ -27,7 +28,8 @@ const RESERVED_TIMEOUT: Duration = Duration::from_secs(2);
 /// Bounds of a service's connections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConnectionLimits {
-    /// Open connections. Further ones are answered once, and with 503 unless they ask for health, readiness or metrics.
+    /// Open connections. Further ones are answered once, and with 503 unless they ask for health, readiness or
+    /// metrics.
     pub n_connections: usize,
     /// Open connections of one peer: an IPv4 address, or a /64 network of IPv6.
     pub n_per_peer: usize,

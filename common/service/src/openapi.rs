@@ -1,4 +1,5 @@
-//! The description for programs: OpenAPI 3.1, made from the routes and from the types that their handlers take and return.
+//! The description for programs: OpenAPI 3.1, made from the routes and from the types that their handlers take and
+//! return.
 
 mod schemas;
 
@@ -28,9 +29,9 @@ pub struct About {
 }
 
 impl<S: Clone + Send + Sync + 'static> Routes<S> {
-    /// Adds `GET /`, a text for people: every route and parameter; and `GET /openapi.json`, the same for programs with all
-    /// types, made on the first request. `M`: members of the service's problems beyond those of RFC 9457. Returns the router
-    /// and the table.
+    /// Adds `GET /`, a text for people: every route and parameter; and `GET /openapi.json`, the same for programs
+    /// with all types, made on the first request. `M`: members of the service's problems beyond those of RFC 9457.
+    /// Returns the router and the table.
     pub fn described<M: JsonSchema>(self, about: About) -> (Router<S>, Vec<Route>) {
         let table = Arc::<OnceLock<Vec<Route>>>::default();
         let (of_help, of_document) = (Arc::clone(&table), Arc::clone(&table));

@@ -1,4 +1,5 @@
-//! The stage around every request: its id, whether it is admitted, its log line, its counter, and the body of an error.
+//! The stage around every request: its id, whether it is admitted, its log line, its counter, and the body of an
+//! error.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -33,8 +34,8 @@ struct Observer {
     access: Access,
 }
 
-/// Puts this stage around a router: ids in `x-request-id` (the client's own if it sent one), the checks of `access`, a
-/// problem as the body of every error (a panic of a handler is one), counts in `responses`.
+/// Puts this stage around a router: ids in `x-request-id` (the client's own if it sent one), the checks of
+/// `access`, a problem as the body of every error (a panic of a handler is one), counts in `responses`.
 pub fn observed(router: Router, responses: Arc<ResponseCounts>, access: Access) -> Router {
     let observer = Arc::new(Observer { n_requests: AtomicU64::new(0), responses, access });
     router.layer(CatchPanicLayer::custom(panicked)).layer(from_fn_with_state(observer, observe))

@@ -189,8 +189,8 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         self.add::<H::Answer>(Method::GET, path, summary, get(handler))
     }
 
-    /// Adds a resource that takes a `B` in JSON, of at most `max_body_bytes`. The body is read, and bodies of another type,
-    /// longer ones and slow ones are refused, before the handler is called; the handler parses it.
+    /// Adds a resource that takes a `B` in JSON, of at most `max_body_bytes`. The body is read, and bodies of
+    /// another type, longer ones and slow ones are refused, before the handler is called; the handler parses it.
     pub fn post<B: JsonSchema, T: 'static, H: Handler<T, S> + Answering<T>>(
         self,
         path: &'static str,

@@ -1,7 +1,7 @@
 //! TLS: a certificate and its key from PEM files, read anew when they change.
 //!
-//! Whoever renews a certificate replaces two files, one after the other. A pair that does not fit together is left aside
-//! with a warning, and the one before it stays in use.
+//! Whoever renews a certificate replaces two files, one after the other. A pair that does not fit together is left
+//! aside with a warning, and the one before it stays in use.
 
 use std::fmt;
 use std::io;

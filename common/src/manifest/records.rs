@@ -96,8 +96,8 @@ pub struct ObjectRecord {
 
 /// The distribution of the scores of a bank of texts in a scene.
 ///
-/// Nearly all pairs of text and Gaussian do not match, so this is the distribution of non-matches in this scene with this
-/// encoder.
+/// Nearly all pairs of text and Gaussian do not match, so this is the distribution of non-matches in this scene
+/// with this encoder.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {

@@ -19,8 +19,8 @@ pub fn quantise_vectors(vectors: &[f32], m: usize, n_vectors: usize) -> (Vec<i8>
 
 /// Collects runs of consecutive Gaussians of the same object.
 ///
-/// `objects`: the object of each Gaussian of a shard, [`NO_OBJECT`](super::columns::NO_OBJECT) for none. Returns the end and
-/// the object of each run.
+/// `objects`: the object of each Gaussian of a shard, [`NO_OBJECT`](super::columns::NO_OBJECT) for none. Returns
+/// the end and the object of each run.
 pub fn collect_runs(objects: impl IntoIterator<Item = u16>) -> (Vec<u32>, Vec<u16>) {
     let (mut run_ends, mut run_objects) = (Vec::new(), Vec::new());
     for (index, object) in (0u32..).zip(objects) {

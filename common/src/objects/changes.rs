@@ -1,7 +1,7 @@
 //! Which things of two generations are the same.
 //!
-//! First those of the same Gaussians; then those that look alike and whose boxes overlap, most overlap first; then, of
-//! the rest, those that look alike and have the same size, nearest first. A thing is matched once.
+//! First those of the same Gaussians; then those that look alike and whose boxes overlap, most overlap first;
+//! then, of the rest, those that look alike and have the same size, nearest first. A thing is matched once.
 
 use glam::DVec3;
 use serde::Serialize;
@@ -9,8 +9,8 @@ use serde::Serialize;
 use super::thing::Thing;
 use crate::frames::Aabb;
 
-/// Least cosine of the vectors of a thing that stayed. Other photos change a thing's vector; another thing at its place
-/// differs more.
+/// Least cosine of the vectors of a thing that stayed. Other photos change a thing's vector; another thing at its
+/// place differs more.
 const STAYED_COSINE: f64 = 0.8;
 /// Least share of the union of two boxes that both cover, for a thing that stayed.
 const STAYED_OVERLAP: f64 = 0.25;
@@ -20,8 +20,8 @@ const MOVED_COSINE: f64 = 0.9;
 const MOVED_SIZE_RATIO: f64 = 1.5;
 /// Boxes are widened on each side by this share of their diagonal, so that flat things overlap as thick ones do.
 const MARGIN: f64 = 0.05;
-/// Things of the later list that one of the earlier may be paired with, those of lowest cost: bounds memory where thousands
-/// are alike.
+/// Things of the later list that one of the earlier may be paired with, those of lowest cost: bounds memory where
+/// thousands are alike.
 const MAX_CANDIDATES: usize = 32;
 
 /// A thing that lies elsewhere.
@@ -53,8 +53,8 @@ pub struct Changes {
 
 /// Returns the changes between two lists, each ascending by id.
 ///
-/// `new_knows` says whether the later list would have a thing of the earlier one if it were still there, `old_knows` the
-/// reverse; other things are matched where they lie, and not compared otherwise.
+/// `new_knows` says whether the later list would have a thing of the earlier one if it were still there,
+/// `old_knows` the reverse; other things are matched where they lie, and not compared otherwise.
 pub fn changes(
     old: Vec<Thing>,
     new: Vec<Thing>,

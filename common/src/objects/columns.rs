@@ -140,8 +140,8 @@ impl<'a> Objects<'a> {
     }
 }
 
-/// Returns the score of an object from the cosines of its vectors: the average of the first (the mean of its masks)
-/// and the best of the others (its sides).
+/// Returns the score of an object from the cosines of its vectors: the average of the first (the mean of its
+/// masks) and the best of the others (its sides).
 ///
 /// The mean alone blends sides into a vector that no text describes; the best side alone lets one odd crop among
 /// hundreds match anything.

@@ -43,7 +43,8 @@ fn from_hex<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error>
 }
 
 impl Thing {
-    /// Adds the objects of a shard to a generation's things, by id; of an object in several shards, the first is taken.
+    /// Adds the objects of a shard to a generation's things, by id; of an object in several shards, the first is
+    /// taken.
     pub fn add_all(things: &mut BTreeMap<u64, Self>, shard: &ShardView<'_>, objects: &Objects<'_>) {
         let dim = shard.header.dim as usize;
         let len = objects.header.n_vectors as usize * dim;

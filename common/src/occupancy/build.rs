@@ -25,8 +25,9 @@ pub struct BuiltOccupancy {
 }
 
 impl BuiltOccupancy {
-    /// Packs blocks, in any order, each at most once. Blocks without a known voxel are left out; so are those more than 256
-    /// blocks from the median block along an axis, which stray Gaussians make: a robot takes both as unknown.
+    /// Packs blocks, in any order, each at most once. Blocks without a known voxel are left out; so are those more
+    /// than 256 blocks from the median block along an axis, which stray Gaussians make: a robot takes both as
+    /// unknown.
     pub fn pack(voxel: f64, min_opacity: f32, min_views: u32, blocks: &[Block]) -> Self {
         let mut known: Vec<Block> = blocks.iter().copied().filter(|b| b.occupied | b.free != 0).collect();
         for axis in 0..3 {

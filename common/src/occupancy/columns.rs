@@ -130,7 +130,8 @@ impl<'a> Occupancy<'a> {
         ]
     }
 
-    /// Returns the runs of blocks, ascending. A run may be long: readers clip it before they go through its blocks.
+    /// Returns the runs of blocks, ascending. A run may be long: readers clip it before they go through its
+    /// blocks.
     pub fn runs(&self) -> impl Iterator<Item = BlockRun<'a>> + 'a {
         let mut masks = self.masks;
         self.runs.iter().filter_map(move |run| {
@@ -162,7 +163,8 @@ pub(super) fn state_of(masks: [u64; 2], [x, y, z]: [i32; 3]) -> VoxelState {
 }
 
 impl Occupancy<'_> {
-    /// Returns the state of a voxel of the scene's lattice. Goes through the runs: for tests and judges, not for maps.
+    /// Returns the state of a voxel of the scene's lattice. Goes through the runs: for tests and judges, not for
+    /// maps.
     pub fn state(&self, voxel: [i32; 3]) -> VoxelState {
         let block = voxel.map(|v| v.div_euclid(BLOCK_EDGE));
         let of_run = |run: BlockRun<'_>| {

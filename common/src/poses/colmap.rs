@@ -109,8 +109,8 @@ fn n_images(model_dir: &Path) -> Option<u64> {
     Some(n)
 }
 
-/// Returns the first of these folders that exists, or else the first: `images/` beside a parent folder `sparse`, beside
-/// the model's folder, in the model's folder.
+/// Returns the first of these folders that exists, or else the first: `images/` beside a parent folder `sparse`,
+/// beside the model's folder, in the model's folder.
 fn default_images_dir(model_dir: &Path) -> Result<PathBuf, PoseError> {
     let beside = parent(model_dir)?;
     let mut candidates = vec![beside.join("images"), model_dir.join("images")];
@@ -154,8 +154,8 @@ struct Images {
 }
 
 impl Images {
-    /// Adds an image record; one without a pose (zeros, NaN), as some exporters write it for photos that they could not
-    /// place, is left out.
+    /// Adds an image record; one without a pose (zeros, NaN), as some exporters write it for photos that they
+    /// could not place, is left out.
     fn push(
         &mut self,
         name: &str,

@@ -20,15 +20,14 @@ pub use view_set::{AppliedTransform, PoseSource, ViewSet};
 
 /// Reads the posed views at `path`.
 ///
-/// `path` is the folder of a COLMAP model (or one of its files, or a folder with `sparse/0`, `0` or `sparse`; of several
-/// numbered models the one with most images), or a nerfstudio
-/// `transforms.json` (or its folder), or a scene folder as ScanNet's SensReader exports it (`color/`, `pose/`,
-/// `intrinsic/`). COLMAP takes precedence over `transforms.json`, that over ScanNet, and binary over text, which is
-/// rounded.
+/// `path` is the folder of a COLMAP model (or one of its files, or a folder with `sparse/0`, `0` or `sparse`; of
+/// several numbered models the one with most images), or a nerfstudio `transforms.json` (or its folder), or a
+/// scene folder as ScanNet's SensReader exports it (`color/`, `pose/`, `intrinsic/`). COLMAP takes precedence over
+/// `transforms.json`, that over ScanNet, and binary over text, which is rounded.
 ///
-/// `images_dir` is the folder of the images. The default is `images/` beside COLMAP's `sparse/` (or beside or in the
-/// model's folder), the paths in a `transforms.json`, and ScanNet's `color/`. Images need not exist, except that ScanNet
-/// states their size nowhere else.
+/// `images_dir` is the folder of the images. The default is `images/` beside COLMAP's `sparse/` (or beside or in
+/// the model's folder), the paths in a `transforms.json`, and ScanNet's `color/`. Images need not exist, except
+/// that ScanNet states their size nowhere else.
 ///
 /// # Errors
 /// [`PoseError`], with file and place, for data that is missing, damaged or not supported.

@@ -30,8 +30,8 @@ impl PhotoFinder {
         Self { dir, listed: HashMap::new() }
     }
 
-    /// Returns the photo at the longest ending of `path` that exists in the folder, with the stated file name or else in
-    /// other letters or with the ending of another photo format; and that ending.
+    /// Returns the photo at the longest ending of `path` that exists in the folder, with the stated file name or
+    /// else in other letters or with the ending of another photo format; and that ending.
     pub(super) fn find(&mut self, path: &str) -> Option<(PathBuf, String)> {
         let parts: Vec<&str> = Path::new(path)
             .components()

@@ -1,8 +1,9 @@
-//! The frame of a splat that was trained in another one than its poses': nerfstudio's `dataparser_transforms.json`.
+//! The frame of a splat that was trained in another one than its poses': nerfstudio's
+//! `dataparser_transforms.json`.
 //!
-//! `ns-train` changes the world of its input poses and writes the change into the run's folder:
-//! `trained = scale * (transform * original)`. `ns-export gaussian-splat` writes the splat in the trained frame. Which
-//! frame is `original` depends on the dataparser (nerfstudio 1.1, `data/dataparsers/`):
+//! `ns-train` changes the world of its input poses and writes the change into the run's folder: `trained = scale *
+//! (transform * original)`. `ns-export gaussian-splat` writes the splat in the trained frame. Which frame is
+//! `original` depends on the dataparser (nerfstudio 1.1, `data/dataparsers/`):
 //!
 //! | poses | `original` |
 //! |---|---|
@@ -10,8 +11,8 @@
 //! | `transforms.json` | the world before its `applied_transform` and `applied_scale` |
 //! | ScanNet | ScanNet's world with x and y swapped and z negated, which the file does not mention |
 //!
-//! The ScanNet dataparser never rotates further, so a file with a rotation is of another dataparser and begins at the
-//! poses themselves.
+//! The ScanNet dataparser never rotates further, so a file with a rotation is of another dataparser and begins at
+//! the poses themselves.
 
 use std::fmt;
 use std::io::Read;

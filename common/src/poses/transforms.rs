@@ -1,7 +1,7 @@
 //! Nerfstudio's `transforms.json` (its documentation, "Data conventions").
 //!
-//! `transform_matrix` is world from camera in OpenGL axes (x right, y up, z backward). An `applied_transform` records an
-//! earlier change of the world frame; it is not undone, so the world frame is that of the file's poses.
+//! `transform_matrix` is world from camera in OpenGL axes (x right, y up, z backward). An `applied_transform`
+//! records an earlier change of the world frame; it is not undone, so the world frame is that of the file's poses.
 
 use std::f64::consts::PI;
 use std::path::{Component, Path, PathBuf};
@@ -134,8 +134,8 @@ struct Frames<'a> {
 }
 
 impl Frames<'_> {
-    /// Returns the path of a frame's photo and its name: where the file says, or else at the longest ending of that path
-    /// that exists. `name`: by the file, perhaps without an ending.
+    /// Returns the path of a frame's photo and its name: where the file says, or else at the longest ending of
+    /// that path that exists. `name`: by the file, perhaps without an ending.
     fn photo(&mut self, index: usize, name: Option<String>) -> Option<(PathBuf, String)> {
         let (name, file_path) = (name?, &self.paths[index]);
         let (image_path, ending) = match self.images_dir {
@@ -187,9 +187,10 @@ fn view(
 
 /// Returns the name of each image: its path relative to the folder of the images; `None` if it has none.
 ///
-/// The folder of an image is the first one called `images` or `images_N` (nerfstudio's downscaled copies), so that names
-/// agree with COLMAP's. If these folders differ, as `left/images` and `right/images` do, names keep the folders that
-/// tell them apart: they are relative to the folder that holds all of them. A path without such a folder is a name.
+/// The folder of an image is the first one called `images` or `images_N` (nerfstudio's downscaled copies), so that
+/// names agree with COLMAP's. If these folders differ, as `left/images` and `right/images` do, names keep the
+/// folders that tell them apart: they are relative to the folder that holds all of them. A path without such a
+/// folder is a name.
 fn names_of(file_paths: &[String]) -> Vec<Option<String>> {
     let split: Vec<(Vec<&str>, usize)> = file_paths
         .iter()
@@ -228,8 +229,8 @@ fn is_image_folder(name: &str) -> bool {
         .is_some_and(|rest| rest.is_empty() || rest.strip_prefix('_').is_some_and(is_number))
 }
 
-/// Returns the path and an empty text or, if it has no image extension, the first path with one that exists, and the
-/// text added.
+/// Returns the path and an empty text or, if it has no image extension, the first path with one that exists, and
+/// the text added.
 pub(super) fn existing(path: &Path) -> (PathBuf, String) {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
     if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || path.is_file() {

@@ -122,7 +122,8 @@ pub struct ShardView<'a> {
     pub residuals: Option<Residuals<'a>>,
     /// The columns that only the exact profile has.
     pub exact: Option<ExactColumns<'a>>,
-    /// Indices in the input splat file, where the scene was encoded with them; exact shards have a column of their own.
+    /// Indices in the input splat file, where the scene was encoded with them; exact shards have a column of their
+    /// own.
     pub packed_indices: Option<PackedIndices<'a>>,
 }
 

@@ -5,7 +5,8 @@ use super::format::CODEWORDS;
 use crate::objects::{Objects, object_score};
 
 impl ShardView<'_> {
-    /// Writes the vector of a centroid to `out` (`[dim]`), in float64; the formula is in the module's documentation.
+    /// Writes the vector of a centroid to `out` (`[dim]`), in float64; the formula is in the module's
+    /// documentation.
     pub fn decode_centroid(&self, centroid: usize, out: &mut [f64]) {
         let m = self.header.n_components as usize;
         let step = f64::from(self.header.centroid_step);
@@ -14,8 +15,8 @@ impl ShardView<'_> {
         self.combine(&components, out);
     }
 
-    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), as accurately as this profile allows, in
-    /// float64.
+    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), as accurately as this profile allows,
+    /// in float64.
     pub fn decode(&self, index: usize, out: &mut [f64]) {
         let dim = self.header.dim as usize;
         if let Some(exact) = &self.exact {
@@ -26,7 +27,8 @@ impl ShardView<'_> {
         self.combine(&self.components(index), out);
     }
 
-    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), decoded from its fine residual, in float64.
+    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), decoded from its fine residual, in
+    /// float64.
     pub fn decode_fine(&self, index: usize, fine: &Fine<'_>, out: &mut [f64]) {
         let m = self.header.n_components as usize;
         let centroid = self.centroid_of(index);
@@ -37,8 +39,8 @@ impl ShardView<'_> {
         self.combine(&of_centroid.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
     }
 
-    /// Returns the score of every Gaussian with evidence for a query (`[dim]`), from embeddings as this profile decodes
-    /// them, in float64.
+    /// Returns the score of every Gaussian with evidence for a query (`[dim]`), from embeddings as this profile
+    /// decodes them, in float64.
     pub fn scores(&self, query: &[f32]) -> Vec<f64> {
         let dim = self.header.dim as usize;
         let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
@@ -126,8 +128,8 @@ impl ShardView<'_> {
         }
     }
 
-    /// Returns the score of each of the shard's objects for a query (`[dim]`), see [`object_score`]; products are in
-    /// float64.
+    /// Returns the score of each of the shard's objects for a query (`[dim]`), see [`object_score`]; products are
+    /// in float64.
     pub fn object_scores(&self, objects: &Objects<'_>, query: &[f32]) -> Vec<f32> {
         let (offset, of_components) = self.components_of_query(query);
         let m = of_components.len();

@@ -77,8 +77,8 @@ pub mod section {
 pub struct ScoreErrors {
     /// Mean over texts and Gaussians.
     pub mean: f32,
-    /// For 95 of 100 texts like those held out of the bank, 99 of 100 scores err by no more; 0 where too few texts were
-    /// held out.
+    /// For 95 of 100 texts like those held out of the bank, 99 of 100 scores err by no more; 0 where too few texts
+    /// were held out.
     pub likely: f32,
     /// Largest.
     pub max: f32,

@@ -1,7 +1,8 @@
 //! Indices of Gaussians in the input splat file, packed into as few bits as a cell's range of indices needs.
 //!
-//! Every profile may have the column. Each index has the same width, so that a reader finds any one without reading the
-//! others: `index[i] = least + the width_bits bits from bit i * width_bits on`, bits counted from the lowest of each word.
+//! Every profile may have the column. Each index has the same width, so that a reader finds any one without
+//! reading the others: `index[i] = least + the width_bits bits from bit i * width_bits on`, bits counted from the
+//! lowest of each word.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -41,7 +42,8 @@ impl PackedIndices<'_> {
         ((u64::from(self.words[word]) | high) >> shift & ((1 << width) - 1)) as u32
     }
 
-    /// Checks a column of `n` indices: a width of at most 32 bits, no index above the largest u32, zeros after the last.
+    /// Checks a column of `n` indices: a width of at most 32 bits, no index above the largest u32, zeros after the
+    /// last.
     pub(super) fn check(&self, n: usize) -> Result<(), String> {
         let IndicesHeader { least, .. } = self.header;
         if let Some(at) = (0..n).find(|at| least.checked_add(self.offset(*at)).is_none()) {

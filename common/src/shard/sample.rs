@@ -147,8 +147,8 @@ impl SampleObjects {
     }
 }
 
-/// Returns the manifest that lists shards, which may be several of a cell in different profiles. Their encoder is named after
-/// nothing; generation 1.
+/// Returns the manifest that lists shards, which may be several of a cell in different profiles. Their encoder is
+/// named after nothing; generation 1.
 pub fn manifest(scene: &str, shards: &[(Profile, &[u8])]) -> Manifest {
     let mut cells: BTreeMap<u32, CellRecord> = BTreeMap::new();
     let mut encoder = EncoderRecord {

@@ -23,9 +23,9 @@ impl ReadOptions {
 /// Highest degree of spherical harmonics that [`Gaussians`] holds.
 pub(super) const MAX_SH_DEGREE: u8 = 3;
 
-/// Largest ratio of decoded to compressed size accepted. Trained scenes take at least 8 bytes a Gaussian even as SPZ
-/// or SOG (measured: 14 and 25) and decode to 68 bytes, or 248 with all harmonics: a ratio of 31 at most. A larger
-/// ratio means a wrong count.
+/// Largest ratio of decoded to compressed size accepted. Trained scenes take at least 8 bytes a Gaussian even as
+/// SPZ or SOG (measured: 14 and 25) and decode to 68 bytes, or 248 with all harmonics: a ratio of 31 at most. A
+/// larger ratio means a wrong count.
 const MAX_EXPANSION: u64 = 32;
 /// Decoded bytes accepted beyond that ratio.
 const EXPANSION_FREE_BYTES: u64 = 32 << 20;

@@ -45,8 +45,8 @@ impl Input {
         Place::Byte(self.offset_bytes)
     }
 
-    /// Returns the next `n` bytes without consuming them, or fewer if the file is shorter; only for a file that was just
-    /// opened, and small `n`.
+    /// Returns the next `n` bytes without consuming them, or fewer if the file is shorter; only for a file that
+    /// was just opened, and small `n`.
     pub fn peek(&mut self, n: usize) -> Result<&[u8], SplatError> {
         let buffered = self.reader.fill_buf()?;
         Ok(&buffered[..n.min(buffered.len())])
@@ -79,7 +79,8 @@ impl Input {
         ))
     }
 
-    /// Reads a line, line feed included, into `line`, at most `limit_bytes`; `line` is empty at the end of the file.
+    /// Reads a line, line feed included, into `line`, at most `limit_bytes`; `line` is empty at the end of the
+    /// file.
     pub fn read_line(&mut self, line: &mut Vec<u8>, limit_bytes: u64) -> Result<(), SplatError> {
         line.clear();
         Ok(self.take(limit_bytes).read_until(b'\n', line).map(drop)?)

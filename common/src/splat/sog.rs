@@ -1,5 +1,5 @@
-//! SOG (PlayCanvas): a `meta.json` and lossless WebP images with a pixel per Gaussian, in a folder or a ZIP bundle.
-//! Version 2 maps bytes through codebooks; version 1 (without `version`) maps them to ranges.
+//! SOG (PlayCanvas): a `meta.json` and lossless WebP images with a pixel per Gaussian, in a folder or a ZIP
+//! bundle. Version 2 maps bytes through codebooks; version 1 (without `version`) maps them to ranges.
 
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Component, Path, PathBuf};
@@ -17,7 +17,8 @@ use crate::Gaussians;
 
 /// Meta files take about 15 kB, mostly three codebooks of 256 numbers.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Images may be larger than the count requires: their last row is filled up, or they are squares of a power of two.
+/// Images may be larger than the count requires: their last row is filled up, or they are squares of a power of
+/// two.
 const SPARE_PIXELS: u64 = 1 << 16;
 /// The codebook of harmonics has this many entries per row, and at most 65,536 entries: labels have 16 bits.
 const CODEBOOK_COLUMNS: usize = 64;
@@ -77,8 +78,8 @@ impl OneOrMany {
 }
 
 impl Quantised {
-    /// Returns the number of each byte of a channel; NaN beyond the end of a short codebook, which makes the Gaussians
-    /// that use it unusable.
+    /// Returns the number of each byte of a channel; NaN beyond the end of a short codebook, which makes the
+    /// Gaussians that use it unusable.
     fn table(&self, channel: usize) -> Option<[f64; 256]> {
         if let Some(codebook) = &self.codebook {
             let mut table = [f64::NAN; 256];

@@ -1,8 +1,8 @@
-//! SPZ files (nianticlabs/spz): columns of quantised values, in one gzip stream (versions 2 and 3) or in a Zstandard
-//! stream per column (version 4).
+//! SPZ files (nianticlabs/spz): columns of quantised values, in one gzip stream (versions 2 and 3) or in a
+//! Zstandard stream per column (version 4).
 //!
-//! Stored axes are right, up, back; the reader turns them to right, down, front, the frame of the PLY: y and z change
-//! sign.
+//! Stored axes are right, up, back; the reader turns them to right, down, front, the frame of the PLY: y and z
+//! change sign.
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
@@ -248,8 +248,8 @@ fn read_whole(
     Ok(out)
 }
 
-/// Reads and checks the part of version 4 that precedes the streams: the rest of the header, the extensions and the table
-/// of contents. Returns the compressed size of each stream.
+/// Reads and checks the part of version 4 that precedes the streams: the rest of the header, the extensions and
+/// the table of contents. Returns the compressed size of each stream.
 fn read_contents(
     input: &mut Input,
     raw: &[u8; Header::BYTES],
@@ -308,7 +308,8 @@ fn read_contents(
     Ok(compressed_bytes)
 }
 
-/// Reads extension records (type, length, content) to the end and refuses coordinate systems other than right, up, back.
+/// Reads extension records (type, length, content) to the end and refuses coordinate systems other than right, up,
+/// back.
 fn check_extensions(path: &Path, place: &Place, stream: &mut impl Read) -> Result<(), SplatError> {
     let failed = |source| SplatError::undecodable(path, place.clone(), "the extensions", source);
     loop {
@@ -371,8 +372,8 @@ fn decode(header: &Header, columns: &mut Columns, mut out: Gaussians) -> Result<
     Ok(out)
 }
 
-/// Returns a rotation `wxyz` packed as the index of its largest component (of x y z w) in two bits, and a sign and nine
-/// bits of magnitude, 0..=1/sqrt(2), for each of the others.
+/// Returns a rotation `wxyz` packed as the index of its largest component (of x y z w) in two bits, and a sign and
+/// nine bits of magnitude, 0..=1/sqrt(2), for each of the others.
 fn smallest_three(word: u32) -> [f64; 4] {
     let others = [20, 10, 0].map(|shift| {
         let magnitude = f64::from((word >> shift) & 0x1ff) / 511.0 * std::f64::consts::FRAC_1_SQRT_2;

@@ -1,4 +1,5 @@
-//! Canonical JSON, the form of metadata that signatures cover: members by name, no spaces, two escapes, no fractions.
+//! Canonical JSON, the form of metadata that signatures cover: members by name, no spaces, two escapes, no
+//! fractions.
 
 use serde_json::Value;
 

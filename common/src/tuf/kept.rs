@@ -14,8 +14,8 @@ pub struct Kept {
     pub root: String,
     pub timestamp: Option<String>,
     pub snapshot: Option<String>,
-    /// The newest targets metadata: saves a download, and need not outlive the process, because the snapshot states its
-    /// version.
+    /// The newest targets metadata: saves a download, and need not outlive the process, because the snapshot
+    /// states its version.
     #[serde(skip)]
     pub targets: Option<String>,
 }
@@ -41,7 +41,8 @@ impl Kept {
         Some(SignedMetadata::<Timestamp>::parse(Timestamp::TYPE, bytes).ok()?.expires_unix_secs)
     }
 
-    /// Returns the time of signing that the newest timestamp states, seconds since 1970; it lies before its expiry.
+    /// Returns the time of signing that the newest timestamp states, seconds since 1970; it lies before its
+    /// expiry.
     pub fn signed_unix_secs(&self) -> Option<u64> {
         let bytes = self.timestamp.as_ref()?.as_bytes();
         signed_unix_secs(&SignedMetadata::parse(Timestamp::TYPE, bytes).ok()?)

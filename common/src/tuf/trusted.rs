@@ -1,7 +1,7 @@
 //! The rules of each step: what a new file must satisfy, given what is trusted already.
 //!
-//! Steps come in the order of the specification: roots, timestamp, snapshot, targets. A step that fails leaves the rest
-//! as it was.
+//! Steps come in the order of the specification: roots, timestamp, snapshot, targets. A step that fails leaves the
+//! rest as it was.
 
 use super::error::TufError;
 use super::kept::{parse_own_root, signed_unix_secs};
@@ -66,8 +66,8 @@ impl Trusted {
         self.now_unix_secs
     }
 
-    /// Takes the next root (5.3.4 and 5.3.5): the version after the present one, signed by the present root's keys and
-    /// by its own.
+    /// Takes the next root (5.3.4 and 5.3.5): the version after the present one, signed by the present root's keys
+    /// and by its own.
     pub fn add_root(&mut self, bytes: &[u8]) -> Result<(), TufError> {
         self.before_timestamp(Root::TYPE)?;
         let next = SignedMetadata::<Root>::parse(Root::TYPE, bytes)?;
@@ -119,8 +119,8 @@ impl Trusted {
         Ok(Offered::New)
     }
 
-    /// Takes a snapshot (5.5): the one that the timestamp states, signed, not expired. `before`: the snapshot of an
-    /// earlier update, whose targets metadata must all be there, none of them older.
+    /// Takes a snapshot (5.5): the one that the timestamp states, signed, not expired. `before`: the snapshot of
+    /// an earlier update, whose targets metadata must all be there, none of them older.
     pub fn add_snapshot(&mut self, bytes: &[u8], before: Option<&[u8]>) -> Result<(), TufError> {
         let order = || TufError::Order { role: Snapshot::TYPE.into() };
         let meta = self.timestamp.as_ref().filter(|_| self.targets.is_none()).ok_or_else(order)?;

@@ -1,4 +1,5 @@
-//! The client workflow (section 5 of the specification): which files are read, in which order, and how much of each.
+//! The client workflow (section 5 of the specification): which files are read, in which order, and how much of
+//! each.
 
 use super::error::TufError;
 use super::kept::{Kept, text};
@@ -8,8 +9,8 @@ use super::{MAX_ROOT_BYTES, MAX_ROOTS, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MA
 
 /// Where metadata comes from.
 pub trait Source {
-    /// Reads a metadata file, such as `2.root.json`: at most `max_bytes + 1` bytes, so that a longer one shows. `None` if
-    /// there is no such file.
+    /// Reads a metadata file, such as `2.root.json`: at most `max_bytes + 1` bytes, so that a longer one shows.
+    /// `None` if there is no such file.
     ///
     /// # Errors
     /// One clause with the cause, if the file can be neither read nor said to be missing.
@@ -18,8 +19,9 @@ pub trait Source {
 
 /// Brings what is kept up to date and returns it, checked: roots, timestamp, snapshot and top-level targets.
 ///
-/// `kept` holds what was accepted, also after an error, so that a root that names new keys counts even if the rest does
-/// not arrive. The caller makes it durable in both cases. `clock_unix_secs`: the time; a later signed time counts instead.
+/// `kept` holds what was accepted, also after an error, so that a root that names new keys counts even if the rest
+/// does not arrive. The caller makes it durable in both cases. `clock_unix_secs`: the time; a later signed time
+/// counts instead.
 pub fn refresh(kept: &mut Kept, source: &mut dyn Source, clock_unix_secs: u64) -> Result<Trusted, TufError> {
     let mut trusted = Trusted::new(kept.root.as_bytes(), clock_unix_secs)?;
     add_roots(&mut trusted, kept, source)?;

@@ -1,5 +1,5 @@
-//! Damaged files of every format give an error that names the file, or consistent columns; never a panic, and never
-//! memory out of proportion.
+//! Damaged files of every format give an error that names the file, or consistent columns; never a panic, and
+//! never memory out of proportion.
 
 use std::io::Read;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -11,8 +11,8 @@ use slag_test_support::{memory_of, trials};
 use super::generated::{gzip, write_sog_v1};
 use super::{assert_columns_agree, needs_shared, read_all, shared};
 
-/// Damages a file: truncates it, flips bits, overwrites a word with an extreme value, or changes a digit. Half of the
-/// places lie near the front, among the headers.
+/// Damages a file: truncates it, flips bits, overwrites a word with an extreme value, or changes a digit. Half of
+/// the places lie near the front, among the headers.
 fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
     let mut out = bytes.to_vec();
     let n_changes = 1 + random.below(4);
@@ -61,7 +61,8 @@ fn assert_survives(path: &Path, len_bytes: usize, what: &str) -> bool {
     }
 }
 
-/// Damages the content of a file `n` times, and a fifth as often outside the nightly checks; `pack` turns the damaged content into the file.
+/// Damages the content of a file `n` times, and a fifth as often outside the nightly checks; `pack` turns the
+/// damaged content into the file.
 fn survives_damage(name: &str, content: &[u8], n: u64, pack: impl Fn(&[u8]) -> Vec<u8>) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(name);

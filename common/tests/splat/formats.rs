@@ -1,5 +1,5 @@
-//! All formats against `expected.json`, which was recorded with splat-transform 2.7.1 and confirmed by a second reader;
-//! trained scenes against a separate parser of their layout.
+//! All formats against `expected.json`, which was recorded with splat-transform 2.7.1 and confirmed by a second
+//! reader; trained scenes against a separate parser of their layout.
 
 use serde_json::Value;
 use slag_common::splat::{ReadOptions, SplatError, read};
@@ -32,8 +32,8 @@ fn every_format_gives_the_recorded_gaussians() {
                 assert_near(found.expect("not empty"), bound, 1e-6, &format!("{name} {side}"));
             }
         }
-        // .splat stores rotations as bytes, and readers take 127.5 or 128 as zero: up to 0.9 degrees, and half of that
-        // between quaternions. For other formats: f32 rounding of the recorded values.
+        // .splat stores rotations as bytes, and readers take 127.5 or 128 as zero: up to 0.9 degrees, and half of
+        // that between quaternions. For other formats: f32 rounding of the recorded values.
         let rotation_tolerance = if name.ends_with(".splat") { 0.008 } else { 2e-6 };
         for row in expected["gaussians"].as_array().expect("an array") {
             let i = row["index"].as_u64().expect("an index") as usize;

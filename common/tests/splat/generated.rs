@@ -1,5 +1,5 @@
-//! Generated files for cases without a recorded file: SPZ of degree 3 and 4 and its extensions, SOG version 1, and false
-//! counts.
+//! Generated files for cases without a recorded file: SPZ of degree 3 and 4 and its extensions, SOG version 1, and
+//! false counts.
 
 use std::io::Write;
 use std::path::Path;

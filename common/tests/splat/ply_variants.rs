@@ -130,8 +130,8 @@ fn missing_properties_are_named() {
     assert!(error.ends_with("give the PLY of the splat"), "{error}");
 }
 
-/// Returns a compressed PLY with `n_chunks` chunks without colour ranges (as in the first version) and five Gaussians with
-/// harmonics of degree 1; all harmonics of a Gaussian have the same byte of `sh`.
+/// Returns a compressed PLY with `n_chunks` chunks without colour ranges (as in the first version) and five
+/// Gaussians with harmonics of degree 1; all harmonics of a Gaussian have the same byte of `sh`.
 fn compressed(n_chunks: usize, sh: &[u8]) -> Vec<u8> {
     let axes = ["x", "y", "z", "scale_x", "scale_y", "scale_z"];
     let ranges = axes.map(|axis| format!("property float min_{axis}\nproperty float max_{axis}\n")).concat();
@@ -169,7 +169,8 @@ fn compressed_ply_by_hand() {
         assert_near(found.into(), expected, 1e-6, "colour");
     }
     assert_eq!(found.opacities[4], 1.0);
-    // w, x, y are 0.5 * sqrt(2) * (2 n / 1023 - 1) for n = 1023, 512, 511; z, the largest, follows from unit length.
+    // w, x, y are 0.5 * sqrt(2) * (2 n / 1023 - 1) for n = 1023, 512, 511; z, the largest, follows from unit
+    // length.
     let small = 0.5_f64.sqrt() / 1023.0;
     for (found, expected) in
         found.rotations_wxyz[4].into_iter().zip([0.5_f64.sqrt(), small, -small, 0.5_f64.sqrt()])
@@ -258,7 +259,8 @@ fn one_row(properties: &[(&str, &str, f64)]) -> Vec<u8> {
     format!("ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n{}\n", row.join(" ")).into_bytes()
 }
 
-/// Flat Gaussians of 2DGS, colours as numbers of 0 to 1, harmonics of degree 4; and files that are no splats are named.
+/// Flat Gaussians of 2DGS, colours as numbers of 0 to 1, harmonics of degree 4; and files that are no splats are
+/// named.
 #[test]
 fn files_of_other_kinds_are_read_or_named() {
     let dir = tempfile::tempdir().expect("a folder");

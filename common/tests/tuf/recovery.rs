@@ -59,7 +59,8 @@ fn a_new_root_is_kept_after_an_error() {
     assert!(kept.timestamp.is_some(), "its keys have not changed");
 }
 
-/// Who holds the online keys signs the highest versions; honest metadata is then a rollback, until a root names new keys.
+/// Who holds the online keys signs the highest versions; honest metadata is then a rollback, until a root names
+/// new keys.
 #[test]
 fn fast_forward_is_made_good_by_a_new_root() {
     for taken in ["timestamp", "snapshot", "targets"] {
@@ -129,7 +130,8 @@ fn a_withdrawn_key_is_refused() {
     update(&mut kept, &mut repo).expect("the new key");
 }
 
-/// All online keys without the root: what they say counts until a root withdraws them, and they cannot name others.
+/// All online keys without the root: what they say counts until a root withdraws them, and they cannot name
+/// others.
 #[test]
 fn online_keys_cannot_name_keys() {
     let mut repo = Repo::new();

@@ -1,5 +1,5 @@
-//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each; all of them, or for a first picture and for far cells every
-//! few.
+//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each; all of them, or for a first picture and for far
+//! cells every few.
 
 use glam::{DVec3, Vec3};
 use half::f16;
@@ -16,12 +16,14 @@ const PLAIN: [u8; 4] = [160, 160, 160, 230];
 /// No rotation, see [`slag_common::appearance::rotation_code`].
 const UNTURNED: [u8; 3] = [255, 128, 0];
 
-/// Writes a cell's message: magic, version, N (u32), the origin in the world (three f32), flags (u32; 1: the appearance is
-/// known), `step` (u32); then a column each of centres less the origin (three f16), colours, opacities, sizes and rotations.
+/// Writes a cell's message: magic, version, N (u32), the origin in the world (three f32), flags (u32; 1: the
+/// appearance is known), `step` (u32); then a column each of centres less the origin (three f16), colours,
+/// opacities, sizes and rotations.
 ///
-/// `positions`: `[N]`, world, those of every `step`-th Gaussian of the cell, the first one included; `appearance`: of all its
-/// Gaussians. Those that are sent stand for the others: each has the area of `step` of them. Without an appearance,
-/// Gaussians are as large as their distances to their neighbours in the order of the shard, which follows a curve through space.
+/// `positions`: `[N]`, world, those of every `step`-th Gaussian of the cell, the first one included; `appearance`:
+/// of all its Gaussians. Those that are sent stand for the others: each has the area of `step` of them. Without an
+/// appearance, Gaussians are as large as their distances to their neighbours in the order of the shard, which
+/// follows a curve through space.
 pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>, step: Step) -> Vec<u8> {
     let low = positions.iter().copied().reduce(DVec3::min).unwrap_or_default();
     let high = positions.iter().copied().reduce(DVec3::max).unwrap_or_default();
@@ -87,8 +89,8 @@ impl Step {
     }
 }
 
-/// Returns half the distance of each position to the nearer of its neighbours in the order, within a quarter and twice
-/// the median.
+/// Returns half the distance of each position to the nearer of its neighbours in the order, within a quarter and
+/// twice the median.
 fn sizes(positions: &[DVec3]) -> Vec<f32> {
     let apart: Vec<f32> = positions.windows(2).map(|pair| pair[0].distance(pair[1]) as f32).collect();
     let mut sorted: Vec<f32> = apart.iter().copied().filter(|d| *d > 0.0).collect();

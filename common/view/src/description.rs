@@ -125,8 +125,8 @@ impl Photo {
 pub struct Words {
     /// The generation whose things are counted.
     pub generation: u64,
-    /// Those of most things first: the words that the text model knows, or of one that takes any text everyday words that find
-    /// something.
+    /// Those of most things first: the words that the text model knows, or of one that takes any text everyday
+    /// words that find something.
     pub words: Vec<Word>,
     /// Whether all are counted; if not, the next request goes on.
     pub complete: bool,
@@ -138,7 +138,8 @@ impl Words {
     /// Time after which a request encodes no further everyday word: questions wait meanwhile.
     const ENCODING: Duration = Duration::from_millis(500);
 
-    /// Encodes words as long as there is time for it. Returns what `encode` made of them, and whether all were encoded.
+    /// Encodes words as long as there is time for it. Returns what `encode` made of them, and whether all were
+    /// encoded.
     ///
     /// # Errors
     /// The first of `encode`.

@@ -1,8 +1,8 @@
-//! The page that draws a scene, asks it and shows the answers. `scripts/build-page.sh` builds it from `web/` into `dist/`;
-//! the build embeds it compressed, and [`router`] serves it under `/view` without a network or files.
+//! The page that draws a scene, asks it and shows the answers. `scripts/build-page.sh` builds it from `web/` into
+//! `dist/`; the build embeds it compressed, and [`router`] serves it under `/view` without a network or files.
 //!
-//! The program that serves the page describes its scene ([`Description`]) and sends Gaussians ([`cell_message`]) and scores
-//! ([`ScoresMessage`]) in the layouts of `docs/view.md`.
+//! The program that serves the page describes its scene ([`Description`]) and sends Gaussians ([`cell_message`])
+//! and scores ([`ScoresMessage`]) in the layouts of `docs/view.md`.
 
 mod cell;
 mod description;

@@ -12,9 +12,10 @@ const ROW_BYTES: usize = 8;
 /// Largest level.
 const LAST_LEVEL: f32 = 255.0;
 
-/// A message of scores in the making: magic, version, least and largest score (f32 each), number of cells and generation (u32
-/// each); for each cell its id and number of Gaussians (u32 each); then a level for each Gaussian of each cell. Level 0 is
-/// a Gaussian that no view shows; the score of level `b` is `least + b / 255 * (largest - least)`.
+/// A message of scores in the making: magic, version, least and largest score (f32 each), number of cells and
+/// generation (u32 each); for each cell its id and number of Gaussians (u32 each); then a level for each Gaussian
+/// of each cell. Level 0 is a Gaussian that no view shows; the score of level `b` is `least + b / 255 * (largest -
+/// least)`.
 pub struct ScoresMessage {
     bytes: Vec<u8>,
     /// Where the levels of each cell begin.

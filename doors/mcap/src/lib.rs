@@ -1,4 +1,5 @@
-//! A robot's answers and the ground around it as an MCAP file, which Foxglove and the MCAP libraries read (docs/api.md).
+//! A robot's answers and the ground around it as an MCAP file, which Foxglove and the MCAP libraries read
+//! (docs/api.md).
 
 mod args;
 mod file;

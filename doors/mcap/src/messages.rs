@@ -1,4 +1,5 @@
-//! What a robot says, as Foxglove's messages in JSON (foxglove.dev/docs/sdk/schemas): positions in metres in the scene's frame.
+//! What a robot says, as Foxglove's messages in JSON (foxglove.dev/docs/sdk/schemas): positions in metres in the
+//! scene's frame.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -75,8 +76,8 @@ pub fn points(stamp: Stamp<'_>, answers: &[PointAnswer]) -> Value {
     })
 }
 
-/// Returns a `foxglove.Grid` of the ground: 0 unknown, 1 ground that the robot cannot reach, 2 reached, 3 obstacle. `None` if the
-/// robot's runs are not as many cells as it says.
+/// Returns a `foxglove.Grid` of the ground: 0 unknown, 1 ground that the robot cannot reach, 2 reached, 3
+/// obstacle. `None` if the robot's runs are not as many cells as it says.
 pub fn ground(stamp: Stamp<'_>, floor: &Floor) -> Option<Value> {
     let number = |place: FloorPlace| match place {
         FloorPlace::Unknown => 0,

@@ -14,8 +14,8 @@ pub struct Args {
     /// Speak streamable HTTP at /mcp of this address, instead of stdin and stdout.
     #[arg(long, value_name = "IP:PORT|unix:PATH")]
     pub listen: Option<Listen>,
-    /// Name that clients call this machine by, besides localhost and the address listened on; other names are refused.
-    /// May be repeated.
+    /// Name that clients call this machine by, besides localhost and the address listened on; other names are
+    /// refused. May be repeated.
     #[arg(long, value_name = "NAME", requires = "listen")]
     pub host: Vec<String>,
 }

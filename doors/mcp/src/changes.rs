@@ -8,8 +8,8 @@ use slag_robot::Changes;
 #[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Compare {
-    /// Kinds of things that may have changed, such as ["chair", "box"]: each changed thing names the one that it is most like.
-    /// The map has no names of its own.
+    /// Kinds of things that may have changed, such as ["chair", "box"]: each changed thing names the one that it
+    /// is most like. The map has no names of its own.
     #[serde(default)]
     #[schemars(length(max = 32))]
     pub words: Vec<String>,
@@ -45,8 +45,8 @@ pub struct Difference {
     pub moved: Vec<Move>,
     /// Things that are as they were, anywhere.
     pub n_unchanged: u64,
-    /// Things of which it is unknown whether they changed, anywhere: the robot had their place on board in one of the
-    /// generations only.
+    /// Things of which it is unknown whether they changed, anywhere: the robot had their place on board in one of
+    /// the generations only.
     pub n_not_compared: u64,
     /// Why nothing was compared.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -162,8 +162,8 @@ mod tests {
         assert!(nothing.parameters().is_empty());
     }
 
-    /// A reply with every member, and what becomes of each: 5400 s are 1.5 h, 3 + 4 things are unchanged, a box from (1, 2, 3) to
-    /// (2, 4, 6) has edges of 1, 2 and 3.
+    /// A reply with every member, and what becomes of each: 5400 s are 1.5 h, 3 + 4 things are unchanged, a box
+    /// from (1, 2, 3) to (2, 4, 6) has edges of 1, 2 and 3.
     #[test]
     fn replies_become_differences() {
         let thing = |id: &str| {

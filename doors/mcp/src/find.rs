@@ -14,12 +14,12 @@ const MAX_LIMIT: u32 = 50;
 #[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Wanted {
-    /// A thing in a few words, such as "red office chair". May name one relation or comparison: "mug on the table",
-    /// "nearest door to the sofa", "second largest box".
+    /// A thing in a few words, such as "red office chair". May name one relation or comparison: "mug on the
+    /// table", "nearest door to the sofa", "second largest box".
     #[schemars(length(min = 1, max = 512))]
     pub what: String,
-    /// Where the asker is, [x, y, z] in the world frame. Left and right are seen from there, and answers have their
-    /// distance from there.
+    /// Where the asker is, [x, y, z] in the world frame. Left and right are seen from there, and answers have
+    /// their distance from there.
     pub near: Option<[f64; 3]>,
     /// Where the asker looks, radians from the world's x axis towards y. For "left of me" and the like.
     pub heading_rad: Option<f64>,

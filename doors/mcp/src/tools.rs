@@ -30,8 +30,8 @@ impl Tools {
         Self { robot, router: Self::router() }
     }
 
-    /// Find things on the robot's map by words. Gives positions, sizes and how well each matches, best first; or why
-    /// there is none.
+    /// Find things on the robot's map by words. Gives positions, sizes and how well each matches, best first; or
+    /// why there is none.
     #[tool(annotations(title = "Find things", read_only_hint = true, open_world_hint = false))]
     async fn find(&self, Parameters(wanted): Parameters<Wanted>) -> Result<Json<Found>, String> {
         let request = wanted.request()?;
@@ -39,8 +39,9 @@ impl Tools {
         self.blocking(move |robot| Found::new(robot.ask(&request).map_err(refused)?)).await.map(Json)
     }
 
-    /// Find where the robot can stand near a thing: places that it reaches, has room at, and sees the thing from, best first; or
-    /// why there is none. Where the map does not say which places are free, the answer is an error that says so.
+    /// Find where the robot can stand near a thing: places that it reaches, has room at, and sees the thing from,
+    /// best first; or why there is none. Where the map does not say which places are free, the answer is an error
+    /// that says so.
     #[tool(annotations(title = "Where to stand", read_only_hint = true, open_world_hint = false))]
     async fn where_to_stand(&self, Parameters(going): Parameters<Going>) -> Result<Json<Stands>, String> {
         let refused = |error: RobotError| error.to_string();
@@ -49,7 +50,8 @@ impl Tools {
             .map(Json)
     }
 
-    /// Describe what the robot's map covers: its extent, age and gaps, and how many things match each of some words.
+    /// Describe what the robot's map covers: its extent, age and gaps, and how many things match each of some
+    /// words.
     #[tool(annotations(title = "Describe the place", read_only_hint = true, open_world_hint = false))]
     async fn describe_place(
         &self,

@@ -38,7 +38,8 @@ pub struct Args {
     /// Frame of the robot, for --position tf.
     #[arg(long, value_name = "FRAME", default_value = "base_link")]
     base_frame: String,
-    /// Where the robot's position comes from: it is posted to the robot's program, and answers near it rank higher.
+    /// Where the robot's position comes from: it is posted to the robot's program, and answers near it rank
+    /// higher.
     #[arg(long, default_value = "tf")]
     position: Source,
     /// Least time between two positions that are posted.

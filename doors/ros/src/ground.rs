@@ -15,9 +15,10 @@ const UNKNOWN: i8 = -1;
 
 /// Returns the map, or `None` if the robot's reply is none, or it reaches nothing.
 ///
-/// Free is only ground under a robot that stands where it can go: within `radius_m` of a place that its middle reaches, which
-/// is clear of obstacles by that much. A table top or the roof of a car is ground that nothing leads to, so it is unknown.
-/// Cells are joined until they are few enough; one is free only if all of it is, and occupied if any of it is.
+/// Free is only ground under a robot that stands where it can go: within `radius_m` of a place that its middle
+/// reaches, which is clear of obstacles by that much. A table top or the roof of a car is ground that nothing
+/// leads to, so it is unknown. Cells are joined until they are few enough; one is free only if all of it is, and
+/// occupied if any of it is.
 pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGrid> {
     let places = floor.cells()?;
     let [width, height] = floor.size;
@@ -65,8 +66,8 @@ pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGri
     })
 }
 
-/// Returns the cells with their middle nearer than `radius` cells to the middle of a reached one: a cell at just that distance may
-/// be an obstacle.
+/// Returns the cells with their middle nearer than `radius` cells to the middle of a reached one: a cell at just
+/// that distance may be an obstacle.
 fn free(places: &[FloorPlace], [width, height]: [usize; 2], radius: f64) -> Vec<bool> {
     let reach = radius.clamp(0.0, 1e3).floor() as isize;
     let offsets: Vec<(isize, isize)> = (-reach..=reach)
@@ -108,8 +109,8 @@ mod tests {
         grid(header("map"), &floor, radius_m).expect("a map")
     }
 
-    /// By hand, cells of 0.25 m and a robot of 0.26 m: the ground beside the reached cell is free, the table top (g after o) and
-    /// ground farther away are unknown.
+    /// By hand, cells of 0.25 m and a robot of 0.26 m: the ground beside the reached cell is free, the table top
+    /// (g after o) and ground farther away are unknown.
     #[test]
     fn only_ground_under_the_robot_is_free() {
         let grid = map([7, 3], "g7g1r1g1o1g1o1u1g7", 0.25, 0.26);
@@ -119,8 +120,8 @@ mod tests {
         assert_eq!(<[f64; 3]>::from(grid.info.origin.position), [1.0, 2.0, 0.5]);
     }
 
-    /// By hand: a million cells become at most 60,000; an obstacle of one cell stays, and no joined cell is free that is not all
-    /// free.
+    /// By hand: a million cells become at most 60,000; an obstacle of one cell stays, and no joined cell is free
+    /// that is not all free.
     #[test]
     fn large_maps_are_joined() {
         let grid = map([1000, 1000], "r500500o1r499499", 0.05, 0.0);

@@ -87,7 +87,8 @@ messages! {
     FindReply { success: bool, message: String, detections: Detection3DArray }
 }
 
-// A message without members has one on the wire. Later versions add an error text behind the code, which is not read.
+// A message without members has one on the wire. Later versions add an error text behind the code, which is not
+// read.
 #[cfg(not(feature = "jazzy"))]
 messages! {
     /// Result of `nav2_msgs/NavigateToPose`.

@@ -27,8 +27,8 @@ pub struct Navigator {
 }
 
 impl Navigator {
-    /// Makes the client of `/navigate_to_pose`. `service`, `topic`, `latched`: quality of the action's services, of its feedback,
-    /// and of its status.
+    /// Makes the client of `/navigate_to_pose`. `service`, `topic`, `latched`: quality of the action's services,
+    /// of its feedback, and of its status.
     ///
     /// # Errors
     /// The middleware refuses.
@@ -49,8 +49,8 @@ impl Navigator {
         Ok(Self { client: client.map_err(|e| anyhow!("cannot use the action navigate_to_pose: {e}"))? })
     }
 
-    /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended. A message of `stop` cancels the
-    /// goal; its end alone means that another goal takes its place, for which Nav2 gives this one up.
+    /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended. A message of `stop`
+    /// cancels the goal; its end alone means that another goal takes its place, for which Nav2 gives this one up.
     ///
     /// # Errors
     /// No server takes the goal, or it was not reached.

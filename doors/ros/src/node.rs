@@ -122,7 +122,8 @@ struct Navigation {
     navigator: Navigator,
     /// How the newest goal stands.
     state: Publisher<Text>,
-    /// Cancels the newest goal with a message, and ends with that goal. If it is dropped, another goal takes its place.
+    /// Cancels the newest goal with a message, and ends with that goal. If it is dropped, another goal takes its
+    /// place.
     newest: Mutex<Option<(oneshot::Sender<()>, oneshot::Receiver<()>)>>,
 }
 
@@ -165,7 +166,8 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     let mut node = node.map_err(|e| anyhow!("cannot make the node: {e:?}"))?;
     let own = |topic: &str| Name::new(&format!("/{}", settings.name), topic);
     let kept = reliable(KEPT).durability(Durability::TransientLocal);
-    // Those who join later hear no earlier answer, which they would take for the last; so map_server offers its map.
+    // Those who join later hear no earlier answer, which they would take for the last; so map_server offers its
+    // map.
     let latest = reliable(1).durability(Durability::TransientLocal);
     let pose = ("geometry_msgs", "PoseStamped");
     let goal_pose = (settings.goals == GoalSink::Topic).then(|| {
@@ -330,7 +332,8 @@ async fn serve(server: Server<FindRequest, FindReply>, shared: Arc<Shared>) {
     }
 }
 
-/// Answers the calls for places to stand. A place that was asked for is not a goal yet: nothing is sent to navigation.
+/// Answers the calls for places to stand. A place that was asked for is not a goal yet: nothing is sent to
+/// navigation.
 async fn serve_stand(server: Server<StandRequest, StandReply>, shared: Arc<Shared>) {
     loop {
         let (id, request) = match server.async_receive_request().await {
@@ -408,8 +411,8 @@ impl Shared {
         }
     }
 
-    /// Cancels the newest goal because a later wish has no place to stand: the robot must not drive on to what nobody asks for
-    /// any more.
+    /// Cancels the newest goal because a later wish has no place to stand: the robot must not drive on to what
+    /// nobody asks for any more.
     async fn stop_driving(&self, text: &str, reason: &str) {
         if let Some(navigation) = &self.navigation {
             navigation.stop().await;

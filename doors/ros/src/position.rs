@@ -10,8 +10,8 @@ pub fn of_frame(frames: &Transforms, scene_frame: &str, base_frame: &str) -> Opt
     frames.target_from(scene_frame, base_frame).map(|base| base.origin())
 }
 
-/// Returns the place that odometry states; `None` while nothing connects its frame to the scene's. Odometry drifts, so
-/// its frame is not the scene's unless a localiser says so.
+/// Returns the place that odometry states; `None` while nothing connects its frame to the scene's. Odometry
+/// drifts, so its frame is not the scene's unless a localiser says so.
 pub fn of_odometry(frames: &Transforms, scene_frame: &str, odometry: &Odometry) -> Option<[f64; 3]> {
     let scene_from_odometry = frames.target_from(scene_frame, &odometry.header.frame_id)?;
     let position: [f64; 3] = odometry.pose.pose.position.into();

@@ -22,15 +22,16 @@ impl Transforms {
         }
     }
 
-    /// Returns the motion from a frame to another; `None` if nothing connects them. They are joined at their first common
-    /// ancestor, as a static transform may make the scene a sibling of the robot's map.
+    /// Returns the motion from a frame to another; `None` if nothing connects them. They are joined at their first
+    /// common ancestor, as a static transform may make the scene a sibling of the robot's map.
     pub fn target_from(&self, target: &str, frame: &str) -> Option<Rigid> {
         let of_target: HashMap<&str, Rigid> = self.ancestors(target).collect();
         self.ancestors(frame)
             .find_map(|(name, from_frame)| Some(of_target.get(name)?.inverse().after(from_frame)))
     }
 
-    /// Returns a frame and those above it, each with the motion from the frame to it. In a circle each is met once.
+    /// Returns a frame and those above it, each with the motion from the frame to it. In a circle each is met
+    /// once.
     fn ancestors<'a>(&'a self, frame: &'a str) -> impl Iterator<Item = (&'a str, Rigid)> {
         let first = Some((plain(frame), Rigid::IDENTITY));
         std::iter::successors(first, |(at, at_from_frame)| {

@@ -1,9 +1,9 @@
 //! Flags from the environment and from a file, where the command line does not give them.
 //!
-//! In the file, a table holds a command's flags by their long names, and keys before the first table count for every command
-//! that has the flag. The environment's names are made of the same words: `SLAG_EDGE_FETCH_RADIUS` for `fetch --radius`,
-//! `SLAG_EDGE_CACHE` for `--cache` of every command. Values become the flags' defaults, so clap parses them, and `--help`
-//! shows them.
+//! In the file, a table holds a command's flags by their long names, and keys before the first table count for
+//! every command that has the flag. The environment's names are made of the same words: `SLAG_EDGE_FETCH_RADIUS`
+//! for `fetch --radius`, `SLAG_EDGE_CACHE` for `--cache` of every command. Values become the flags' defaults, so
+//! clap parses them, and `--help` shows them.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -113,7 +113,8 @@ fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
     ids
 }
 
-/// Returns the flags of a command that a file may set: all but those that must be given on the command line each time.
+/// Returns the flags of a command that a file may set: all but those that must be given on the command line each
+/// time.
 fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
     let by_hand = |arg: &&Arg| {
         let is_choice = |group: &&clap::ArgGroup| group.is_required_set();
@@ -204,7 +205,8 @@ impl Settings<'_> {
         Ok(None)
     }
 
-    /// Checks a value. One for all commands need not fit each: `from` is an address to one and a number to another.
+    /// Checks a value. One for all commands need not fit each: `from` is an address to one and a number to
+    /// another.
     fn fitting(
         &self,
         arg: &Arg,

@@ -21,7 +21,8 @@ use super::progress::{Bar, print_line};
 /// Settings for following a robot.
 #[derive(Debug, Args)]
 pub struct FollowArgs {
-    /// When following: distance fetched beyond the radius, world units [default: a quarter of the radius, 1 if that is 0].
+    /// When following: distance fetched beyond the radius, world units [default: a quarter of the radius, 1 if
+    /// that is 0].
     #[arg(long, value_name = "D")]
     pub margin: Option<f64>,
     /// When following: least seconds between fetches.
@@ -106,8 +107,8 @@ pub fn watch(
     followed.map_err(failure)
 }
 
-/// Follows the positions posted to the service, on a thread of its own, until the returned flag is set. A follower that
-/// panics is reported by the service, and begins again.
+/// Follows the positions posted to the service, on a thread of its own, until the returned flag is set. A follower
+/// that panics is reported by the service, and begins again.
 pub fn follow_in_background(
     request: FetchRequest,
     ca: Option<PathBuf>,

@@ -33,7 +33,8 @@ pub struct GoalArgs {
     /// Height of the robot [default: 0.1 above the sensor].
     #[arg(long, value_name = "M")]
     pub height_m: Option<f64>,
-    /// Highest step that it climbs, 1.5 of the scene's voxels or more [default: 0.1, or 0.15 with voxels of 0.1 m].
+    /// Highest step that it climbs, 1.5 of the scene's voxels or more [default: 0.1, or 0.15 with voxels of 0.1
+    /// m].
     #[arg(long, value_name = "M")]
     pub step_m: Option<f64>,
     /// Steepest ground that it drives on: rise for each metre of way.
@@ -48,8 +49,8 @@ pub struct GoalArgs {
     /// Most poses.
     #[arg(long, default_value_t = 3)]
     pub limit: usize,
-    /// Write the ground around the robot as a picture: black what it must not touch, grey what is unknown, white where it
-    /// can go.
+    /// Write the ground around the robot as a picture: black what it must not touch, grey what is unknown, white
+    /// where it can go.
     #[arg(long, value_name = "FILE.pgm")]
     pub map: Option<PathBuf>,
     #[command(flatten)]

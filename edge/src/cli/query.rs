@@ -58,8 +58,8 @@ pub struct QueryArgs {
     pub cache: CacheArgs,
     #[command(flatten)]
     pub models: ModelArgs,
-    /// Write the Gaussians that answered to a PLY of points: position, score, rank of their answer, and index in the input
-    /// splat file where the shards know it.
+    /// Write the Gaussians that answered to a PLY of points: position, score, rank of their answer, and index in
+    /// the input splat file where the shards know it.
     #[arg(long, value_name = "FILE")]
     pub ply: Option<PathBuf>,
     /// Print the answers as JSON.

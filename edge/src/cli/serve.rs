@@ -53,8 +53,8 @@ pub struct ServeArgs {
     /// Most time that one query may take, seconds.
     #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=3600))]
     pub max_query_secs: u64,
-    /// Read every shard on board again within this time, seconds, evenly; 0: never. One that rotted costs its cell only, and the
-    /// next fetch replaces it.
+    /// Read every shard on board again within this time, seconds, evenly; 0: never. One that rotted costs its cell
+    /// only, and the next fetch replaces it.
     #[arg(long, value_name = "S", default_value_t = 24 * 3600)]
     pub scrub_secs: u64,
     /// Follow the robot: fetch from this store around the positions posted to POST /position.

@@ -30,7 +30,8 @@ pub fn tell(news: News) {
 #[cfg(not(unix))]
 pub fn tell(_: News) {}
 
-/// Says for ever that the service is alive, as long as `is_alive` says so in time; returns at once if nobody expects it.
+/// Says for ever that the service is alive, as long as `is_alive` says so in time; returns at once if nobody
+/// expects it.
 pub async fn pulse<A: Future<Output = bool>>(is_alive: impl Fn() -> A) {
     let timeout: Option<Duration> = match () {
         #[cfg(unix)]

@@ -1,4 +1,5 @@
-//! Records the objects of shards that are about to go (`store/history.rs`). What fails here is logged, never the fetch's failure.
+//! Records the objects of shards that are about to go (`store/history.rs`). What fails here is logged, never the
+//! fetch's failure.
 
 use rayon::prelude::*;
 use slag_common::Hash32;
@@ -9,8 +10,8 @@ use super::staging::put;
 use crate::store::history::{self, MAX_GENERATIONS, Record};
 use crate::store::{Current, CurrentCell, EdgeCache, OpenShard, beside_queries};
 
-/// Records the objects of the generation on board: of all its cells if `next`, another manifest, follows, else of those that
-/// leave. `manifest`: its own. `cells`: those that stay, by id.
+/// Records the objects of the generation on board: of all its cells if `next`, another manifest, follows, else of
+/// those that leave. `manifest`: its own. `cells`: those that stay, by id.
 pub fn note(cache: &EdgeCache, old: &Current, manifest: &Manifest, next: Hash32, cells: &[CurrentCell]) {
     let stays = |cell: &CurrentCell| {
         let at = cells.binary_search_by_key(&cell.cell_id, |other| other.cell_id);

@@ -5,7 +5,8 @@
 //!
 //! 0. lock; files renamed by a killed fetch are made durable before anything builds on them
 //! 1. metadata: brought up to date and recorded; manifest: hash, scene, encoder; scene and request are recorded
-//! 2. history: the objects of shards that will go are recorded (`history/`); space: shards that neither the old nor the new generation needs are removed
+//! 2. history: the objects of shards that will go are recorded (`history/`); space: shards that neither the old
+//!    nor the new generation needs are removed
 //! 3. each missing shard: staged, synced, hashed, checked, renamed into `shards/`; folder synced
 //! 4. manifest: staged, synced, renamed into `manifests/`; folder synced
 //! 5. `current`: written aside, synced, renamed; folder synced: this switches generations

@@ -47,8 +47,8 @@ impl<'a> Check<'a> {
         self.cells.get(&hash).copied()
     }
 
-    /// Returns whether an object on board is what the manifest describes. It is read only where the manifest by which it came
-    /// described it otherwise: readers find what rots, and mark it.
+    /// Returns whether an object on board is what the manifest describes. It is read only where the manifest by
+    /// which it came described it otherwise: readers find what rots, and mark it.
     pub fn is_fit(&self, cache: &EdgeCache, on_board: Option<&Offer>, hash: Hash32) -> bool {
         let Some(cell) = self.cell(hash) else { return true };
         let described = |manifest: &Manifest| {

@@ -1,4 +1,5 @@
-//! What a store offers: its metadata is brought up to date, and the manifest that it names is downloaded if it is news.
+//! What a store offers: its metadata is brought up to date, and the manifest that it names is downloaded if it is
+//! news.
 
 use slag_common::Hash32;
 use slag_common::manifest::{self, Manifest, ManifestError, TextModelRecord};

@@ -137,8 +137,8 @@ fn cells_at(
     listed.collect()
 }
 
-/// Returns the objects that must be on board before these cells become current: their shards, and the text model that the scene
-/// carries.
+/// Returns the objects that must be on board before these cells become current: their shards, and the text model
+/// that the scene carries.
 fn objects(cells: &[CurrentCell], manifest: &Manifest) -> Result<Vec<Object>, PlanError> {
     let mut seen = BTreeSet::new();
     let object = |cell: &CurrentCell| match seen.insert(cell.hash) {

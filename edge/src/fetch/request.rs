@@ -1,4 +1,5 @@
-//! What a fetch is asked for, and its surroundings: clock, cancel flag, random numbers, progress and network limits.
+//! What a fetch is asked for, and its surroundings: clock, cancel flag, random numbers, progress and network
+//! limits.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -74,7 +75,8 @@ pub struct Environment<'a> {
     pub progress: &'a dyn Progress,
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a (dyn Fn() -> f64 + Sync),
-    /// Certificates (PEM) of the authorities that may vouch for `https://` addresses; absent: those that browsers trust.
+    /// Certificates (PEM) of the authorities that may vouch for `https://` addresses; absent: those that browsers
+    /// trust.
     pub ca: Option<&'a Path>,
     pub limits: NetworkLimits,
 }

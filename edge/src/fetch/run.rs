@@ -139,8 +139,8 @@ struct Offered<'a> {
 }
 
 impl<'a> Offered<'a> {
-    /// Decides what to download, keep and free. What readers marked as damaged is downloaded again, and so is what the manifest
-    /// describes otherwise than the one by which it came.
+    /// Decides what to download, keep and free. What readers marked as damaged is downloaded again, and so is what
+    /// the manifest describes otherwise than the one by which it came.
     fn plan(self) -> Result<Planned<'a>, FetchError> {
         let Locked { cache, request, usage, last, on_board, .. } = &self.locked;
         let manifest = &self.offer.manifest;

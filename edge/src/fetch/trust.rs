@@ -38,8 +38,8 @@ pub struct AddedRoot {
     pub is_new: bool,
 }
 
-/// Trusts a root by hand. A root that the robot began with changes nothing, so that keys which were revoked since stay
-/// revoked. `replace`: trust it in place of another one.
+/// Trusts a root by hand. A root that the robot began with changes nothing, so that keys which were revoked since
+/// stay revoked. `replace`: trust it in place of another one.
 pub fn add_root(
     cache: &EdgeCache,
     root: &FirstRoot,

@@ -1,5 +1,5 @@
-//! Which shards fetches needed: `usage.json`. What is lost here costs time only: shards are freed in another order. So nothing of
-//! it fails a fetch, and a damaged file is made anew.
+//! Which shards fetches needed: `usage.json`. What is lost here costs time only: shards are freed in another
+//! order. So nothing of it fails a fetch, and a damaged file is made anew.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;

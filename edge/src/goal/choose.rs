@@ -89,7 +89,8 @@ fn place(look: &Look) -> f64 {
     look.position_in_world.x + 1e3 * look.position_in_world.y
 }
 
-/// Returns the cells with a point within a horizontal distance, and those cells alone, in the order of their numbers.
+/// Returns the cells with a point within a horizontal distance, and those cells alone, in the order of their
+/// numbers.
 fn cells_near(window: &Window, points: &[DVec3], distance: f64) -> Vec<usize> {
     let voxels: Vec<[i64; 2]> =
         points.iter().map(|point| window.voxel_of(*point)).map(|[x, y, _]| [x.into(), y.into()]).collect();

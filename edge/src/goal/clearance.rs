@@ -8,10 +8,11 @@ use super::ground::{Floor, Ground};
 /// Instead of the height of a cell without ground; heights are below 128.
 const NO_GROUND: u8 = u8::MAX;
 
-/// Returns which cells the robot must not touch: those without ground, and those with a drop beside them that is higher than a
-/// step (in voxels).
+/// Returns which cells the robot must not touch: those without ground, and those with a drop beside them that is
+/// higher than a step (in voxels).
 ///
-/// It is the upper side of a drop that counts, so a robot may drive along below a ledge, and never onto it or off it.
+/// It is the upper side of a drop that counts, so a robot may drive along below a ledge, and never onto it or off
+/// it.
 pub fn obstacles(ground: &Ground, step: u8) -> Vec<bool> {
     let (floors, n_y) = (&ground.floors, ground.n_y);
     let mut obstacles = vec![false; floors.len()];

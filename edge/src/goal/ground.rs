@@ -5,8 +5,8 @@ use slag_common::occupancy::BLOCK_EDGE;
 
 use super::space::{Space, Stacked};
 
-/// How far a surface lies below the upper side of its highest occupied voxel, in edges of a voxel: voxels are occupied up to 0.94
-/// edges from a surface, so it lies 0.94 to 1.44 edges below (`docs/numerics.md`).
+/// How far a surface lies below the upper side of its highest occupied voxel, in edges of a voxel: voxels are
+/// occupied up to 0.94 edges from a surface, so it lies 0.94 to 1.44 edges below (`docs/numerics.md`).
 pub const SURFACE_DEPTH: f64 = 1.2;
 
 /// Voxels that a level surface occupies at most: those with centres up to 0.94 edges from it.
@@ -42,9 +42,9 @@ impl Ground {
         Self { surfaces: vec![0; floors.len()], floors, n_y }
     }
 
-    /// Finds the ground. `headroom`: free voxels that must lie above, 1 to 128. Columns without ground are obstacles where their
-    /// lowest surface is higher than a `step`, in voxels, or another one lies within the headroom above it: what is higher, such
-    /// as a ceiling, is in no robot's way.
+    /// Finds the ground. `headroom`: free voxels that must lie above, 1 to 128. Columns without ground are
+    /// obstacles where their lowest surface is higher than a `step`, in voxels, or another one lies within the
+    /// headroom above it: what is higher, such as a ceiling, is in no robot's way.
     pub fn find(space: &Space, headroom: u32, step: u32) -> Self {
         let edge = BLOCK_EDGE as usize;
         let [n_columns_x, n_columns_y] = space.window.n;
@@ -78,8 +78,8 @@ impl Ground {
         below.checked_ilog2().map(|z| z as u8)
     }
 
-    /// Continues a surface from a cell: whatever a robot that climbs `step` voxels gets to over neighbours is ground at that
-    /// height, even if the column has a lower surface, such as the furniture of the storey below.
+    /// Continues a surface from a cell: whatever a robot that climbs `step` voxels gets to over neighbours is
+    /// ground at that height, even if the column has a lower surface, such as the furniture of the storey below.
     /// Returns which cells.
     pub fn continue_from(&mut self, cell: usize, z: u8, step: u8) -> Vec<bool> {
         let (n_y, n) = (self.n_y, self.floors.len());
@@ -112,8 +112,8 @@ impl Ground {
         (0..=step).find_map(|d| has(z.checked_sub(d)).or_else(|| has(z.checked_add(d))))
     }
 
-    /// Makes ground that is too steep for the robot an obstacle: where the ground rises or falls along a line by more than
-    /// `slope` times its length and a step besides, over at most a metre. Lines end at higher steps.
+    /// Makes ground that is too steep for the robot an obstacle: where the ground rises or falls along a line by
+    /// more than `slope` times its length and a step besides, over at most a metre. Lines end at higher steps.
     pub fn block_slopes(&mut self, slope: f64, step: u8, voxel: f64) {
         let (n_y, floors) = (self.n_y, &self.floors);
         let n_x = floors.len() / n_y.max(1);
@@ -151,7 +151,8 @@ impl Ground {
     }
 }
 
-/// Returns occupied and free voxels of the 16 columns of voxels in a column of blocks; bit z is the voxel at height z.
+/// Returns occupied and free voxels of the 16 columns of voxels in a column of blocks; bit z is the voxel at
+/// height z.
 pub fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
     // Lower and upper half, by cell.
     let (mut occupied, mut free) = ([[0u64; 16]; 2], [[0u64; 16]; 2]);
@@ -262,7 +263,8 @@ mod tests {
         assert_eq!(floor(1 | 1 << 127, 0, 128, 1), Floor::Blocked);
     }
 
-    /// By hand: a row of cells with a floor at 5 and, in the third, a surface at 1 below it, such as a table of the storey below.
+    /// By hand: a row of cells with a floor at 5 and, in the third, a surface at 1 below it, such as a table of
+    /// the storey below.
     #[test]
     fn ground_continues_at_the_robots_height() {
         let mut ground = Ground {

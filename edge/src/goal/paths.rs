@@ -4,22 +4,23 @@ use rayon::prelude::*;
 
 use super::ground::{Floor, Ground};
 
-/// Cost of a step to a neighbour along an axis; diagonal ones cost 17: their ratio is within 0.2 % of the square root of 2.
+/// Cost of a step to a neighbour along an axis; diagonal ones cost 17: their ratio is within 0.2 % of the square
+/// root of 2.
 const STRAIGHT: u32 = 12;
 const DIAGONAL: u32 = 17;
 /// No way leads here.
 pub const UNREACHED: u32 = u32::MAX;
 
-/// Most connected places, 10 square metres in voxels of 5 cm, that are looked through before a search for a way to one of them:
-/// the tops of things have no way, so the search would go everywhere.
+/// Most connected places, 10 square metres in voxels of 5 cm, that are looked through before a search for a way to
+/// one of them: the tops of things have no way, so the search would go everywhere.
 const MAX_CONNECTED: usize = 4096;
 
 /// Height of a place where no robot's middle may be; others are below 128, and steps at most 100.
 const CLOSED: u8 = u8::MAX;
 
-/// The ways from a robot to the places around it: shortest ones over safe cells along eight directions, whose neighbours differ
-/// by a step at most (Dijkstra's algorithm with Dial's buckets: lengths are whole numbers, and a step costs at most 17). They are
-/// found from the nearest place on, as far as they are asked for.
+/// The ways from a robot to the places around it: shortest ones over safe cells along eight directions, whose
+/// neighbours differ by a step at most (Dijkstra's algorithm with Dial's buckets: lengths are whole numbers, and a
+/// step costs at most 17). They are found from the nearest place on, as far as they are asked for.
 pub struct Paths {
     /// By cell, with a border of closed ones: height of the ground.
     heights: Vec<u8>,
@@ -93,7 +94,8 @@ impl Paths {
         ]
     }
 
-    /// Closes the cells connected with a cell if they are at most `most` and no way has come to any of them: none will.
+    /// Closes the cells connected with a cell if they are at most `most` and no way has come to any of them: none
+    /// will.
     fn close_island(&mut self, cell: usize, most: usize) {
         if self.heights[cell] == CLOSED || self.is_open[cell] {
             return;

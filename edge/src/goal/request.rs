@@ -14,8 +14,8 @@ pub const SENSOR_HEIGHT_M: [f64; 2] = [0.05, 2.3];
 pub const HEIGHT_M: [f64; 2] = [0.05, 2.4];
 /// Least and largest step.
 pub const STEP_M: [f64; 2] = [0.0, 0.5];
-/// Least step that shows in a scene, in its voxels: heights of surfaces are known to half a voxel, so a difference of n voxels
-/// may be n and a half high, and level ground may differ by one.
+/// Least step that shows in a scene, in its voxels: heights of surfaces are known to half a voxel, so a difference
+/// of n voxels may be n and a half high, and level ground may differ by one.
 pub(super) const LEAST_STEP_VOXELS: f64 = 1.5;
 /// Least and largest slope.
 pub const SLOPE: [f64; 2] = [0.02, 5.0];
@@ -80,8 +80,8 @@ impl GoalRequest {
         }
     }
 
-    /// Returns the highest step that the robot climbs, in a scene with voxels of edge `voxel`, metres. By default 0.1 m, or
-    /// up to 0.15 m where lower steps do not show in the voxels.
+    /// Returns the highest step that the robot climbs, in a scene with voxels of edge `voxel`, metres. By default
+    /// 0.1 m, or up to 0.15 m where lower steps do not show in the voxels.
     pub fn step_m(&self, voxel: f64) -> f64 {
         self.step_m.unwrap_or((LEAST_STEP_VOXELS * voxel).clamp(0.1, 0.15))
     }

@@ -8,10 +8,11 @@ use slag_common::occupancy::BLOCK_EDGE;
 use super::ground::voxels_of;
 use super::space::{COLUMN_BLOCKS, Space};
 
-/// Distance from a point of the thing within which the line need not be free, in edges of a voxel: the thing's own surface, and
-/// the voxels just before it, are occupied or unknown.
+/// Distance from a point of the thing within which the line need not be free, in edges of a voxel: the thing's own
+/// surface, and the voxels just before it, are occupied or unknown.
 const TOLERANCE: f64 = 2.0;
-/// Distance from the sides of a voxel, in its edges, from which on a place surely lies in it: more than rounding moves one.
+/// Distance from the sides of a voxel, in its edges, from which on a place surely lies in it: more than rounding
+/// moves one.
 const SIDE: f64 = 1e-3;
 /// Distance from a point, in edges of a voxel, beyond which a place is not within [`TOLERANCE`] of it.
 const BEFORE: f64 = TOLERANCE + SIDE;
@@ -31,8 +32,8 @@ pub struct Thing<'a> {
     n: [usize; 2],
     /// By those cells: free voxels.
     free: Vec<Bits>,
-    /// Voxels that its surface may occupy, those with a point of it and their neighbours. Voxels are occupied up to 0.94 edges
-    /// from a surface, so there are no others.
+    /// Voxels that its surface may occupy, those with a point of it and their neighbours. Voxels are occupied up
+    /// to 0.94 edges from a surface, so there are no others.
     own: Vec<Bits>,
     /// Those outside the cells at hand.
     own_elsewhere: HashSet<[i32; 3]>,
@@ -125,14 +126,15 @@ fn place(at: [i32; 3]) -> ([i32; 3], u64) {
     (at.map(|v| v.div_euclid(BLOCK_EDGE)), 1 << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x)))
 }
 
-/// Returns whether a point of a thing is seen by a sensor in the voxel `at`: every voxel on the line from the sensor is free until the line enters voxels that
-/// the thing's own surface may occupy, which it does not leave, or comes within [`TOLERANCE`] of the point.
+/// Returns whether a point of a thing is seen by a sensor in the voxel `at`: every voxel on the line from the
+/// sensor is free until the line enters voxels that the thing's own surface may occupy, which it does not leave,
+/// or comes within [`TOLERANCE`] of the point.
 ///
-/// A sensor below the whole thing looks at the board or the table that carries it. Their highest voxels belong to both, so only
-/// those that lie wholly above the thing's bottom count as the thing's.
+/// A sensor below the whole thing looks at the board or the table that carries it. Their highest voxels belong to
+/// both, so only those that lie wholly above the thing's bottom count as the thing's.
 ///
-/// The voxels that a line passes are those of Amanatides and Woo, "A Fast Voxel Traversal Algorithm" (1987). Unknown ones hide
-/// what is behind them.
+/// The voxels that a line passes are those of Amanatides and Woo, "A Fast Voxel Traversal Algorithm" (1987).
+/// Unknown ones hide what is behind them.
 ///
 /// `hint` is looked at first and updated. It changes no result.
 pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3, hint: &mut Hint) -> bool {
@@ -190,8 +192,8 @@ impl Hint {
     /// Nothing hid the point yet.
     pub const NONE: Self = Self { axis: 0, plane: f64::NAN };
 
-    /// Returns whether the voxel in which a line to a point meets the plane surely hides the point. `line`: from the sensor;
-    /// `point`: from the window's corner.
+    /// Returns whether the voxel in which a line to a point meets the plane surely hides the point. `line`: from
+    /// the sensor; `point`: from the window's corner.
     fn hides(self, thing: &Thing<'_>, line: DVec3, point: DVec3, lowest: i32) -> bool {
         let per_voxel = 1.0 / thing.space.window.voxel;
         let (line, point) = (line * per_voxel, point * per_voxel);
@@ -213,7 +215,8 @@ struct Walk {
     at: [i32; 3],
     /// Axis along which it entered the voxel.
     axis: usize,
-    /// Distances along the line: to where it entered the voxel, to the next side across each axis, and between two sides.
+    /// Distances along the line: to where it entered the voxel, to the next side across each axis, and between two
+    /// sides.
     entered: f64,
     next: [f64; 3],
     between: [f64; 3],

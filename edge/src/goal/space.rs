@@ -92,7 +92,8 @@ pub struct Space {
 }
 
 impl Space {
-    /// Gathers the blocks of a window from the shards' occupancies; those with voxels of another size are left out.
+    /// Gathers the blocks of a window from the shards' occupancies; those with voxels of another size are left
+    /// out.
     ///
     /// Returns `None` if they are more than 8 million, or the budget is spent.
     pub fn gather(window: Window, occupancies: &[Occupancy<'_>], budget: &Budget) -> Option<Self> {
@@ -137,8 +138,8 @@ impl Space {
         &self.blocks[self.starts[column] as usize..self.starts[column + 1] as usize]
     }
 
-    /// Returns the free voxels of a block, counted from the window's corner: those seen through, without a surface. Beyond the
-    /// window none is known to be free.
+    /// Returns the free voxels of a block, counted from the window's corner: those seen through, without a
+    /// surface. Beyond the window none is known to be free.
     pub fn free(&self, [x, y, z]: [i32; 3]) -> u64 {
         let [n_x, n_y] = self.window.n;
         let is_inside = x >= 0 && y >= 0 && (x as usize) < n_x && (y as usize) < n_y;
@@ -171,8 +172,9 @@ impl Iterator for Masks<'_> {
 
 impl ExactSizeIterator for Masks<'_> {}
 
-/// Goes through the pieces of an occupancy's runs that lie in columns of a window: the column, the height of the first block
-/// and the masks. Ends when `visit` returns false. The time is bounded by the window and the number of runs.
+/// Goes through the pieces of an occupancy's runs that lie in columns of a window: the column, the height of the
+/// first block and the masks. Ends when `visit` returns false. The time is bounded by the window and the number of
+/// runs.
 fn for_columns<'a>(
     occupancy: &Occupancy<'a>,
     window: &Window,

@@ -18,7 +18,8 @@ pub const START_M: f64 = 0.5;
 /// Most cells of a map: 50 m around the robot in voxels of 5 cm, and some 100 MB.
 const MAX_CELLS: f64 = 4.2e6;
 
-/// Most height of what the request says of the robot above the ground that it stands on, metres: its sensor's, say.
+/// Most height of what the request says of the robot above the ground that it stands on, metres: its sensor's,
+/// say.
 const MAX_HEIGHT_M: f64 = 1.5;
 /// Bytes for a cell, in all steps together.
 const CELL_BYTES: usize = 36;
@@ -68,8 +69,9 @@ pub(super) struct Surroundings<'a> {
     budget: &'a Budget,
 }
 
-/// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`] away. If the request
-/// says where the robot is, its height counts: a table top above it is none, nor is the floor of the storey below.
+/// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`] away. If
+/// the request says where the robot is, its height counts: a table top above it is none, nor is the floor of the
+/// storey below.
 fn own_surface(window: &Window, ground: &Ground, request: &GoalRequest, near: DVec3) -> Option<(usize, u8)> {
     let height = |offset: f64| window.voxel_of(near + DVec3::Z * offset)[2];
     let highest = height(request.step_m(window.voxel) + SURFACE_DEPTH * window.voxel) - 1;
@@ -169,7 +171,8 @@ impl<'a> Surroundings<'a> {
         Around { space, ground, paths, clearance, budget: self.budget }
     }
 
-    /// Returns the safe cell nearest to the robot on the ground that it stands on, at most [`START_M`] or its radius away.
+    /// Returns the safe cell nearest to the robot on the ground that it stands on, at most [`START_M`] or its
+    /// radius away.
     pub(super) fn start(&self, near: DVec3, radius_m: f64) -> Option<usize> {
         let cells = cells_within(&self.space.window, near, START_M.max(radius_m));
         let nearest = cells

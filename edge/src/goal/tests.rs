@@ -167,7 +167,8 @@ fn a_screen_hides_the_thing_from_low_sensors() {
     goals_with(&world, &request(1.3)).expect("over the screen it is seen");
 }
 
-/// A board with a thing on it, over the whole way: the robot drives below, and sees nothing of the thing through the board.
+/// A board with a thing on it, over the whole way: the robot drives below, and sees nothing of the thing through
+/// the board.
 #[test]
 fn nothing_is_seen_through_what_a_thing_stands_on() {
     let board = |p: DVec3| inside(p, [1.4, 1.4, 0.65], [4.6, 4.6, 0.7]).then_some(At::Solid);
@@ -188,8 +189,8 @@ fn nothing_is_seen_through_what_a_thing_stands_on() {
     stand(&empty, &request, START, &on_board).expect("poses");
 }
 
-/// A plate on a wall, from below: the line to it goes along the wall, through voxels that wall and plate share, for longer than
-/// two edges. A bump of the wall below it hides it.
+/// A plate on a wall, from below: the line to it goes along the wall, through voxels that wall and plate share,
+/// for longer than two edges. A bump of the wall below it hides it.
 #[test]
 fn what_hangs_on_a_wall_is_seen_from_below() {
     let wall = |p: DVec3| (p.x > 4.9 && p.x < 5.1).then_some(At::Solid);
@@ -210,8 +211,8 @@ fn what_hangs_on_a_wall_is_seen_from_below() {
     assert_eq!(found, Err(NoGoal::NotVisible));
 }
 
-/// A pole behind a screen with a slit of one voxel: it is seen from a strip of 10 cm, and the cheapest place of its square is not
-/// on the strip, as the robot comes from beside it.
+/// A pole behind a screen with a slit of one voxel: it is seen from a strip of 10 cm, and the cheapest place of
+/// its square is not on the strip, as the robot comes from beside it.
 #[test]
 fn a_narrow_strip_from_which_a_thing_is_seen_is_found() {
     let screen = |slit: bool| {
@@ -280,8 +281,8 @@ fn tables_are_driven_under_or_around() {
     assert_eq!(goals_with(&world, &high), Err(NoGoal::Unreachable));
 }
 
-/// The robot is told to be a little inside a coffee table, by its edge: its top is ground with room above, and nearer than the
-/// floor, but the robot's height is that of the floor.
+/// The robot is told to be a little inside a coffee table, by its edge: its top is ground with room above, and
+/// nearer than the floor, but the robot's height is that of the floor.
 #[test]
 fn the_robots_height_decides_where_it_stands() {
     let table = |p: DVec3| inside(p, [1.0, 2.4, 0.0], [1.9, 3.6, 0.35]).then_some(At::Solid);

@@ -74,8 +74,8 @@ impl App {
         self.n_reload_attempts.subscribe()
     }
 
-    /// Loads another generation if the cache changed (one `stat` call): in the background, so that the one on board answers
-    /// meanwhile, or at once where none is on board. Blocks for the latter alone.
+    /// Loads another generation if the cache changed (one `stat` call): in the background, so that the one on
+    /// board answers meanwhile, or at once where none is on board. Blocks for the latter alone.
     pub(super) fn reload_if_stale(self: &Arc<Self>) {
         if !self.engine.is_stale() {
             return;
@@ -151,8 +151,9 @@ impl App {
         tokio::task::spawn_blocking(move || work(&app)).await.unwrap_or_else(|e| Err(Problem::internal(e)))
     }
 
-    /// Runs work within the limits of a query, on the newest generation: one permit of those for queries in progress, which
-    /// ends with the work, and a budget of memory and time. `time`: the most that the client gives it.
+    /// Runs work within the limits of a query, on the newest generation: one permit of those for queries in
+    /// progress, which ends with the work, and a budget of memory and time. `time`: the most that the client gives
+    /// it.
     pub(super) async fn within_limits<T: Send + 'static>(
         self: &Arc<Self>,
         time: Option<Duration>,

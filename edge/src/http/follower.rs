@@ -14,9 +14,9 @@ pub const RESTARTS: Backoff = Backoff { first: Duration::from_secs(1), longest: 
 /// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(50);
 
-/// Runs `follow` until it returns. If it panics, `following` says so (and with it `/readyz`, `/position`, `/status` and
-/// `/metrics`) until a fetch of its successor ends, and `follow` runs again after a pause that doubles with each
-/// failure in a row. Returns `None` if cancelled in a pause.
+/// Runs `follow` until it returns. If it panics, `following` says so (and with it `/readyz`, `/position`,
+/// `/status` and `/metrics`) until a fetch of its successor ends, and `follow` runs again after a pause that
+/// doubles with each failure in a row. Returns `None` if cancelled in a pause.
 pub fn keep_following<T>(
     following: &Following,
     restarts: Backoff,

@@ -1,4 +1,5 @@
-//! Scrubs in the background: each shard on board is read again within a given time, so that rot is found before an answer needs it.
+//! Scrubs in the background: each shard on board is read again within a given time, so that rot is found before an
+//! answer needs it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -11,8 +12,8 @@ const NAP: Duration = Duration::from_millis(100);
 /// Pause while no scene is loaded.
 const IDLE: Duration = Duration::from_secs(1);
 
-/// Reads every shard on board once in `round`, evenly, until `cancel` is set. A damaged one is marked, the generation is opened
-/// again without it, and a follower fetches it.
+/// Reads every shard on board once in `round`, evenly, until `cancel` is set. A damaged one is marked, the
+/// generation is opened again without it, and a follower fetches it.
 pub fn keep_scrubbing(app: &App, round: Duration, cancel: &AtomicBool) {
     let mut scrubber = Scrubber::default();
     while !cancel.load(Ordering::Relaxed) {

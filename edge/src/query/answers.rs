@@ -55,8 +55,9 @@ pub struct Answers {
     pub is_exact: bool,
     /// Bound on the error of every score.
     pub score_error_bound: f32,
-    /// For 95 of 100 questions, 99 of 100 scores of each shard err by no more: measured over texts that the codebook
-    /// was not made for. With negatives, for 90 of 100. Absent if answers are exact or it was not measured.
+    /// For 95 of 100 questions, 99 of 100 scores of each shard err by no more: measured over texts that the
+    /// codebook was not made for. With negatives, for 90 of 100. Absent if answers are exact or it was not
+    /// measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub score_error_likely: Option<f32>,
     /// Whether the whole region asked for was fetched; absent without `radius` and `box`.
@@ -198,14 +199,15 @@ pub struct ClusterAnswer {
     /// For an object: its Gaussians in the whole scene.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub n_gaussians_in_scene: Option<u64>,
-    /// For an object that the region asked for cuts: where the whole of it is. Everything else describes the part inside.
+    /// For an object that the region asked for cuts: where the whole of it is. Everything else describes the part
+    /// inside.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub whole: Option<Whole>,
     /// For an object: the photo that shows it best.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub evidence: Option<Evidence>,
-    /// Key of the ranking: (score - base) / (1 + distance / 10 m), 0 below base; base is the mean score of unrelated texts for
-    /// cosines, 0 for relevancies; without a metric scale 10 m is 40 default voxels.
+    /// Key of the ranking: (score - base) / (1 + distance / 10 m), 0 below base; base is the mean score of
+    /// unrelated texts for cosines, 0 for relevancies; without a metric scale 10 m is 40 default voxels.
     pub relevance: f32,
     /// Distance of the position from `near`.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -134,8 +134,8 @@ impl Ask {
 }
 
 impl Engine {
-    /// Answers several questions from the loaded generation. Blocks for milliseconds of computing, at most as long as the
-    /// budget says.
+    /// Answers several questions from the loaded generation. Blocks for milliseconds of computing, at most as long
+    /// as the budget says.
     pub fn ask(&self, ask: &Ask, budget: &Budget) -> Result<AskReply, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;

@@ -179,8 +179,8 @@ pub struct MovedThing {
 }
 
 impl Engine {
-    /// Compares two generations that the robot has had. What only one of them knows is not called changed. Blocks for
-    /// milliseconds; for a second where thousands of things changed.
+    /// Compares two generations that the robot has had. What only one of them knows is not called changed. Blocks
+    /// for milliseconds; for a second where thousands of things changed.
     ///
     /// # Errors
     /// [`ChangesError`]. That nothing is remembered yet is a reply.

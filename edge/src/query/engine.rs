@@ -88,8 +88,8 @@ struct Loaded {
     failed_at: Option<Instant>,
 }
 
-/// A generation, and the text model that was in use with it: a reload replaces both at once, and a question must not take the
-/// vectors of one model to the scene of another.
+/// A generation, and the text model that was in use with it: a reload replaces both at once, and a question must
+/// not take the vectors of one model to the scene of another.
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
     text: Arc<TextService>,
@@ -202,8 +202,8 @@ impl Engine {
         retry || self.cache.current_stat().is_ok_and(|stat| stat != loaded.tried)
     }
 
-    /// Opens the cache's current generation and makes it the one in use; questions in progress keep theirs.
-    /// If it does not open, the previous one stays in use. A text model that the scene carries comes into use with it.
+    /// Opens the cache's current generation and makes it the one in use; questions in progress keep theirs. If it
+    /// does not open, the previous one stays in use. A text model that the scene carries comes into use with it.
     pub fn reload(&self) -> Result<(), StoreError> {
         let tried = self.cache.current_stat().ok().flatten();
         let before = self.snapshot().ok();
@@ -255,8 +255,8 @@ impl Engine {
         Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text) })
     }
 
-    /// Answers a request from the loaded generation. Blocks for milliseconds of computing, at most as long as the budget
-    /// says.
+    /// Answers a request from the loaded generation. Blocks for milliseconds of computing, at most as long as the
+    /// budget says.
     pub fn answer(&self, request: &QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
         request.check()?;
         let on_board = self.on_board()?;

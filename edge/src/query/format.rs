@@ -65,8 +65,8 @@ impl std::str::FromStr for Format {
 }
 
 impl Reply {
-    /// Returns the Gaussians of all answers as a PLY of points, in the same pieces as [`Reply::pieces`] does. Clusters and
-    /// objects need [`QueryRequest::members`](super::QueryRequest::members).
+    /// Returns the Gaussians of all answers as a PLY of points, in the same pieces as [`Reply::pieces`] does.
+    /// Clusters and objects need [`QueryRequest::members`](super::QueryRequest::members).
     pub fn ply(&self) -> impl Iterator<Item = io::Result<Vec<u8>>> {
         ply::Pieces::new(self)
     }

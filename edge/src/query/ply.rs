@@ -13,7 +13,8 @@ use crate::score::Run;
 /// A piece ends with the first point past this size.
 const PIECE_BYTES: usize = 256 << 10;
 
-/// The pieces of a reply as a PLY. Points are in the order of questions, of answers, and of storage within an answer.
+/// The pieces of a reply as a PLY. Points are in the order of questions, of answers, and of storage within an
+/// answer.
 pub struct Pieces<R> {
     reply: R,
     properties: PointProperties,

@@ -35,8 +35,8 @@ impl Scale {
         }
     }
 
-    /// Returns the reported score of what has nothing to do with the question: 0 for a relevancy; for a cosine the mean of a
-    /// bank of texts' scores over whatever is scored, or 0 if it was not measured.
+    /// Returns the reported score of what has nothing to do with the question: 0 for a relevancy; for a cosine the
+    /// mean of a bank of texts' scores over whatever is scored, or 0 if it was not measured.
     pub fn base(self, calibration: Option<Calibration>) -> f32 {
         match self.0 {
             ScoreKind::Cosine => calibration.map_or(0.0, |measured| measured.score_mean),

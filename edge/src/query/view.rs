@@ -84,8 +84,8 @@ impl Engine {
         })
     }
 
-    /// Returns the message of a cell's Gaussians, all or every few, or nothing if the cell is not on board or of another generation than
-    /// `generation`, where that is given.
+    /// Returns the message of a cell's Gaussians, all or every few, or nothing if the cell is not on board or of
+    /// another generation than `generation`, where that is given.
     pub fn view_cell(
         &self,
         cell_id: u32,
@@ -105,8 +105,8 @@ impl Engine {
         Ok(Some(cell_message(&positions, shard.appearance(), step)))
     }
 
-    /// Returns the words that the text model knows, each with the number of objects on board that it finds; of a model that
-    /// takes any text, everyday words that find something.
+    /// Returns the words that the text model knows, each with the number of objects on board that it finds; of a
+    /// model that takes any text, everyday words that find something.
     pub fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
@@ -165,8 +165,8 @@ impl Engine {
     }
 }
 
-/// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a while for
-/// each, and encodes some more at the next request.
+/// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a
+/// while for each, and encodes some more at the next request.
 fn everyday_vectors(on_board: &OnBoard) -> Result<(Vec<WordVector>, bool), QueryError> {
     let (vectors, is_complete) = Words::encode(everyday_words(), |word| match on_board.encode(word) {
         Ok(vector) => Ok(Some((word.to_owned(), vector))),

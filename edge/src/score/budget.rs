@@ -1,7 +1,7 @@
 //! What a request may use: bytes and time, checked while it is scored and clustered.
 //!
-//! Work that fans out over threads cannot return an error from every loop, so a budget latches: once it is spent, loops
-//! end early, and whoever started the work asks [`Budget::check`] before it uses the result.
+//! Work that fans out over threads cannot return an error from every loop, so a budget latches: once it is spent,
+//! loops end early, and whoever started the work asks [`Budget::check`] before it uses the result.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, OnceLock};

@@ -14,8 +14,8 @@ use super::region::Region;
 /// fall short, because so few scores have the largest errors.
 pub(super) const UNDECIDED: f32 = 9.0;
 
-/// How far an f16-rounded unit embedding may lie from the unrounded one that its centroid's radius was measured to:
-/// half a step of f16 at 1 (2^-11), plus the steps of components too small for f16's exponents.
+/// How far an f16-rounded unit embedding may lie from the unrounded one that its centroid's radius was measured
+/// to: half a step of f16 at 1 (2^-11), plus the steps of components too small for f16's exponents.
 pub(super) const F16_ROUNDING: f32 = 5e-4;
 
 /// The data that members are scored by, beyond their centroid.

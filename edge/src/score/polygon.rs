@@ -17,7 +17,8 @@ pub struct Polygon {
 }
 
 impl Polygon {
-    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for another number or corners out of bounds.
+    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for another number or corners out of
+    /// bounds.
     pub fn new(corners: Vec<DVec2>) -> Option<Self> {
         let is_within = |corner: &DVec2| corner.is_finite() && corner.abs().max_element() <= MAX_COORDINATE;
         if !(3..=MAX_CORNERS).contains(&corners.len()) || !corners.iter().all(is_within) {
@@ -37,8 +38,8 @@ impl Polygon {
         (0..n).map(move |at| (self.corners[at], self.corners[(at + 1) % n]))
     }
 
-    /// Returns whether a point lies inside: a ray along x crosses an odd number of edges. A point on the border may lie
-    /// on either side.
+    /// Returns whether a point lies inside: a ray along x crosses an odd number of edges. A point on the border
+    /// may lie on either side.
     pub fn contains(&self, point: DVec2) -> bool {
         let crosses = |(a, b): (DVec2, DVec2)| {
             (a.y > point.y) != (b.y > point.y) && point.x < (b.x - a.x) * (point.y - a.y) / (b.y - a.y) + a.x

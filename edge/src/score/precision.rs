@@ -9,9 +9,9 @@ use serde::Serialize;
 pub enum Precision {
     /// Codebook centroids only: fastest; every score is within the stated bound.
     Centroids,
-    /// As `Exact`, but in shards with exact embeddings reads only those that the measured errors of codes and
-    /// fine residuals leave undecided. Finds nearly all of the exact answer, tens of times faster; answers state the likely
-    /// errors of its scores.
+    /// As `Exact`, but in shards with exact embeddings reads only those that the measured errors of codes and fine
+    /// residuals leave undecided. Finds nearly all of the exact answer, tens of times faster; answers state the
+    /// likely errors of its scores.
     Measured,
     /// Centroids, and where they cannot decide, the shard's exact embeddings or residual codes.
     #[default]

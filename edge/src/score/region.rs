@@ -22,8 +22,8 @@ impl Ball {
     }
 }
 
-/// A ball, a box and a polygon, each optional. A Gaussian lies inside if its mean lies in all of them; the borders of ball and
-/// box are included.
+/// A ball, a box and a polygon, each optional. A Gaussian lies inside if its mean lies in all of them; the borders
+/// of ball and box are included.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Region {
     pub ball: Option<Ball>,

@@ -17,7 +17,8 @@ use super::question::{Question, check};
 use super::region::Region;
 use super::select::AnswerBuffers;
 
-/// What a search may use: a budget, and buffers that the next search reuses, so that it allocates little but its answers.
+/// What a search may use: a budget, and buffers that the next search reuses, so that it allocates little but its
+/// answers.
 #[derive(Default)]
 pub struct Scratch {
     budget: Budget,
@@ -149,8 +150,8 @@ impl<'a> Search<'a> {
         self.put_back(buffers);
     }
 
-    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from `near`,
-    /// then by cell and index. The selection is exact with respect to the scores returned.
+    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from
+    /// `near`, then by cell and index. The selection is exact with respect to the scores returned.
     pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
         let mut hits = Vec::new();
         self.best_into(limit, threshold, near, &mut hits);
@@ -204,7 +205,8 @@ impl<'a> Search<'a> {
     }
 
     /// Returns the score errors that were measured over a bank of texts, each the maximum over the shards
-    /// searched, so that the likely one holds for each of them; `None` if answers are exact, or if a shard lacks measurements for the data read.
+    /// searched, so that the likely one holds for each of them; `None` if answers are exact, or if a shard lacks
+    /// measurements for the data read.
     pub fn measured_errors(&self) -> Option<ScoreErrors> {
         let mut largest: Option<ScoreErrors> = None;
         for shard in self.searched() {

@@ -1,6 +1,6 @@
-//! Shards on board that a reader found damaged. Readers hold no lock, so that they only leave a mark: an empty file
-//! `damaged/HASH`. A marked shard is not opened any more, and the next fetch downloads it again, unread: a sector that cannot be
-//! read would end the program that maps it.
+//! Shards on board that a reader found damaged. Readers hold no lock, so that they only leave a mark: an empty
+//! file `damaged/HASH`. A marked shard is not opened any more, and the next fetch downloads it again, unread: a
+//! sector that cannot be read would end the program that maps it.
 
 use std::collections::BTreeSet;
 

@@ -24,8 +24,8 @@ pub fn is_bad_medium(e: &io::Error) -> bool {
 
 /// Returns a function that adds a path to an error of the system.
 fn at(path: &Path) -> impl Fn(io::Error) -> io::Error {
-    // What file systems and block devices answer with. Linux: EIO, ENXIO, EBADE, ENODATA, ENOLINK, EBADMSG, EILSEQ,
-    // ETIMEDOUT, EUCLEAN (a broken inode), EREMOTEIO.
+    // What file systems and block devices answer with. Linux: EIO, ENXIO, EBADE, ENODATA, ENOLINK, EBADMSG,
+    // EILSEQ, ETIMEDOUT, EUCLEAN (a broken inode), EREMOTEIO.
     let codes: &[i32] = match (cfg!(target_os = "linux"), cfg!(unix)) {
         (true, _) => &[5, 6, 52, 61, 67, 74, 84, 110, 117, 121],
         (false, true) => &[5],

@@ -1,8 +1,9 @@
-//! The objects of generations that the robot has had: a small record of each, `history/GENERATION`, so that generations can be
-//! compared after their shards are gone.
+//! The objects of generations that the robot has had: a small record of each, `history/GENERATION`, so that
+//! generations can be compared after their shards are gone.
 //!
-//! A record is a container (`slag_common::container`) of JSON, vectors (`[n][dim]` i8) and their steps (`[n]` f32). It may be
-//! lost at any time: one that is missing or damaged only means that its generation is not compared.
+//! A record is a container (`slag_common::container`) of JSON, vectors (`[n][dim]` i8) and their steps (`[n]`
+//! f32). It may be lost at any time: one that is missing or damaged only means that its generation is not
+//! compared.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -60,8 +61,8 @@ struct Missing {
 }
 
 impl Record {
-    /// Collects the objects of shards of one generation, those nearest to `centre` first if they are too many. `None`: there
-    /// are none, or there is too much to remember.
+    /// Collects the objects of shards of one generation, those nearest to `centre` first if they are too many.
+    /// `None`: there are none, or there is too much to remember.
     pub fn collect<'a>(
         manifest: &Manifest,
         centre: DVec3,
@@ -112,8 +113,8 @@ impl Record {
         Self { missing, things: things.into_values().collect(), ..newer }
     }
 
-    /// Returns whether a thing's box touches no cell whose objects are not known: were it in this generation, it would be
-    /// listed.
+    /// Returns whether a thing's box touches no cell whose objects are not known: were it in this generation, it
+    /// would be listed.
     pub fn knows(&self, thing: &Thing) -> bool {
         let touches = |of: &Aabb| {
             let Aabb { min, max } = thing.box_in_world;

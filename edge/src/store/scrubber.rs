@@ -27,8 +27,9 @@ pub struct Scrubbed {
 }
 
 impl Scrubber {
-    /// Reads the shard of a generation that was read longest ago; `None` if it has none. Takes as much memory as the shard
-    /// meanwhile: a sector that cannot be read is an error of `read`, but ends a program that reads it through a map.
+    /// Reads the shard of a generation that was read longest ago; `None` if it has none. Takes as much memory as
+    /// the shard meanwhile: a sector that cannot be read is an error of `read`, but ends a program that reads it
+    /// through a map.
     pub fn step(&mut self, cache: &EdgeCache, snapshot: &Snapshot) -> Option<Scrubbed> {
         let hashes = || snapshot.shards.iter().map(|shard| (shard.hash(snapshot.current.profile), shard));
         let n_before = self.read.len();

@@ -100,7 +100,8 @@ impl OpenShard {
     }
 }
 
-/// Reads a file and checks it as [`check_shard`] does. Not through a map, where a page that cannot be read ends the program.
+/// Reads a file and checks it as [`check_shard`] does. Not through a map, where a page that cannot be read ends
+/// the program.
 pub fn check_file<'a>(
     cache: &EdgeCache,
     path: &Path,

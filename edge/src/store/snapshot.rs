@@ -29,7 +29,8 @@ pub struct Snapshot {
     pub manifest: Manifest,
     /// The shards, by cell id, ascending; shared with snapshots of other generations that list them.
     pub shards: Vec<Arc<OpenShard>>,
-    /// Cells within the radius whose shards could not be fetched or opened; some have an earlier generation's shard.
+    /// Cells within the radius whose shards could not be fetched or opened; some have an earlier generation's
+    /// shard.
     pub bad_cells: Vec<BadCell>,
     /// Whether a shard could not be opened for a reason that may pass, such as too many open files.
     pub may_recover: bool,
@@ -37,8 +38,8 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// Opens the current generation: maps and checks every shard once. One that does not open costs its cell only, and is marked
-    /// for the next fetch.
+    /// Opens the current generation: maps and checks every shard once. One that does not open costs its cell only,
+    /// and is marked for the next fetch.
     ///
     /// # Errors
     /// [`StoreError`]; that of the first shard if none opens. A fetch that replaces `current` meanwhile is not an error.

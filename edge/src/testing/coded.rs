@@ -20,8 +20,8 @@ pub struct CodedShard {
     pub has_basis: bool,
     /// 0: no residual code.
     pub n_subspaces: usize,
-    /// Whether exact embeddings are beside the code, and fine residuals: any, for nothing is decided by what is not
-    /// measured, and these errors are stated: [`CODE_ERROR`] and [`FINE_ERROR`].
+    /// Whether exact embeddings are beside the code, and fine residuals: any, for nothing is decided by what is
+    /// not measured, and these errors are stated: [`CODE_ERROR`] and [`FINE_ERROR`].
     pub is_exact: bool,
     /// Members of each centroid.
     pub centroid_lens: Vec<usize>,

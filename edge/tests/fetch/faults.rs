@@ -1,6 +1,6 @@
 //! Storage and network fail together, in a thousand trials (a quarter of them outside the nightly checks;
-//! `SLAG_TRIALS=10000`: more). After each, the old or the new generation answers a real query, whole. Storage includes
-//! the two copies of the trust state, and the records of use.
+//! `SLAG_TRIALS=10000`: more). After each, the old or the new generation answers a real query, whole. Storage
+//! includes the two copies of the trust state, and the records of use.
 
 use std::collections::BTreeSet;
 use std::path::Path;

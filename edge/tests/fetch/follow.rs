@@ -163,8 +163,8 @@ fn following_survives_the_loss_of_the_network() {
     assert_eq!(scene.hash(6, Profile::Compact), robot.snapshot().current.cells[0].hash);
 }
 
-/// A follower that was not told whom to trust tries again when the robot moves, and when somebody tells it: the pause after a
-/// failure would be an hour.
+/// A follower that was not told whom to trust tries again when the robot moves, and when somebody tells it: the
+/// pause after a failure would be an hour.
 #[test]
 fn a_follower_waits_for_trust_and_not_for_time() {
     let scene = Published::new(1, &[0; 3], 20);

@@ -26,7 +26,8 @@ fn before() -> Published {
     published(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1), thing(3, 25.0, 2), thing(9, 55.0, 0)])
 }
 
-/// By hand: 1 stays, 2 goes, 3 moves to x = 5, 5 appears. 9, beyond the robot's cells, goes as well, and 10 appears there.
+/// By hand: 1 stays, 2 goes, 3 moves to x = 5, 5 appears. 9, beyond the robot's cells, goes as well, and 10
+/// appears there.
 fn after() -> Published {
     published(2, &[thing(1, 2.0, 0), thing(4, 5.0, 2), thing(5, 18.0, 3), thing(10, 45.0, 3)])
 }
@@ -108,7 +109,8 @@ fn what_is_left_behind_has_not_gone() {
     assert_eq!(reply.n_not_compared, 4, "{reply:?}");
 }
 
-/// The records are written before anything goes: at whatever step the power fails, they are there after the next fetch.
+/// The records are written before anything goes: at whatever step the power fails, they are there after the next
+/// fetch.
 #[test]
 fn a_power_cut_loses_no_history() {
     let dir = tempfile::tempdir().expect("temporary folder");

@@ -309,13 +309,14 @@ fn names_that_are_paths_are_refused() {
     }
 }
 
-/// Shards with false sizes and counts under valid checksums, hashes and signatures; the format's own tests have more lies.
+/// Shards with false sizes and counts under valid checksums, hashes and signatures; the format's own tests have
+/// more lies.
 #[test]
 fn shards_that_lie_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
     let sound = scene.objects[&scene.hash(0, Profile::Compact)].clone();
-    // docs/formats.md: the section table begins at 32; an entry is id, 0, offset, length, checksum in 32 bytes; the
-    // header section comes first. The checksum is the beginning of the hash.
+    // docs/formats.md: the section table begins at 32; an entry is id, 0, offset, length, checksum in 32 bytes;
+    // the header section comes first. The checksum is the beginning of the hash.
     let row = |n: usize| 32 + 32 * n;
     let set =
         |bytes: &mut Vec<u8>, at: usize, value: u64| bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());

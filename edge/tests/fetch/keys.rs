@@ -133,8 +133,8 @@ fn files_of_different_states_are_not_mixed() {
     trial.accepts(new);
 }
 
-/// A network that repeats the last state for ever is noticed when the timestamp expires; what is on board answers on.
-/// A clock that is behind does not help: the newest time that was signed counts.
+/// A network that repeats the last state for ever is noticed when the timestamp expires; what is on board answers
+/// on. A clock that is behind does not help: the newest time that was signed counts.
 #[test]
 fn a_frozen_store_is_noticed() {
     let expiring = |at: u64, version: u64| {
@@ -153,8 +153,8 @@ fn a_frozen_store_is_noticed() {
     trial.accepts(expiring(NOW - 999, 2));
 }
 
-/// Time is the later of the clock and the newest signed time. A clock that is ahead stops fetches while it is ahead, and
-/// leaves nothing behind; at 1970, what the newest signed time allows is taken.
+/// Time is the later of the clock and the newest signed time. A clock that is ahead stops fetches while it is
+/// ahead, and leaves nothing behind; at 1970, what the newest signed time allows is taken.
 #[test]
 fn a_clock_that_is_wrong_costs_no_more_than_fetches() {
     let mut trial = Trial::new(of(1, &[FIRST], 1));

@@ -66,7 +66,8 @@ fn fetches_and_scrubs_read_and_do_not_map() {
     assert!(Scrubber::default().step(&robot.cache, &snapshot).is_some_and(|step| step.is_sound));
 }
 
-/// ext4 neither reads, removes nor replaces it: the cell stays away until somebody checks the disk, the others go on.
+/// ext4 neither reads, removes nor replaces it: the cell stays away until somebody checks the disk, the others go
+/// on.
 #[needs_loop_disk]
 #[test]
 fn an_inode_that_cannot_be_read_fails_no_fetch() {

@@ -68,7 +68,8 @@ fn a_rotten_shard_costs_its_cell_only() {
     }
 }
 
-/// Whichever bit of whichever shards flips: the others answer, and so does a rotten one whose columns are whole (padding).
+/// Whichever bit of whichever shards flips: the others answer, and so does a rotten one whose columns are whole
+/// (padding).
 #[test]
 fn any_rot_costs_its_cells_only() {
     let dir = tempfile::tempdir().expect("temporary folder");

@@ -31,8 +31,8 @@ fn the_second_fetch_brings_only_the_difference() {
     assert_holds(&robot.snapshot(), &first, 0..3);
     let stat = robot.cache.current_stat().expect("readable");
 
-    // Nothing new: three small requests (is there another root, timestamp, targets), and nothing written. Source and
-    // position are those of the last fetch.
+    // Nothing new: three small requests (is there another root, timestamp, targets), and nothing written. Source
+    // and position are those of the last fetch.
     robot.request = FetchRequest { from: None, at: None, ..robot.request };
     let report = robot.fetch().expect("works");
     assert_eq!((report.downloaded.n_shards, report.kept.n_shards, report.freed.n_shards), (0, 3, 0));

@@ -83,7 +83,8 @@ fn a_flipped_bit_in_the_records_costs_nothing() {
     assert!(n_trials >= n_flips, "{n_trials}");
 }
 
-/// A script that adds the first root again, after its keys were revoked, changes nothing; another root needs --replace.
+/// A script that adds the first root again, after its keys were revoked, changes nothing; another root needs
+/// --replace.
 #[test]
 fn adding_the_first_root_again_does_not_bring_its_keys_back() {
     let rotated = Rotated::new();

@@ -11,7 +11,8 @@ use super::scene::Published;
 use super::server::Server;
 use super::{Robot, assert_holds};
 
-/// A bit that flips on the medium leaves the file's time alone. No fetch reads it; a reader, or the scrub of one that is open, does.
+/// A bit that flips on the medium leaves the file's time alone. No fetch reads it; a reader, or the scrub of one
+/// that is open, does.
 #[test]
 fn rot_is_found_within_a_day() {
     let scene = Published::new(1, &[0; 3], 40);

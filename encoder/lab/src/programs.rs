@@ -30,8 +30,8 @@ pub(crate) fn finish(command: &mut Command) -> Result<()> {
     if output.status.success() { Ok(()) } else { Err(anyhow!("{}: {message}", line(command))) }
 }
 
-/// Runs a command and parses the JSON that it prints. Exit code 3 is no error: some inputs were left out, and the figures
-/// count them.
+/// Runs a command and parses the JSON that it prints. Exit code 3 is no error: some inputs were left out, and the
+/// figures count them.
 pub(crate) fn json_of(command: &mut Command) -> Result<Value> {
     let output = command.stdin(Stdio::null()).output().with_context(|| line(command))?;
     let printed: Option<Value> = serde_json::from_slice(&output.stdout).ok();

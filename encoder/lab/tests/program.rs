@@ -1,5 +1,5 @@
-//! The program as a user meets it. Cargo builds a package's programs before its integration tests: the end-to-end tests
-//! in `tests/` run this one.
+//! The program as a user meets it. Cargo builds a package's programs before its integration tests: the end-to-end
+//! tests in `tests/` run this one.
 
 use std::process::{Command, Output};
 

@@ -9,8 +9,8 @@ fn in_memory() -> Bucket {
     Bucket { store, prefix: Key::from("scene"), url: "memory://scene".into(), is_local: false, runtime }
 }
 
-/// What every kind of bucket does; `other` is the same bucket, opened again. Those of S3 are tested with real servers
-/// (`tests/fleet/s3.rs`).
+/// What every kind of bucket does; `other` is the same bucket, opened again. Those of S3 are tested with real
+/// servers (`tests/fleet/s3.rs`).
 fn conforms(one: &Bucket, other: &Bucket) {
     assert!(one.put_new("jobs/2/plan.json", "first").expect("puts"));
     assert!(!other.put_new("jobs/2/plan.json", "second").expect("puts"), "a conditional put is one for all");

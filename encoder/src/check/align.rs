@@ -6,8 +6,8 @@ use slag_math::eigen::eigen_symmetric;
 
 /// Fewest cameras for a similarity.
 const MIN_CAMERAS: usize = 3;
-/// Cameras whose second-largest spread is below this share of the largest stand on a line: the rotation about it is
-/// undetermined.
+/// Cameras whose second-largest spread is below this share of the largest stand on a line: the rotation about it
+/// is undetermined.
 const MIN_SPREAD: f64 = 1e-3;
 /// Points this near to their mean, relative to the mean's distance from the origin, are one point.
 const ROUNDING: f64 = 1e-12;
@@ -19,8 +19,8 @@ pub struct Alignment {
     pub similarity: Similarity,
     /// Cameras in both sets.
     pub n_cameras: usize,
-    /// Root mean square of the distances that remain, over the root mean square distance of the second set's cameras
-    /// from their mean.
+    /// Root mean square of the distances that remain, over the root mean square distance of the second set's
+    /// cameras from their mean.
     pub residual: f64,
 }
 

@@ -11,7 +11,8 @@ use super::view::{CheckView, at_width, mean};
 use super::{CheckError, CheckOptions};
 use crate::raster::{LoadedScene, Rasterizer};
 
-/// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain colour, dB.
+/// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain
+/// colour, dB.
 pub(super) const CLEAR_GAIN_DB: f64 = 3.0;
 /// Gain that counts where the data themselves suggest a mistake, dB.
 const SUSPECTED_GAIN_DB: f64 = 0.5;
@@ -145,8 +146,9 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Tries what is suspected, then common mistakes and frames, then a sweep of scales, until one explains the photos.
-    /// Returns all trials, best first; a frame of nerfstudio's defaults or a scale among the best is refined.
+    /// Tries what is suspected, then common mistakes and frames, then a sweep of scales, until one explains the
+    /// photos. Returns all trials, best first; a frame of nerfstudio's defaults or a scale among the best is
+    /// refined.
     fn run(&self, frames: &[FrameCandidate]) -> Result<Vec<Trial>, CheckError> {
         let mut tried = Vec::new();
         for mistake in &self.suspected {
@@ -180,15 +182,15 @@ impl Search<'_> {
         Ok(Trial { mistake, psnr_db })
     }
 
-    /// Returns whether a correction is clearly better than the inputs as given, and its drawings fit by themselves: one that
-    /// merely turns black into some colour gains, too.
+    /// Returns whether a correction is clearly better than the inputs as given, and its drawings fit by
+    /// themselves: one that merely turns black into some colour gains, too.
     fn explains(&self, trial: &Trial) -> bool {
         let gain_db = if self.suspected.contains(&trial.mistake) { SUSPECTED_GAIN_DB } else { CLEAR_GAIN_DB };
         trial.psnr_db > (self.given_psnr_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
     }
 
-    /// Moves a similarity that is computed from other data than the trainer's, or swept, to where the drawings match best
-    /// (pattern search, Hooke and Jeeves 1961). Others are exact.
+    /// Moves a similarity that is computed from other data than the trainer's, or swept, to where the drawings
+    /// match best (pattern search, Hooke and Jeeves 1961). Others are exact.
     fn refined(&self, best: Trial) -> Result<Trial, CheckError> {
         // Directions of the search: scale, three rotations and three translations, up and down.
         let (directions, least_gain_db) = match best.mistake {

@@ -28,8 +28,8 @@ pub enum Mistake {
     CentreAtZero,
     /// The scene is larger than the cameras' world by this factor.
     SceneScale(f64),
-    /// The worlds differ by right angles: axis i of the splat's is this axis of the cameras', counted from 1, with its
-    /// sign.
+    /// The worlds differ by right angles: axis i of the splat's is this axis of the cameras', counted from 1, with
+    /// its sign.
     WorldAxes([i8; 3]),
     /// The worlds differ by a similarity.
     Frame(FrameCandidate),
@@ -123,7 +123,8 @@ impl Mistake {
         corrected
     }
 
-    /// Returns the splat with the mistake corrected, with colours of degree 0; `None` if the mistake is not the splat's.
+    /// Returns the splat with the mistake corrected, with colours of degree 0; `None` if the mistake is not the
+    /// splat's.
     pub fn corrected_splat(self, scene: &Gaussians) -> Option<Gaussians> {
         let mut corrected = match self {
             Self::Mirrored(_) | Self::Activated { .. } => Gaussians {
@@ -233,9 +234,9 @@ impl fmt::Display for FrameCause {
     }
 }
 
-/// Returns the frames in which nerfstudio trains by default: cameras centred at their mean, the mean of their up axes
-/// turned to z, scaled so that the largest coordinate of a camera is 1 (`auto_orient_and_center_poses`, methods `up` of
-/// its own data sets and `none` of ScanNet), each with and without a change of axes from COLMAP's.
+/// Returns the frames in which nerfstudio trains by default: cameras centred at their mean, the mean of their up
+/// axes turned to z, scaled so that the largest coordinate of a camera is 1 (`auto_orient_and_center_poses`,
+/// methods `up` of its own data sets and `none` of ScanNet), each with and without a change of axes from COLMAP's.
 pub fn nerfstudio_defaults(views: &[View]) -> Vec<FrameCandidate> {
     let world_from_camera: Vec<DAffine3> =
         views.iter().map(|view| view.camera_from_world.inverse()).collect();

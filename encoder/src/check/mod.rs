@@ -1,7 +1,7 @@
 //! Checks that photos, poses and scene belong together, before any expensive work.
 //!
-//! The check draws sample views of the scene, compares each with its photo and, where they differ, looks for common
-//! mistakes in poses, intrinsics and splat.
+//! The check draws sample views of the scene, compares each with its photo and, where they differ, looks for
+//! common mistakes in poses, intrinsics and splat.
 
 mod align;
 mod diagnosis;
@@ -82,8 +82,8 @@ pub enum CheckError {
 
 /// Draws the views of a scene and compares them with their photos.
 ///
-/// The scene is loaded once. Views are taken one at a time, so that one photo is in memory, plus `diagnosis_views` small copies.
-/// Photos that cannot be read are left out and named in the report.
+/// The scene is loaded once. Views are taken one at a time, so that one photo is in memory, plus `diagnosis_views`
+/// small copies. Photos that cannot be read are left out and named in the report.
 ///
 /// # Errors
 /// [`CheckError`] if no photo can be read, a view cannot be drawn or a picture cannot be written. A scene that

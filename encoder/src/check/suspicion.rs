@@ -70,8 +70,8 @@ fn share(usable: &[usize], is: impl Fn(usize) -> bool) -> f64 {
     usable.iter().filter(|i| is(**i)).count() as f64 / usable.len().max(1) as f64
 }
 
-/// A scale s read as a logarithm becomes exp(s): above 1, and just above it for most. An opacity of 0 to 1 read as a logit
-/// becomes 0.5 to 0.731.
+/// A scale s read as a logarithm becomes exp(s): above 1, and just above it for most. An opacity of 0 to 1 read as
+/// a logit becomes 0.5 to 0.731.
 fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
     let scale_share = |most: f32| share(usable, |i| scene.scales[i].iter().all(|s| (1.0..=most).contains(s)));
     let scales = scale_share(f32::INFINITY) > MOST && scale_share(1.5) > 0.5;
@@ -79,7 +79,8 @@ fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
     (usable.len() >= 1000 && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
 }
 
-/// Returns the rounding of coordinates that were stored in 32 bits and the size of small Gaussians, where the first is larger.
+/// Returns the rounding of coordinates that were stored in 32 bits and the size of small Gaussians, where the
+/// first is larger.
 fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<(f64, f64)> {
     let means = || usable.iter().map(|i| scene.means_in_world[*i]);
     let is_f32 = |mean: DVec3| mean.to_array().iter().all(|x| f64::from(*x as f32) == *x);

@@ -49,8 +49,9 @@ const TO: [[f64; 3]; 6] = [
     [8.8, -11.7, 8.1],
 ];
 
-/// Oracle: Umeyama's method by singular values in NumPy, float64, recorded. Jacobi's rotations stop at off-diagonals of 1e-9. The points are unrelated; those of the
-/// second case are mirrored, so the best orthogonal matrix of one of them is a reflection, which must not be taken.
+/// Oracle: Umeyama's method by singular values in NumPy, float64, recorded. Jacobi's rotations stop at
+/// off-diagonals of 1e-9. The points are unrelated; those of the second case are mirrored, so the best orthogonal
+/// matrix of one of them is a reflection, which must not be taken.
 #[test]
 fn similarities_are_umeyamas() {
     let recorded = [
@@ -122,8 +123,8 @@ fn cameras_are_paired_by_name_and_must_determine_a_rotation() {
     assert_eq!(align(&from, &twice), Err(AlignError::Few { n: 0 }));
 }
 
-/// Restates `auto_orient_and_center_poses` (method `up`, centre `poses`) in matrices, with Rodrigues' formula, and the
-/// scaling of nerfstudio's dataparser.
+/// Restates `auto_orient_and_center_poses` (method `up`, centre `poses`) in matrices, with Rodrigues' formula, and
+/// the scaling of nerfstudio's dataparser.
 #[test]
 fn nerfstudios_defaults_are_its_formulas() {
     let views = views(&FROM);

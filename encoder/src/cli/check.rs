@@ -33,12 +33,12 @@ pub struct CheckArgs {
     /// Folder for PNGs of each photo beside its rendering.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// A second set of poses of the same photos, in the splat's world: the similarity between both worlds follows from
-    /// the camera centres, and is tried.
+    /// A second set of poses of the same photos, in the splat's world: the similarity between both worlds follows
+    /// from the camera centres, and is tried.
     #[arg(long, value_name = "PATH")]
     pub also_poses: Option<PathBuf>,
-    /// Where splat and poses differ by a similarity (rotation, scale, translation), writes it into this file, in the
-    /// format of nerfstudio's dataparser_transforms.json; `encode --splat-frame FILE` applies it.
+    /// Where splat and poses differ by a similarity (rotation, scale, translation), writes it into this file, in
+    /// the format of nerfstudio's dataparser_transforms.json; `encode --splat-frame FILE` applies it.
     #[arg(long, value_name = "FILE")]
     pub write_frame: Option<PathBuf>,
 }

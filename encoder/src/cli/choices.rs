@@ -15,9 +15,10 @@ pub struct ChoiceArgs {
     /// Bundle of choices; other flags override single choices.
     #[arg(long, value_enum, default_value_t)]
     pub preset: Preset,
-    /// Which parts of a photo get vectors: `masks`, from their crops and from what the photo shows in and around them (the
-    /// image model's patches, or windows over the photo: image.patches and image.windows in model.toml); `crops`, masks from
-    /// their crops alone; `patches`, without masks, so no objects are found [default: the preset's].
+    /// Which parts of a photo get vectors: `masks`, from their crops and from what the photo shows in and around
+    /// them (the image model's patches, or windows over the photo: image.patches and image.windows in model.toml);
+    /// `crops`, masks from their crops alone; `patches`, without masks, so no objects are found [default: the
+    /// preset's].
     #[arg(long, value_enum)]
     regions: Option<Regions>,
     /// Weight that is summed; `falloff` is the paper's formula as printed [default: the preset's].
@@ -35,11 +36,12 @@ pub struct ChoiceArgs {
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX")]
     min_mask_px: Option<u32>,
-    /// Keeps slivers, which ragged edges of overlapping masks leave, as regions; without it they join their neighbours.
+    /// Keeps slivers, which ragged edges of overlapping masks leave, as regions; without it they join their
+    /// neighbours.
     #[arg(long)]
     keep_slivers: bool,
-    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024, or
-    /// `twice` for twice that width [default: the preset's].
+    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024,
+    /// or `twice` for twice that width [default: the preset's].
     #[arg(long, value_name = "photo|twice|PX", value_parser = parse_raster_width)]
     raster_width: Option<RasterWidth>,
     /// Skips the search for objects: masks of different views that show the same Gaussians.
@@ -48,7 +50,8 @@ pub struct ChoiceArgs {
     /// Drops views in which a Gaussian has less than this share of its weight in its best view
     #[arg(long, value_name = "SHARE", value_parser = share)]
     min_view_share: Option<f32>,
-    /// Each mask counts (1 - truncation)^POWER; truncation is the share of its outline that the photo's edge cuts off
+    /// Each mask counts (1 - truncation)^POWER; truncation is the share of its outline that the photo's edge cuts
+    /// off
     #[arg(long, value_name = "POWER", value_parser = amount)]
     truncation_power: Option<f32>,
     /// Weight of the superpoint's mean, relative to the Gaussian's own
@@ -63,13 +66,15 @@ pub struct ChoiceArgs {
     /// Whether Gaussians without evidence take their superpoint's mean
     #[arg(long, value_name = "BOOL")]
     fill: Option<bool>,
-    /// Mean error of scores that the compact profile may have, relative to the spread of scores [default: the preset's].
+    /// Mean error of scores that the compact profile may have, relative to the spread of scores [default: the
+    /// preset's].
     #[arg(long, value_name = "E", value_parser = parse_error)]
     compact_error: Option<f32>,
     /// The same for the balanced profile.
     #[arg(long, value_name = "E", value_parser = parse_error)]
     balanced_error: Option<f32>,
-    /// Most components of a vector in compact and balanced shards, even [default: as many as the errors need, at most 128].
+    /// Most components of a vector in compact and balanced shards, even [default: as many as the errors need, at
+    /// most 128].
     #[arg(long, value_name = "N", value_parser = parse_components)]
     max_components: Option<usize>,
 }

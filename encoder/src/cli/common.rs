@@ -63,7 +63,8 @@ pub struct OutputArgs {
 }
 
 impl OutputArgs {
-    /// Logs to stderr from now on: warnings and above with `--quiet`, else information as well; RUST_LOG overrides both.
+    /// Logs to stderr from now on: warnings and above with `--quiet`, else information as well; RUST_LOG overrides
+    /// both.
     ///
     /// # Panics
     /// If the process logs already.
@@ -87,8 +88,9 @@ impl OutputArgs {
 /// Where models come from.
 #[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
-    /// Folder with model.toml, or name of a pulled model (`models list`). `colours` knows colours and shapes only, and
-    /// needs no ONNX Runtime [default: the embedded models; for queries, those that the store was encoded with].
+    /// Folder with model.toml, or name of a pulled model (`models list`). `colours` knows colours and shapes only,
+    /// and needs no ONNX Runtime [default: the embedded models; for queries, those that the store was encoded
+    /// with].
     #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
     pub models: Option<PathBuf>,
     /// How models run.
@@ -102,8 +104,8 @@ pub struct InputArgs {
     /// Splat: .ply, .spz, compressed .ply, .sog (file or folder) or .splat.
     #[arg(long, value_name = "FILE")]
     pub scene: PathBuf,
-    /// Poses: the folder of a COLMAP model, a nerfstudio transforms.json, or a ScanNet scene folder (color/, pose/,
-    /// intrinsic/).
+    /// Poses: the folder of a COLMAP model, a nerfstudio transforms.json, or a ScanNet scene folder (color/,
+    /// pose/, intrinsic/).
     #[arg(long, value_name = "PATH")]
     pub views: PathBuf,
     /// Folder of the photos, if they are not beside the poses.
@@ -113,8 +115,8 @@ pub struct InputArgs {
     #[arg(long, value_name = "N")]
     pub every: Option<NonZeroU32>,
     /// Says how the splat's frame follows from that of the poses: `auto` for dataparser_transforms.json beside the
-    /// splat, where nerfstudio's export lies with the file of its training run; `none` where both have one frame; or a
-    /// file in that format, as `check --write-frame` makes it.
+    /// splat, where nerfstudio's export lies with the file of its training run; `none` where both have one frame;
+    /// or a file in that format, as `check --write-frame` makes it.
     #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
     pub splat_frame: FrameChoice,
     /// What the splat file has in place of logarithms of scales and logits of opacities: `scales`, `opacities` or

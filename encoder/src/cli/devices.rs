@@ -23,12 +23,13 @@ pub(super) fn run(json: bool) -> Result<Exit> {
     Ok(Exit::Done)
 }
 
-/// Starts the program anew without Mesa's layer that selects devices, if the layer would print an error of its own.
+/// Starts the program anew without Mesa's layer that selects devices, if the layer would print an error of its
+/// own.
 ///
-/// The layer asks the Wayland compositor for its device, and libwayland prints "error: XDG_RUNTIME_DIR is invalid" where
-/// there is no session, as on servers. The layer only orders devices, and only its variable in the environment
-/// disables it; a process cannot change its own environment safely once it has threads. On success the new program
-/// replaces this one under the same process id; if it cannot be started, this one goes on.
+/// The layer asks the Wayland compositor for its device, and libwayland prints "error: XDG_RUNTIME_DIR is invalid"
+/// where there is no session, as on servers. The layer only orders devices, and only its variable in the
+/// environment disables it; a process cannot change its own environment safely once it has threads. On success the
+/// new program replaces this one under the same process id; if it cannot be started, this one goes on.
 pub fn silence_device_selection() {
     #[cfg(target_os = "linux")]
     {

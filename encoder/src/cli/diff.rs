@@ -15,8 +15,8 @@ use crate::store::{Published, StoreReader};
 /// `diff`.
 #[derive(Debug, Args)]
 pub struct DiffArgs {
-    /// The earlier generation: STORE for its current one, STORE@N for generation N, which is the current one or the one
-    /// before it.
+    /// The earlier generation: STORE for its current one, STORE@N for generation N, which is the current one or
+    /// the one before it.
     #[arg(value_name = "OLD")]
     old: At,
     /// The later generation [default: OLD's current one, and OLD is the one before it].

@@ -38,8 +38,9 @@ pub struct EncodeArgs {
     /// Store to publish into; made if absent.
     #[arg(long, value_name = "DIR")]
     store: PathBuf,
-    /// Where masks come from: `auto` for a model (the embedded one, or --segmenter), `graph` for the segmenter without
-    /// a model, which needs no ONNX Runtime, or your own masks: a folder of id PNGs or RLE JSON, or a COCO file.
+    /// Where masks come from: `auto` for a model (the embedded one, or --segmenter), `graph` for the segmenter
+    /// without a model, which needs no ONNX Runtime, or your own masks: a folder of id PNGs or RLE JSON, or a COCO
+    /// file.
     #[arg(long, value_name = "auto|graph|DIR", default_value = "auto")]
     masks: String,
     /// Segment Anything instead of the built-in segmenter.
@@ -57,29 +58,32 @@ pub struct EncodeArgs {
     /// Seconds after which no further view is begun; the finished views are published.
     #[arg(long, value_name = "SECS", value_parser = parse_secs)]
     time_budget: Option<Duration>,
-    /// Poses of further photos in the same world, in one file of poses or several: the scene is encoded from these and
-    /// those of --views, and only views that the store does not keep are segmented, embedded and rasterised. Keeps the
-    /// contributions of views, as --keep-views does.
+    /// Poses of further photos in the same world, in one file of poses or several: the scene is encoded from these
+    /// and those of --views, and only views that the store does not keep are segmented, embedded and rasterised.
+    /// Keeps the contributions of views, as --keep-views does.
     #[arg(long = "add", value_name = "POSES")]
     added: Vec<PathBuf>,
-    /// Leaves out a view, by its name in the poses file; nothing else is segmented, embedded and rasterised again. Keeps
-    /// the contributions of views, as --keep-views does.
+    /// Leaves out a view, by its name in the poses file; nothing else is segmented, embedded and rasterised again.
+    /// Keeps the contributions of views, as --keep-views does.
     #[arg(long = "drop", value_name = "VIEW")]
     dropped: Vec<String>,
-    /// Keeps the contributions of views, so that another encode of the same views (with another codebook, say) is quick
+    /// Keeps the contributions of views, so that another encode of the same views (with another codebook, say) is
+    /// quick
     #[arg(long)]
     keep_views: bool,
-    /// Where weights are rasterised: auto (all GPUs, else the CPU), gpu, cpu, or numbers of `slag-encoder devices` such as
-    /// 0,1. --gpus names the GPUs of models.
+    /// Where weights are rasterised: auto (all GPUs, else the CPU), gpu, cpu, or numbers of `slag-encoder devices`
+    /// such as 0,1. --gpus names the GPUs of models.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub(super) device: DeviceChoice,
-    /// NVIDIA GPUs that share the work of models, where --provider names cuda or tensorrt: all, or numbers such as 0,1.
+    /// NVIDIA GPUs that share the work of models, where --provider names cuda or tensorrt: all, or numbers such as
+    /// 0,1.
     #[arg(long, value_name = "all|N,...", default_value_t)]
     gpus: GpuChoice,
     /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
-    /// Memory for the scene, photos and lists: a number with MiB or GiB, MB or GB [default: half of the free memory].
+    /// Memory for the scene, photos and lists: a number with MiB or GiB, MB or GB [default: half of the free
+    /// memory].
     #[arg(long, value_name = "BYTES", value_parser = parse_memory)]
     memory: Option<u64>,
     /// Name of the scene [default: the name of the store's folder].
@@ -88,8 +92,8 @@ pub struct EncodeArgs {
     /// World units are metres; a geo-reference implies it.
     #[arg(long)]
     metric: bool,
-    /// Geo-reference JSON, {"origin": {"lat", "lon", "alt"}}, of the world's east-north-up frame [default: geo.json
-    /// beside the scene, if it exists].
+    /// Geo-reference JSON, {"origin": {"lat", "lon", "alt"}}, of the world's east-north-up frame [default:
+    /// geo.json beside the scene, if it exists].
     #[arg(long, value_name = "FILE")]
     geo: Option<PathBuf>,
     /// Most Gaussians in a cell.
@@ -105,24 +109,24 @@ pub struct EncodeArgs {
     /// cell's small Gaussians].
     #[arg(long, value_name = "E")]
     position_error: Option<f64>,
-    /// Compact and balanced shards say which Gaussian of the splat file each of theirs is, as exact ones always do: at most
-    /// 4 bytes a Gaussian, 2.5 in a scene of a million.
+    /// Compact and balanced shards say which Gaussian of the splat file each of theirs is, as exact ones always
+    /// do: at most 4 bytes a Gaussian, 2.5 in a scene of a million.
     #[arg(long)]
     input_indices: bool,
-    /// Shards tell how their Gaussians look, so that the page at /view shows colours on a robot, too: 10 bytes a Gaussian
-    /// in every profile.
+    /// Shards tell how their Gaussians look, so that the page at /view shows colours on a robot, too: 10 bytes a
+    /// Gaussian in every profile.
     #[arg(long)]
     appearance: bool,
-    /// Shards say which places are free, occupied or unknown, so that robots find places to stand; with a value: the edge of
-    /// a voxel, metres, 0.02 to 0.5. For metric scenes.
+    /// Shards say which places are free, occupied or unknown, so that robots find places to stand; with a value:
+    /// the edge of a voxel, metres, 0.02 to 0.5. For metric scenes.
     #[arg(long, value_name = "M", num_args = 0..=1, default_missing_value = "0.05")]
     occupancy: Option<f64>,
-    /// Shards say where their photos were taken, so that the page at /view shows cameras on a robot, too: 44 bytes and the
-    /// name a photo in every profile. Pictures are not published.
+    /// Shards say where their photos were taken, so that the page at /view shows cameras on a robot, too: 44 bytes
+    /// and the name a photo in every profile. Pictures are not published.
     #[arg(long)]
     photo_poses: bool,
-    /// The store carries the text side of --models, signed as all else: robots fetch it with the scene and need no --models.
-    /// Refused unless the licence in model.toml permits passing the weights on.
+    /// The store carries the text side of --models, signed as all else: robots fetch it with the scene and need no
+    /// --models. Refused unless the licence in model.toml permits passing the weights on.
     #[arg(long)]
     text_model: bool,
     /// Publishes a generation in which no Gaussian has an embedding, too: nothing is found in it.
@@ -131,8 +135,8 @@ pub struct EncodeArgs {
     /// Views by other machines.
     #[command(flatten)]
     fleet: super::fleet::CoordinatorArgs,
-    /// Writes a report of the encode, one HTML file: views, masks, objects, cells, errors by profile, what was left out and
-    /// why.
+    /// Writes a report of the encode, one HTML file: views, masks, objects, cells, errors by profile, what was
+    /// left out and why.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
     /// Drops an unfinished encode of another splat or with other settings in the store.

@@ -15,7 +15,8 @@ use crate::store::metadata::{Metadata, MetadataReader, signing_unix_secs};
 /// `keys`.
 #[derive(Debug, Subcommand)]
 pub enum KeysCommand {
-    /// Makes all keys and the first root, before the first encode. Without it, the first encode makes one key a role.
+    /// Makes all keys and the first root, before the first encode. Without it, the first encode makes one key a
+    /// role.
     Init {
         /// The store.
         #[command(flatten)]
@@ -29,7 +30,8 @@ pub enum KeysCommand {
     },
     /// Shows root, keys and expiry, and the SHA-256 for `slag-edge trust add --sha256`.
     Status(KeysArgs),
-    /// Signs the root anew with the same keys, for five more years, before or after it expires. Robots follow by themselves.
+    /// Signs the root anew with the same keys, for five more years, before or after it expires. Robots follow by
+    /// themselves.
     Renew(KeysArgs),
     /// Replaces all keys of some roles by new ones. Robots follow by themselves.
     Rotate {

@@ -24,8 +24,8 @@ pub fn default_memory_bytes() -> u64 {
     half_of(free_memory_bytes())
 }
 
-/// Returns the free memory, within the limit of the control group (version 2) if there is one; `None` on machines that do
-/// not report it.
+/// Returns the free memory, within the limit of the control group (version 2) if there is one; `None` on machines
+/// that do not report it.
 pub fn free_memory_bytes() -> Option<u64> {
     let read = |path: &str| fs::read_to_string(path).ok();
     let group = |file: &str| read(&format!("/sys/fs/cgroup/memory.{file}"))?.trim().parse::<u64>().ok();

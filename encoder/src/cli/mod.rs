@@ -70,12 +70,14 @@ pub enum Command {
     /// Compares renderings of the scene with the photos: do poses and scene fit?
     ///
     /// Where they do not, it names the likely mistake: camera axes, world axes, scale, nerfstudio's training frame
-    /// without its dataparser_transforms.json. A similarity that brings both into one frame is stated, and written by
+    /// without its dataparser_transforms.json. A similarity that brings both into one frame is stated, and written
+    /// by
     /// --write-frame for `encode --splat-frame`.
     Check(check::CheckArgs),
     /// Encodes a scene into a store.
     Encode(Box<encode::EncodeArgs>),
-    /// Does views and cells of an encode that another machine coordinates (`encode --blobs`), until it is published.
+    /// Does views and cells of an encode that another machine coordinates (`encode --blobs`), until it is
+    /// published.
     #[cfg(feature = "fleet")]
     Worker(Box<fleet::WorkerArgs>),
     /// Scores every Gaussian of a store against a text, in full precision.

@@ -39,8 +39,8 @@ pub struct QueryArgs {
     /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).
     #[arg(long, value_name = "FILE")]
     pub scores: Option<PathBuf>,
-    /// Writes the Gaussians that match as a PLY, best first: with --scene a splat, else points with position, score and
-    /// index in the input.
+    /// Writes the Gaussians that match as a PLY, best first: with --scene a splat, else points with position,
+    /// score and index in the input.
     #[arg(long, value_name = "FILE")]
     pub ply: Option<PathBuf>,
     /// The splat that the store was encoded from.

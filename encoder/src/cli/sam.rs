@@ -14,8 +14,8 @@ use crate::segment::{SamLevels, SamSettings, ScoreFilter};
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Segment Anything")]
 pub struct SamArgs {
-    /// SAM, SAM 2, MobileSAM, EdgeTAM or another model of that kind: a folder with model.toml, or the name of a pulled
-    /// model (`models list`).
+    /// SAM, SAM 2, MobileSAM, EdgeTAM or another model of that kind: a folder with model.toml, or the name of a
+    /// pulled model (`models list`).
     #[arg(long, value_name = "NAME|DIR")]
     segmenter: Option<PathBuf>,
     /// Points along each side of the grid of prompts: 8, 16, 32, 64 [default: the preset's].

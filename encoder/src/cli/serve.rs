@@ -25,8 +25,8 @@ pub struct ServeArgs {
     /// Address to listen on, or unix:PATH; 0.0.0.0:7733 lets other machines connect.
     #[arg(long, value_name = "IP:PORT|unix:PATH", default_value = "127.0.0.1:7733")]
     pub listen: Listen,
-    /// Name that robots call this machine by; other names are then refused. May be repeated [default: any name beyond
-    /// this machine, else localhost and IP addresses].
+    /// Name that robots call this machine by; other names are then refused. May be repeated [default: any name
+    /// beyond this machine, else localhost and IP addresses].
     #[arg(long, value_name = "NAME")]
     pub host: Vec<String>,
     /// Let pages of this origin read answers (CORS), such as https://map.example. May be repeated.

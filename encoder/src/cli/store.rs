@@ -23,11 +23,13 @@ use crate::store::{
 pub enum StoreCommand {
     /// Lists the generations of a store with their cells and bytes.
     Ls(StoreArgs),
-    /// Reads every byte that a store publishes, and names what is damaged or missing: another encode writes it anew.
+    /// Reads every byte that a store publishes, and names what is damaged or missing: another encode writes it
+    /// anew.
     Verify(StoreArgs),
     /// Removes what neither the current generation nor the one before it needs.
     Gc(StoreArgs),
-    /// Writes the store as static files, from which robots fetch over any web server; again after each encode and refresh.
+    /// Writes the store as static files, from which robots fetch over any web server; again after each encode and
+    /// refresh.
     Export {
         /// The store.
         #[command(flatten)]

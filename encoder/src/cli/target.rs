@@ -14,8 +14,8 @@ use crate::encode::{InputSettings, count_inputs};
 #[derive(Clone, Debug, Default, Args)]
 #[command(next_help_heading = "Target")]
 pub struct TargetArgs {
-    /// Picks the most accurate measured setting that is expected to take at most this many seconds. The expectation
-    /// holds for the machine, models and size of photos that the front was measured with.
+    /// Picks the most accurate measured setting that is expected to take at most this many seconds. The
+    /// expectation holds for the machine, models and size of photos that the front was measured with.
     #[arg(long, value_name = "S", value_parser = parse_seconds, requires = "front", conflicts_with_all = ["choices", "segmenter"])]
     target_seconds: Option<f64>,
     /// Picks the most accurate measured setting whose compact shards are expected to have at most this many bytes.
@@ -34,7 +34,8 @@ fn parse_seconds(text: &str) -> Result<f64, String> {
 }
 
 impl TargetArgs {
-    /// Returns the choices that meet the target on the inputs, and what is expected of them; `None` without a target.
+    /// Returns the choices that meet the target on the inputs, and what is expected of them; `None` without a
+    /// target.
     pub(super) fn choose(&self, inputs: &InputSettings) -> Result<Option<(ChoiceArgs, Expectation)>> {
         let target = Target { seconds: self.target_seconds, bytes: self.target_bytes.map(|bytes| bytes.0) };
         let Some(path) = &self.front else { return Ok(None) };

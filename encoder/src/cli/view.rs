@@ -22,11 +22,12 @@ pub struct ViewArgs {
     /// Store to draw and to ask.
     #[arg(long, value_name = "DIR", required_unless_present = "scene")]
     pub store: Option<PathBuf>,
-    /// Splat to draw: alone, or the one that the store was encoded from. The store is then drawn with its colours and
-    /// scored in full precision.
+    /// Splat to draw: alone, or the one that the store was encoded from. The store is then drawn with its colours
+    /// and scored in full precision.
     #[arg(long, value_name = "FILE")]
     pub scene: Option<PathBuf>,
-    /// Poses of the photos, which are then shown where they were taken, with the answer's box drawn in its best photo.
+    /// Poses of the photos, which are then shown where they were taken, with the answer's box drawn in its best
+    /// photo.
     #[arg(long, value_name = "PATH")]
     pub views: Option<PathBuf>,
     /// Folder of the photos, if they are not beside the poses.
@@ -35,7 +36,8 @@ pub struct ViewArgs {
     /// Says how the splat's frame follows from that of the poses, as for `encode`.
     #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
     pub splat_frame: FrameChoice,
-    /// Axis of the world that points up: x, y, z, -x, -y or -z [default: z in metric stores, else up in most photos, else z].
+    /// Axis of the world that points up: x, y, z, -x, -y or -z [default: z in metric stores, else up in most
+    /// photos, else z].
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true, value_parser = parse_axis)]
     pub up: Option<Vec3>,
     /// Models; they must be those that the store was encoded with.

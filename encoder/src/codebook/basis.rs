@@ -33,8 +33,8 @@ pub struct TextBank {
 }
 
 impl TextBank {
-    /// Encodes a model's own vocabulary, or else everyday words; words that the model does not know are left out. Too few words
-    /// are replaced by pseudo-random directions.
+    /// Encodes a model's own vocabulary, or else everyday words; words that the model does not know are left out.
+    /// Too few words are replaced by pseudo-random directions.
     pub fn of_model(encoder: &mut dyn TextEncoder) -> Self {
         let words: Vec<String> = match encoder.vocabulary() {
             Some(words) => words.to_vec(),
@@ -69,8 +69,8 @@ impl TextBank {
         self.vectors.is_empty()
     }
 
-    /// Returns whether a text is held out: the codebook is not made for it, so errors of its scores are like those of
-    /// texts that nobody has seen.
+    /// Returns whether a text is held out: the codebook is not made for it, so errors of its scores are like those
+    /// of texts that nobody has seen.
     pub fn is_held_out(&self, text: usize) -> bool {
         self.len() >= LARGE_BANK && text % HELD_OUT_STEP == HELD_OUT_STEP - 1
     }

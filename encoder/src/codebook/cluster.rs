@@ -10,8 +10,8 @@ const SPLIT_ROUNDS: usize = 3;
 const REFINE_ROUNDS: usize = 1;
 /// Up to so many clusters are all split: each is still far too large.
 const FEW_CLUSTERS: usize = 16;
-/// One in so many clusters is split at a time, the worst first: the order is almost that of splitting one by one, and
-/// threads have work.
+/// One in so many clusters is split at a time, the worst first: the order is almost that of splitting one by one,
+/// and threads have work.
 const SPLIT_SHARE: usize = 8;
 
 /// Clusters of points.
@@ -136,8 +136,8 @@ fn split(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Vec<Cluster> {
     done
 }
 
-/// Splits a cluster by 2-means, starting from the member farthest from the centre and the member farthest from that.
-/// Returns the cluster itself if all members coincide.
+/// Splits a cluster by 2-means, starting from the member farthest from the centre and the member farthest from
+/// that. Returns the cluster itself if all members coincide.
 fn split_in_two(points: Rows<'_>, cluster: Cluster) -> Result<[Cluster; 2], Cluster> {
     let farthest = |from: &[f32]| {
         let distance = |point: &u32| (squared_distance(points.get(*point as usize), from), *point);

@@ -54,8 +54,8 @@ pub(super) struct Reference<'a> {
 }
 
 impl Reference<'_> {
-    /// Returns for each centroid the largest distance of a member from its decoded form, and the errors of the decoded
-    /// scores. `residuals`: components, in the order of the members, to add to the centroids.
+    /// Returns for each centroid the largest distance of a member from its decoded form, and the errors of the
+    /// decoded scores. `residuals`: components, in the order of the members, to add to the centroids.
     pub(super) fn compare(&self, residuals: Option<(&Decoder<'_>, &[f32])>) -> (Vec<f32>, ScoreErrors) {
         let Self {
             embeddings,

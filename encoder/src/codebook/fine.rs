@@ -14,8 +14,8 @@ pub struct FineResiduals {
     pub errors: ScoreErrors,
 }
 
-/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits. Returns them and their decoded form, in
-/// readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
+/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits. Returns them and their decoded form,
+/// in readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
 pub(super) fn round(
     residuals: &[f32],
     m: usize,

@@ -61,8 +61,8 @@ impl<'a> Sample<'a> {
         place.is_multiple_of(self.stride)
     }
 
-    /// Returns the errors of scores; zeros without texts. `missed`: the sample's embeddings minus their decoded form,
-    /// `[sample][dim]`.
+    /// Returns the errors of scores; zeros without texts. `missed`: the sample's embeddings minus their decoded
+    /// form, `[sample][dim]`.
     pub fn errors(&self, missed: &[f32]) -> ScoreErrors {
         if self.bank.is_empty() || missed.is_empty() {
             return ScoreErrors { spread: self.spread, ..ScoreErrors::default() };
@@ -82,11 +82,11 @@ impl<'a> Sample<'a> {
     }
 }
 
-/// Returns a bound for a text like those held out, by split conformal prediction (Vovk, Gammerman and Shafer 2005): for
-/// 95 of 100 such texts, 99 of 100 scores err by no more.
+/// Returns a bound for a text like those held out, by split conformal prediction (Vovk, Gammerman and Shafer
+/// 2005): for 95 of 100 such texts, 99 of 100 scores err by no more.
 ///
-/// `errors`: `[n][n_texts]`, absolute. The bound is the ceil(0.95 (h + 1))-th smallest of the h held-out texts' own 99th
-/// percentiles; `None` if that is more than h.
+/// `errors`: `[n][n_texts]`, absolute. The bound is the ceil(0.95 (h + 1))-th smallest of the h held-out texts'
+/// own 99th percentiles; `None` if that is more than h.
 pub fn likely_error(errors: &[f32], n_texts: usize, is_held_out: impl Fn(usize) -> bool) -> Option<f32> {
     if errors.is_empty() {
         return None;

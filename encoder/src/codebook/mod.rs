@@ -1,10 +1,10 @@
 //! Stage 5: an error-bounded codebook per cell, and a residual code where one centroid is not enough.
 //!
-//! Embeddings cluster strongly, so a cell stores K centroids, and each Gaussian belongs to one. Centroids and residuals are
-//! stored in the cell's own coordinates ([`basis`]), in which equal distances are equal errors of scores. K and the
-//! length of the code follow from the requested errors ([`cluster`], [`residual`]); a few centroids more bring the farthest
-//! Gaussians nearer ([`outliers`]). Hard radii are computed from the
-//! full embeddings; errors of scores are measured over a bank of texts ([`measure`]).
+//! Embeddings cluster strongly, so a cell stores K centroids, and each Gaussian belongs to one. Centroids and
+//! residuals are stored in the cell's own coordinates ([`basis`]), in which equal distances are equal errors of
+//! scores. K and the length of the code follow from the requested errors ([`cluster`], [`residual`]); a few
+//! centroids more bring the farthest Gaussians nearer ([`outliers`]). Hard radii are computed from the full
+//! embeddings; errors of scores are measured over a bank of texts ([`measure`]).
 
 pub mod basis;
 pub mod cluster;
@@ -30,12 +30,13 @@ use slag_math::matrix::{Panels, Rows};
 pub use basis::{ScoreMetric, TextBank};
 pub use fine::FineResiduals;
 
-/// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled house, whose
-/// errors have heavy tails; 1.25 for normally distributed errors.
+/// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled
+/// house, whose errors have heavy tails; 1.25 for normally distributed errors.
 const RMS_OF_MEAN: f32 = 1.35;
 /// Bytes of a centroid in a compact shard beside its components: start and radius.
 const BYTES_BESIDE_COMPONENTS: usize = 8;
-/// One centroid of an outlier for so many components of an embedding, in a cell of any size: a sixteenth of the bytes of its basis.
+/// One centroid of an outlier for so many components of an embedding, in a cell of any size: a sixteenth of the
+/// bytes of its basis.
 const OUTLIERS_OF_DIM: usize = 16;
 /// Step of the centroids' components.
 const CENTROID_STEP: f32 = 1.0 / 127.0;
@@ -55,13 +56,13 @@ pub struct CodebookSettings {
     pub compact_error: f32,
     /// Largest accepted error of the balanced profile.
     pub balanced_error: f32,
-    /// Most components of a centroid: the dimension of compact and balanced shards. Fewer are taken where the errors
-    /// allow it; even, 2 to [`MAX_COMPONENTS`].
+    /// Most components of a centroid: the dimension of compact and balanced shards. Fewer are taken where the
+    /// errors allow it; even, 2 to [`MAX_COMPONENTS`].
     pub max_components: usize,
     /// Fewest Gaussians per centroid, on average.
     pub min_gaussians_per_centroid: usize,
-    /// Bytes per Gaussian that centroids of outliers may take, beside a sixteenth of the basis: they lower the hard bound
-    /// of scores. 0: no such centroids.
+    /// Bytes per Gaussian that centroids of outliers may take, beside a sixteenth of the basis: they lower the
+    /// hard bound of scores. 0: no such centroids.
     pub outlier_bytes: f32,
     /// Most subspaces of the residual code (half a byte each); below 2 there is no code.
     pub max_subspaces: usize,
@@ -276,8 +277,8 @@ impl ScaledResiduals {
         Self { m, residuals, scales }
     }
 
-    /// Returns the residual code, if one is needed, and the rotation (rows `[m][m]`) to the residuals' eigenvectors in the
-    /// order of its components.
+    /// Returns the residual code, if one is needed, and the rotation (rows `[m][m]`) to the residuals'
+    /// eigenvectors in the order of its components.
     fn plan(&self, codes: &[u32], max_rms: f32, max_subspaces: usize) -> (Option<ResidualCode>, Vec<f32>) {
         let m = self.m;
         let residuals = Rows::all(&self.residuals, m);
@@ -332,8 +333,8 @@ impl<'a> StoredCentroids<'a> {
     }
 }
 
-/// Returns the largest absolute value of each component. A lower bound keeps residuals within the range of half floats and
-/// readers.
+/// Returns the largest absolute value of each component. A lower bound keeps residuals within the range of half
+/// floats and readers.
 fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
     let largest_scale = scales.iter().copied().fold(0.0, f32::max);
     let mut ranges = vec![(largest_scale / 8.0).max(1e-3); m];

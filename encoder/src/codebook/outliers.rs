@@ -1,4 +1,5 @@
-//! Centroids for outliers: the hard bound of a score is the largest distance of a Gaussian from its centroid, and few are far.
+//! Centroids for outliers: the hard bound of a score is the largest distance of a Gaussian from its centroid, and
+//! few are far.
 
 use rayon::prelude::*;
 
@@ -18,10 +19,12 @@ struct Outlier {
     squared_distance: f32,
 }
 
-/// Makes up to `n_more` centres out of the Gaussians farthest from theirs, one by one, each with the outliers that it is nearer
-/// to (Gonzalez 1985: as many other centres beside the given ones would leave about half of the radius at least).
+/// Makes up to `n_more` centres out of the Gaussians farthest from theirs, one by one, each with the outliers that
+/// it is nearer to (Gonzalez 1985: as many other centres beside the given ones would leave about half of the
+/// radius at least).
 ///
-/// Ends when no distance is above `enough`. `points`: the components of the embeddings, in which the clusters were found. Distances are those of the embeddings.
+/// Ends when no distance is above `enough`. `points`: the components of the embeddings, in which the clusters were
+/// found. Distances are those of the embeddings.
 pub(super) fn separate(
     embeddings: Rows<'_>,
     basis: &Basis,

@@ -1,8 +1,8 @@
 //! The residual code: a residual, an embedding minus its centroid, becomes one of 16 codewords in each subspace of
 //! components.
 //!
-//! Components are the eigenvectors of the residuals, so subspaces can be coded one by one (optimised product quantisation: Ge,
-//! He, Ke and Sun 2013). Codes have four bits, which a byte shuffle can look up.
+//! Components are the eigenvectors of the residuals, so subspaces can be coded one by one (optimised product
+//! quantisation: Ge, He, Ke and Sun 2013). Codes have four bits, which a byte shuffle can look up.
 
 use half::f16;
 use rayon::prelude::*;
@@ -57,8 +57,8 @@ pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
     (vectors.into_iter().map(|v| v as f32).collect(), values)
 }
 
-/// Assigns components to subspaces with the least total loss. Returns the components in the order of their subspaces
-/// (those in none last), and the starts of the subspaces.
+/// Assigns components to subspaces with the least total loss. Returns the components in the order of their
+/// subspaces (those in none last), and the starts of the subspaces.
 pub fn subspaces(variances: &[f64], n_subspaces: usize) -> (Vec<usize>, Vec<u32>) {
     let log = |c: usize| log_variance(variances[c]);
     let mut members: Vec<Vec<usize>> = (0..n_subspaces).map(|c| vec![c]).collect();
@@ -192,8 +192,8 @@ pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
 }
 
 /// Returns the code with the fewest subspaces that leaves at most `max_rms` of the residuals, and the order of
-/// components that it needs; `None` if no code is needed, or if `max_subspaces` is below 2. `scales`: the divisor of each
-/// residual.
+/// components that it needs; `None` if no code is needed, or if `max_subspaces` is below 2. `scales`: the divisor
+/// of each residual.
 pub fn plan(
     residuals: Rows<'_>,
     scales: &[f32],
@@ -233,8 +233,8 @@ pub fn plan(
         });
         (order, code, error)
     };
-    // The error of a short code shows how far the residuals are from the estimate's Gaussian ones. The needed length follows,
-    // and only that code is trained.
+    // The error of a short code shows how far the residuals are from the estimate's Gaussian ones. The needed
+    // length follows, and only that code is trained.
     let few = (2 * SUBSPACES_STEP).min(max_subspaces);
     let (order, code, error) = train(few);
     if error <= target || few == max_subspaces {
@@ -258,8 +258,8 @@ fn estimated_loss(variances: &[f64], n_subspaces: usize) -> f64 {
     starts.windows(2).map(of_subspace).sum::<f64>() + outside.iter().map(|c| variances[*c]).sum::<f64>()
 }
 
-/// Returns the loss of `d` Gaussian components coded in four bits, from the sum of the logarithms of their variances (rate
-/// distortion at equal loss).
+/// Returns the loss of `d` Gaussian components coded in four bits, from the sum of the logarithms of their
+/// variances (rate distortion at equal loss).
 fn loss(d: usize, log_product: f64) -> f64 {
     d as f64 * ((log_product - 8.0 * std::f64::consts::LN_2) / d as f64).exp()
 }

@@ -1,4 +1,5 @@
-//! What changed between two generations: things that appeared, went or moved, and the bytes that robots have to fetch.
+//! What changed between two generations: things that appeared, went or moved, and the bytes that robots have to
+//! fetch.
 //!
 //! `things.rs` reads the objects of a generation; [`changes`] says which of two generations are the same.
 

@@ -7,8 +7,8 @@ use super::*;
 use crate::store::tests::manifest;
 use crate::store::{Extras, Store, StoreReader};
 
-/// A shard whose things have a Gaussian each, unit boxes around x = their ids, and vectors along one axis. `seed` makes other
-/// bytes of the same things.
+/// A shard whose things have a Gaussian each, unit boxes around x = their ids, and vectors along one axis. `seed`
+/// makes other bytes of the same things.
 fn shard(seed: u16, ids: &[u64]) -> Vec<u8> {
     let n = ids.len() as u32;
     let records: Vec<ObjectRecord> = ids
@@ -104,8 +104,8 @@ fn ids(things: &[Thing]) -> Vec<u64> {
     things.iter().map(|thing| thing.id).collect()
 }
 
-/// Cell 0 stays as it is, cell 1 has other things, cell 2 the same things in another shard and a new profile. By hand: 3 and 20 are
-/// the same; 10 is gone, 14 is like it and so it moved by 4; 15 appeared.
+/// Cell 0 stays as it is, cell 1 has other things, cell 2 the same things in another shard and a new profile. By
+/// hand: 3 and 20 are the same; 10 is gone, 14 is like it and so it moved by 4; 15 appeared.
 #[test]
 fn two_generations_of_a_store_by_hand() {
     let dir = tempfile::tempdir().expect("a folder");

@@ -49,7 +49,8 @@ pub enum EmbedError {
 }
 
 impl EmbedError {
-    /// Returns whether it lies in the crops or the photo: a model that cannot run fails on those of other views, too.
+    /// Returns whether it lies in the crops or the photo: a model that cannot run fails on those of other views,
+    /// too.
     pub(crate) fn is_of_crops(&self) -> bool {
         match self {
             Self::Mask { .. } => true,
@@ -69,7 +70,8 @@ pub enum PatchUse {
 }
 
 impl PatchUse {
-    /// Adds the vectors of regions to those of the crops, `[masks][dim]`, or mixes the patches into them; all are unit vectors.
+    /// Adds the vectors of regions to those of the crops, `[masks][dim]`, or mixes the patches into them; all are
+    /// unit vectors.
     /// # Errors
     /// [`EmbedError::Patches`] where the encoder fails.
     pub(crate) fn add_to(

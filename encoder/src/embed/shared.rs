@@ -1,9 +1,9 @@
 //! Crops of several views in common batches, for image models on GPUs.
 //!
-//! A GPU is quickest with hundreds of crops at once, more than one view has. Views leave their crops in a queue and sleep until
-//! theirs are done; each lane has a thread that runs the next batch, with crops of whichever views. Nobody waits for a batch to
-//! be full: while the lanes are at work the queue grows, and batches with it. Views are woken one by one: all at once would be
-//! in the way of the threads that feed the GPUs.
+//! A GPU is quickest with hundreds of crops at once, more than one view has. Views leave their crops in a queue
+//! and sleep until theirs are done; each lane has a thread that runs the next batch, with crops of whichever
+//! views. Nobody waits for a batch to be full: while the lanes are at work the queue grows, and batches with it.
+//! Views are woken one by one: all at once would be in the way of the threads that feed the GPUs.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -291,7 +291,8 @@ mod tests {
         }))
     }
 
-    /// Views of 1 to 29 crops: each gets the vectors that an encoder of its own gives, for any number of GPUs and lanes.
+    /// Views of 1 to 29 crops: each gets the vectors that an encoder of its own gives, for any number of GPUs and
+    /// lanes.
     #[test]
     fn views_that_share_batches_get_the_vectors_of_their_own() {
         let models = ModelDir::embedded().expect("opens");

@@ -3,8 +3,8 @@
 use crate::masks::windows::Windows;
 use crate::masks::{Mask, patches};
 
-/// Share of a mask's vector that is the mean of patches or windows; the rest is its crop's. Chosen on the labelled house and yard
-/// (docs/decisions.md).
+/// Share of a mask's vector that is the mean of patches or windows; the rest is its crop's. Chosen on the labelled
+/// house and yard (docs/decisions.md).
 const SHARE_OF_PATCHES: f32 = 0.5;
 const SHARE_OF_WINDOWS: f32 = 0.35;
 
@@ -33,8 +33,8 @@ impl Surroundings {
         self.of_mask.len()
     }
 
-    /// Mixes the direction of the mean of `of_photo`, `[vectors][dim]`, over each mask into its unit vector of `of_masks`,
-    /// `[masks][dim]`, which remains one. A mean without a direction changes nothing.
+    /// Mixes the direction of the mean of `of_photo`, `[vectors][dim]`, over each mask into its unit vector of
+    /// `of_masks`, `[masks][dim]`, which remains one. A mean without a direction changes nothing.
     pub fn mix(&self, of_masks: &mut [f32], of_photo: &[f32], dim: usize) {
         for (vector, shares) in of_masks.chunks_exact_mut(dim.max(1)).zip(&self.of_mask) {
             let mut mean = vec![0.0; dim];
@@ -91,7 +91,8 @@ mod tests {
             (0..dim).for_each(|d| by_patch[d] += f64::from(of_patches[patch * dim + d]));
             let mut first = 0;
             for size in [1u32, 2, 4] {
-                // The windows of this size that contain the pixel: each covers two by two cells half a window wide.
+                // The windows of this size that contain the pixel: each covers two by two cells half a window
+                // wide.
                 let n = 2 * size - 1;
                 let cell =
                     |x: u32, edge: u32| ((f64::from(x) + 0.5) * f64::from(2 * size) / f64::from(edge)) as u32;

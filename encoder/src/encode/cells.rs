@@ -1,7 +1,7 @@
 //! The third step: the contributions of all views become objects, fields and shards of every cell.
 //!
-//! Contributions are read cell by cell. Several cells at once are lifted and become codebooks and shards, as many as the
-//! memory plan holds. A cell's bytes do not depend on the others'.
+//! Contributions are read cell by cell. Several cells at once are lifted and become codebooks and shards, as many
+//! as the memory plan holds. A cell's bytes do not depend on the others'.
 
 use std::path::PathBuf;
 
@@ -254,8 +254,8 @@ impl Opened {
         }
         let pass_bytes = memory.rest(index.largest_part_bytes())?;
         let cell_bytes = shard::largest_cell_bytes(split, models.dim()) + index.largest_part_bytes();
-        // Cells come second: contributions that are not kept in memory are read six times. But what superpoints and objects
-        // took is free again.
+        // Cells come second: contributions that are not kept in memory are read six times. But what superpoints
+        // and objects took is free again.
         let rest_bytes = memory.rest_of(memory::Phase::Cells);
         let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
         let n_more = (spare_bytes / cell_bytes.max(1)).min(context.pool().current_num_threads() as u64 - 1);
@@ -273,7 +273,8 @@ impl Opened {
     }
 }
 
-/// Returns the peak that is expected of the steps from here on; `None` where the system does not tell what the process holds.
+/// Returns the peak that is expected of the steps from here on; `None` where the system does not tell what the
+/// process holds.
 fn planned_peak(
     memory: &MemoryPlan,
     plan: &Plan<'_>,

@@ -1,10 +1,10 @@
 //! Which views to take first: those that together show the most of the scene, known before any mask is paid for.
 //!
-//! A raster of low resolution gives the blending weight `a(k, v) = Σ_p alpha T` of each Gaussian `k` over a view `v`
-//! without its margin, at which the photo's edge cuts things off: the solid angle that is seen of it, which falls
-//! with the square of the distance, with the cosine of the angle, and with what stands in front. It counts twice,
-//! each time against the best view of the same Gaussian: the lift weighs a view by it, and the crops that the view
-//! gives are as much finer. A set of views `S` is worth
+//! A raster of low resolution gives the blending weight `a(k, v) = Σ_p alpha T` of each Gaussian `k` over a view
+//! `v` without its margin, at which the photo's edge cuts things off: the solid angle that is seen of it, which
+//! falls with the square of the distance, with the cosine of the angle, and with what stands in front. It counts
+//! twice, each time against the best view of the same Gaussian: the lift weighs a view by it, and the crops that
+//! the view gives are as much finer. A set of views `S` is worth
 //!
 //! ```text
 //! f(S) = Σ_k g(Σ_{v in S} q(k, v))     q(k, v) = (a(k, v) / max_v a(k, v))^2     g(x) = ln(1 + s x)
@@ -12,8 +12,8 @@
 //!
 //! `f` is monotone and submodular, because `g` is growing and concave: so the first `n` views of the greedy order
 //! are worth at least `1 - 1/e` of the best `n` (Nemhauser, Wolsey and Fisher 1978, for every `n` at once). Gains
-//! only fall, so most need not be computed again (Minoux 1978). All contributions are integers: the order does not depend
-//! on threads, and equal gains go by the views' names.
+//! only fall, so most need not be computed again (Minoux 1978). All contributions are integers: the order does not
+//! depend on threads, and equal gains go by the views' names.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -218,8 +218,8 @@ mod tests {
         contributions.iter().map(|sum: &f64| (STEEPNESS * sum).ln_1p()).sum()
     }
 
-    /// Oracle: every set of n views, and the definition in f64; the bound of Nemhauser, Wolsey and Fisher holds for
-    /// every n, and each step of the order is the best one but for the steps of the tables.
+    /// Oracle: every set of n views, and the definition in f64; the bound of Nemhauser, Wolsey and Fisher holds
+    /// for every n, and each step of the order is the best one but for the steps of the tables.
     #[test]
     fn the_order_keeps_the_guarantee() {
         let mut random = Random::new(1);

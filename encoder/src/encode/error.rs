@@ -172,7 +172,8 @@ mod tests {
         assert!(EncodeError::from(error).is_of_one_view());
     }
 
-    /// A crop without pixels, or with a vector of no length, is its view's fault; a model that fails on it fails on others.
+    /// A crop without pixels, or with a vector of no length, is its view's fault; a model that fails on it fails
+    /// on others.
     #[test]
     fn a_bad_crop_is_one_views_fault() {
         let of = |cause: InferenceError| {

@@ -1,8 +1,8 @@
 //! The measured front of settings, and the choice of one for a target of seconds or bytes.
 //!
-//! `slag-lab bench tradeoff` writes it. Seconds are a sum of two shares: those of the views grow with their number, the
-//! others with the number of Gaussians. Photos of another size, other models or another machine need a front of their
-//! own.
+//! `slag-lab bench tradeoff` writes it. Seconds are a sum of two shares: those of the views grow with their
+//! number, the others with the number of Gaussians. Photos of another size, other models or another machine need a
+//! front of their own.
 
 use std::path::{Path, PathBuf};
 

@@ -67,8 +67,8 @@ impl Executor for Here {
     }
 }
 
-/// Takes views through their stages: each with whether it has a thread of its own. `on_bad_view` is told of an error
-/// that lies in one view's input; the view then ends.
+/// Takes views through their stages: each with whether it has a thread of its own. `on_bad_view` is told of an
+/// error that lies in one view's input; the view then ends.
 ///
 /// # Errors
 /// Those of the stages that lie in no view, and those of `on_bad_view`.
@@ -90,8 +90,8 @@ pub(crate) fn work_off<'v>(
             false => stages.step(work),
         };
         match result {
-            // One bad photo or mask file of a thousand must not end an encode. A model that fails on one view fails
-            // on the others too.
+            // One bad photo or mask file of a thousand must not end an encode. A model that fails on one view
+            // fails on the others too.
             Err(error) if error.is_of_one_view() => on_bad_view(view, error).map(|()| None),
             result => result.map(|work| Some((is_alone, work?))),
         }

@@ -22,8 +22,8 @@ pub(crate) const OF_A_FLEET: &str = "fleet";
 pub(super) struct Identities {
     /// Hash of everything on which the contributions of all views depend.
     pub(super) of_scene: Hash32,
-    /// `[n_views]`: hash of everything on which the contributions of a view depend, in the order of the views. That
-    /// includes `of_scene`, but no other view: photos can be added and withdrawn.
+    /// `[n_views]`: hash of everything on which the contributions of a view depend, in the order of the views.
+    /// That includes `of_scene`, but no other view: photos can be added and withdrawn.
     pub(super) of_view: Vec<Hash32>,
 }
 

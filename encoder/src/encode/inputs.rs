@@ -19,8 +19,8 @@ use crate::{check, ingest};
 /// A splat of which fewer than one in so many Gaussians can be seen is damaged.
 const MIN_VISIBLE_ONE_IN: usize = 20;
 
-/// Bytes that a pixel of a photo takes while it is worked on: three as read and three without distortion, one for whether the
-/// lens shows it, four each for its depth and its segment.
+/// Bytes that a pixel of a photo takes while it is worked on: three as read and three without distortion, one for
+/// whether the lens shows it, four each for its depth and its segment.
 const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
 /// Of these, while it waits: its colours, whether the lens shows it, its depth.
 const WAITING_BYTES_PER_PX: u64 = 3 + 1 + 4;
@@ -190,8 +190,9 @@ fn find_views(
 mod tests {
     use super::*;
 
-    /// By hand: a photo of 400 x 300 pixels, whose file is absent, and two of 40 x 30, which their headers say, of the same
-    /// camera. Two are worked on, 15 bytes a pixel; of two more that may wait there is one, 8 bytes a pixel.
+    /// By hand: a photo of 400 x 300 pixels, whose file is absent, and two of 40 x 30, which their headers say, of
+    /// the same camera. Two are worked on, 15 bytes a pixel; of two more that may wait there is one, 8 bytes a
+    /// pixel.
     #[test]
     fn photos_are_reserved_by_their_files_in_work_and_waiting() {
         let folder = tempfile::tempdir().expect("a folder");

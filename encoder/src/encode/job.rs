@@ -34,7 +34,8 @@ pub struct JobStatus {
     pub step: Option<String>,
 }
 
-/// Returns the state of the encode that a store keeps views of, if there is one. `db`: the store's catalogue, or a copy.
+/// Returns the state of the encode that a store keeps views of, if there is one. `db`: the store's catalogue, or a
+/// copy.
 pub fn job_status(db: &sled::Db, store: &Path) -> Result<Option<JobStatus>, EncodeError> {
     let records = |source| EncodeError::Records { path: store.to_owned(), source };
     let tree = db.open_tree(TREE).map_err(records)?;
@@ -61,8 +62,8 @@ pub(crate) struct Job<'a> {
 }
 
 impl<'a> Job<'a> {
-    /// Takes up what an encode of the same scene left, or begins one. Views that it has done are done here, too, where
-    /// their identities are the same. `id_of_view`: by name.
+    /// Takes up what an encode of the same scene left, or begins one. Views that it has done are done here, too,
+    /// where their identities are the same. `id_of_view`: by name.
     ///
     /// # Errors
     /// [`EncodeError::OtherJob`] if one of another scene or other settings is unfinished and `restart` is not set.
@@ -198,8 +199,8 @@ impl<'a> Job<'a> {
         Ok(())
     }
 
-    /// Takes up the files of a job whose records are lost: a catalogue that was made anew has none. A file of contributions
-    /// is renamed into place when it and its outlines are whole.
+    /// Takes up the files of a job whose records are lost: a catalogue that was made anew has none. A file of
+    /// contributions is renamed into place when it and its outlines are whole.
     fn adopt(&self) -> Result<(), EncodeError> {
         let records = |source| records_error(self.store, source);
         if self.records.contains_key(IDENTITY_KEY).map_err(records)? {
@@ -345,8 +346,8 @@ mod tests {
         assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
     }
 
-    /// Records that are lost with the catalogue are made again from the files: nothing is done twice, and another scene does
-    /// not drop them.
+    /// Records that are lost with the catalogue are made again from the files: nothing is done twice, and another
+    /// scene does not drop them.
     #[test]
     fn a_job_outlives_its_records() {
         let dir = tempfile::tempdir().expect("a folder");

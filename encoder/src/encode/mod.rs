@@ -11,8 +11,8 @@
 //! Views are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet.
 //!
 //! Views are independent: a killed encode resumes after the last finished view, if it is the same encode
-//! (`identity.rs`). The later steps read the contributions in the order of the views' names, so the store's bytes do
-//! not depend on threads, on the order of views or on interruptions.
+//! (`identity.rs`). The later steps read the contributions in the order of the views' names, so the store's bytes
+//! do not depend on threads, on the order of views or on interruptions.
 
 mod cell;
 mod cells;

@@ -1,9 +1,9 @@
 //! Views on their way through stages that overlap: while a device has one view, the cores prepare the next.
 //!
-//! Each stage has as many slots as views may be in it at once, and a queue as long. A free thread takes the view that
-//! is furthest, so that views leave before others come in and the memory is that of few. Stages of the processor
-//! share its cores; one that waits for a GPU or the disk takes none from them. On a processor alone this is a thread
-//! a core, each with a view.
+//! Each stage has as many slots as views may be in it at once, and a queue as long. A free thread takes the view
+//! that is furthest, so that views leave before others come in and the memory is that of few. Stages of the
+//! processor share its cores; one that waits for a GPU or the disk takes none from them. On a processor alone this
+//! is a thread a core, each with a view.
 
 use std::any::Any;
 use std::collections::VecDeque;
@@ -65,9 +65,9 @@ enum Task<T> {
     Step(usize, T),
 }
 
-/// Takes what `source` yields through the stages, `n_cores` at a time on the processor. A source that has nothing may have
-/// more later: it is asked again whenever a stage has room, until nothing is under way. It may take its time: stages go on
-/// meanwhile.
+/// Takes what `source` yields through the stages, `n_cores` at a time on the processor. A source that has nothing
+/// may have more later: it is asked again whenever a stage has room, until nothing is under way. It may take its
+/// time: stages go on meanwhile.
 ///
 /// `step` does the work of a stage (its index) and returns what the next one takes; `None` ends an item's way.
 ///
@@ -372,7 +372,8 @@ mod tests {
         .expect("no error");
     }
 
-    /// By hand: cores take items all the way; with a device in between, each boundary holds as many as either side has slots.
+    /// By hand: cores take items all the way; with a device in between, each boundary holds as many as either side
+    /// has slots.
     #[test]
     fn items_under_way_are_bounded() {
         let of_cpu = [stage("a", 3, true), stage("b", 3, true), stage("disk", 1, false)];

@@ -39,11 +39,12 @@ const MAX_TESTS: usize = 1 << 24;
 const RUNTIME_BYTES: u64 = 56 << 20;
 /// What a session takes beside its weights, and what the allocator keeps for each thread.
 const SESSION_BYTES: u64 = 4 << 20;
-/// What a GPU's driver keeps in the process, and what each view takes that is with it: copies of all that goes there and back.
+/// What a GPU's driver keeps in the process, and what each view takes that is with it: copies of all that goes
+/// there and back.
 const DEVICE_BYTES: u64 = 140 << 20;
 const DEVICE_BYTES_PER_VIEW: u64 = 10 << 20;
-/// What the processor's rasteriser takes for each Gaussian in a view's frustum, most of them hidden: 110 projected and in
-/// tiles, and 200 blended for each of a fifth.
+/// What the processor's rasteriser takes for each Gaussian in a view's frustum, most of them hidden: 110 projected
+/// and in tiles, and 200 blended for each of a fifth.
 const RASTER_BYTES_PER_VISIBLE: u64 = 150;
 
 /// What was decided.
@@ -164,8 +165,8 @@ impl Plan<'_> {
     }
 }
 
-/// Returns the encoder of the store's generation, where this encode publishes vectors of another: robots refuse them until
-/// they have its text model.
+/// Returns the encoder of the store's generation, where this encode publishes vectors of another: robots refuse
+/// them until they have its text model.
 fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<String> {
     // A store without a generation, or with a damaged one, has none to be told of.
     let reader = StoreReader::open(&settings.output.store).ok()?;
@@ -209,8 +210,8 @@ fn expect_runtime(
     }
 }
 
-/// Returns how many Gaussians are in the frusta of views that are worked on at the same time, at most: of `n_at_once` that
-/// follow one another. Few views see far, but these hold the most, and they lie together.
+/// Returns how many Gaussians are in the frusta of views that are worked on at the same time, at most: of
+/// `n_at_once` that follow one another. Few views see far, but these hold the most, and they lie together.
 fn n_visible_at_once(views: &[&View], means_in_world: &[DVec3], n_at_once: usize) -> u64 {
     let step = (means_in_world.len() * views.len() / MAX_TESTS).max(1);
     let n_visible: Vec<u64> = views.par_iter().map(|view| n_before(means_in_world, step, view)).collect();
@@ -231,7 +232,8 @@ fn n_before(means_in_world: &[DVec3], step: usize, view: &View) -> u64 {
     means_in_world.iter().step_by(step).filter(is_before).count() as u64
 }
 
-/// Returns which kept views cannot be taken over, and says so; an encode that is unfinished is refused later, not replaced.
+/// Returns which kept views cannot be taken over, and says so; an encode that is unfinished is refused later, not
+/// replaced.
 fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, EncodeError> {
     let kept =
         job_status(store.db(), store.dir())?.filter(|status| status.n_views > 0 && status.is_published);
@@ -247,8 +249,8 @@ fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, Enco
     Ok(Some(LostViews { n_views, reason }))
 }
 
-/// Reserves what is known of scene and settings; what depends on masks and contributions is reserved once the views are
-/// done.
+/// Reserves what is known of scene and settings; what depends on masks and contributions is reserved once the
+/// views are done.
 fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>) -> MemoryPlan {
     let n_gaussians = inputs.scene.len();
     let mut memory = MemoryPlan::new(settings.run.memory_bytes);
@@ -345,7 +347,8 @@ mod tests {
     use slag_common::Gaussians;
     use slag_models::ModelDir;
 
-    /// Superpoints take more than 204 bytes a Gaussian, once all views are done: a budget below that is refused before.
+    /// Superpoints take more than 204 bytes a Gaussian, once all views are done: a budget below that is refused
+    /// before.
     #[test]
     fn what_refinement_takes_is_refused_before_the_first_view() {
         let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);

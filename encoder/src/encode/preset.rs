@@ -9,13 +9,14 @@ use crate::segment::SamSettings;
 /// A bundle of choices. `slag-lab bench tradeoff` measures the cost and quality of each.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// The paper's own settings: SAM on a grid of 16 x 16 points with LangSplat's filters, whole masks alone, uncleaned;
-    /// white behind the masks, rasters 648 pixels wide, the plain average, no objects. Without `--segmenter` the
-    /// built-in segmenter stands in for SAM, with its coarsest masks.
+    /// The paper's own settings: SAM on a grid of 16 x 16 points with LangSplat's filters, whole masks alone,
+    /// uncleaned; white behind the masks, rasters 648 pixels wide, the plain average, no objects. Without
+    /// `--segmenter` the built-in segmenter stands in for SAM, with its coarsest masks.
     Paper,
     /// The paper's method with the masks of `balanced`: rasters as wide as photos, the plain average, no objects.
     Plain,
-    /// Half of the views, by coverage; two scales of masks, by their crops alone; coarse rasters; refined contributions.
+    /// Half of the views, by coverage; two scales of masks, by their crops alone; coarse rasters; refined
+    /// contributions.
     Fast,
     /// All views; refined contributions.
     #[default]

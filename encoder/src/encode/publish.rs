@@ -84,7 +84,8 @@ fn tidy_up(plan: Plan<'_>, has_open: bool, encoder: Hash32) -> Result<(), Encode
     Ok(())
 }
 
-/// Writes the text side of models into a store; what is there already is kept. Robots then fetch it with the scene.
+/// Writes the text side of models into a store; what is there already is kept. Robots then fetch it with the
+/// scene.
 fn carry_text_model(store: &Store, models: &ModelDir) -> Result<TextModelRecord, EncodeError> {
     let text_side = models.text_side()?;
     let mut files = Vec::new();

@@ -19,10 +19,11 @@ use crate::raster::WeightKind;
 use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
 
-/// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and no
-/// better answers (generated scenes of seeds 601 to 605, and the labelled house).
+/// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and
+/// no better answers (generated scenes of seeds 601 to 605, and the labelled house).
 pub const DEFAULT_MASK_LEVELS: usize = 3;
-/// Widest raster where the settings do not ask for more: masks are coarser than this, and time grows with the square.
+/// Widest raster where the settings do not ask for more: masks are coarser than this, and time grows with the
+/// square.
 pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
 /// Gaussians of a cell at most: shards number them with 16 bits.
 pub const MAX_CELL_GAUSSIANS: usize = 65_536;
@@ -93,8 +94,8 @@ pub struct ViewSettings {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Regions {
-    /// Masks: by a crop each and, where the image model has patches that are aligned with text, by the patches within them;
-    /// else, where the model wants them, by windows over the photo.
+    /// Masks: by a crop each and, where the image model has patches that are aligned with text, by the patches
+    /// within them; else, where the model wants them, by windows over the photo.
     #[default]
     Masks,
     /// Masks, by a crop each.
@@ -223,8 +224,8 @@ pub struct RunSettings {
     pub restart: bool,
     /// Whether the views' contributions are kept after publication, for an encode with another aggregation.
     pub keep_views: bool,
-    /// The NVIDIA GPUs that share the work of models, as CUDA numbers them, at least one; without an NVIDIA provider they
-    /// mean nothing.
+    /// The NVIDIA GPUs that share the work of models, as CUDA numbers them, at least one; without an NVIDIA
+    /// provider they mean nothing.
     pub gpus: Vec<u32>,
 }
 
@@ -262,8 +263,8 @@ pub enum ViewOrder {
 }
 
 impl EncodeSettings {
-    /// Returns the settings to encode a splat and its photos into a store: those of the program without flags, and of
-    /// [`Preset::Balanced`](super::Preset::Balanced).
+    /// Returns the settings to encode a splat and its photos into a store: those of the program without flags, and
+    /// of [`Preset::Balanced`](super::Preset::Balanced).
     pub fn new(scene: PathBuf, views: PathBuf, store: PathBuf, metric: bool) -> Self {
         Self {
             inputs: InputSettings {

@@ -67,7 +67,8 @@ pub(crate) struct ViewStages<'a> {
 
 /// The image encoders.
 enum Encoders {
-    /// One for each view at work, on the processor; those that are not at work. They are opened as they are needed.
+    /// One for each view at work, on the processor; those that are not at work. They are opened as they are
+    /// needed.
     OfViews(Mutex<Vec<Box<dyn ImageEncoder>>>),
     /// On GPUs, for the crops of all views.
     Shared(SharedEncoders),

@@ -1,8 +1,8 @@
 //! The threads of a run. Two encodes in one process do not share them, and rayon's global pool stays as it is.
 //!
-//! Where there are as many pieces of work as threads, each piece has a thread of its own: threads that share a piece wait
-//! for each other's parts, and take up another piece meanwhile, which the first then waits for. The last pieces, too few
-//! for that, are shared. Results do not depend on who did the work.
+//! Where there are as many pieces of work as threads, each piece has a thread of its own: threads that share a
+//! piece wait for each other's parts, and take up another piece meanwhile, which the first then waits for. The
+//! last pieces, too few for that, are shared. Results do not depend on who did the work.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -36,7 +36,8 @@ impl Workers {
         &self.shared
     }
 
-    /// Returns how many of `n_pieces`, the first ones, get a thread of their own where `n_at_once` are worked on at a time.
+    /// Returns how many of `n_pieces`, the first ones, get a thread of their own where `n_at_once` are worked on
+    /// at a time.
     pub(crate) fn n_alone(&self, n_pieces: usize, n_at_once: usize) -> usize {
         let n_threads = self.shared.current_num_threads();
         // Fewer pieces than threads would leave threads without work.

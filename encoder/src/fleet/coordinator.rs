@@ -1,5 +1,5 @@
-//! The coordinator: uploads the inputs of an encode, and brings the views that workers do to this machine, which makes
-//! the cells.
+//! The coordinator: uploads the inputs of an encode, and brings the views that workers do to this machine, which
+//! makes the cells.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::AtomicBool;

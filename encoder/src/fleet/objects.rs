@@ -1,5 +1,5 @@
-//! The binary objects in a bucket: the scene, with the columns that an encode reads, in the world of the poses, and what a
-//! view leaves.
+//! The binary objects in a bucket: the scene, with the columns that an encode reads, in the world of the poses,
+//! and what a view leaves.
 
 use std::ops::Range;
 

@@ -1,8 +1,8 @@
-//! A run's queue on NATS JetStream: a stream with work-queue retention for each run, and one durable pull consumer that all
-//! workers share. It only hands out work: the coordinator fills it again from what the bucket lacks.
+//! A run's queue on NATS JetStream: a stream with work-queue retention for each run, and one durable pull consumer
+//! that all workers share. It only hands out work: the coordinator fills it again from what the bucket lacks.
 //!
-//! A worker holds few messages at a time, says that it is at work on each of them every third of the time after which the
-//! server would hand it to another, and acknowledges a message once its result is in the bucket.
+//! A worker holds few messages at a time, says that it is at work on each of them every third of the time after
+//! which the server would hand it to another, and acknowledges a message once its result is in the bucket.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt::Display;
@@ -103,7 +103,8 @@ impl Enqueuer {
         })
     }
 
-    /// Fills the queue with the views that are not done where the stream is gone, was never filled, or has lost them.
+    /// Fills the queue with the views that are not done where the stream is gone, was never filled, or has lost
+    /// them.
     ///
     /// A server that refuses or does not answer is asked again later.
     pub(super) fn keep_filled(&mut self, open: &[usize]) {

@@ -1,13 +1,13 @@
-//! A worker's folder for one run: photos in work. It goes with the run; what killed workers left goes when the next one
-//! begins, which knows them by their locks: a lock ends with its process, however that ends.
+//! A worker's folder for one run: photos in work. It goes with the run; what killed workers left goes when the
+//! next one begins, which knows them by their locks: a lock ends with its process, however that ends.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use super::error::FleetError;
 
-/// Names of folders begin so. The process's number follows, which says little: workers of other machines and containers may share
-/// the parent.
+/// Names of folders begin so. The process's number follows, which says little: workers of other machines and
+/// containers may share the parent.
 const PREFIX: &str = "slag-worker-";
 
 /// The file in each folder that its worker holds locked.

@@ -19,7 +19,8 @@ use crate::lift::photos::{MaskOutline, outlines_to_bytes};
 use crate::raster::LoadedScene;
 use crate::segment::Segmenter;
 
-/// Views whose photos are fetched at once, and views whose objects are put: one while another is decoded or packed.
+/// Views whose photos are fetched at once, and views whose objects are put: one while another is decoded or
+/// packed.
 const N_AT_ONCE: usize = 2;
 
 /// What views are done with.
@@ -123,8 +124,8 @@ impl ViewSink for ViewWork<'_> {
     }
 }
 
-/// Yields the views that are to be had at present. The pipeline asks for them with its lock held, so nothing here waits for the
-/// bucket: whether another worker did a view meanwhile is found where its photo is fetched.
+/// Yields the views that are to be had at present. The pipeline asks for them with its lock held, so nothing here
+/// waits for the bucket: whether another worker did a view meanwhile is found where its photo is fetched.
 fn views_to_do<'a>(
     dispatcher: &'a dyn Dispatcher,
     views: &'a [View],

@@ -51,7 +51,8 @@ pub(crate) struct WorkerSettings {
     pub(crate) segmenter: Option<PathBuf>,
     /// Time to wait for a run to begin, and for a heartbeat of its coordinator.
     pub(crate) patience: Duration,
-    /// Whether it goes on to the next run when one is published; to the run that takes a run's place it always does.
+    /// Whether it goes on to the next run when one is published; to the run that takes a run's place it always
+    /// does.
     pub(crate) stays: bool,
 }
 

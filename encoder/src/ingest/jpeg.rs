@@ -4,7 +4,8 @@ use std::io::{self, BufRead, Read};
 
 /// Returns whether the file contains its end-of-image marker (ITU-T T.81, B.1.1).
 ///
-/// Segments are skipped by their lengths, so the marker of an embedded thumbnail does not count; coded data are searched.
+/// Segments are skipped by their lengths, so the marker of an embedded thumbnail does not count; coded data are
+/// searched.
 ///
 /// # Errors
 /// Errors of the reader, except for the end of the file.
@@ -40,8 +41,8 @@ fn find_end(file: &mut impl BufRead) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    /// Start marker, a segment with the end marker of a thumbnail, a scan header, coded data with a stuffed byte 255 and a
-    /// restart marker, end marker.
+    /// Start marker, a segment with the end marker of a thumbnail, a scan header, coded data with a stuffed byte
+    /// 255 and a restart marker, end marker.
     const WHOLE: [u8; 25] = [
         0xFF, 0xD8, 0xFF, 0xE1, 0, 6, 0xFF, 0xD8, 0xFF, 0xD9, 0xFF, 0xDA, 0, 3, 9, 7, 0xFF, 0, 8, 0xFF, 0xD3,
         5, 0xFF, 0xFF, 0xD9,

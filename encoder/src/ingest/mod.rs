@@ -117,9 +117,9 @@ pub fn photo_area_px(view: &View) -> u64 {
 
 /// Loads the photo of a view and undistorts it.
 ///
-/// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay unchanged.
-/// Transparent pixels are outside of the photo. An EXIF orientation is applied where only the turned photo has its camera's
-/// size, and else ignored, see [`RotatedPhotos`].
+/// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay
+/// unchanged. Transparent pixels are outside of the photo. An EXIF orientation is applied where only the turned
+/// photo has its camera's size, and else ignored, see [`RotatedPhotos`].
 ///
 /// # Errors
 /// [`IngestError`] if the file cannot be read or decoded, or its size does not match the camera.
@@ -192,8 +192,8 @@ fn swaps_sides(orientation: Orientation) -> bool {
     matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// Returns whether a size is exactly proportional to that of the camera, or is a reduction of it by an integer factor with
-/// each side rounded up or down, as in downscaled copies.
+/// Returns whether a size is exactly proportional to that of the camera, or is a reduction of it by an integer
+/// factor with each side rounded up or down, as in downscaled copies.
 fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
     let proportional = u64::from(width_px) * u64::from(camera.height_px)
         == u64::from(height_px) * u64::from(camera.width_px);

@@ -40,7 +40,8 @@ pub struct FoundFrame {
     pub stated: SplatFromPoses,
 }
 
-/// Looks for the file that states the frame of the splat at `scene`; `source` and `applied` are those of the poses.
+/// Looks for the file that states the frame of the splat at `scene`; `source` and `applied` are those of the
+/// poses.
 ///
 /// # Errors
 /// [`PoseError`] if the file cannot be read.

@@ -18,8 +18,8 @@ impl Undistorter {
         Self { camera, max_radius: camera.distortion.monotonic_radius() }
     }
 
-    /// Returns the position of the centre of an ideal pixel in the distorted image, pixels; `None` outside the image or
-    /// the range of the lens model.
+    /// Returns the position of the centre of an ideal pixel in the distorted image, pixels; `None` outside the
+    /// image or the range of the lens model.
     fn source_px(&self, column: u32, row: u32) -> Option<[f64; 2]> {
         let ideal = self.camera.distorted_from_pixel([f64::from(column) + 0.5, f64::from(row) + 0.5]);
         if ideal[0].hypot(ideal[1]) > self.max_radius || self.camera.distortion.folds_at(ideal) {
@@ -31,8 +31,8 @@ impl Undistorter {
         inside.then_some([u, v])
     }
 
-    /// Returns the ideal image, sampled bilinearly, and whether each of its pixels (row-major) is inside the photo. Pixels
-    /// outside are black.
+    /// Returns the ideal image, sampled bilinearly, and whether each of its pixels (row-major) is inside the
+    /// photo. Pixels outside are black.
     ///
     /// # Panics
     /// If the image does not have the size of the camera.
@@ -51,7 +51,8 @@ impl Undistorter {
         (ideal, valid)
     }
 
-    /// Maps labels (row-major) to the ideal image by nearest neighbour. Pixels outside the photo get the label `outside`.
+    /// Maps labels (row-major) to the ideal image by nearest neighbour. Pixels outside the photo get the label
+    /// `outside`.
     ///
     /// # Panics
     /// If the number of labels is not the number of pixels of the camera.
@@ -74,8 +75,8 @@ impl Undistorter {
     }
 }
 
-/// Returns the colour at a position, pixels, interpolated between the four pixel centres around it. Within half a pixel of
-/// the border, the colour is that of the edge.
+/// Returns the colour at a position, pixels, interpolated between the four pixel centres around it. Within half a
+/// pixel of the border, the colour is that of the edge.
 fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> [u8; 3] {
     let axis = |position: f64, size_px: u32| {
         let from_centre = (position - 0.5).clamp(0.0, f64::from(size_px - 1));

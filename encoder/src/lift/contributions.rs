@@ -1,9 +1,9 @@
-//! A view's mask vectors, regions and sparse contributions, in a file of the job's folder: a killed encode does not compute
-//! them again.
+//! A view's mask vectors, regions and sparse contributions, in a file of the job's folder: a killed encode does
+//! not compute them again.
 //!
-//! The file starts with a container that holds all but the contributions. These follow it, ordered by (cell, slice of
-//! its Gaussians): the contributions of consecutive cells are one range of the file, so a pass over all cells reads each
-//! byte once.
+//! The file starts with a container that holds all but the contributions. These follow it, ordered by (cell, slice
+//! of its Gaussians): the contributions of consecutive cells are one range of the file, so a pass over all cells
+//! reads each byte once.
 
 use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
@@ -135,8 +135,8 @@ pub enum ContributionError {
     },
 }
 
-/// Returns the CRC-32 of some entries: at a gigabyte per scene a cryptographic hash would be the slowest step of the lift.
-/// Storage and network have checksums of their own.
+/// Returns the CRC-32 of some entries: at a gigabyte per scene a cryptographic hash would be the slowest step of
+/// the lift. Storage and network have checksums of their own.
 fn checksum(entries: &[PackedEntry]) -> u64 {
     u64::from(crc32fast::hash(bytemuck::cast_slice(entries)))
 }

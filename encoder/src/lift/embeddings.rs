@@ -1,8 +1,9 @@
 //! The embeddings of many Gaussians at once, from their contributions.
 //!
-//! A component of an embedding is a sum over hundreds of region vectors, far more than fit a cache. So neighbouring Gaussians,
-//! which share most of their regions, are processed together, a block of components at a time. Every component is summed
-//! in the order of the entries, and products are rounded before they are added: the bits are the same on any machine.
+//! A component of an embedding is a sum over hundreds of region vectors, far more than fit a cache. So
+//! neighbouring Gaussians, which share most of their regions, are processed together, a block of components at a
+//! time. Every component is summed in the order of the entries, and products are rounded before they are added:
+//! the bits are the same on any machine.
 
 use std::ops::Range;
 
@@ -153,8 +154,8 @@ impl<S: Simd> Work<S> for Chunk<'_> {
     }
 }
 
-/// Writes the sum of `weight * vector` over some entries. The components of a step stay in registers until all entries are
-/// added.
+/// Writes the sum of `weight * vector` over some entries. The components of a step stay in registers until all
+/// entries are added.
 #[inline(always)]
 fn add_vectors<S: Simd>(
     simd: S,

@@ -31,8 +31,8 @@ pub struct CellField {
 }
 
 impl CellField {
-    /// Makes the field of a part and writes its embeddings to `embeddings` (`[N][dim]`): unit, or zeros where there is no
-    /// evidence. `input_indices`: of the part's Gaussians.
+    /// Makes the field of a part and writes its embeddings to `embeddings` (`[N][dim]`): unit, or zeros where
+    /// there is no evidence. `input_indices`: of the part's Gaussians.
     pub fn new(
         input_indices: Vec<u32>,
         contributions: PartContributions,

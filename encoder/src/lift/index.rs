@@ -14,11 +14,11 @@ use super::part::{Part, PartContributions};
 use super::table::RegionTable;
 use crate::memory::{MemoryPlan, Phase};
 
-/// Most entries of a part. A constant, not a share of the budget: parts are published, and a store must not depend on
-/// the memory of the machine that made it.
+/// Most entries of a part. A constant, not a share of the budget: parts are published, and a store must not depend
+/// on the memory of the machine that made it.
 pub(super) const PART_ENTRIES: u64 = 1 << 22;
-/// Most entries of a group that is transposed, even where the budget allows more: a larger one leaves the processor's
-/// caches. As many as a part's.
+/// Most entries of a group that is transposed, even where the budget allows more: a larger one leaves the
+/// processor's caches. As many as a part's.
 const GROUP_ENTRIES: u64 = PART_ENTRIES;
 /// Bytes of a transposed entry: region and weight.
 const BYTES_PER_TRANSPOSED_ENTRY: u64 = size_of::<(u32, f32)>() as u64;
@@ -55,8 +55,8 @@ pub struct RawGroup {
 }
 
 impl ContributionIndex {
-    /// Opens the files of all views, in the order of the views' names, and collects their regions. `n_gaussians_of_cell`:
-    /// number of Gaussians of each cell of the scene.
+    /// Opens the files of all views, in the order of the views' names, and collects their regions.
+    /// `n_gaussians_of_cell`: number of Gaussians of each cell of the scene.
     pub fn open(
         paths: &[PathBuf],
         dim: usize,
@@ -177,8 +177,8 @@ impl ContributionIndex {
         self.parts.iter().map(of_part).sum()
     }
 
-    /// Returns the bytes that a pass is expected to take of a budget: those that are kept for the next one, and those of the
-    /// parts that all threads work on at a time.
+    /// Returns the bytes that a pass is expected to take of a budget: those that are kept for the next one, and
+    /// those of the parts that all threads work on at a time.
     pub(crate) fn expected_bytes(&self, budget_bytes: u64, n_threads: u64) -> (u64, u64) {
         let all_bytes = self.kept_bytes();
         let n_at_once = self.n_entries().min(n_threads * GROUP_ENTRIES);
@@ -189,8 +189,8 @@ impl ContributionIndex {
         }
     }
 
-    /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part. `n_largest`: how many of
-    /// the largest parts a group may hold where the budget allows more.
+    /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part. `n_largest`: how
+    /// many of the largest parts a group may hold where the budget allows more.
     pub fn groups(&self, budget_bytes: u64, n_largest: u64) -> Vec<Range<usize>> {
         let max_entries = GROUP_ENTRIES.saturating_mul(n_largest);
         let mut groups: Vec<Range<usize>> = Vec::new();

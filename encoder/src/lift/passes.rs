@@ -1,5 +1,5 @@
-//! A pass over the contributions of all parts. The lift, its refinements and the objects need several: where the budget
-//! holds all parts, the first pass keeps them and later passes read no file.
+//! A pass over the contributions of all parts. The lift, its refinements and the objects need several: where the
+//! budget holds all parts, the first pass keeps them and later passes read no file.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -83,8 +83,8 @@ impl ContributionIndex {
         wanted_bytes.max(self.largest_part_bytes())
     }
 
-    /// Starts a pass that takes at most `budget_bytes`, or what the largest part needs. Total weights follow the table's
-    /// present weights of masks. A group is what all threads work on at a time.
+    /// Starts a pass that takes at most `budget_bytes`, or what the largest part needs. Total weights follow the
+    /// table's present weights of masks. A group is what all threads work on at a time.
     pub(super) fn transposed_groups<'a>(
         &'a self,
         table: &'a RegionTable,
@@ -98,7 +98,8 @@ impl ContributionIndex {
                 (self.groups(for_groups, n_threads), Source::Memory { parts, mask_counts })
             }
             None => {
-                // Half the budget: refinement and objects build lists of their own, which also grow with the entries.
+                // Half the budget: refinement and objects build lists of their own, which also grow with the
+                // entries.
                 let keeps = self.kept_bytes().saturating_add(self.largest_part_bytes()) <= budget_bytes / 2;
                 let for_groups = if keeps { budget_bytes - self.kept_bytes() } else { budget_bytes };
                 let kept = keeps.then(|| Vec::with_capacity(self.parts().len()));

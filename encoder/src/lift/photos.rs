@@ -1,5 +1,5 @@
-//! The outlines of a view's masks in its photo, kept beside its contributions: how much the photo's edge cuts off, and the
-//! box that shows the object.
+//! The outlines of a view's masks in its photo, kept beside its contributions: how much the photo's edge cuts off,
+//! and the box that shows the object.
 
 use std::path::Path;
 
@@ -33,8 +33,8 @@ pub struct MaskOutline {
 }
 
 impl MaskOutline {
-    /// Returns the outline of a mask of a photo of `width_px` x `height_px`. `valid`: the pixels that undistortion filled;
-    /// `None` if all.
+    /// Returns the outline of a mask of a photo of `width_px` x `height_px`. `valid`: the pixels that undistortion
+    /// filled; `None` if all.
     pub fn of(mask: &Mask, width_px: u32, height_px: u32, valid: Option<&[bool]>) -> Self {
         let BoxPx { x0, y0, x1, y1 } = mask.box_px;
         let is_there = |x: u32, y: u32| {

@@ -1,8 +1,9 @@
-//! Superpoints: small pieces of surface of one appearance, by graph-based segmentation (Felzenszwalb and Huttenlocher,
-//! "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004) of the Gaussians' nearest-neighbour graph.
+//! Superpoints: small pieces of surface of one appearance, by graph-based segmentation (Felzenszwalb and
+//! Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004) of the Gaussians' nearest-neighbour
+//! graph.
 //!
-//! The length of an edge is the difference of its ends in colour, in the direction of their thinnest axes and, if known, in
-//! their embeddings. Distance only decides which Gaussians are neighbours.
+//! The length of an edge is the difference of its ends in colour, in the direction of their thinnest axes and, if
+//! known, in their embeddings. Distance only decides which Gaussians are neighbours.
 
 use rayon::prelude::*;
 use slag_common::Gaussians;
@@ -26,8 +27,8 @@ pub struct SuperpointSettings {
     pub normal: f32,
     /// Length of a right angle between sketches of embeddings.
     pub field: f32,
-    /// Scale of observation k: an edge joins two components if it is at most each component's longest inner edge plus k over
-    /// its size.
+    /// Scale of observation k: an edge joins two components if it is at most each component's longest inner edge
+    /// plus k over its size.
     pub scale: f32,
     /// Smaller components are joined to their most similar neighbour.
     pub min_gaussians: u32,
@@ -41,7 +42,8 @@ impl Default for SuperpointSettings {
 }
 
 impl SuperpointSettings {
-    /// Returns settings for larger superpoints of the same edges: about the sides of a thing, where the default ones are patches.
+    /// Returns settings for larger superpoints of the same edges: about the sides of a thing, where the default
+    /// ones are patches.
     pub fn coarse() -> Self {
         Self { scale: 20.0, min_gaussians: 60, ..Self::default() }
     }
@@ -162,8 +164,8 @@ impl Superpoints {
         sizes
     }
 
-    /// Returns each superpoint's most frequent label, of equally many the first; `None` where it has none. `labels`: of
-    /// Gaussians, in any order.
+    /// Returns each superpoint's most frequent label, of equally many the first; `None` where it has none.
+    /// `labels`: of Gaussians, in any order.
     pub fn most_frequent<L: Copy + Ord + Send>(
         &self,
         labels: impl ParallelIterator<Item = (u32, L)>,
@@ -189,8 +191,8 @@ impl Superpoints {
         Graph::new(scene, sketches, settings).superpoints(settings)
     }
 
-    /// Returns the bytes that partitioning `n_gaussians` takes, at `n_scales` at once: neighbours while they are searched, then
-    /// with the edges and what joins them.
+    /// Returns the bytes that partitioning `n_gaussians` takes, at `n_scales` at once: neighbours while they are
+    /// searched, then with the edges and what joins them.
     pub fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
         let n = settings.n_neighbours;
         let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);

@@ -1,10 +1,10 @@
 //! The regions of all views: which masks cover each, and the masks' vectors.
 //!
-//! `V_r`, the sum of a region's mask vectors, is not stored: a mask has several regions, and a few additions compute the sum
-//! when it is needed. So a scene's table is hardly larger than its mask vectors.
+//! `V_r`, the sum of a region's mask vectors, is not stored: a mask has several regions, and a few additions
+//! compute the sum when it is needed. So a scene's table is hardly larger than its mask vectors.
 //!
-//! In the plain average every mask has weight 1. [`RegionTable::set_mask_weights`] sets other weights,
-//! `V_r = Σ_j m_j e_j` and `n_r = Σ_j m_j`. [`RegionTable::append_mixture`] adds a region of no view: any mixture of masks.
+//! In the plain average every mask has weight 1. [`RegionTable::set_mask_weights`] sets other weights, `V_r = Σ_j
+//! m_j e_j` and `n_r = Σ_j m_j`. [`RegionTable::append_mixture`] adds a region of no view: any mixture of masks.
 
 use std::io::{self, Write};
 use std::ops::Range;
@@ -161,7 +161,8 @@ impl RegionTable {
         regions.map(|region| self.masks_of(region).map(|(_, share)| share).sum()).collect()
     }
 
-    /// Writes components `from..from + out.len()` of `V_r`; inlined, to be compiled for the caller's instruction set.
+    /// Writes components `from..from + out.len()` of `V_r`; inlined, to be compiled for the caller's instruction
+    /// set.
     #[inline(always)]
     pub(super) fn components(&self, region: usize, from: usize, out: &mut [f32]) {
         out.fill(0.0);

@@ -261,7 +261,8 @@ fn parts_of_a_cell_make_the_cell() {
     assert_eq!(joined, field(transpose(&whole, 0).remove(0)));
 }
 
-/// Where the budget holds all parts, only the first pass reads the files; total weights follow the table all the same.
+/// Where the budget holds all parts, only the first pass reads the files; total weights follow the table all the
+/// same.
 #[test]
 fn parts_that_fit_the_budget_are_read_once() {
     let scene = scene_of(5, 10_000, 4);

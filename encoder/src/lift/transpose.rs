@@ -1,5 +1,5 @@
-//! Brings the contributions of all views together by Gaussian: each group of parts is transposed from the views' order
-//! to the Gaussians'.
+//! Brings the contributions of all views together by Gaussian: each group of parts is transposed from the views'
+//! order to the Gaussians'.
 
 use rayon::prelude::*;
 use slag_common::container::ContainerError;

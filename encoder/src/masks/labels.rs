@@ -5,8 +5,8 @@ use super::regions::NO_REGION;
 
 /// Converts a label image into one mask per label except [`NO_REGION`], in ascending order of the labels.
 ///
-/// `labels`: row-major, `width_px` per row, each below `n_labels` or [`NO_REGION`]. Returns `None` if the boxes of all
-/// masks together exceed `limit_bytes`.
+/// `labels`: row-major, `width_px` per row, each below `n_labels` or [`NO_REGION`]. Returns `None` if the boxes of
+/// all masks together exceed `limit_bytes`.
 pub fn masks_of_labels(
     labels: &[u32],
     width_px: u32,

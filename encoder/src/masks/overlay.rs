@@ -9,8 +9,8 @@ const TINT: f32 = 0.35;
 /// Turn of the hue from one mask to the next: the golden ratio keeps neighbours in the list apart.
 const HUE_STEP: f32 = 0.618_034;
 
-/// Returns the photo, at most `width_px` wide, with the masks tinted and their borders drawn, each in a colour of its own.
-/// Later masks lie over earlier ones.
+/// Returns the photo, at most `width_px` wide, with the masks tinted and their borders drawn, each in a colour of
+/// its own. Later masks lie over earlier ones.
 pub fn overlay(photo: &RgbImage, masks: &[Mask], width_px: u32) -> RgbImage {
     let width = width_px.min(photo.width()).max(1);
     let scale = f64::from(photo.width()) / f64::from(width);
@@ -66,7 +66,8 @@ mod tests {
         let area_px = inside.iter().filter(|inside| **inside).count() as u32;
         let picture = overlay(&photo, &[Mask { box_px, inside, area_px, level: 0 }], 40);
         assert_eq!(picture.dimensions(), (40, 20));
-        // The first colour is red. By hand, in pixels of half the size: inside, on the border, in the notch, outside.
+        // The first colour is red. By hand, in pixels of half the size: inside, on the border, in the notch,
+        // outside.
         assert_eq!(picture.get_pixel(15, 8).0, [154, 65, 65]);
         assert_eq!(picture.get_pixel(10, 8).0, [255, 0, 0]);
         for (x, y) in [(25, 13), (9, 8), (30, 8), (15, 3), (15, 16)] {

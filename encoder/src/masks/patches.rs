@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use super::mask::{BoxPx, Mask};
 
-/// Returns the patches of a photo that have pixels, with their numbers, row by row. Patch `k` of `per_side` covers the pixels
-/// whose centres lie in `[k, k + 1) * width / per_side`, and the same down the photo.
+/// Returns the patches of a photo that have pixels, with their numbers, row by row. Patch `k` of `per_side` covers
+/// the pixels whose centres lie in `[k, k + 1) * width / per_side`, and the same down the photo.
 pub fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, Mask)> {
     // The first pixel whose centre is at or after the patch's edge: ceil(k * edge / per_side - 1/2).
     let first = |k: u32, edge_px: u32| {
@@ -28,8 +28,8 @@ pub fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, 
     patches
 }
 
-/// Returns the share of a mask's pixels in each patch where it has some, by number of the patch. Patches are those of
-/// [`patch_masks`].
+/// Returns the share of a mask's pixels in each patch where it has some, by number of the patch. Patches are those
+/// of [`patch_masks`].
 pub fn shares(mask: &Mask, per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, f32)> {
     // The patch of a pixel's centre: floor((x + 1/2) * per_side / edge).
     let patch = |x: u32, edge_px: u32| {

@@ -32,8 +32,8 @@ const SLIVERS_PER_MASK: u32 = 8;
 /// Divides a raster into regions, the sets of pixels that lie in the same masks.
 ///
 /// `masks` belong to an image of `width_px` x `height_px`; the parts of their boxes outside the image are ignored.
-/// Each pixel centre of the raster of `target_width_px` x `target_height_px` takes the nearest image pixel. `valid`:
-/// `[height_px * width_px]`, row-major; invalid pixels belong to no region.
+/// Each pixel centre of the raster of `target_width_px` x `target_height_px` takes the nearest image pixel.
+/// `valid`: `[height_px * width_px]`, row-major; invalid pixels belong to no region.
 ///
 /// Returns the map, and the masks of each region as ascending indices into `masks`. Masks refine the partition one
 /// after the other, each within its box, so the time is proportional to the area of the boxes.
@@ -87,8 +87,8 @@ pub fn partition(
         for class in touched.drain(..) {
             let at = class as usize;
             let inside = std::mem::take(&mut inside_of_class[at]);
-            // A class that lies in the mask entirely keeps its number, so there are never more classes than pixels.
-            // The uncovered class is the exception: its number is reserved.
+            // A class that lies in the mask entirely keeps its number, so there are never more classes than
+            // pixels. The uncovered class is the exception: its number is reserved.
             split_of_class[at] = class;
             if class == UNCOVERED || inside < size_of_class[at] {
                 split_of_class[at] = size_of_class.len() as u32;
@@ -107,9 +107,9 @@ pub fn partition(
 
 /// Merges slivers, which ragged edges of overlapping masks leave, into their neighbours.
 ///
-/// A sliver has fewer pixels than a 10,000th of the raster and than an eighth of every mask that covers it. It joins
-/// the region, not itself a sliver, with which it shares the longest border; without such a neighbour it stays. A mask
-/// never disappears: if all of its regions would join others, its largest one stays.
+/// A sliver has fewer pixels than a 10,000th of the raster and than an eighth of every mask that covers it. It
+/// joins the region, not itself a sliver, with which it shares the longest border; without such a neighbour it
+/// stays. A mask never disappears: if all of its regions would join others, its largest one stays.
 pub fn absorb_slivers(map: &mut RegionMap, masks_of_region: &mut Vec<Vec<u32>>) {
     let mut size_of_region = vec![0_u32; map.n_regions as usize];
     let covered = map.region_of_pixel.iter().filter(|region| **region != NO_REGION);

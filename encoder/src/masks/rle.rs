@@ -1,8 +1,8 @@
 //! COCO's run-length encoding of masks.
 //!
 //! The runs alternate between outside and inside, column by column. Their compact text has signed base-32 digits,
-//! least significant first; from the third run on, it holds the difference to the run two before. This is the format
-//! of the COCO API (`maskApi.c`), which its authors call "similar to LEB128".
+//! least significant first; from the third run on, it holds the difference to the run two before. This is the
+//! format of the COCO API (`maskApi.c`), which its authors call "similar to LEB128".
 
 use serde::Serialize;
 

@@ -3,7 +3,8 @@
 use super::mask::{BoxPx, Mask};
 use super::patches;
 
-/// Windows over a photo: for each size `s` those of `1/s` of its edges, half of one apart, so `(2 s - 1)^2`, row by row.
+/// Windows over a photo: for each size `s` those of `1/s` of its edges, half of one apart, so `(2 s - 1)^2`, row
+/// by row.
 pub struct Windows {
     sizes: Vec<u32>,
     width_px: u32,
@@ -38,8 +39,8 @@ impl Windows {
         masks
     }
 
-    /// Returns the share of a mask in each window where it has some, by the window's number: a pixel counts for all windows of a
-    /// size that it is in, alike, and for each size alike.
+    /// Returns the share of a mask in each window where it has some, by the window's number: a pixel counts for
+    /// all windows of a size that it is in, alike, and for each size alike.
     pub fn shares(&self, mask: &Mask) -> Vec<(usize, f32)> {
         let mut shares = Vec::new();
         let mut first = 0;

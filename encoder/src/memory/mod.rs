@@ -1,10 +1,11 @@
 //! The budget of working memory: named reservations.
 //!
-//! Each module that allocates what grows with the scene has a function `reserve`, beside the allocation, that names the
-//! purpose and states the bytes. The encoder calls them before the first view, and again once the views are done for
-//! what depends on masks and contributions.
+//! Each module that allocates what grows with the scene has a function `reserve`, beside the allocation, that
+//! names the purpose and states the bytes. The encoder calls them before the first view, and again once the views
+//! are done for what depends on masks and contributions.
 //!
-//! A reservation is a bound. Beside it stands what is expected, from which the peak of the whole process is planned.
+//! A reservation is a bound. Beside it stands what is expected, from which the peak of the whole process is
+//! planned.
 
 mod process;
 
@@ -139,7 +140,8 @@ impl MemoryPlan {
         self.is_before_views = false;
     }
 
-    /// Returns the bytes of the budget that are free during a phase. [`Self::rest`] are those that are free during all.
+    /// Returns the bytes of the budget that are free during a phase. [`Self::rest`] are those that are free during
+    /// all.
     pub fn rest_of(&self, phase: Phase) -> u64 {
         self.available_bytes.saturating_sub(self.reserved_bytes(phase))
     }

@@ -17,8 +17,8 @@ fn status_bytes(name: &str) -> Option<u64> {
     Some(kib * 1024)
 }
 
-/// Gives freed memory back to the system. The allocator of glibc keeps what threads freed for these threads alone, so that
-/// each phase would come on top of the one before.
+/// Gives freed memory back to the system. The allocator of glibc keeps what threads freed for these threads alone,
+/// so that each phase would come on top of the one before.
 pub fn give_back() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     trim();
@@ -27,8 +27,8 @@ pub fn give_back() {
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 #[expect(unsafe_code, reason = "glibc offers it as a C function alone")]
 fn trim() {
-    // SAFETY: it takes a number, locks each arena of the allocator, and touches pages that lie in free chunks alone, so
-    // that no value can change. It may be called at any time from any thread.
+    // SAFETY: it takes a number, locks each arena of the allocator, and touches pages that lie in free chunks
+    // alone, so that no value can change. It may be called at any time from any thread.
     unsafe { libc::malloc_trim(0) };
 }
 
@@ -36,9 +36,9 @@ fn trim() {
 mod tests {
     use super::*;
 
-    /// A thread frees 64 MB in pieces that the allocator keeps, with pieces between them that live on: given back, they are no
-    /// longer held, and the others are as they were. Other tests of this process may take as much meanwhile, so there are
-    /// several attempts.
+    /// A thread frees 64 MB in pieces that the allocator keeps, with pieces between them that live on: given back,
+    /// they are no longer held, and the others are as they were. Other tests of this process may take as much
+    /// meanwhile, so there are several attempts.
     #[test]
     fn freed_memory_is_given_back_and_the_rest_is_kept() {
         let is_less_held = || {

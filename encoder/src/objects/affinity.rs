@@ -1,9 +1,9 @@
 //! How much masks speak for two superpoints being of one object.
 //!
-//! In a view that sees both, it is the share of the masks of either that show both: segmenters return wholes and parts side by
-//! side, so an object's superpoints share its mask and those of all that contains it, and superpoints of two objects
-//! only the latter.
-//! Yin et al. ("SAI3D", CVPR 2024) join superpoints by masks, too, of one level.
+//! In a view that sees both, it is the share of the masks of either that show both: segmenters return wholes and
+//! parts side by side, so an object's superpoints share its mask and those of all that contains it, and
+//! superpoints of two objects only the latter. Yin et al. ("SAI3D", CVPR 2024) join superpoints by masks, too, of
+//! one level.
 
 use std::cmp::Ordering;
 
@@ -19,8 +19,8 @@ const PRIOR_WEIGHT: f64 = 1.0;
 /// A share of 1.
 pub(super) const SHARE: u64 = 1 << 20;
 
-/// What views say about two superpoints, or two sets of them; evidence is added. Integers, so that sums do not depend on their
-/// order.
+/// What views say about two superpoints, or two sets of them; evidence is added. Integers, so that sums do not
+/// depend on their order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Evidence {
     /// Sum over the views of the share of masks that show both, in units of [`SHARE`], times Gaussians.
@@ -72,7 +72,8 @@ fn of_pair(sightings: &Sightings, a: usize, b: usize) -> Evidence {
     evidence
 }
 
-/// Returns the number of masks that show both superpoints, and of those that show either; none where a view sees one alone.
+/// Returns the number of masks that show both superpoints, and of those that show either; none where a view sees
+/// one alone.
 fn shared(a: &ViewSighting<'_>, b: &ViewSighting<'_>) -> (u64, u64) {
     if a.n == 0 || b.n == 0 {
         return (0, 0);

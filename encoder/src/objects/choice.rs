@@ -1,9 +1,10 @@
 //! Which nodes of the tree are objects: those that views agree on.
 //!
-//! A view's agreement with a node is the best intersection over union between one of its masks and what it sees of the node. A
-//! node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan et al., CVPR 2024, judges masks). The
-//! nodes are chosen, none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: an object
-//! wins over its parts if views agree on it nearly as well. A node without consensus is no object.
+//! A view's agreement with a node is the best intersection over union between one of its masks and what it sees of
+//! the node. A node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan
+//! et al., CVPR 2024, judges masks). The nodes are chosen, none part of another, for which the sum of consensus^8
+//! n^(1/4) is largest, n the number of Gaussians: an object wins over its parts if views agree on it nearly as
+//! well. A node without consensus is no object.
 
 use std::collections::BTreeMap;
 
@@ -16,8 +17,8 @@ use super::tree::Tree;
 const OBSERVED_TENTHS: u64 = 1;
 /// Nodes below this consensus are no objects.
 const MIN_CONSENSUS: f64 = 0.3;
-/// A mask with more than this intersection over union shows the node: a majority of their union, so that no mask shows two
-/// nodes that have nothing in common.
+/// A mask with more than this intersection over union shows the node: a majority of their union, so that no mask
+/// shows two nodes that have nothing in common.
 const SAME_IOU: f64 = 0.5;
 /// An object needs masks in this many views: a single view has none to agree with.
 const MIN_VIEWS: usize = 2;

@@ -20,8 +20,8 @@ use crate::lift::{ContributionError, RegionTable, SceneContributions};
 
 /// Smaller objects are dropped, as the robot drops smaller clusters.
 const MIN_GAUSSIANS: u32 = 10;
-/// Share of the means that an object's box leaves out on either side of each axis, as boxes of clusters do: floaters
-/// would make the box as large as the room.
+/// Share of the means that an object's box leaves out on either side of each axis, as boxes of clusters do:
+/// floaters would make the box as large as the room.
 const TRIMMED: f64 = 0.02;
 
 /// Finds the objects of a scene while its refinement is pending: superpoints are known, and nothing is mixed yet.

@@ -31,7 +31,8 @@ use crate::memory::{MemoryPlan, Phase};
 pub(crate) use find::find;
 pub use object::{NONE, Object, ObjectsReport, SceneObjects};
 
-/// Reserves what finding the objects of a scene takes, and the object of each Gaussian. `has_superpoints`: they are given.
+/// Reserves what finding the objects of a scene takes, and the object of each Gaussian. `has_superpoints`: they
+/// are given.
 pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, has_superpoints: bool) {
     let labels_bytes = (n_gaussians * size_of::<u32>()) as u64;
     memory.reserve(Phase::Always, "the object of each Gaussian", labels_bytes);

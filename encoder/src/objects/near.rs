@@ -27,8 +27,8 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     memory.reserve_expecting(Phase::Objects, "superpoints near each other", len_bytes, expected_bytes);
 }
 
-/// Returns the pairs of superpoints that lie near each other: a sampled Gaussian of one is among the nearest neighbours of a
-/// sample of the other. The lower number comes first; pairs are ascending.
+/// Returns the pairs of superpoints that lie near each other: a sampled Gaussian of one is among the nearest
+/// neighbours of a sample of the other. The lower number comes first; pairs are ascending.
 pub(super) fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u32)> {
     let samples = samples(superpoints);
     let points: Vec<[f64; 3]> =
@@ -48,8 +48,8 @@ pub(super) fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u
     pairs
 }
 
-/// Returns up to [`MAX_SAMPLES`] Gaussians of each superpoint, spread evenly over its own in the order of the scene: superpoint
-/// and Gaussian, ascending.
+/// Returns up to [`MAX_SAMPLES`] Gaussians of each superpoint, spread evenly over its own in the order of the
+/// scene: superpoint and Gaussian, ascending.
 fn samples(superpoints: &Superpoints) -> Vec<(u32, u32)> {
     let sizes = superpoints.sizes();
     let most = superpoints.of_gaussian.len() / GAUSSIANS_PER_SAMPLE / superpoints.n.max(1);
@@ -79,7 +79,8 @@ mod tests {
 
     use super::*;
 
-    /// By hand: 40 superpoints of 10 Gaussians along a line; the 24 nearest samples on either side are those of six.
+    /// By hand: 40 superpoints of 10 Gaussians along a line; the 24 nearest samples on either side are those of
+    /// six.
     #[test]
     fn pairs_are_near_and_samples_are_even() {
         let n = 400u32;

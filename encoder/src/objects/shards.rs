@@ -80,7 +80,8 @@ impl<'a> CentroidBasis<'a> {
         vectors.chunks_exact(self.dim).flat_map(solve).collect()
     }
 
-    /// Returns the largest distance between vectors (`[n][dim]`) and those that their rounded components decode to.
+    /// Returns the largest distance between vectors (`[n][dim]`) and those that their rounded components decode
+    /// to.
     fn largest_error(&self, vectors: &[f32], components: &[i8], steps: &[f32]) -> f32 {
         let m = self.m();
         let of_vector = |((vector, components), step): ((&[f32], &[i8]), &f32)| {
@@ -114,7 +115,8 @@ pub struct CellObjects {
 }
 
 impl CellObjects {
-    /// Collects the objects of a cell. `locals`: its Gaussians in the order of the shard; `basis`: of its centroids.
+    /// Collects the objects of a cell. `locals`: its Gaussians in the order of the shard; `basis`: of its
+    /// centroids.
     pub fn new(scene: &SceneObjects, cell_id: u32, locals: &[u32], basis: &CentroidBasis<'_>) -> Self {
         let object_of = &scene.object_of[cell_id as usize];
         let mut n_here = vec![0u32; scene.objects.len()];

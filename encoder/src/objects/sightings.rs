@@ -6,13 +6,13 @@ use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::lift::{ContributionError, PartContributions, RegionTable, SceneContributions};
 use crate::memory::{MemoryPlan, Phase};
 
-/// A view sees a Gaussian if its weight there is at least this share of that in its best view: remnants behind other
-/// Gaussians say nothing.
+/// A view sees a Gaussian if its weight there is at least this share of that in its best view: remnants behind
+/// other Gaussians say nothing.
 const MIN_WEIGHT_SHARE: f32 = 0.1;
 /// Gaussians that a thread goes through at once.
 const GAUSSIANS_PER_TASK: usize = 1 << 12;
-/// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, and of labelled scenes a
-/// fifteenth.
+/// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, and of labelled
+/// scenes a fifteenth.
 const ENTRIES_PER_REGION: u64 = 8;
 const EXPECTED_ENTRIES_PER_REGION: u64 = 15;
 
@@ -189,7 +189,8 @@ fn join(mut entries: Vec<Entry>) -> Vec<Entry> {
     entries
 }
 
-/// Returns, for each view that sees a Gaussian, the region with most of its weight there. Entries are by view, then region.
+/// Returns, for each view that sees a Gaussian, the region with most of its weight there. Entries are by view,
+/// then region.
 fn seen(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<u32> {
     let mut views: Vec<(u32, f32, u32, f32)> = Vec::new();
     for (region, weight) in regions.iter().zip(weights) {
@@ -213,7 +214,8 @@ fn seen(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<u32> {
 mod tests {
     use super::*;
 
-    /// Computed by hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 less than a tenth, view 3 nothing.
+    /// Computed by hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 less than a tenth, view 3
+    /// nothing.
     #[test]
     fn a_gaussian_shows_the_region_of_most_weight_where_it_is_seen() {
         let view_of_region = [0, 0, 1, 1, 1, 2, 3];

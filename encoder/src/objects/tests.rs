@@ -170,8 +170,9 @@ fn a_search_can_be_cancelled() {
     assert!(matches!(found, Err(ContributionError::Cancelled)));
 }
 
-/// By hand: at the ends of a row, two pieces that are near nothing of each other, and in two views one mask over both: each has
-/// an intersection over union of one half with it. None has a mask of its own, so none is an object.
+/// By hand: at the ends of a row, two pieces that are near nothing of each other, and in two views one mask over
+/// both: each has an intersection over union of one half with it. None has a mask of its own, so none is an
+/// object.
 #[test]
 fn a_mask_is_of_one_object_at_most() {
     let (n, per_superpoint) = (1500u32, 10u32);
@@ -231,8 +232,8 @@ fn shards_carry_the_objects_of_their_cell() {
     }
 }
 
-/// Oracle: the normal equations, and the definition of what is kept, in float64. Vectors that the basis can make come
-/// back, of others what is left is at right angles to it, and the stated bound is the largest distance.
+/// Oracle: the normal equations, and the definition of what is kept, in float64. Vectors that the basis can make
+/// come back, of others what is left is at right angles to it, and the stated bound is the largest distance.
 #[test]
 fn vectors_are_kept_in_the_basis_of_centroids() {
     let mut random = Random::new(9);

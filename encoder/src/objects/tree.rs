@@ -1,8 +1,8 @@
-//! Superpoints are joined pair by pair, those with most affinity first: each join is a candidate for an object, from a side of a
-//! cup to the whole table.
+//! Superpoints are joined pair by pair, those with most affinity first: each join is a candidate for an object,
+//! from a side of a cup to the whole table.
 //!
-//! The affinity of two sets is that of all their pairs that lie near each other, added up (average linkage, Sokal and
-//! Michener 1958).
+//! The affinity of two sets is that of all their pairs that lie near each other, added up (average linkage, Sokal
+//! and Michener 1958).
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
@@ -22,8 +22,8 @@ pub(super) struct Tree {
 type Pair = (u64, Reverse<u32>, Reverse<u32>);
 
 impl Tree {
-    /// Joins `n` superpoints until no two have evidence. Of equal affinities the pair with the lowest numbers comes first; a join
-    /// goes by the number of the part that is near more others, of equally many the lower one.
+    /// Joins `n` superpoints until no two have evidence. Of equal affinities the pair with the lowest numbers
+    /// comes first; a join goes by the number of the part that is near more others, of equally many the lower one.
     pub(super) fn new(n: usize, pairs: &[(u32, u32, Evidence)]) -> Self {
         let mut tree = Self { n_leaves: n, parts: Vec::new() };
         let mut neighbours: Vec<BTreeMap<u32, Evidence>> = vec![BTreeMap::new(); n];

@@ -13,8 +13,8 @@ pub(super) const MAX_MEDOIDS: usize = 4;
 /// Most masks considered, the heaviest first: more hardly change the medoids, and time grows with the square.
 const MAX_MASKS: usize = 256;
 
-/// Returns `[n][dim]`: the direction of the weighted mean of some masks' vectors, then medoids. Each medoid in turn is the
-/// mask that most raises the weighted mean of all masks' cosines with their nearest medoid.
+/// Returns `[n][dim]`: the direction of the weighted mean of some masks' vectors, then medoids. Each medoid in
+/// turn is the mask that most raises the weighted mean of all masks' cosines with their nearest medoid.
 pub(super) fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
     let dim = table.dim();
     let vector = |mask: u32| table.mask_vectors().get(mask as usize);

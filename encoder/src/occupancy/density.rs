@@ -1,8 +1,8 @@
 //! Which voxels hold a surface: the opacity of all Gaussians at each voxel, by Beer and Lambert's law.
 //!
-//! `opacity = 1 - exp(-sum over Gaussians of alpha exp(-d^2 / 2))`, where d is the distance of the voxel's centre from the
-//! mean in standard deviations of the Gaussian, widened by [`VOXEL_VARIANCE`] of the voxel's edge squared; d above
-//! [`MAX_SIGMAS`] counts nothing.
+//! `opacity = 1 - exp(-sum over Gaussians of alpha exp(-d^2 / 2))`, where d is the distance of the voxel's centre
+//! from the mean in standard deviations of the Gaussian, widened by [`VOXEL_VARIANCE`] of the voxel's edge
+//! squared; d above [`MAX_SIGMAS`] counts nothing.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -18,8 +18,9 @@ use super::lattice::{BlockAt, Lattice};
 pub const MIN_OPACITY: f32 = 0.1;
 /// Distance from a mean, in standard deviations, up to which a Gaussian counts.
 pub const MAX_SIGMAS: f64 = 3.0;
-/// Variance that widens a Gaussian, in squared edges of a voxel. A surface is thinner than a voxel: without it a voxel's
-/// centre beside the surface sees nothing. With 0.15 a closed surface of opaque Gaussians that touches a corner of the voxel,
+/// Variance that widens a Gaussian, in squared edges of a voxel. A surface is thinner than a voxel: without it a
+/// voxel's centre beside the surface sees nothing. With 0.15 a closed surface of opaque Gaussians that touches a
+/// corner of the voxel,
 /// 0.866 edges from its centre, still gives an opacity of 0.16.
 pub const VOXEL_VARIANCE: f64 = 0.15;
 
@@ -27,10 +28,11 @@ pub const VOXEL_VARIANCE: f64 = 0.15;
 const TILE_BLOCKS: i32 = 16;
 /// Voxels along an edge of a tile.
 const TILE_EDGE: usize = (TILE_BLOCKS * BLOCK_EDGE) as usize;
-/// Tiles along an axis that a Gaussian may reach into: larger ones are sky and other background that no robot drives into.
+/// Tiles along an axis that a Gaussian may reach into: larger ones are sky and other background that no robot
+/// drives into.
 const MAX_TILES: i32 = 8;
-/// Standard deviation along its shortest axis, world units, above which a Gaussian is fog, sky or other background: the
-/// Gaussians of a surface are thin.
+/// Standard deviation along its shortest axis, world units, above which a Gaussian is fog, sky or other
+/// background: the Gaussians of a surface are thin.
 const MAX_THICKNESS: f32 = 0.2;
 
 /// The occupied voxels of a scene.
@@ -84,8 +86,8 @@ impl Ellipsoid {
         (last - first < i64::from(MAX_TILES)).then_some(first as i32..=last as i32)
     }
 
-    /// Adds `alpha exp(-d^2 / 2)` to the voxels of a tile, row by row along z: where a row enters and leaves the ellipsoid is
-    /// a quadratic equation.
+    /// Adds `alpha exp(-d^2 / 2)` to the voxels of a tile, row by row along z: where a row enters and leaves the
+    /// ellipsoid is a quadratic equation.
     fn add_to(&self, tile: [i32; 3], sums: &mut [f32]) {
         let first = tile.map(|t| i64::from(t) * TILE_EDGE as i64);
         let clipped = |axis: usize, range: RangeInclusive<i64>| {
@@ -117,8 +119,8 @@ impl Ellipsoid {
     }
 }
 
-/// Finds the occupied voxels. `usable`: the Gaussians to take, ascending. The result does not depend on threads: a tile
-/// belongs to one, and adds its Gaussians in their order.
+/// Finds the occupied voxels. `usable`: the Gaussians to take, ascending. The result does not depend on threads: a
+/// tile belongs to one, and adds its Gaussians in their order.
 pub(super) fn occupied(scene: &Gaussians, usable: &[u32], lattice: Lattice) -> Occupied {
     let ellipsoid = |index: &u32| Ellipsoid::new(scene, *index as usize, lattice);
     let reached: Vec<Option<[RangeInclusive<i32>; 3]>> = usable

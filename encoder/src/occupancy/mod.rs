@@ -61,7 +61,8 @@ impl SceneOccupancy {
     }
 }
 
-/// Finds the free and occupied places of a scene from its Gaussians and the views that look at it; `None` if cancelled.
+/// Finds the free and occupied places of a scene from its Gaussians and the views that look at it; `None` if
+/// cancelled.
 ///
 /// # Errors
 /// A view cannot be drawn: its index in `views`, and the cause.

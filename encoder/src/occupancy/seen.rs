@@ -32,7 +32,8 @@ pub(super) struct Candidate {
     pub(super) seen: u64,
 }
 
-/// Returns the blocks with an occupied voxel and those above them up to the headroom, by place. `occupied`: by place.
+/// Returns the blocks with an occupied voxel and those above them up to the headroom, by place. `occupied`: by
+/// place.
 pub(super) fn candidates(occupied: &[(BlockAt, u64)], lattice: Lattice) -> Vec<Candidate> {
     let above = (HEADROOM / lattice.block()).ceil() as i32;
     let mut all: Vec<Candidate> = Vec::new();
@@ -54,8 +55,9 @@ pub(super) struct Depth {
 }
 
 impl Depth {
-    /// Takes the depth of each pixel. At the edge of a surface it lies between that surface and the one behind it, so such a pixel may look through
-    /// what the nearer surface hides. It is one pixel wide, voxels with a surface are occupied in any case, and two views must agree.
+    /// Takes the depth of each pixel. At the edge of a surface it lies between that surface and the one behind it,
+    /// so such a pixel may look through what the nearer surface hides. It is one pixel wide, voxels with a surface
+    /// are occupied in any case, and two views must agree.
     pub(super) fn new(view: RasterView, drawing: &Drawing) -> Self {
         let of_pixel = |pixel: usize| match drawing.coverage[pixel] {
             coverage if coverage >= MIN_COVERAGE => drawing.depth[pixel],

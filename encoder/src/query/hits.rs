@@ -1,4 +1,5 @@
-//! The Gaussians that a query found: which they are in the input splat file, where they lie, and themselves as a splat.
+//! The Gaussians that a query found: which they are in the input splat file, where they lie, and themselves as a
+//! splat.
 
 use std::collections::HashMap;
 
@@ -55,8 +56,8 @@ impl Scores {
     }
 }
 
-/// Returns Gaussians of the input with their positions, in the order given. Those that no shard knows the index of are left
-/// out; a scene encoded with exact shards or input indices has none.
+/// Returns Gaussians of the input with their positions, in the order given. Those that no shard knows the index of
+/// are left out; a scene encoded with exact shards or input indices has none.
 pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result<Vec<Hit>, QueryError> {
     let mut positions: HashMap<u32, Option<DVec3>> = indices.iter().map(|index| (*index, None)).collect();
     if positions.is_empty() {
@@ -94,7 +95,8 @@ fn indexed_shard(
     Ok(None)
 }
 
-/// Checks that a splat is the one that a store was encoded from: by its number of Gaussians, and by the positions of some.
+/// Checks that a splat is the one that a store was encoded from: by its number of Gaussians, and by the positions
+/// of some.
 pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Result<(), SceneMismatch> {
     let manifest = reader.manifest();
     let expected = manifest.n_gaussians + manifest.n_rejected;

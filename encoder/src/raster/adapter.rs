@@ -45,7 +45,8 @@ pub struct GpuOptions {
     pub max_resident_bytes: u64,
     /// Initial capacity for visible Gaussians, pairs and contributions; it grows when a view needs more.
     pub first_capacity: u32,
-    /// Views processed at once, fewer where the device's memory does not suffice: while one is copied back, others compute.
+    /// Views processed at once, fewer where the device's memory does not suffice: while one is copied back, others
+    /// compute.
     pub views_in_flight: usize,
 }
 

@@ -29,8 +29,8 @@ pub struct Tiles {
 /// A key that orders Gaussians from near to far, and the columns `first..=last` of tiles in a row.
 type Candidate = (u64, (u32, u32));
 
-/// Lists, for every tile, the Gaussians with a footprint that may contain one of its pixel centres. They are ordered by
-/// camera z as `f32`; ties are broken by index.
+/// Lists, for every tile, the Gaussians with a footprint that may contain one of its pixel centres. They are
+/// ordered by camera z as `f32`; ties are broken by index.
 pub fn bin(visible: &[ScreenGaussian], camera: &Intrinsics) -> Tiles {
     let (width_px, height_px) = (camera.width_px, camera.height_px);
     let n_rows = height_px.div_ceil(TILE) as usize;
@@ -92,8 +92,8 @@ impl<'a> Footprint<'a> {
         Self { gaussian, reach2, extent_y_px: extent_px.y, y_of_rightmost }
     }
 
-    /// Returns the columns of tiles that the footprint touches in the row of tiles at `top_px`. Apart from the margin of
-    /// the reach, the result is exact to the pixel.
+    /// Returns the columns of tiles that the footprint touches in the row of tiles at `top_px`. Apart from the
+    /// margin of the reach, the result is exact to the pixel.
     fn columns(&self, top_px: u32, camera: &Intrinsics) -> Option<(u32, u32)> {
         let g = self.gaussian;
         let bottom_px = (top_px + TILE).min(camera.height_px) - 1;

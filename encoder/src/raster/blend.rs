@@ -9,14 +9,14 @@ use super::project::ScreenGaussian;
 use super::simd::Lanes;
 use super::weights::WeightKind;
 
-/// Gaussians that are fetched and prepared at once. Between batches, rows with only opaque pixels are identified, to
-/// skip them.
+/// Gaussians that are fetched and prepared at once. Between batches, rows with only opaque pixels are identified,
+/// to skip them.
 const BATCH: usize = 32;
 
 /// Largest exponent that matters: `exp(-6)` is below 1/255, so no alpha beyond it counts.
 pub const MAX_POWER: f32 = 6.0;
-/// Polynomial for `exp(t - 3/4)` with `|t| <= 3/4`, interpolated at the Chebyshev nodes. Its fourth power has a relative
-/// error of at most 1.6e-7.
+/// Polynomial for `exp(t - 3/4)` with `|t| <= 3/4`, interpolated at the Chebyshev nodes. Its fourth power has a
+/// relative error of at most 1.6e-7.
 pub const EXP_OF_MINUS_C: [f32; 8] = [
     0.472_366_54,
     0.472_366_55,
@@ -57,7 +57,8 @@ impl TileRect {
     }
 }
 
-/// Consumes the weights of the Gaussians of a tile, from near to far. `member` is an index into the visible Gaussians.
+/// Consumes the weights of the Gaussians of a tile, from near to far. `member` is an index into the visible
+/// Gaussians.
 pub trait WeightSink {
     /// Consumes the weights at the pixels of vector `v` in row `y`; 0 at pixels without weight.
     fn add<S: Lanes>(&mut self, simd: S, member: u32, y: usize, v: usize, weights: S::f32s);
@@ -239,14 +240,15 @@ impl InTile {
     }
 }
 
-/// Selects `set` in the lanes of the mask and `unset` in the others. `select_f32s` is not always inlined, which costs
-/// AVX2 a call with its masks in memory.
+/// Selects `set` in the lanes of the mask and `unset` in the others. `select_f32s` is not always inlined, which
+/// costs AVX2 a call with its masks in memory.
 #[inline(always)]
 fn select<S: Simd>(simd: S, mask: S::m32s, set: S::f32s, unset: S::f32s) -> S::f32s {
     cast(simd.select_u32s(mask, cast(set), cast(unset)))
 }
 
-/// Returns `exp(-power)` for `power >= 0` with a relative error below 1e-6. Powers above [`MAX_POWER`] are clamped.
+/// Returns `exp(-power)` for `power >= 0` with a relative error below 1e-6. Powers above [`MAX_POWER`] are
+/// clamped.
 ///
 /// It uses basic arithmetic instead of the platform's `exp`, which allows SIMD and gives the same bits everywhere.
 #[inline(always)]

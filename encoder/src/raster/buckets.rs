@@ -11,7 +11,8 @@ pub(super) struct Buckets<T> {
     items: Vec<T>,
 }
 
-/// Returns where each bucket starts, and where the last one ends. `spans`: the buckets `first..=last` of each item.
+/// Returns where each bucket starts, and where the last one ends. `spans`: the buckets `first..=last` of each
+/// item.
 fn starts_of(n_buckets: usize, spans: impl Iterator<Item = (u32, u32)>) -> Vec<usize> {
     // How many items begin and end at each bucket; of large ones there may be more than 2^32 in all.
     let (mut begin, mut end) = (vec![0_usize; n_buckets + 1], vec![0_usize; n_buckets + 1]);

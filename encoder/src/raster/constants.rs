@@ -12,10 +12,11 @@ pub const COVARIANCE_BLUR_PX2: f64 = 0.3;
 pub const MAX_ALPHA: f32 = 0.999;
 /// Smallest alpha that counts: the footprint of a Gaussian ends where its alpha falls below.
 pub const MIN_ALPHA: f32 = 1.0 / 255.0;
-/// Transmittance at which a pixel is opaque. The first Gaussian that would reach it ends the pixel and is not blended.
+/// Transmittance at which a pixel is opaque. The first Gaussian that would reach it ends the pixel and is not
+/// blended.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
-/// Margin around the image within which the Jacobian of the projection is exact, as a share of the tangent of half the
-/// field of view. Beyond it, the Jacobian is evaluated at the limit.
+/// Margin around the image within which the Jacobian of the projection is exact, as a share of the tangent of half
+/// the field of view. Beyond it, the Jacobian is evaluated at the limit.
 pub const FOV_MARGIN: f64 = 0.3;
 /// Added to the squared Mahalanobis reach of a footprint before culling. The rounding error of `f32` is below 5e-5
 /// there, so no pixel with a sufficient alpha is culled.

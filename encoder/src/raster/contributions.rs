@@ -16,8 +16,8 @@ use crate::masks::{NO_REGION, RegionMap};
 /// Units of a fixed-point weight per pixel.
 const FIXED_UNITS: f64 = (1_u64 << SUM_FRACTION_BITS) as f64;
 
-/// Sums of a tile's weights in `f64` are exact in any order. A weight is at least 2^-22, hence a multiple of 2^-45, and
-/// the sum of 256 weights fits 53 bits.
+/// Sums of a tile's weights in `f64` are exact in any order. A weight is at least 2^-22, hence a multiple of
+/// 2^-45, and the sum of 256 weights fits 53 bits.
 const _: () = {
     assert!(MIN_ALPHA as f64 * MIN_TRANSMITTANCE as f64 > 1.0 / (1 << 22) as f64);
     assert!(TILE_SIZE_PX * TILE_SIZE_PX <= 1 << 8);
@@ -89,7 +89,8 @@ fn merge_range(
     first: usize,
     by_row: &[&[TileContribution]],
 ) -> Vec<RegionWeight> {
-    // A counting sort groups the few contributions of each Gaussian; only within a group they are sorted by region.
+    // A counting sort groups the few contributions of each Gaussian; only within a group they are sorted by
+    // region.
     let mut ends = vec![0_usize; visible.len()];
     for of_tile in by_row.iter().copied().flatten() {
         ends[of_tile.member as usize - first] += 1;

@@ -109,7 +109,8 @@ impl Devices {
                 chosen.map(|(_, adapter)| adapter).collect()
             }
             DeviceChoice::Auto | DeviceChoice::Gpu => {
-                // A GPU appears once per graphics interface; within the interface of the best adapter, GPUs are distinct.
+                // A GPU appears once per graphics interface; within the interface of the best adapter, GPUs are
+                // distinct.
                 let backend = all.first().map(|a| a.report.backend.clone());
                 let (software, hardware): (Vec<Adapter>, Vec<Adapter>) = all
                     .into_iter()
@@ -206,8 +207,8 @@ impl Rasterizer for Devices {
     }
 }
 
-/// A scene on several GPUs. Each GPU has one slot per view in flight. A view goes to the GPU with the most free slots,
-/// so a slow view occupies only its own slot.
+/// A scene on several GPUs. Each GPU has one slot per view in flight. A view goes to the GPU with the most free
+/// slots, so a slow view occupies only its own slot.
 struct SharedScene<'s> {
     gpus: Vec<Box<dyn LoadedScene + 's>>,
     views_in_flight: usize,
@@ -227,7 +228,8 @@ impl<'s> SharedScene<'s> {
         self.slots.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes a slot of the GPU with the most free slots, and waits for one if necessary; `None` if no GPU is usable.
+    /// Takes a slot of the GPU with the most free slots, and waits for one if necessary; `None` if no GPU is
+    /// usable.
     fn take(&self) -> Option<Slot<'_, 's>> {
         let mut slots = self.slots();
         while slots.is_usable.contains(&true) {

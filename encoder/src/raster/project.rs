@@ -14,10 +14,10 @@ use crate::memory::{MemoryPlan, Phase};
 
 /// A Gaussian on the screen.
 ///
-/// With `d = pixel centre - mean_px`, `u = inv_width * (d.x - slope * d.y)` and `v = inv_height * d.y`, the exponent is
-/// `(u^2 + v^2) / 2`: the fields are the Cholesky factor of the inverse covariance. A sum of squares loses no digits,
-/// whereas the terms of `a dx^2 + 2 b dx dy + c dy^2` cancel for needles. The size is 56 bytes, because tiles access
-/// Gaussians at random and a cache line has 64.
+/// With `d = pixel centre - mean_px`, `u = inv_width * (d.x - slope * d.y)` and `v = inv_height * d.y`, the
+/// exponent is `(u^2 + v^2) / 2`: the fields are the Cholesky factor of the inverse covariance. A sum of squares
+/// loses no digits, whereas the terms of `a dx^2 + 2 b dx dy + c dy^2` cancel for needles. The size is 56 bytes,
+/// because tiles access Gaussians at random and a cache line has 64.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Zeroable)]
 pub struct ScreenGaussian {
     /// Index in the scene.
@@ -51,8 +51,8 @@ impl ScreenGaussian {
         [self.mean_px.y - extent, self.mean_px.y + extent]
     }
 
-    /// Returns the pixels `first..=last` of an axis with centres in `[low, high]` and in the image; `None` if there are
-    /// none.
+    /// Returns the pixels `first..=last` of an axis with centres in `[low, high]` and in the image; `None` if
+    /// there are none.
     pub fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
         let first = (low - 0.5).max(0.0);
         let last = (high - 0.5).min(f64::from(size_px) - 1.0);
@@ -69,7 +69,8 @@ impl ScreenGaussian {
 /// The Gaussians of a scene that a view can see.
 #[derive(Clone, Debug, Default)]
 pub struct Projection {
-    /// Gaussians with at least one pixel centre of the image in the bounding box of their footprint, in scene order.
+    /// Gaussians with at least one pixel centre of the image in the bounding box of their footprint, in scene
+    /// order.
     pub visible: Vec<ScreenGaussian>,
     /// Number of Gaussians that cannot be drawn.
     pub unusable: usize,
@@ -190,8 +191,8 @@ impl Bounds {
         }
     }
 
-    /// Returns whether the footprint of a Gaussian with this mean (camera frame) contains no pixel centre for certain.
-    /// All lengths are multiplied by z, which avoids divisions.
+    /// Returns whether the footprint of a Gaussian with this mean (camera frame) contains no pixel centre for
+    /// certain. All lengths are multiplied by z, which avoids divisions.
     fn exclude(&self, mean: DVec3, size: Size) -> bool {
         if !(NEAR_Z..=FAR_Z).contains(&mean.z) {
             return true;
@@ -263,8 +264,8 @@ fn project_one(
     Ok(in_image.map(|_| on_screen))
 }
 
-/// Returns the rows of the Jacobian of the pinhole projection (Zwicker et al., EWA splatting, 2001), px per world unit,
-/// evaluated within a slightly widened field of view.
+/// Returns the rows of the Jacobian of the pinhole projection (Zwicker et al., EWA splatting, 2001), px per world
+/// unit, evaluated within a slightly widened field of view.
 fn jacobian_rows(mean: DVec3, camera: &Intrinsics) -> [DVec3; 2] {
     let [limit_x, limit_y] = tangent_limits(camera);
     let tan_x = (mean.x / mean.z).max(limit_x[0]).min(limit_x[1]);

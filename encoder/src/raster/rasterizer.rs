@@ -60,8 +60,8 @@ pub trait Rasterizer: Send + Sync {
 pub trait LoadedScene: Send + Sync {
     /// Returns the contribution of each Gaussian to each region.
     ///
-    /// Pixels of [`NO_REGION`](crate::masks::NO_REGION) are blended but not recorded. The same input gives the same
-    /// bits for any number of threads.
+    /// Pixels of [`NO_REGION`](crate::masks::NO_REGION) are blended but not recorded. The same input gives the
+    /// same bits for any number of threads.
     ///
     /// # Errors
     /// [`RasterError`] for inconsistent input or if a device fails.
@@ -74,8 +74,8 @@ pub trait LoadedScene: Send + Sync {
         Ok(self.weights_and_times(view, regions, kind, false)?.0)
     }
 
-    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure them.
-    /// Measuring may slow the view down.
+    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure
+    /// them. Measuring may slow the view down.
     fn weights_timed(
         &self,
         view: &RasterView,

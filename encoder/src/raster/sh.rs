@@ -7,8 +7,8 @@ use slag_common::gaussians::SH_C0;
 
 use super::project::ScreenGaussian;
 
-/// Factors of the real spherical harmonics of degree 1, 2 and 3, in the order and with the signs of 3DGS (Kerbl et al.
-/// 2023), which follows the polynomials of Ramamoorthi and Hanrahan.
+/// Factors of the real spherical harmonics of degree 1, 2 and 3, in the order and with the signs of 3DGS (Kerbl et
+/// al. 2023), which follows the polynomials of Ramamoorthi and Hanrahan.
 const SH_C1: f32 = 0.488_602_51;
 const SH_C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_2];
 const SH_C3: [f32; 7] =

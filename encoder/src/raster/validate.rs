@@ -49,7 +49,8 @@ pub(super) fn check_view(view: &RasterView) -> Result<(), RasterError> {
             centre_px: [centre_x_px, centre_y_px],
         });
     }
-    // Poses are often stored as f32 or rounded text. A deviation of 1e-3 still is a rotation; a mirror or scale is not.
+    // Poses are often stored as f32 or rounded text. A deviation of 1e-3 still is a rotation; a mirror or scale is
+    // not.
     let rotation = view.camera_from_world.matrix3;
     let excess = rotation.transpose() * rotation - DMat3::IDENTITY;
     let off =

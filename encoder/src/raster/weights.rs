@@ -5,8 +5,8 @@
 pub enum WeightKind {
     /// `alpha * T`: the Gaussian's contribution to the picture, attenuated by the Gaussians in front of it.
     Blend,
-    /// `exp(-d' S^-1 d / 2)`, as printed in the paper: without opacity and occlusion. The footprint still ends where
-    /// alpha falls below 1/255.
+    /// `exp(-d' S^-1 d / 2)`, as printed in the paper: without opacity and occlusion. The footprint still ends
+    /// where alpha falls below 1/255.
     Falloff,
 }
 
@@ -28,7 +28,8 @@ pub struct ViewCounters {
     pub visible: usize,
     /// Number of (Gaussian, tile) pairs.
     pub pairs: usize,
-    /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once projected.
+    /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once
+    /// projected.
     pub unusable: usize,
 }
 

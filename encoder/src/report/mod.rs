@@ -1,4 +1,5 @@
-//! The report of an encode: one page with its views, masks, objects, cells, errors by profile, and what was left out and why.
+//! The report of an encode: one page with its views, masks, objects, cells, errors by profile, and what was left
+//! out and why.
 
 mod map;
 mod recorder;

@@ -1,8 +1,9 @@
 //! The built-in segmenter: graph-based segmentation at several scales (Felzenszwalb and Huttenlocher, "Efficient
 //! Graph-Based Image Segmentation", IJCV 59(2), 2004).
 //!
-//! The weights of edges combine the object boundaries that a small model predicts from the photo and the splat's depth,
-//! differences of colour in CIE L*a*b* (where distances are about proportional to perceived differences), and jumps of depth.
+//! The weights of edges combine the object boundaries that a small model predicts from the photo and the splat's
+//! depth, differences of colour in CIE L*a*b* (where distances are about proportional to perceived differences),
+//! and jumps of depth.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -27,8 +28,8 @@ use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
 /// Steps of an edge weight per unit of L*a*b* distance; 16 bits then exceed the distance from black to white.
 const WEIGHT_STEPS: f32 = 200.0;
-/// Inverse of the least share of a component's pixels that are surrounded by the component: it is a third for a strip 3 px
-/// wide, and almost zero for a ring around an object.
+/// Inverse of the least share of a component's pixels that are surrounded by the component: it is a third for a
+/// strip 3 px wide, and almost zero for a ring around an object.
 const MIN_SURROUNDED: u32 = 8;
 /// Smallest mask, pixels of the working image: a JPEG block, the size of its artefacts.
 const MIN_AREA_PX: u32 = 64;
@@ -135,8 +136,8 @@ impl GraphSegmenter {
         Self { settings, identity, model: None }
     }
 
-    /// Creates a segmenter with the embedded model, which runs on one thread per image; `gpus`: those that share the
-    /// photos, where the session asks for GPUs.
+    /// Creates a segmenter with the embedded model, which runs on one thread per image; `gpus`: those that share
+    /// the photos, where the session asks for GPUs.
     ///
     /// # Errors
     /// [`SessionError`] if ONNX Runtime does not load.
@@ -291,8 +292,9 @@ impl Raster {
 
     /// Returns the relative depth jump between neighbours; 0 if unknown.
     ///
-    /// The inverse depth of a plane is linear in the image. So the slope on each side is extrapolated across the edge, and
-    /// the jump is the smaller of the two residuals. A slanted floor and the fold between floor and wall have no jump.
+    /// The inverse depth of a plane is linear in the image. So the slope on each side is extrapolated across the
+    /// edge, and the jump is the smaller of the two residuals. A slanted floor and the fold between floor and wall
+    /// have no jump.
     fn depth_jump(&self, a: usize, b: usize, step: (i64, i64)) -> f32 {
         let Some(depth_m) = &self.depth_m else { return 0.0 };
         let inverse = |pixel: usize| if depth_m[pixel] > 0.0 { 1.0 / depth_m[pixel] } else { f32::NAN };
@@ -308,7 +310,8 @@ impl Raster {
         if relative.is_finite() { relative } else { 0.0 }
     }
 
-    /// Returns the edges between valid pixels with their weights, in ascending order of weight and then of position.
+    /// Returns the edges between valid pixels with their weights, in ascending order of weight and then of
+    /// position.
     ///
     /// `boundaries`: `[neighbour][pixel]`, 0 to 1.
     fn edges_by_weight(&self, settings: &GraphSettings, boundaries: Option<&[f32]>) -> Vec<(Edge, u16)> {
@@ -382,8 +385,8 @@ impl Raster {
 
     /// Returns for each root whether a sufficient share of its component is surrounded by the component.
     ///
-    /// A smoothed outline is a ramp of colours. A component as narrow as this ramp is a strip of it and belongs to no
-    /// object.
+    /// A smoothed outline is a ramp of colours. A component as narrow as this ramp is a strip of it and belongs to
+    /// no object.
     fn thick(&self, components: &mut Components) -> Vec<bool> {
         let roots: Vec<usize> =
             (0..self.lab.len() as u32).map(|pixel| components.root(pixel) as usize).collect();

@@ -15,7 +15,8 @@ pub(super) const MAX_MASK_BYTES: u64 = 1 << 30;
 /// Finds the masks of a photo.
 pub trait Segmenter: Sync {
     /// Returns the identity of the segmenter: its method, every parameter, and the hashes of its weights. Two
-    /// segmenters of equal identity find the same masks in a photo for which [`Self::identity_of_view`] is equal too.
+    /// segmenters of equal identity find the same masks in a photo for which [`Self::identity_of_view`] is equal
+    /// too.
     fn identity(&self) -> String;
 
     /// Returns the hash of what this view's masks come from beside the photo: its mask file; `None` if nothing.
@@ -39,8 +40,8 @@ pub trait Segmenter: Sync {
         false
     }
 
-    /// Returns the number of photos that the segmenter's own threads or device process at once; `None` if it works on
-    /// the caller's thread.
+    /// Returns the number of photos that the segmenter's own threads or device process at once; `None` if it works
+    /// on the caller's thread.
     fn concurrency(&self) -> Option<usize> {
         None
     }
@@ -70,8 +71,8 @@ pub struct SegmentInput<'a> {
     pub undistorter: Option<&'a Undistorter>,
     /// Depth of the scene, camera z per pixel of `image`, row-major; 0 or NaN if unknown.
     pub depth: Option<&'a [f32]>,
-    /// The threads for [`Self::install`]. A segmenter with threads of its own is not called from one of them: it would
-    /// wait for itself.
+    /// The threads for [`Self::install`]. A segmenter with threads of its own is not called from one of them: it
+    /// would wait for itself.
     pub pool: Option<&'a ThreadPool>,
 }
 

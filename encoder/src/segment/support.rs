@@ -1,14 +1,15 @@
 //! How much of a component's outline the boundary model confirms.
 //!
-//! Components also end where the graph had to stop somewhere: across a carpet, or around two things with nothing between
-//! them that looks like a border. Such a mask shows no single thing.
+//! Components also end where the graph had to stop somewhere: across a carpet, or around two things with nothing
+//! between them that looks like a border. Such a mask shows no single thing.
 
 use crate::masks::NO_REGION;
 
-/// Returns for each component the mean, over the pairs of pixels across its outline, of the strongest boundary predicted
-/// within a pixel: 0 to 1, and 1 for a component without an outline. The photo's edge is no outline.
+/// Returns for each component the mean, over the pairs of pixels across its outline, of the strongest boundary
+/// predicted within a pixel: 0 to 1, and 1 for a component without an outline. The photo's edge is no outline.
 ///
-/// `of_pixel`: each pixel's component, row-major. `boundaries`: `[neighbour][pixel]`, the first to the right, the third below.
+/// `of_pixel`: each pixel's component, row-major. `boundaries`: `[neighbour][pixel]`, the first to the right, the
+/// third below.
 pub(super) fn of_outlines(
     of_pixel: &[u32],
     width_px: usize,
@@ -80,7 +81,8 @@ mod tests {
         let of_pixel = square(2, 2);
         assert_eq!(support(&of_pixel, &boundaries(&of_pixel, |_, _| true)), [1.0, 1.0]);
         assert_eq!(support(&of_pixel, &boundaries(&of_pixel, |_, _| false)), [0.0, 0.0]);
-        // Without its right side, whose pairs begin in column 5; none of these is beside a pair of another side of its kind.
+        // Without its right side, whose pairs begin in column 5; none of these is beside a pair of another side of
+        // its kind.
         let three_sides = support(&of_pixel, &boundaries(&of_pixel, |x, y| x != 5 || !(2..6).contains(&y)));
         // The bottom's last pair begins in that column, too, but its neighbour is predicted.
         assert_eq!(three_sides, [0.75, 0.75]);

@@ -70,8 +70,8 @@ pub struct CellEmbeddings {
     pub has_evidence: Vec<bool>,
 }
 
-/// Returns the bytes that building the shards of a cell of `n_gaussians` takes: embeddings in f32, in f16 and in the shard,
-/// and the codebook.
+/// Returns the bytes that building the shards of a cell of `n_gaussians` takes: embeddings in f32, in f16 and in
+/// the shard, and the codebook.
 pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     let per_component = size_of::<f32>() + 2 * size_of::<f16>();
     (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
@@ -94,8 +94,8 @@ pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve_expecting(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim), 0);
 }
 
-/// Returns the bytes that cells of at most `len_bytes` are expected to take, as measured: the precision of the default needs half
-/// of the coordinates, and without the exact profile there are no embeddings in f16.
+/// Returns the bytes that cells of at most `len_bytes` are expected to take, as measured: the precision of the
+/// default needs half of the coordinates, and without the exact profile there are no embeddings in f16.
 pub fn expected_bytes(len_bytes: u64) -> u64 {
     len_bytes / 20 * 9
 }
@@ -119,9 +119,9 @@ pub struct ShardBuilder<'a> {
     pub settings: &'a ShardSettings,
 }
 
-/// The Gaussians of a cell in the order of its shards: by centroid, then along the Morton curve; those without evidence
-/// last. Three numbers name a Gaussian: its place in this order, its *local* (its place in [`Cell::gaussians`] and in
-/// [`CellEmbeddings`]) and its index in the input.
+/// The Gaussians of a cell in the order of its shards: by centroid, then along the Morton curve; those without
+/// evidence last. Three numbers name a Gaussian: its place in this order, its *local* (its place in
+/// [`Cell::gaussians`] and in [`CellEmbeddings`]) and its index in the input.
 struct ShardOrder<'a> {
     cell: &'a Cell,
     /// By place: the local.
@@ -283,8 +283,8 @@ fn built(profile: Profile, view: &ShardView<'_>, additions: Additions<'_>) -> Bu
 /// Largest distance between an embedding and its f16 form: half a step of f16 at 1, and of its denormals.
 const F16_ROUNDING: f32 = 5e-4;
 
-/// Returns the photos of each cell: a photo belongs to the cell whose Gaussians' means are nearest to its camera, the first of
-/// such cells, so a robot has the cameras of the area that it fetched and no photo twice.
+/// Returns the photos of each cell: a photo belongs to the cell whose Gaussians' means are nearest to its camera,
+/// the first of such cells, so a robot has the cameras of the area that it fetched and no photo twice.
 pub fn photo_poses(split: &CellSplit, views: &[&View]) -> Vec<BuiltPhotoPoses> {
     let mut of_cells = vec![BuiltPhotoPoses::default(); split.cells.len()];
     for view in views {

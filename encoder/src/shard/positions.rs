@@ -8,7 +8,8 @@ use crate::cells::Cell;
 
 /// A cell's positions, on the cell's grid.
 pub(super) struct QuantisedPositions {
-    /// Largest distance of a stored position from the mean, per axis: half a step, unless the doubles of readers are coarser.
+    /// Largest distance of a stored position from the mean, per axis: half a step, unless the doubles of readers
+    /// are coarser.
     pub(super) error: f64,
     columns: Columns,
 }

@@ -4,9 +4,9 @@
 //! |---|---|---|
 //! | `generations` | number, big-endian | [`GenerationRecord`], of every generation ever published |
 //!
-//! `encode` and `push` keep the state of their work in trees of their own. A writer holds the database for as long as it
-//! writes; readers read a copy. It repeats what files say, but for the history, so a damaged one is set aside and made
-//! anew from the files.
+//! `encode` and `push` keep the state of their work in trees of their own. A writer holds the database for as long
+//! as it writes; readers read a copy. It repeats what files say, but for the history, so a damaged one is set
+//! aside and made anew from the files.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -89,8 +89,8 @@ pub(crate) struct Catalogue {
 }
 
 impl Catalogue {
-    /// Opens the database of a store for writing; a damaged one is renamed to `db.damaged`, and an empty one takes its
-    /// place. Waits up to `patience` for another writer.
+    /// Opens the database of a store for writing; a damaged one is renamed to `db.damaged`, and an empty one takes
+    /// its place. Waits up to `patience` for another writer.
     pub(crate) fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
         let path = store.join("db");
         let refused = |fault| match fault {
@@ -191,8 +191,8 @@ pub(crate) struct CatalogueCopy {
 }
 
 impl CatalogueCopy {
-    /// Copies a store's catalogue to a folder under `scratch`, which goes with it. `None` if the store has no catalogue, or
-    /// the copy is damaged: a writer may have changed it meanwhile.
+    /// Copies a store's catalogue to a folder under `scratch`, which goes with it. `None` if the store has no
+    /// catalogue, or the copy is damaged: a writer may have changed it meanwhile.
     pub(crate) fn of(store: &Path, scratch: &Path) -> Result<Option<Self>, StoreError> {
         let db = store.join("db");
         if !db.is_dir() {

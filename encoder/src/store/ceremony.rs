@@ -1,8 +1,8 @@
 //! Changes of the keys that a store's root names.
 //!
-//! The next root takes effect once enough keys of the present root and of its own have signed it. Where root's keys lie
-//! elsewhere, it waits as a draft, `keys/N.root.draft.json`: the draft is carried there, signed, carried back and
-//! installed.
+//! The next root takes effect once enough keys of the present root and of its own have signed it. Where root's
+//! keys lie elsewhere, it waits as a draft, `keys/N.root.draft.json`: the draft is carried there, signed, carried
+//! back and installed.
 
 use std::path::{Path, PathBuf};
 
@@ -59,8 +59,8 @@ pub(crate) struct KeysStatus {
 }
 
 impl Metadata {
-    /// Makes new keys, and a root that names them. It is installed at once if root's keys in `root_folder` are enough;
-    /// otherwise it is a draft.
+    /// Makes new keys, and a root that names them. It is installed at once if root's keys in `root_folder` are
+    /// enough; otherwise it is a draft.
     pub(crate) fn change_keys(
         &self,
         change: &Change,

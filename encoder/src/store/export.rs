@@ -27,8 +27,8 @@ pub(crate) struct Exported {
     pub(crate) n_removed: usize,
 }
 
-/// Writes what robots need of a store into a folder, or brings one up to date. Robots that fetch meanwhile find the old
-/// generation or the new one.
+/// Writes what robots need of a store into a folder, or brings one up to date. Robots that fetch meanwhile find
+/// the old generation or the new one.
 ///
 /// # Errors
 /// [`StoreError`]; [`StoreError::ObjectHash`] for a damaged shard, before anything names it.
@@ -80,7 +80,8 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     Ok(Exported { n_files: fresh.len(), len_bytes, n_removed })
 }
 
-/// Returns the files of metadata by name, the timestamp last: roots, targets and snapshots are there before it names them.
+/// Returns the files of metadata by name, the timestamp last: roots, targets and snapshots are there before it
+/// names them.
 fn read_metadata(store: &Path) -> Result<Vec<(String, Vec<u8>)>, StoreError> {
     let mut files = Vec::new();
     for entry in fs_err::read_dir(metadata::folder(store))? {

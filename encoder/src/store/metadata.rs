@@ -32,8 +32,8 @@ pub(crate) const TIMESTAMP_DAYS: u32 = 30;
 const SECS_PER_DAY: u64 = 86_400;
 const TARGETS_SECS: u64 = 365 * SECS_PER_DAY;
 pub(super) const ROOT_SECS: u64 = 5 * 365 * SECS_PER_DAY;
-/// 2026-01-01: nothing is signed as of an earlier time, whatever a machine's clock says that forgot the time. What is signed as of
-/// 1970 has expired before any robot sees it.
+/// 2026-01-01: nothing is signed as of an earlier time, whatever a machine's clock says that forgot the time. What
+/// is signed as of 1970 has expired before any robot sees it.
 pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 
 /// What a signature of the timestamp states.
@@ -119,7 +119,8 @@ impl MetadataReader {
         folder(&self.store).join(name)
     }
 
-    /// Returns what expires soon, or has expired: robots then refuse the store. Each text says until when, and what to do.
+    /// Returns what expires soon, or has expired: robots then refuse the store. Each text says until when, and
+    /// what to do.
     pub(crate) fn expiry_warnings(&self, now_unix_secs: u64) -> Result<Vec<String>, StoreError> {
         let store = self.store.display();
         let expires = |what: &str, at: u64, command: &str| {
@@ -162,8 +163,8 @@ impl Metadata {
     }
 
     /// Publishes a manifest; nothing changes if it is published already. Makes keys and root at the first time.
-    /// `created_unix_secs`: when the manifest was made; the clock counts if it is later, because a manifest may be dated
-    /// back to be reproducible.
+    /// `created_unix_secs`: when the manifest was made; the clock counts if it is later, because a manifest may be
+    /// dated back to be reproducible.
     pub(crate) fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
         let now_unix_secs = created_unix_secs.max(signing_unix_secs());
         if self.newest_root()?.is_none() {
@@ -267,7 +268,8 @@ pub(crate) fn clock_unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
-/// Returns the time as of which metadata is signed: the system's, unless its clock stands before this program was made.
+/// Returns the time as of which metadata is signed: the system's, unless its clock stands before this program was
+/// made.
 pub(crate) fn signing_unix_secs() -> u64 {
     signing_time(clock_unix_secs())
 }

@@ -102,8 +102,8 @@ fn a_refresh_keeps_clients_and_needs_no_root_key() {
     update(&mut kept, dir.path(), later).expect("fresh");
 }
 
-/// A root that was made while the clock stood at 1970 has expired for every robot: a refresh does not help, a renewal does, and the
-/// warnings say so. Nobody is warned of a root that has years to go.
+/// A root that was made while the clock stood at 1970 has expired for every robot: a refresh does not help, a
+/// renewal does, and the warnings say so. Nobody is warned of a root that has years to go.
 #[test]
 fn an_expired_root_is_warned_of_and_renewed() {
     let dir = tempfile::tempdir().expect("temporary folder");

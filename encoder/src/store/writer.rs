@@ -89,7 +89,8 @@ impl Store {
 
     /// Writes an object through a callback and returns its hash and length; safe from many threads.
     ///
-    /// The object is durable on return. An object that is there already is kept if its content has its hash, else replaced.
+    /// The object is durable on return. An object that is there already is kept if its content has its hash, else
+    /// replaced.
     ///
     /// # Errors
     /// [`StoreError::Io`], from the callback too.

@@ -106,7 +106,8 @@ impl Generation {
         }
     }
 
-    /// Returns the message of every Gaussian's score with a question, the first of `vectors`, against its negatives.
+    /// Returns the message of every Gaussian's score with a question, the first of `vectors`, against its
+    /// negatives.
     pub(super) fn scores(&self, vectors: &[Vec<f32>]) -> Result<Vec<u8>, ViewError> {
         let manifest = self.reader.manifest();
         let of_cells: Vec<Vec<f32>> = match &self.scored {

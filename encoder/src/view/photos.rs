@@ -23,7 +23,8 @@ fn photo(view: &View) -> Photo {
     }
 }
 
-/// Returns the direction that is up in most photos: the mean of the cameras' upward axes; nothing if these cancel out.
+/// Returns the direction that is up in most photos: the mean of the cameras' upward axes; nothing if these cancel
+/// out.
 pub(crate) fn up_of(views: &[View]) -> Option<Vec3> {
     let up = |view: &View| view.camera_from_world.inverse().transform_vector3(DVec3::NEG_Y).normalize();
     let sum: DVec3 = views.iter().map(up).sum();

@@ -34,8 +34,8 @@ impl Shard {
     }
 }
 
-/// Combines the scores of a question with those of its negatives: the relevancy (LERF, Kerr et al. 2023, section 3.3), or the
-/// question's own where there are none.
+/// Combines the scores of a question with those of its negatives: the relevancy (LERF, Kerr et al. 2023, section
+/// 3.3), or the question's own where there are none.
 pub(super) fn combined(mut of_vectors: Vec<Vec<f32>>) -> Vec<f32> {
     let mut own = of_vectors.swap_remove(0);
     if !of_vectors.is_empty() {

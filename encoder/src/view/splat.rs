@@ -9,7 +9,8 @@ use super::error::ViewError;
 use crate::cells::{self, CellLimits, CellSplit};
 
 pub(super) const PROGRAM: &str = "slag-encoder";
-/// Gaussians of a cell where a splat is shown alone: the first cell is small enough for a first picture within a second.
+/// Gaussians of a cell where a splat is shown alone: the first cell is small enough for a first picture within a
+/// second.
 const MAX_GAUSSIANS: usize = 65_536;
 
 /// A splat, cut into cells of its own where there is no store.

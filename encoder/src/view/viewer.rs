@@ -64,7 +64,8 @@ impl Viewer {
         Self { shown, generation: Mutex::default(), text: Mutex::default() }
     }
 
-    /// Returns the store's current generation; blocks while it is read. A generation that does not open leaves the one before.
+    /// Returns the store's current generation; blocks while it is read. A generation that does not open leaves the
+    /// one before.
     fn generation(&self) -> Result<Arc<Generation>, ViewError> {
         let Some(store) = &self.shown.store else { return Err(ViewError::NoStore) };
         let mut opened = locked(&self.generation);
@@ -139,8 +140,8 @@ impl Viewer {
         })
     }
 
-    /// Returns the words that the current generation's text model knows, each with the number of things that it finds; of a
-    /// model that takes any text, everyday words that find something.
+    /// Returns the words that the current generation's text model knows, each with the number of things that it
+    /// finds; of a model that takes any text, everyday words that find something.
     pub(super) fn words(&self) -> Result<Words, ViewError> {
         self.with_text_encoder(|generation, opened| {
             let manifest = generation.reader.manifest();

@@ -15,8 +15,8 @@ pub struct Backend {
     pub bound_factor: f64,
     /// Relative error of alpha within which either side of a cut is right.
     pub cut_tolerance: f64,
-    /// Whether depth order and sides of cuts equal the oracle's wherever rounding does not decide. An f32 projection swaps
-    /// neighbours in depth, which changes single weights but hardly their sum.
+    /// Whether depth order and sides of cuts equal the oracle's wherever rounding does not decide. An f32
+    /// projection swaps neighbours in depth, which changes single weights but hardly their sum.
     pub keeps_order: bool,
     /// Whether it runs on a processor through a graphics driver: a hundred times slower than a GPU.
     pub is_software_gpu: bool,

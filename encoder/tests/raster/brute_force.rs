@@ -92,8 +92,8 @@ fn the_number_of_threads_does_not_change_a_bit() {
     }
 }
 
-/// Contributions to a coarser partition are the sums over its parts, to the fixed point's 2^-33 for each part and tile and
-/// the final rounding to `f32`.
+/// Contributions to a coarser partition are the sums over its parts, to the fixed point's 2^-33 for each part and
+/// tile and the final rounding to `f32`.
 #[test]
 fn sums_over_regions_add_up() {
     for Backend { name, rasterizer, .. } in backends() {

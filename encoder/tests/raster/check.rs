@@ -349,8 +349,8 @@ impl Rasterizer for Counted {
     }
 }
 
-/// Each photo is loaded after the previous view was drawn: one photo is in memory, whatever their number. The scene is loaded
-/// once, and once more for each correction of the splat itself.
+/// Each photo is loaded after the previous view was drawn: one photo is in memory, whatever their number. The
+/// scene is loaded once, and once more for each correction of the splat itself.
 #[test]
 fn photos_are_loaded_one_at_a_time_and_the_scene_once() {
     let counting: &'static Counting = Box::leak(Box::default());

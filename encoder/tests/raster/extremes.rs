@@ -160,7 +160,8 @@ fn logits() {
     Row { name: "logits", range, claimed: 1e-5, unit_px: 1.0 }.check(&read);
 }
 
-/// Pixels within a few f32 steps of both cuts, beside an isolated Gaussian, so that pixels on a cut are a small share.
+/// Pixels within a few f32 steps of both cuts, beside an isolated Gaussian, so that pixels on a cut are a small
+/// share.
 #[test]
 fn on_the_cuts() {
     let steps = |value: f32, n: i32| f64::from(f32::from_bits(value.to_bits().wrapping_add_signed(n)));
@@ -307,8 +308,8 @@ fn image_sizes() {
         .check(&cases);
 }
 
-/// Closed form: a very wide Gaussian adds its opacity at every pixel, and the one behind it the rest. An f32 running sum
-/// stops growing at 2^24 steps of its own size.
+/// Closed form: a very wide Gaussian adds its opacity at every pixel, and the one behind it the rest. An f32
+/// running sum stops growing at 2^24 steps of its own size.
 #[test]
 fn sums_over_many_pixels() {
     let random = &mut Random::new(1);

@@ -42,8 +42,8 @@ pub struct Row {
 }
 
 impl Row {
-    /// Compares every contribution of every case with the oracle, on every backend, and prints the row, with the backend's
-    /// distance from the first one outside cuts.
+    /// Compares every contribution of every case with the oracle, on every backend, and prints the row, with the
+    /// backend's distance from the first one outside cuts.
     pub fn check(&self, cases: &[Case]) {
         let mut of_first: Vec<Found> = Vec::new();
         for (b, backend) in backends().iter().enumerate() {

@@ -1,5 +1,5 @@
-//! `slag-manual`: writes manual pages and shell completions of all programs, from the definitions that parse their command
-//! lines. A program of its own, so that the others carry neither generator.
+//! `slag-manual`: writes manual pages and shell completions of all programs, from the definitions that parse their
+//! command lines. A program of its own, so that the others carry neither generator.
 
 use std::path::{Path, PathBuf};
 
@@ -9,8 +9,8 @@ use clap_complete::Shell;
 
 /// Writes manual pages and shell completions of slag-encoder, slag-edge, slag-mcap, slag-mcp and slag-ros.
 ///
-/// A page for each command: slag-edge-fetch.1. Completions under the names that bash, zsh and fish look for: slag-edge.bash,
-/// _slag-edge, slag-edge.fish.
+/// A page for each command: slag-edge-fetch.1. Completions under the names that bash, zsh and fish look for:
+/// slag-edge.bash, _slag-edge, slag-edge.fish.
 #[derive(Debug, Parser)]
 #[command(name = "slag-manual", version)]
 struct Args {

@@ -82,8 +82,8 @@ impl Hub {
 
     /// Pulls the missing files of a model and writes its `model.toml`.
     ///
-    /// Only one pull runs at a time; others wait. An interrupted pull leaves whole files, and partial ones that the next
-    /// pull resumes.
+    /// Only one pull runs at a time; others wait. An interrupted pull leaves whole files, and partial ones that
+    /// the next pull resumes.
     /// # Errors
     /// [`HubError`]; [`HubError::Licence`] if the licence restricts use and was not accepted, now or earlier.
     pub fn pull(&self, name: &str, side: Side, accepts_licence: bool) -> Result<Vec<PulledFile>, HubError> {
@@ -154,8 +154,8 @@ impl Hub {
         Ok(verified)
     }
 
-    /// Returns the folder of the model `name`: that of a pulled model if `name` is one and not itself a folder with a
-    /// `model.toml`, else `name`.
+    /// Returns the folder of the model `name`: that of a pulled model if `name` is one and not itself a folder
+    /// with a `model.toml`, else `name`.
     /// # Errors
     /// [`HubError::NotPulled`] if it is a model of the table that is not pulled.
     pub fn resolve(&self, name: &Path) -> Result<PathBuf, HubError> {

@@ -43,14 +43,16 @@ pub struct Entry {
     pub licence_note: String,
     /// Address of the licence.
     pub licence_url: String,
-    /// Whether the licence restricts the use of the weights (research only, for example), so that the user must accept it.
+    /// Whether the licence restricts the use of the weights (research only, for example), so that the user must
+    /// accept it.
     #[serde(default)]
     pub restricts_use: bool,
     /// Owner and name at the hub.
     pub repository: String,
     /// The commit; default: that of the first pull.
     pub revision: Option<String>,
-    /// The script that makes the files from the published weights, where no export is published; nothing is pulled then.
+    /// The script that makes the files from the published weights, where no export is published; nothing is pulled
+    /// then.
     pub export: Option<String>,
     /// Files at the hub by role: `image`, `text` and `tokenizer`, or `image_encoder` and `mask_decoder`.
     #[serde(default)]
@@ -77,15 +79,16 @@ pub struct Known {
 }
 
 impl Entry {
-    /// Returns the files' paths, the image side first, each followed by its file of weights; `text_only`: without the
-    /// image side.
+    /// Returns the files' paths, the image side first, each followed by its file of weights; `text_only`: without
+    /// the image side.
     pub fn paths(&self, text_only: bool) -> Vec<&str> {
         let roles = &ROLES[if text_only { FIRST_OF_TEXT } else { 0 }..];
         let parts = |role: &&str| [self.files.get(*role), self.data.get(*role)];
         roles.iter().flat_map(parts).flatten().map(String::as_str).collect()
     }
 
-    /// Returns the paths of the image model: the ONNX file, then its weights if they are separate. Empty without one.
+    /// Returns the paths of the image model: the ONNX file, then its weights if they are separate. Empty without
+    /// one.
     pub(super) fn image_paths(&self) -> Vec<&str> {
         [self.files.get("image"), self.data.get("image")].into_iter().flatten().map(String::as_str).collect()
     }

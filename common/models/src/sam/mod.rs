@@ -1,6 +1,6 @@
-//! Segment Anything (Kirillov et al. 2023) and Segment Anything 2 (Ravi et al. 2024) in two ONNX files: an image encoder,
-//! and a prompt encoder with the mask decoder. SAM, MobileSAM, EdgeSAM and SAM-HQ have the first layout; SAM 2, SAM 2.1
-//! and EdgeTAM the second.
+//! Segment Anything (Kirillov et al. 2023) and Segment Anything 2 (Ravi et al. 2024) in two ONNX files: an image
+//! encoder, and a prompt encoder with the mask decoder. SAM, MobileSAM, EdgeSAM and SAM-HQ have the first layout;
+//! SAM 2, SAM 2.1 and EdgeTAM the second.
 //!
 //! ```toml
 //! name = "sam-vit-base"
@@ -18,9 +18,9 @@
 //! std = [0.229, 0.224, 0.225]
 //! ```
 //!
-//! Inputs and outputs are not named in the description: the decoder's inputs are matched with the encoder's outputs
-//! by name, points, labels and boxes by type and shape. Boxes, where a decoder takes them, are none. SAM 2's decoder takes
-//! one prompt a call and tells whether there is an object at all (`object_score_logits`).
+//! Inputs and outputs are not named in the description: the decoder's inputs are matched with the encoder's
+//! outputs by name, points, labels and boxes by type and shape. Boxes, where a decoder takes them, are none. SAM
+//! 2's decoder takes one prompt a call and tells whether there is an object at all (`object_score_logits`).
 
 mod description;
 mod letterbox;
@@ -94,7 +94,8 @@ impl Embedding {
 pub struct Decoded {
     /// The model's estimate of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
     pub predicted_ious: Vec<f32>,
-    /// The model's logit of each prompt that there is an object at all, `[prompts]`; empty if the model does not tell.
+    /// The model's logit of each prompt that there is an object at all, `[prompts]`; empty if the model does not
+    /// tell.
     pub object_logits: Vec<f32>,
     /// Logits of the whole square, padding included: `[prompts][MASKS_PER_PROMPT][rows][columns]`.
     pub logits: Floats,
@@ -110,7 +111,8 @@ impl Sam {
         Self::open_for(dir, options, None)
     }
 
-    /// Opens the directory `dir` with a decoder for `n_prompts` at a time, which is quicker on GPUs: fewer are filled up.
+    /// Opens the directory `dir` with a decoder for `n_prompts` at a time, which is quicker on GPUs: fewer are
+    /// filled up.
     pub fn open_for(
         dir: &Path,
         options: &SessionOptions,
@@ -155,8 +157,8 @@ impl Sam {
         &self.id
     }
 
-    /// Returns an image's pixel values, `[3][size_px][size_px]`: resized (Pillow's bilinear) to fill the square with the
-    /// longer edge or, for SAM 2, with both, normalised, and padded with zeros. `image` must have pixels.
+    /// Returns an image's pixel values, `[3][size_px][size_px]`: resized (Pillow's bilinear) to fill the square
+    /// with the longer edge or, for SAM 2, with both, normalised, and padded with zeros. `image` must have pixels.
     pub fn pixel_values(&self, image: &RgbImage) -> Vec<f32> {
         let Letterbox { resized_px: [width_px, height_px], .. } = self.letterbox_of(image);
         let whole = Window { left_px: 0, top_px: 0, width_px, height_px };
@@ -209,8 +211,8 @@ impl Sam {
 
     /// Proposes masks for `n_prompts` prompts with the same number of points each.
     ///
-    /// `points`: `[n_prompts][points]` in pixels of the square, see [`Letterbox::point`]. `labels`: for each point, 1
-    /// inside the object, 0 outside, -1 no point.
+    /// `points`: `[n_prompts][points]` in pixels of the square, see [`Letterbox::point`]. `labels`: for each
+    /// point, 1 inside the object, 0 outside, -1 no point.
     /// # Errors
     /// [`SessionError`] if the model fails or its output is not of SAM's shapes.
     pub fn decode(

@@ -52,7 +52,8 @@ fn a_thing_is_matched_once_and_to_the_nearest() {
     assert_eq!((found.went[0].id, found.appeared[0].id), (1, 4));
 }
 
-/// Boxes of 1 with margins of 0.05 sqrt(3) are 1.17 wide; half a unit apart they share 0.67 of 1.67 (by hand 0.402).
+/// Boxes of 1 with margins of 0.05 sqrt(3) are 1.17 wide; half a unit apart they share 0.67 of 1.67 (by hand
+/// 0.402).
 #[test]
 fn overlaps_by_hand() {
     let of = |x: f64, thickness: f64| thing(1, [x, 0.0, 0.0], [1.0, 1.0, thickness], CHAIR).box_in_world;
@@ -61,8 +62,9 @@ fn overlaps_by_hand() {
     assert_eq!(overlap(&of(0.0, 1.0), &of(3.0, 1.0)), 0.0);
 }
 
-/// Both lists end at x = 10, the earlier one at x = 0 as well. By hand: a thing that only one can know is neither new nor
-/// gone, one across the border that changed a little stays, and one does not move to where it may have been all the time.
+/// Both lists end at x = 10, the earlier one at x = 0 as well. By hand: a thing that only one can know is neither
+/// new nor gone, one across the border that changed a little stays, and one does not move to where it may have
+/// been all the time.
 #[test]
 fn what_one_list_cannot_know_is_not_compared() {
     let at = |id, x: f64| thing(id, [x, 0.0, 0.0], [1.0; 3], CHAIR);

@@ -1,5 +1,5 @@
-//! Compressed PLY files of PlayCanvas: the element `chunk` has the ranges of 256 Gaussians, `vertex` has four packed
-//! words per Gaussian, and the optional `sh` has bytes.
+//! Compressed PLY files of PlayCanvas: the element `chunk` has the ranges of 256 Gaussians, `vertex` has four
+//! packed words per Gaussian, and the optional `sh` has bytes.
 
 use glam::DVec3;
 
@@ -54,8 +54,8 @@ fn unit_11_10_11(word: u32) -> [f64; 3] {
     [unit(word, 21, 11), unit(word, 11, 10), unit(word, 0, 11)]
 }
 
-/// Returns a rotation packed as the index of its largest component and 10 bits for each of the others, which lie within
-/// +-1/sqrt(2).
+/// Returns a rotation packed as the index of its largest component and 10 bits for each of the others, which lie
+/// within +-1/sqrt(2).
 fn unpack_rotation(word: u32) -> [f64; 4] {
     let others = [20, 10, 0].map(|shift| (unit(word, shift, 10) - 0.5) * std::f64::consts::SQRT_2);
     with_largest((word >> 30) as usize, others)

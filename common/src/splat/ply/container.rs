@@ -54,8 +54,8 @@ impl Scalar {
         }
     }
 
-    /// Returns the value at the start of `bytes`, which holds at least [`Scalar::bytes`]; f64 represents every value of
-    /// every type exactly.
+    /// Returns the value at the start of `bytes`, which holds at least [`Scalar::bytes`]; f64 represents every
+    /// value of every type exactly.
     fn decode(self, bytes: &[u8], encoding: Encoding) -> f64 {
         let mut raw = [0; 8];
         let n = self.bytes();
@@ -251,8 +251,8 @@ impl Ply {
         Ok(())
     }
 
-    /// Reads all rows of the next element and passes the properties `wanted` of each row, in that order, to `each`.
-    /// Call [`Ply::seek_element`] and [`Ply::checked_count`] first.
+    /// Reads all rows of the next element and passes the properties `wanted` of each row, in that order, to
+    /// `each`. Call [`Ply::seek_element`] and [`Ply::checked_count`] first.
     pub fn rows(&mut self, wanted: &[usize], mut each: impl FnMut(&[f64])) -> Result<(), SplatError> {
         let element = &self.elements[self.next];
         let mut values = vec![0.0; wanted.len()];

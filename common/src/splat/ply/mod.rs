@@ -1,5 +1,5 @@
-//! PLY files of trained splats, as 3DGS (Kerbl et al. 2023), gsplat, nerfstudio and brush write them, and compressed PLY
-//! files of PlayCanvas. Properties may have any order and type.
+//! PLY files of trained splats, as 3DGS (Kerbl et al. 2023), gsplat, nerfstudio and brush write them, and
+//! compressed PLY files of PlayCanvas. Properties may have any order and type.
 //!
 //! Per vertex: mean `x y z`, rotation `rot_0..3` (wxyz), scale `scale_0..2` (logarithm), `opacity`
 //! (logit), colour `f_dc_0..2` (or `red green blue`), `f_rest_*` (channel by channel); other
@@ -101,8 +101,8 @@ pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Ve
     Ok(rows)
 }
 
-/// Returns the degree of the spherical harmonics in the `f_rest_*` of an element, and the properties in the order of
-/// [`Gaussians::sh_rest`]; the file stores them channel by channel.
+/// Returns the degree of the spherical harmonics in the `f_rest_*` of an element, and the properties in the order
+/// of [`Gaussians::sh_rest`]; the file stores them channel by channel.
 fn sh_rest_properties(ply: &Ply, element: usize) -> Result<(u8, Vec<usize>), SplatError> {
     let property = |i: usize| ply.elements[element].property(&format!("f_rest_{i}"));
     let in_file: Vec<_> = (0..).map_while(property).collect();

@@ -38,8 +38,8 @@ pub struct Point {
 }
 
 impl PointProperties {
-    /// Returns the header of a file of `n` points. `comments`: a line each; control characters and all that is not ASCII
-    /// are escaped.
+    /// Returns the header of a file of `n` points. `comments`: a line each; control characters and all that is not
+    /// ASCII are escaped.
     pub fn header(self, n: u64, comments: &[String]) -> String {
         let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
         for comment in comments {

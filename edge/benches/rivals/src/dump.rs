@@ -15,8 +15,8 @@ pub struct Meta {
     pub n_queries: usize,
 }
 
-/// A dump on disk: little-endian `vectors.f32` `[n][dim]`, `queries.f32` `[n_queries][dim]` and `meta.json`; vectors are of
-/// unit length.
+/// A dump on disk: little-endian `vectors.f32` `[n][dim]`, `queries.f32` `[n_queries][dim]` and `meta.json`;
+/// vectors are of unit length.
 pub struct Dump {
     pub meta: Meta,
     vectors: Mmap,

@@ -141,8 +141,8 @@ fn the_sample_has_every_flag() {
     }
 }
 
-/// By default all queries together may use four times the budget of one; the unit's limit has room for that, half as much again
-/// for what no budget counts, and the program itself.
+/// By default all queries together may use four times the budget of one; the unit's limit has room for that, half
+/// as much again for what no budget counts, and the program itself.
 #[test]
 fn the_unit_has_room_for_all_queries() {
     let unit = include_str!("../../../../jetson/slag-edge.service");

@@ -154,8 +154,8 @@ async fn formats_are_negotiated() {
     assert!(reader.next().is_none());
 }
 
-/// A client that does not read holds no permit, so that others are answered; its cut-off answer does not look complete, and
-/// gives its memory back.
+/// A client that does not read holds no permit, so that others are answered; its cut-off answer does not look
+/// complete, and gives its memory back.
 #[tokio::test]
 async fn answers_that_nobody_reads_stop_nobody() {
     let settings = Settings { max_queries: 1, stream_timeout: Duration::from_secs(1), ..Settings::default() };

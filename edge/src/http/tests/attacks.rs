@@ -123,7 +123,8 @@ async fn questions_in_json_are_reads() {
     }
 }
 
-/// Every route that is described either answers in a size that the cells on board bound, or charges what it allocates.
+/// Every route that is described either answers in a size that the cells on board bound, or charges what it
+/// allocates.
 #[tokio::test]
 async fn every_route_keeps_within_its_budget() {
     let shards = super::v1::room_with(Some(&super::goal::places()));
@@ -251,7 +252,8 @@ async fn service_of(app: &Arc<App>, uri: &str) -> Response {
     router(Arc::clone(app)).oneshot(request).await.expect("infallible")
 }
 
-/// Every Gaussian its own cluster, whatever the limit: a refusal names the budget, and what was taken is given back.
+/// Every Gaussian its own cluster, whatever the limit: a refusal names the budget, and what was taken is given
+/// back.
 #[tokio::test]
 async fn a_query_beyond_its_budget_is_refused() {
     let ask = async |service: &Service| {

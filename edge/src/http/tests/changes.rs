@@ -58,8 +58,8 @@ async fn generations_are_compared_over_http() {
         );
         assert!(read.vector.iter().zip(&written.vector).all(|(a, b)| (a - b).abs() < 0.01), "{read:?}");
     }
-    // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor. The clock of the machine that
-    // encoded has gone back: generations count by their numbers.
+    // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor. The clock
+    // of the machine that encoded has gone back: generations count by their numbers.
     let later = shards(&[6, 22, 33]);
     let manifest = Manifest { created_unix_secs: record.created_unix_secs - 60, ..manifest_of(&later, 2) };
     write_manifest(service.dir.path(), &later, manifest);
@@ -116,8 +116,8 @@ async fn generations_are_compared_over_http() {
     }
 }
 
-/// Cell 2 of the second generation did not come: its shard of the first stands in. By hand: 10 went from cell 1; whether 1002 is
-/// still in cell 2 is not known, although the old shard on board has it.
+/// Cell 2 of the second generation did not come: its shard of the first stands in. By hand: 10 went from cell 1;
+/// whether 1002 is still in cell 2 is not known, although the old shard on board has it.
 #[tokio::test]
 async fn shards_that_stand_in_say_nothing_of_their_generation() {
     let axis_0 = |_| vec![1.0, 0.0, 0.0];
@@ -215,8 +215,8 @@ async fn texts_need_the_encoder_of_the_scene() {
     assert_eq!((status, ids(&body, "appeared")), (StatusCode::OK, vec!["o000000000000000a"]), "{body:#}");
 }
 
-/// Whoever only asks for changes sees the generation that a fetch has put in place: the request that finds it has the service
-/// load it.
+/// Whoever only asks for changes sees the generation that a fetch has put in place: the request that finds it has
+/// the service load it.
 #[tokio::test]
 async fn a_fetched_generation_is_found_by_asking_for_changes() {
     let service = Service::new(Some(&shards(&[6])), Settings::default());

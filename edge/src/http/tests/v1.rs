@@ -25,8 +25,8 @@ fn lattice(from: [u16; 3], to: [u16; 3], n: [u16; 3], axis: usize) -> Vec<Member
     members
 }
 
-/// Two mugs (axis 0), one of them on a table (axis 1), and nothing of axis 2. Metres: the table is 1.6 x 0.9 x 0.74 in a
-/// corner of the world, the other mug stands 3 m along x on the floor.
+/// Two mugs (axis 0), one of them on a table (axis 1), and nothing of axis 2. Metres: the table is 1.6 x 0.9 x
+/// 0.74 in a corner of the world, the other mug stands 3 m along x on the floor.
 fn room() -> [BuiltShard; 1] {
     room_with(None)
 }

@@ -98,8 +98,8 @@ impl Body {
         }
     }
 
-    /// Checks the number of questions, and understands texts. `has_objects`: whether relations can be answered; where they
-    /// cannot, texts stay texts.
+    /// Checks the number of questions, and understands texts. `has_objects`: whether relations can be answered;
+    /// where they cannot, texts stay texts.
     ///
     /// # Errors
     /// The first parameter that is wrong.

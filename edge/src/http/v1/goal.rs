@@ -146,8 +146,8 @@ pub struct Floor {
     origin_in_world: DVec3,
     /// Cells along x and y.
     size: [usize; 2],
-    /// A letter and a count for each run of equal cells, x first: u unknown, o obstacle, g ground, r ground that the robot
-    /// reaches.
+    /// A letter and a count for each run of equal cells, x first: u unknown, o obstacle, g ground, r ground that
+    /// the robot reaches.
     runs: String,
 }
 

@@ -86,8 +86,8 @@ struct Searched<'a> {
     is_exact: bool,
     /// Bound of the error of every score.
     score_error_bound: f32,
-    /// For 95 of 100 questions (90 with negatives), 99 of 100 scores of each shard err by no more, measured over texts that the
-    /// codebook was not made for; absent where answers are exact or it was not measured.
+    /// For 95 of 100 questions (90 with negatives), 99 of 100 scores of each shard err by no more, measured over
+    /// texts that the codebook was not made for; absent where answers are exact or it was not measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     score_error_likely: Option<f32>,
     /// Whether all of the requested region is on board.

@@ -20,8 +20,8 @@ const PIECE_SLACK_M: f64 = 0.1;
 /// Default voxels in a metre of a metric scene; in others as many stand for a metre.
 const VOXELS_PER_METRE: f64 = 4.0;
 
-/// An object that may be meant. Objects that lie inside a better one of the same words are pieces of it, and are left out:
-/// they must not be counted, or compared with it.
+/// An object that may be meant. Objects that lie inside a better one of the same words are pieces of it, and are
+/// left out: they must not be counted, or compared with it.
 pub struct Candidate<'a> {
     pub found: FoundObject<'a>,
     pub solid: Solid,

@@ -7,8 +7,8 @@
 //! ```
 //!
 //! Articles count for nothing. The leftmost relation divides a phrase, so relations nest to the right: "mug on the
-//! table near the window" is a mug on (a table near the window). A text of more than [`MAX_TEXT_BYTES`] or with more than
-//! [`MAX_THINGS`] things is no phrase: this bounds time and recursion for every caller.
+//! table near the window" is a mug on (a table near the window). A text of more than [`MAX_TEXT_BYTES`] or with
+//! more than [`MAX_THINGS`] things is no phrase: this bounds time and recursion for every caller.
 
 use super::phrase::{By, MAX_THINGS, Phrase, Pick, Place, Relation};
 use crate::text::MAX_TEXT_BYTES;
@@ -74,8 +74,8 @@ const OPENINGS: [&str; 10] = [
     "take me to",
 ];
 
-/// Returns the meaning of a text, or `None` if it names no relation and no pick, or more than the limits allow: it is one
-/// thing then, for the text model.
+/// Returns the meaning of a text, or `None` if it names no relation and no pick, or more than the limits allow: it
+/// is one thing then, for the text model.
 pub fn understand(text: &str) -> Option<Phrase> {
     if text.len() > MAX_TEXT_BYTES {
         return None;

@@ -8,8 +8,8 @@ use super::candidates::{Candidate, Things};
 use super::geometry::{self, HOLDS, Scale, Solid, Viewer};
 use super::phrase::{By, Phrase, Pick, Place};
 
-/// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not win over a
-/// sure one.
+/// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not
+/// win over a sure one.
 const SURE: f64 = 0.5;
 
 /// A thing that a phrase means.

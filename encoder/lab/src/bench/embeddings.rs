@@ -1,6 +1,7 @@
-//! A synthetic field of embeddings of any size with the structure of lifted ones: things of many kinds; several views of a
-//! thing with different vectors, which its Gaussians weigh differently; and blends where two things meet. The statistics
-//! were measured on the labelled house: views of a thing are 0.45 apart, a sixth of the Gaussians lie at borders.
+//! A synthetic field of embeddings of any size with the structure of lifted ones: things of many kinds; several
+//! views of a thing with different vectors, which its Gaussians weigh differently; and blends where two things
+//! meet. The statistics were measured on the labelled house: views of a thing are 0.45 apart, a sixth of the
+//! Gaussians lie at borders.
 
 use glam::DVec3;
 use slag_encoder::codebook::TextBank;

@@ -1,7 +1,7 @@
 //! Plots as SVG with a logarithmic horizontal axis.
 //!
-//! Not the crate `plotters`: ticks and scales are 60 lines here; its axes are of another type for each scale, and the
-//! legend beside the plot and the places of labels would still be ours.
+//! Not the crate `plotters`: ticks and scales are 60 lines here; its axes are of another type for each scale, and
+//! the legend beside the plot and the places of labels would still be ours.
 
 use std::fmt::Write;
 
@@ -34,8 +34,8 @@ pub(super) enum Style {
     Line,
     /// Points without a line: they have no order.
     Points,
-    /// A staircase in a colour of its own, through points that ascend in both values: what a budget buys. It goes on to
-    /// the right edge.
+    /// A staircase in a colour of its own, through points that ascend in both values: what a budget buys. It goes
+    /// on to the right edge.
     Steps,
 }
 

@@ -1,5 +1,5 @@
-//! `bench query` and `bench text`: answers of the robot's engine over a cache, from a vector to columns of Gaussians; and a
-//! text model, from words to a vector.
+//! `bench query` and `bench text`: answers of the robot's engine over a cache, from a vector to columns of
+//! Gaussians; and a text model, from words to a vector.
 
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -23,8 +23,8 @@ const N_QUERIES: usize = 32;
 const N_RECALL: usize = 16;
 /// Untimed queries, and untimed runs of a text, before the timed ones.
 const N_WARM_UP: usize = 5;
-/// Weight of a scene's embedding in a query that resembles a text: text and image vectors of one thing have cosines around
-/// this (CLIP).
+/// Weight of a scene's embedding in a query that resembles a text: text and image vectors of one thing have
+/// cosines around this (CLIP).
 const LIKENESS: f64 = 0.3;
 /// Gaussians that a dump decodes at a time.
 const CHUNK: usize = 4096;
@@ -47,8 +47,8 @@ pub(crate) struct QueryArgs {
     /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
-    /// Query vectors to use in turn, little-endian f32, unit length [default: 32 generated ones, half in random directions,
-    /// half similar to embeddings of the scene].
+    /// Query vectors to use in turn, little-endian f32, unit length [default: 32 generated ones, half in random
+    /// directions, half similar to embeddings of the scene].
     #[arg(long, value_name = "FILE")]
     queries: Option<PathBuf>,
     /// Writes vectors.f32, queries.f32 and meta.json to a folder, for other engines.
@@ -179,8 +179,8 @@ fn recall(
     Ok(Some(sum / questions.len() as f64))
 }
 
-/// Returns unit vectors: every other one in a random direction, the rest as similar to an embedding of the scene as a text's
-/// vector is to the thing that it names.
+/// Returns unit vectors: every other one in a random direction, the rest as similar to an embedding of the scene
+/// as a text's vector is to the thing that it names.
 fn made_queries(shards: &[ShardView<'_>], dim: usize) -> Vec<Vec<f32>> {
     let mut random = Random::new(1);
     let known: Vec<&ShardView<'_>> = shards.iter().filter(|shard| shard.n_with_evidence() > 0).collect();
@@ -208,8 +208,8 @@ fn normalise(vector: &mut [f64]) {
     }
 }
 
-/// Writes `vectors.f32` (`[n][dim]`: all Gaussians with an embedding, shard by shard, decoded, unit length), `queries.f32`
-/// (`[n_queries][dim]`) and `meta.json`; floats are little-endian.
+/// Writes `vectors.f32` (`[n][dim]`: all Gaussians with an embedding, shard by shard, decoded, unit length),
+/// `queries.f32` (`[n_queries][dim]`) and `meta.json`; floats are little-endian.
 fn dump_vectors(dir: &Path, shards: &[ShardView<'_>], queries: &[Vec<f32>], dim: usize) -> Result<()> {
     fs_err::create_dir_all(dir)?;
     let mut vectors = BufWriter::new(fs_err::File::create(dir.join("vectors.f32"))?);

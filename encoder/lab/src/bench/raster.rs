@@ -179,8 +179,8 @@ struct StageShare {
 }
 
 impl RasterBench {
-    /// Measures all devices on a scene, for each region map. Devices take turns view by view, so that other load on the
-    /// machine affects all of them alike.
+    /// Measures all devices on a scene, for each region map. Devices take turns view by view, so that other load
+    /// on the machine affects all of them alike.
     fn run(
         &self,
         scene: &BenchScene,
@@ -304,8 +304,8 @@ fn shares(times: &[StageTime], n_repeats: usize) -> Vec<StageShare> {
     stages
 }
 
-/// Returns the sum of absolute differences between found and expected contributions, over all (Gaussian, region) pairs of
-/// either, relative to the sum of the expected ones.
+/// Returns the sum of absolute differences between found and expected contributions, over all (Gaussian, region)
+/// pairs of either, relative to the sum of the expected ones.
 fn relative_l1(found: &[ViewWeights], expected: &[ViewWeights]) -> f64 {
     let (mut off, mut total) = (0.0, 0.0);
     for (found, expected) in found.iter().zip(expected) {

@@ -1,8 +1,9 @@
-//! `bench robot`: the paper's table of query times on the robot, with other engines on the same vectors in the same run.
+//! `bench robot`: the paper's table of query times on the robot, with other engines on the same vectors in the
+//! same run.
 //!
-//! A generated field of each size is published, fetched over loopback and queried by the robot's engine. The other engines
-//! (`edge/benches/rivals`) get the same vectors and queries. Each has a process of its own, so that the memory of one is not
-//! counted for the next. One oracle judges all answers: float64 products of the vectors.
+//! A generated field of each size is published, fetched over loopback and queried by the robot's engine. The other
+//! engines (`edge/benches/rivals`) get the same vectors and queries. Each has a process of its own, so that the
+//! memory of one is not counted for the next. One oracle judges all answers: float64 products of the vectors.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -40,8 +41,8 @@ pub(crate) struct RobotArgs {
     /// Numbers of results.
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [1_000, 10_000, 50_000, 100_000], value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
     limits: Vec<u64>,
-    /// What to time: profiles of slag-edge, and engines of slag-bench-rivals. NAME=GAUSSIANS leaves an engine out at
-    /// larger sizes: a graph of millions takes hours to build.
+    /// What to time: profiles of slag-edge, and engines of slag-bench-rivals. NAME=GAUSSIANS leaves an engine out
+    /// at larger sizes: a graph of millions takes hours to build.
     #[arg(
         long,
         value_name = "NAME[=MOST],...",
@@ -87,8 +88,8 @@ impl Engine {
         Profile::ALL.into_iter().find(|profile| profile.name() == self.name)
     }
 
-    /// Returns the memory that measuring a size takes, in bytes, or a little more. Other engines hold all vectors in f32;
-    /// qdrant-edge holds them twice while it moves them into immutable segments.
+    /// Returns the memory that measuring a size takes, in bytes, or a little more. Other engines hold all vectors
+    /// in f32; qdrant-edge holds them twice while it moves them into immutable segments.
     fn memory_bytes(&self, n_gaussians: u64, dim: u32) -> u64 {
         let vectors = n_gaussians * u64::from(dim) * 4;
         match self.name.as_str() {
@@ -149,8 +150,8 @@ pub(crate) struct RobotReport {
     pub(crate) not_run: Vec<String>,
 }
 
-/// Measures what has no file in `OUT/figures` yet, and writes `robot.json` and `robot.md` for all of it. What was measured
-/// before an error is kept.
+/// Measures what has no file in `OUT/figures` yet, and writes `robot.json` and `robot.md` for all of it. What was
+/// measured before an error is kept.
 pub(crate) fn run(args: &RobotArgs, progress: &dyn Progress) -> Result<RobotReport> {
     let texts = TextArgs { models: args.models.clone(), text: vec!["chair".into()], runs: 100 };
     let text = time_texts(&texts);

@@ -36,9 +36,10 @@ pub(super) struct BenchScene {
 impl BenchScene {
     /// Generates a scene with the statistics of a trained one.
     ///
-    /// Flat Gaussians cover ground, objects and a backdrop; they shrink as their number grows, are denser towards the middle,
-    /// log-normal in size, and of high or low opacity. A few large faint Gaussians float in the air. The cameras stand among
-    /// the objects. Equal arguments give equal scenes on machines with the same mathematical library.
+    /// Flat Gaussians cover ground, objects and a backdrop; they shrink as their number grows, are denser towards
+    /// the middle, log-normal in size, and of high or low opacity. A few large faint Gaussians float in the air.
+    /// The cameras stand among the objects. Equal arguments give equal scenes on machines with the same
+    /// mathematical library.
     pub(super) fn generated(n_gaussians: usize, width_px: u32, height_px: u32) -> Self {
         let mut maker = Maker { random: Random::new(1), gaussians: Gaussians::default() };
         let share = |percent: usize| n_gaussians * percent / 100;
@@ -86,8 +87,8 @@ pub(super) fn grid_regions(width_px: u32, height_px: u32, columns: u32, rows: u3
     RegionMap { width_px, height_px, region_of_pixel, n_regions: columns * rows }
 }
 
-/// Returns a map of regions with irregular borders: each pixel belongs to the nearest of `n_regions` sites, one at a random
-/// place in each field of a grid.
+/// Returns a map of regions with irregular borders: each pixel belongs to the nearest of `n_regions` sites, one at
+/// a random place in each field of a grid.
 pub(super) fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap {
     let (width, height) = (f64::from(width_px), f64::from(height_px));
     let columns = ((f64::from(n_regions) * width / height).sqrt().round() as u32).clamp(1, n_regions.max(1));

@@ -39,9 +39,11 @@ enum EvalCommand {
     Scannet(scannet::ScannetArgs),
     /// Evaluates an encoder on crops of generated things: noun, colour and material.
     Encoder(encoder::EncoderArgs),
-    /// Asks the robot's program for places to stand near the things of generated scenes, and compares with their true surfaces.
+    /// Asks the robot's program for places to stand near the things of generated scenes, and compares with their
+    /// true surfaces.
     Goal(goal::GoalArgs),
-    /// Asks the robot's program for things by their relations in generated scenes, beside the plain phrase and the noun.
+    /// Asks the robot's program for things by their relations in generated scenes, beside the plain phrase and the
+    /// noun.
     Relations(relations::RelationsArgs),
 }
 

@@ -69,8 +69,8 @@ fn plural(noun: &str) -> Option<String> {
     (!noun.ends_with(['s', 'x', 'h', 'y', 'f'])).then(|| format!("{noun}s"))
 }
 
-/// Returns questions about things within `radius_m` of the robot: one a form, about the thing with the most pixels among
-/// those that fit the form and were not asked for yet; then one without an answer.
+/// Returns questions about things within `radius_m` of the robot: one a form, about the thing with the most pixels
+/// among those that fit the form and were not asked for yet; then one without an answer.
 pub(super) fn questions(objects: &[TrueObject], robot_in_world: DVec3, radius_m: f64) -> Vec<Asked<'_>> {
     let mut left: Vec<&TrueObject> = objects
         .iter()

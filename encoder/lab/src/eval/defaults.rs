@@ -1,5 +1,5 @@
-//! `eval defaults`: the preset `plain` beside the default, on labelled scenes, with true and with automatic masks, by
-//! Gaussian and by object: the figures that a default is chosen and judged by.
+//! `eval defaults`: the preset `plain` beside the default, on labelled scenes, with true and with automatic masks,
+//! by Gaussian and by object: the figures that a default is chosen and judged by.
 
 use std::fmt;
 

@@ -1,7 +1,7 @@
 //! Evaluates an encoder on crops of generated things: classification by noun, colour and material.
 //!
-//! Crops of [`Split::Test`] show shapes from other seeds than the training data, in all pairs of noun and colour, including
-//! those held out from training.
+//! Crops of [`Split::Test`] show shapes from other seeds than the training data, in all pairs of noun and colour,
+//! including those held out from training.
 
 use std::fmt;
 use std::path::PathBuf;

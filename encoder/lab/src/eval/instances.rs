@@ -39,7 +39,8 @@ impl fmt::Display for Recall {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct InstanceReport {
     pub(crate) n_objects: usize,
-    /// Objects that are two things (under-segmentation): two labels, floors and walls included, have a quarter of it each.
+    /// Objects that are two things (under-segmentation): two labels, floors and walls included, have a quarter of
+    /// it each.
     pub(crate) n_merged_objects: usize,
     /// Things that are two objects (over-segmentation): two objects have a quarter of it each.
     pub(crate) n_split_things: usize,
@@ -68,7 +69,8 @@ impl fmt::Display for InstanceReport {
 
 /// Compares things with objects.
 ///
-/// `object_of`: the object of each Gaussian; `classes`: words with the ids of their things; `scores`: by word and object.
+/// `object_of`: the object of each Gaussian; `classes`: words with the ids of their things; `scores`: by word and
+/// object.
 pub(super) fn report(
     truth: &Truth,
     object_of: &[u32],
@@ -127,8 +129,8 @@ mod tests {
     use super::*;
     use crate::eval::truth::Thing;
 
-    /// By hand: thing 7 (Gaussians 0..4) is object 0 except for one Gaussian; thing 8 (4..8) is split between objects 1 and 2;
-    /// thing 9 has no Gaussians; 8..10 are wall, which object 2 includes.
+    /// By hand: thing 7 (Gaussians 0..4) is object 0 except for one Gaussian; thing 8 (4..8) is split between
+    /// objects 1 and 2; thing 9 has no Gaussians; 8..10 are wall, which object 2 includes.
     #[test]
     fn recall_by_hand() {
         let thing = |id: u16, category: &str| Thing {

@@ -306,7 +306,8 @@ impl Thresholds {
     }
 }
 
-/// The Gaussians that are judged. Retrieval counts those of all things; argmax only those of the queried categories.
+/// The Gaussians that are judged. Retrieval counts those of all things; argmax only those of the queried
+/// categories.
 struct Things {
     /// The Gaussians of all things, with their class where it was asked for.
     gaussians: Vec<(usize, Option<usize>)>,

@@ -1,13 +1,15 @@
-//! LERF-OVS: the open-vocabulary labels that LangSplat (Qin et al. 2024) made for scenes of LERF (Kerr et al. 2023).
+//! LERF-OVS: the open-vocabulary labels that LangSplat (Qin et al. 2024) made for scenes of LERF (Kerr et al.
+//! 2023).
 //!
 //! ```text
 //! LABELS/frame_00041.json   labelme-like: info {name, width, height}, objects [{category, bbox, segmentation}]
 //! ```
 //!
 //! `bbox` holds the corners `x1 y1 x2 y2` and `segmentation` a polygon of pixels, as in LangSplat's
-//! `eval/evaluate_iou_loc.py`; the frames' poses are those of the scene. Gaussians are selected in 3D and rendered alone, as
-//! OpenGaussian (Wu et al. 2024) does: a pixel is selected where their alpha exceeds `MIN_COVERAGE`. A thing is localised if
-//! the rendered scores, averaged over a square of `SMOOTHING_PX`, have their maximum inside one of its boxes.
+//! `eval/evaluate_iou_loc.py`; the frames' poses are those of the scene. Gaussians are selected in 3D and rendered
+//! alone, as OpenGaussian (Wu et al. 2024) does: a pixel is selected where their alpha exceeds `MIN_COVERAGE`. A
+//! thing is localised if the rendered scores, averaged over a square of `SMOOTHING_PX`, have their maximum inside
+//! one of its boxes.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -56,7 +58,8 @@ pub(crate) struct LerfArgs {
     /// Labels of the scene: lerf_ovs/label/SCENE.
     #[arg(long, value_name = "DIR")]
     labels: PathBuf,
-    /// Says how the splat's frame follows from that of the poses, see `slag-encoder encode --help`: auto, none or a file.
+    /// Says how the splat's frame follows from that of the poses, see `slag-encoder encode --help`: auto, none or
+    /// a file.
     #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
     splat_frame: FrameChoice,
     /// The models that the store was encoded with.
@@ -227,7 +230,8 @@ impl LabelledFrame {
     }
 }
 
-/// Sets the pixels in or on a polygon by the even-odd rule; its corners are truncated to whole pixels, as in LangSplat.
+/// Sets the pixels in or on a polygon by the even-odd rule; its corners are truncated to whole pixels, as in
+/// LangSplat.
 fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
     let corners: Vec<[i64; 2]> = polygon.iter().map(|corner| corner.map(|v| v as i32 as i64)).collect();
     let edges: Vec<_> = corners.iter().zip(corners.iter().cycle().skip(1)).collect();
@@ -365,7 +369,8 @@ fn selected(scene: &Gaussians, scores: &[f32], threshold: f32) -> Gaussians {
 fn scored(scene: &Gaussians, scores: &[f32]) -> Gaussians {
     let mut scored = scene.clone();
     (scored.sh_degree, scored.sh_rest) = (0, Vec::new());
-    // A Gaussian without a score counts as the opposite of the query. Scores become colours of 0 to 1, so none is clamped.
+    // A Gaussian without a score counts as the opposite of the query. Scores become colours of 0 to 1, so none is
+    // clamped.
     let colour = |score: f32| (if score.is_nan() { -1.0 } else { score } + 1.0) / 2.0;
     scored.sh_dc.iter_mut().zip(scores).for_each(|(sh, score)| *sh = [(colour(*score) - 0.5) / SH_C0; 3]);
     scored

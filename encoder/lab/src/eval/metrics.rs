@@ -1,6 +1,7 @@
 //! Measures of agreement between answers and labels.
 
-/// Returns the area under the ROC curve, ties counted half (Mann and Whitney 1947); `None` without both positives and negatives.
+/// Returns the area under the ROC curve, ties counted half (Mann and Whitney 1947); `None` without both positives
+/// and negatives.
 pub(super) fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     let n_negative = positive.len() as f64 - n_positive;
@@ -19,8 +20,8 @@ pub(super) fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     Some((sum - n_positive * (n_positive + 1.0) / 2.0) / (n_positive * n_negative))
 }
 
-/// Returns the average precision: the sum of precision over steps of recall, as in TREC and scikit-learn. Equal scores form
-/// one step. `None` without positives.
+/// Returns the average precision: the sum of precision over steps of recall, as in TREC and scikit-learn. Equal
+/// scores form one step. `None` without positives.
 pub(super) fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     if n_positive == 0.0 {

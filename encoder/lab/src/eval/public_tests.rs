@@ -161,8 +161,8 @@ fn label(dir: &Path, name: &str, size: [u32; 2], objects: &[Value]) {
     fs_err::write(dir.join(format!("{name}.json")), label.to_string()).expect("writes");
 }
 
-/// The wall's left half is red: the label "red" there is matched, the label "blue" is not. A word unknown to the encoder is
-/// not found, and a frame without a pose is named. One frame's labels are of a photo twice as large.
+/// The wall's left half is red: the label "red" there is matched, the label "blue" is not. A word unknown to the
+/// encoder is not found, and a frame without a pose is named. One frame's labels are of a photo twice as large.
 #[test]
 fn lerf_labels_are_judged_on_their_frames() {
     let wall = Wall::new();
@@ -253,7 +253,8 @@ fn write_mesh(path: &Path, rows: &[([f64; 3], u16)], with_labels: bool) {
     fs_err::write(path, text + "3 0 1 2\n").expect("writes");
 }
 
-/// By hand: all 192 + 192 vertices on the wall are correct; five of class `wall` are out of reach and count as wrong.
+/// By hand: all 192 + 192 vertices on the wall are correct; five of class `wall` are out of reach and count as
+/// wrong.
 #[test]
 fn scans_are_judged_by_the_protocol() {
     let wall = Wall::new();
@@ -337,8 +338,8 @@ fn segments_and_groups_give_the_labels() {
     failed("label 41, expected 0 to 40");
 }
 
-/// Oracle: the rules restated. The wall's answers are known (left half `wall`, right half `floor`); segments and labels are
-/// made at random; votes are counted segment by segment, IoU and accuracy by sets.
+/// Oracle: the rules restated. The wall's answers are known (left half `wall`, right half `floor`); segments and
+/// labels are made at random; votes are counted segment by segment, IoU and accuracy by sets.
 #[test]
 fn filtered_answers_are_the_majority_of_each_segment() {
     let wall = Wall::new();

@@ -91,8 +91,8 @@ impl Runner {
         Ok(self.models.text_encoder(&self.session)?)
     }
 
-    /// Encodes a scene with masks of a source as `change` says; `method` names the store. `None` where the scene has no
-    /// such masks.
+    /// Encodes a scene with masks of a source as `change` says; `method` names the store. `None` where the scene
+    /// has no such masks.
     pub(crate) fn encode(
         &self,
         files: &SceneFiles,

@@ -1,8 +1,8 @@
-//! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes, 19, 15 and 10 classes,
-//! argmax over the classes' words, means over the classes that a scene has.
+//! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes, 19, 15 and 10
+//! classes, argmax over the classes' words, means over the classes that a scene has.
 //!
-//! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares by index; for other splats, the nearest
-//! Gaussian answers for a vertex. Gaussians with an opacity below `MIN_OPACITY` do not count, as in its
+//! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares by index; for other splats, the
+//! nearest Gaussian answers for a vertex. Gaussians with an opacity below `MIN_OPACITY` do not count, as in its
 //! `scripts/eval_scannet.py`.
 
 use std::collections::{BTreeMap, HashMap};
@@ -70,7 +70,8 @@ const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
 const MIN_OPACITY: f32 = 0.1;
 /// Farther from every Gaussian, a vertex has no answer.
 const MAX_DISTANCE_M: f64 = 0.1;
-/// The paper's rows over its ten scenes: mIoU and mAcc of 19, 15 and 10 classes (Szilagyi, Engelmann, Bohg, RA-L 2025).
+/// The paper's rows over its ten scenes: mIoU and mAcc of 19, 15 and 10 classes (Szilagyi, Engelmann, Bohg, RA-L
+/// 2025).
 const PAPER: [(&str, [[f64; 2]; 3]); 3] = [
     ("OpenGaussian (paper)", [[0.2473, 0.4154], [0.3013, 0.4825], [0.3829, 0.5519]]),
     ("SLAG (paper)", [[0.2898, 0.4340], [0.2898, 0.4426], [0.3714, 0.5480]]),
@@ -92,7 +93,8 @@ pub(crate) struct ScannetArgs {
     /// scannetv2-labels.combined.tsv, for scans without a labelled mesh.
     #[arg(long, value_name = "FILE")]
     categories: Option<PathBuf>,
-    /// Says how the splat's frame follows from that of the scan, see `slag-encoder encode --help`: auto, none or a file.
+    /// Says how the splat's frame follows from that of the scan, see `slag-encoder encode --help`: auto, none or a
+    /// file.
     #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
     splat_frame: FrameChoice,
     /// The models that the stores were encoded with.
@@ -104,11 +106,12 @@ pub(crate) struct ScannetArgs {
 
 #[derive(Clone, Copy, Debug, Default, Args)]
 pub(super) struct ScannetSettings {
-    /// Compares Gaussians and vertices one by one, for splats trained with Gaussians fixed to the vertices (OpenGaussian).
+    /// Compares Gaussians and vertices one by one, for splats trained with Gaussians fixed to the vertices
+    /// (OpenGaussian).
     #[arg(long)]
     pub(super) by_index: bool,
-    /// Also evaluates with the paper's prediction filter (PF): all vertices of a segment of ScanNet's segs.json take its
-    /// most frequent class.
+    /// Also evaluates with the paper's prediction filter (PF): all vertices of a segment of ScanNet's segs.json
+    /// take its most frequent class.
     #[arg(long)]
     pub(super) segments: bool,
     /// Scores this profile's shards, as a robot does [default: the field in full precision].
@@ -126,7 +129,8 @@ pub(crate) struct ScanReport {
     pub(super) filtered: Option<Vec<Subset>>,
     /// Labelled vertices of the 19 classes.
     pub(super) n_labelled: usize,
-    /// Labelled vertices without an answer, because no Gaussian is near or it has no evidence; they count as wrong.
+    /// Labelled vertices without an answer, because no Gaussian is near or it has no evidence; they count as
+    /// wrong.
     pub(super) n_without_answer: usize,
     /// Labels that the table of categories lacks, with their vertices, which are not counted.
     unknown_labels: BTreeMap<String, usize>,
@@ -268,8 +272,9 @@ impl Answers<'_> {
         }
     }
 
-    /// The paper's prediction filter: all vertices of a segment take the class that most of its vertices with an answer
-    /// have, ties going to the first of the list. Vertices that are left out do not vote; those without a label do.
+    /// The paper's prediction filter: all vertices of a segment take the class that most of its vertices with an
+    /// answer have, ties going to the first of the list. Vertices that are left out do not vote; those without a
+    /// label do.
     fn vote(&self, answers: &mut [Option<usize>], segments: &[u32]) {
         let mut votes: HashMap<u32, [u32; CLASSES.len()]> = HashMap::new();
         for ((segment, answer), answerer) in segments.iter().zip(&*answers).zip(self.answerers) {
@@ -303,7 +308,8 @@ fn by_index(scan: &Scan, scene: &Gaussians) -> Result<Vec<Answerer>> {
 
 fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
     let counts = |k: &usize| scene.is_usable(*k) && scene.opacities[*k] >= MIN_OPACITY;
-    // Cubes of edge MAX_DISTANCE_M: a Gaussian within reach lies in the vertex's own cube or in a neighbouring one.
+    // Cubes of edge MAX_DISTANCE_M: a Gaussian within reach lies in the vertex's own cube or in a neighbouring
+    // one.
     let cube_of = |point: DVec3| (point / MAX_DISTANCE_M).floor().to_array().map(|v| v as i64);
     let mut cubes: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
     for k in (0..scene.len()).filter(counts) {

@@ -269,8 +269,8 @@ impl Layout {
         }
     }
 
-    /// Returns cameras all over the walkable places: places and headings are low-discrepancy sequences (Roberts' R2, and the golden
-    /// angle). They are fewer than asked for if there is hardly room.
+    /// Returns cameras all over the walkable places: places and headings are low-discrepancy sequences (Roberts'
+    /// R2, and the golden angle). They are fewer than asked for if there is hardly room.
     fn roam(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
         const STEP: DVec2 = DVec2::new(0.754_877_666_246_692_7, 0.569_840_290_998_053_2);
         const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
@@ -287,8 +287,8 @@ impl Layout {
         cameras.take(n_views as usize).collect()
     }
 
-    /// Returns cameras on an oval walk through each area, which look outwards and across in turn. The first stands `start`
-    /// steps along the oval.
+    /// Returns cameras on an oval walk through each area, which look outwards and across in turn. The first stands
+    /// `start` steps along the oval.
     pub fn walk(&self, n_views: u32, start: f64, intrinsics: Intrinsics) -> Vec<RasterView> {
         let n_areas = self.areas.len() as u32;
         (0..n_views)

@@ -1,4 +1,5 @@
-//! Large scenes: a photographed scene many times over, on a square grid, with its photos, masks and poses moved along.
+//! Large scenes: a photographed scene many times over, on a square grid, with its photos, masks and poses moved
+//! along.
 
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -36,8 +37,9 @@ pub struct WrittenCopies {
     pub spacing: f64,
 }
 
-/// Writes `scene.ply`, `transforms.json`, `images/` and `gt/masks/` from a folder with a labelled scene. Photos and masks are
-/// hard links where the file system allows it. Cameras see neighbouring copies in the distance, where photos show none.
+/// Writes `scene.ply`, `transforms.json`, `images/` and `gt/masks/` from a folder with a labelled scene. Photos
+/// and masks are hard links where the file system allows it. Cameras see neighbouring copies in the distance,
+/// where photos show none.
 pub fn write(
     source: &Path,
     folder: &Path,

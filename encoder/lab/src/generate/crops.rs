@@ -70,8 +70,8 @@ pub struct Label {
     pub segmented: bool,
 }
 
-/// Returns whether a pair of noun and colour is held out for testing; a hash of its words decides, so new nouns do not
-/// affect other pairs.
+/// Returns whether a pair of noun and colour is held out for testing; a hash of its words decides, so new nouns do
+/// not affect other pairs.
 pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
     // FNV-1a (Fowler, Noll, Vo).
     let words = noun.name.bytes().chain(colour.word().bytes());
@@ -81,8 +81,9 @@ pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
     noun.colours().len() > 3 && (hash >> 32) % HELD_OUT_OF == 0
 }
 
-/// Writes crops of the scenes of some seeds: `crops.npy` (u8 `[n][edge][edge][3]`, the encoder's input, white outside the
-/// mask), `labels.json` (a [`Label`] per crop) and `nouns.json` (their words). Returns the number of crops.
+/// Writes crops of the scenes of some seeds: `crops.npy` (u8 `[n][edge][edge][3]`, the encoder's input, white
+/// outside the mask), `labels.json` (a [`Label`] per crop) and `nouns.json` (their words). Returns the number of
+/// crops.
 pub fn write(
     folder: &Path,
     split: Split,

@@ -14,14 +14,14 @@
 //! ```
 //!
 //! - The file's name is the noun, `words` are its synonyms, `is` its kinds.
-//! - `found: SCENE PLACE`: scenes are `room`, `yard`, `street`; places are `floor` (free-standing), `wall` (its back to a
-//!   wall or an edge), `hung` (on a wall), `on` (on another thing's top), `shell` (built by the scene).
-//! - `paint NAME: MATERIALS | COLOURS`; the first paint gives the thing its main colour. `any` stands for all colours,
-//!   `same` for the first paint.
+//! - `found: SCENE PLACE`: scenes are `room`, `yard`, `street`; places are `floor` (free-standing), `wall` (its
+//!   back to a wall or an edge), `hung` (on a wall), `on` (on another thing's top), `shell` (built by the scene).
+//! - `paint NAME: MATERIALS | COLOURS`; the first paint gives the thing its main colour. `any` stands for all
+//!   colours, `same` for the first paint.
 //! - `let NAME = FROM..TO`, or `pick A, B, C`, or one expression. Metres; z points up, the ground is at 0.
-//! - `box`, `ellipsoid`: centre | full sizes; `cylinder`: centre | radius, height; `cone`: centre | lower radius, upper
-//!   radius, height. Then, in any order: `turn RX, RY, RZ` (degrees, about x, then y, then z), `for NAME A, B, C`,
-//!   `if EXPRESSION` (the part exists where it is above 0).
+//! - `box`, `ellipsoid`: centre | full sizes; `cylinder`: centre | radius, height; `cone`: centre | lower radius,
+//!   upper radius, height. Then, in any order: `turn RX, RY, RZ` (degrees, about x, then y, then z), `for NAME A,
+//!   B, C`, `if EXPRESSION` (the part exists where it is above 0).
 //! - `top: z | w, d`: a surface for other things.
 
 use std::path::{Path, PathBuf};

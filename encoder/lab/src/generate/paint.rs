@@ -164,7 +164,8 @@ impl Paint {
             Material::Brick | Material::Tile => {
                 let [width, height] =
                     if self.material == Material::Brick { [0.24, 0.08] } else { [0.3, 0.3] };
-                // Courses run along x and y alike, so that they continue around corners, and rise along z, on floors along y.
+                // Courses run along x and y alike, so that they continue around corners, and rise along z, on
+                // floors along y.
                 let up = if longest == 2 { at.z } else { at.z + at.y };
                 let course = (up / height).floor();
                 let shift = if self.material == Material::Brick { 0.5 * course } else { 0.0 };

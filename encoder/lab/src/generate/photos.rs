@@ -16,8 +16,8 @@ use slag_math::random::Xorshift;
 const N_PHOTOS: u32 = 4;
 
 /// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`), `things.npy` (u16
-/// `[n][height][width]`: the thing's number, 65535 for the sky) and `depths.npy` (f32 `[n][height][width]`: metres along the
-/// camera's axis, infinite for the sky). Returns the number of photos.
+/// `[n][height][width]`: the thing's number, 65535 for the sky) and `depths.npy` (f32 `[n][height][width]`: metres
+/// along the camera's axis, infinite for the sky). Returns the number of photos.
 pub fn write(
     folder: &Path,
     nouns: &[Noun],

@@ -137,8 +137,9 @@ impl Scene {
         self.views = self.layout.photos(walk, n_views);
     }
 
-    /// Writes `scene.ply`, `images/`, `transforms.json`; the held-out views in `test/`; and the labels in `gt/`: `masks/` and
-    /// `test_masks/` (a thing's id at each pixel, 0 for the sky), `instances.json`, `gaussian_instance.npy`.
+    /// Writes `scene.ply`, `images/`, `transforms.json`; the held-out views in `test/`; and the labels in `gt/`:
+    /// `masks/` and `test_masks/` (a thing's id at each pixel, 0 for the sky), `instances.json`,
+    /// `gaussian_instance.npy`.
     pub fn write(&mut self, folder: &Path, progress: &dyn Progress) -> Result<WrittenScene> {
         let truth = folder.join("gt");
         for sub in ["images", "test", "gt/masks", "gt/test_masks"] {

@@ -2,8 +2,8 @@ use super::*;
 use crate::codebook::basis::{ScoreMetric, TextBank};
 use slag_math::random::Random;
 
-/// Oracle: farthest-point picks over all Gaussians in float64, each vector decoded in full. The basis keeps all components, so
-/// the last pick leaves less than the first.
+/// Oracle: farthest-point picks over all Gaussians in float64, each vector decoded in full. The basis keeps all
+/// components, so the last pick leaves less than the first.
 #[test]
 fn the_farthest_get_centroids_first() {
     let (n, dim, n_more) = (400, 6, 12);

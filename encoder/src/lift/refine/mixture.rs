@@ -1,5 +1,5 @@
-//! Gaussians share evidence within superpoints and objects: each superpoint becomes one more region, a mixture of the masks of its
-//! Gaussians, and its Gaussians get an entry of that region.
+//! Gaussians share evidence within superpoints and objects: each superpoint becomes one more region, a mixture of
+//! the masks of its Gaussians, and its Gaussians get an entry of that region.
 
 use rayon::prelude::*;
 
@@ -27,7 +27,8 @@ pub(super) fn sketches(contributions: &PartContributions, region_points: &[Point
     (0..contributions.part.locals.len()).into_par_iter().map(sketch_of).collect()
 }
 
-/// The summed contributions of the Gaussians that a part has of each superpoint: `(superpoint, [(region, weight)])`.
+/// The summed contributions of the Gaussians that a part has of each superpoint: `(superpoint, [(region,
+/// weight)])`.
 pub(super) struct PartSums(Vec<(usize, Vec<(u32, f32)>)>);
 
 impl PartSums {
@@ -152,8 +153,8 @@ impl Mixtures {
         Ok(Self { weight, of_gaussian: superpoints.of_gaussian, regions })
     }
 
-    /// Adds an entry of its superpoint to each Gaussian of a part. With `fill`, a Gaussian without evidence takes the
-    /// superpoint's mixture alone.
+    /// Adds an entry of its superpoint to each Gaussian of a part. With `fill`, a Gaussian without evidence takes
+    /// the superpoint's mixture alone.
     pub(super) fn apply(
         &self,
         contributions: &mut PartContributions,

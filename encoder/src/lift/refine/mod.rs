@@ -7,15 +7,16 @@
 //! | `mixture` | `superpoint`, `coarse`, `object` | a Gaussian takes a share of its superpoint, then of a larger one, then of its object |
 //! | `mixture` | `fill` | a Gaussian without evidence takes its superpoint's mean |
 //!
-//! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a superpoint or
-//! object is one more region of it: a mixture of masks. So scores, shards and the published field need no special case, and a
-//! Gaussian gets at most three more entries.
+//! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a
+//! superpoint or object is one more region of it: a mixture of masks. So scores, shards and the published field
+//! need no special case, and a Gaussian gets at most three more entries.
 //!
-//! The table belongs to the step at work: [`PendingRefinement::begin`] takes the views' table and weighs its masks; objects
-//! are found from the pending refinement; [`PendingRefinement::finish`] returns the table with the mixtures.
+//! The table belongs to the step at work: [`PendingRefinement::begin`] takes the views' table and weighs its
+//! masks; objects are found from the pending refinement; [`PendingRefinement::finish`] returns the table with the
+//! mixtures.
 //!
-//! All decisions are made in principal coordinates of the mask vectors (`points`) and in one order: the result depends
-//! neither on threads nor on the memory budget.
+//! All decisions are made in principal coordinates of the mask vectors (`points`) and in one order: the result
+//! depends neither on threads nor on the memory budget.
 
 mod mixture;
 mod points;
@@ -52,8 +53,8 @@ pub struct Refinement {
     mixtures: Vec<Mixtures>,
 }
 
-/// A refinement of which masks are weighed and superpoints found. Objects, made of superpoints, come next; then Gaussians
-/// share evidence within both.
+/// A refinement of which masks are weighed and superpoints found. Objects, made of superpoints, come next; then
+/// Gaussians share evidence within both.
 pub struct PendingRefinement {
     refinement: Refinement,
     table: RegionTable,
@@ -123,8 +124,8 @@ impl PendingRefinement {
 
     /// Adds mixtures of the masks of superpoints and objects to the table, in one pass over all contributions.
     ///
-    /// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, [`NO_SUPERPOINT`] where it has none; empty without
-    /// objects.
+    /// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, [`NO_SUPERPOINT`] where it has none;
+    /// empty without objects.
     pub fn finish(
         self,
         scene: &SceneContributions<'_>,
@@ -200,7 +201,8 @@ impl Refinement {
         Ok(())
     }
 
-    /// Reserves the lists over all Gaussians: the superpoints' graph, and each Gaussian's superpoints until the last cell.
+    /// Reserves the lists over all Gaussians: the superpoints' graph, and each Gaussian's superpoints until the
+    /// last cell.
     pub(crate) fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
         let n_scales = settings.n_scales();
         if settings.needs_superpoints() {
@@ -216,7 +218,8 @@ impl Refinement {
         }
     }
 
-    /// Reserves what depends on the views: the lists over all regions, and the summed contributions of superpoints.
+    /// Reserves what depends on the views: the lists over all regions, and the summed contributions of
+    /// superpoints.
     pub(crate) fn reserve_contributions(
         memory: &mut MemoryPlan,
         settings: &Aggregation,

@@ -31,8 +31,8 @@ impl Aggregation {
         object: 0.0,
         fill: false,
     };
-    /// The refinements that help both on trained splats and on generated ones (docs/decisions.md). Larger shares of
-    /// superpoints smooth small things away.
+    /// The refinements that help both on trained splats and on generated ones (docs/decisions.md). Larger shares
+    /// of superpoints smooth small things away.
     pub const REFINED: Self = Self {
         min_view_share: 0.05,
         truncation_power: 2.0,

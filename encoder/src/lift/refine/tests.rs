@@ -261,8 +261,8 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
     }
 }
 
-/// Oracle: in float64, a third of a row is the sum of its object's Gaussians, by length; others are left as they are. Superpoints
-/// come first.
+/// Oracle: in float64, a third of a row is the sum of its object's Gaussians, by length; others are left as they
+/// are. Superpoints come first.
 #[test]
 fn an_object_gives_its_part_to_its_gaussians() {
     let views = views();

@@ -14,8 +14,8 @@ const PER_SUPERPOINT: u32 = 10;
 /// Masks a view: one a thing, two for parts, one of everything.
 const N_MASKS: u32 = N_THINGS + 3;
 
-/// Eight views of six things: seven in ten Gaussians are seen. View 2 has one mask for things 0, 1 and 3, view 5 three
-/// for thing 2; half of the views have one for everything.
+/// Eight views of six things: seven in ten Gaussians are seen. View 2 has one mask for things 0, 1 and 3, view 5
+/// three for thing 2; half of the views have one for everything.
 fn made_views(random: &mut Random) -> Views {
     let view = |view: u32| {
         let mut of_view = BTreeMap::new();
@@ -61,7 +61,8 @@ fn random_views(random: &mut Random) -> Views {
     (0..n_views).map(view).collect()
 }
 
-/// The definition, set by set: each superpoint's object, numbered by their first superpoints, and the masks of each.
+/// The definition, set by set: each superpoint's object, numbered by their first superpoints, and the masks of
+/// each.
 fn oracle(views: &Views, pairs: &[(u32, u32)], superpoint_of: &[u32]) -> (Vec<Option<usize>>, Vec<usize>) {
     type Set = BTreeSet<u32>;
     let n = superpoint_of.iter().max().map_or(0, |last| *last as usize + 1);
@@ -104,7 +105,8 @@ fn oracle(views: &Views, pairs: &[(u32, u32)], superpoint_of: &[u32]) -> (Vec<Op
             evidence.insert((*a as usize, *b as usize), (together, all));
         }
     }
-    // Sets of superpoints, joined one pair at a time; every sum is made anew. A set goes by one of its superpoints.
+    // Sets of superpoints, joined one pair at a time; every sum is made anew. A set goes by one of its
+    // superpoints.
     let mut sets: Vec<Vec<usize>> = (0..n).map(|superpoint| vec![superpoint]).collect();
     let mut named: BTreeMap<usize, usize> = (0..n).map(|set| (set, set)).collect();
     let mut parts: BTreeMap<usize, [usize; 2]> = BTreeMap::new();

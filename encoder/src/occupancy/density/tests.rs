@@ -16,8 +16,8 @@ fn random_scene(random: &mut Random, n: usize) -> Gaussians {
     scene
 }
 
-/// Oracle: the definition, in f64, for every voxel and every Gaussian; voxels within a thousandth of the threshold may
-/// fall on either side, since sums are f32.
+/// Oracle: the definition, in f64, for every voxel and every Gaussian; voxels within a thousandth of the threshold
+/// may fall on either side, since sums are f32.
 #[test]
 fn voxels_are_occupied_as_defined() {
     let mut random = Random::new(17);
@@ -57,7 +57,8 @@ fn voxels_are_occupied_as_defined() {
     assert!(n_occupied > 200 && n_undecided < n_occupied / 20, "{n_occupied} {n_undecided}");
 }
 
-/// By hand: a wide thin Gaussian is a surface; a ball of fog and a Gaussian that is wider than 8 tiles of 64 voxels are not.
+/// By hand: a wide thin Gaussian is a surface; a ball of fog and a Gaussian that is wider than 8 tiles of 64
+/// voxels are not.
 #[test]
 fn background_is_left_out() {
     let mut scene = Gaussians::default();
@@ -73,7 +74,8 @@ fn background_is_left_out() {
     assert!(!found.blocks.is_empty() && found.blocks.iter().all(|([x, ..], _)| x.abs() < 20));
 }
 
-/// Reaches beyond 32 bits of tiles, and beyond 64 bits of voxels, are background, too; so are means beyond the lattice.
+/// Reaches beyond 32 bits of tiles, and beyond 64 bits of voxels, are background, too; so are means beyond the
+/// lattice.
 #[test]
 fn the_largest_gaussians_are_background() {
     for scale in [1.5e9, 1e15, 1e25, f32::MAX] {
@@ -91,8 +93,8 @@ fn the_largest_gaussians_are_background() {
     }
 }
 
-/// A plane of opaque Gaussians, 2 mm thick, in any direction: every voxel that it cuts is occupied, and none whose centre
-/// is farther than one and a half edges.
+/// A plane of opaque Gaussians, 2 mm thick, in any direction: every voxel that it cuts is occupied, and none whose
+/// centre is farther than one and a half edges.
 #[test]
 fn a_thin_surface_has_no_holes() {
     let mut random = Random::new(5);

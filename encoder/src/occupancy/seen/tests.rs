@@ -8,8 +8,8 @@ use super::*;
 
 const LATTICE: Lattice = Lattice { voxel: 0.1 };
 
-/// Looks from a random place near the origin. A third of the pixels show a surface 0.3 to 3 m away in patches, others the sky
-/// or something half transparent.
+/// Looks from a random place near the origin. A third of the pixels show a surface 0.3 to 3 m away in patches,
+/// others the sky or something half transparent.
 fn random_picture(random: &mut Random) -> (RasterView, Drawing) {
     let rotation = DQuat::from_xyzw(random.normal(), random.normal(), random.normal(), random.normal());
     let place = DVec3::from([0; 3].map(|_| random.between(-1.0, 1.0)));

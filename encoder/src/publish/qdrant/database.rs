@@ -116,8 +116,8 @@ fn may_pass(error: &QdrantError) -> bool {
         QdrantError::ResourceExhaustedError { .. } | QdrantError::Io(_) => true,
         // Codes of gRPC (`statuscodes.md` of its specification).
         QdrantError::ResponseError { status } => match status.code() as i32 {
-            // Unavailable, deadline exceeded, resource exhausted, aborted; cancelled and unknown: the client's own time
-            // limit, and a connection that broke during a request.
+            // Unavailable, deadline exceeded, resource exhausted, aborted; cancelled and unknown: the client's own
+            // time limit, and a connection that broke during a request.
             14 | 4 | 8 | 10 | 1 | 2 => true,
             // Internal: a refused connection.
             13 => status.message().starts_with("Failed to connect"),

@@ -12,8 +12,8 @@ use qdrant_client::qdrant::{
 };
 use serde::Serialize;
 
-/// Settings of collections: new ones are created with them, existing ones are changed to them. What is not given is
-/// not sent: a new collection has the database's defaults, an existing one keeps its own.
+/// Settings of collections: new ones are created with them, existing ones are changed to them. What is not given
+/// is not sent: a new collection has the database's defaults, an existing one keeps its own.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Args)]
 pub struct IndexSettings {
     /// Edges of each node of the HNSW graph: more are more accurate and take more memory; 0 builds no graph

@@ -30,8 +30,8 @@ pub enum ServeError {
 
 /// Serves a store until `shutdown` completes, then lets answers in progress finish within the drain deadline.
 ///
-/// `on_listening` gets the address to connect to, `http://IP:PORT` (`https` with TLS) or `unix:PATH`: the system chooses the port if
-/// `listen` has port 0.
+/// `on_listening` gets the address to connect to, `http://IP:PORT` (`https` with TLS) or `unix:PATH`: the system
+/// chooses the port if `listen` has port 0.
 ///
 /// # Errors
 /// [`ServeError`]; a store without a published scene is one.

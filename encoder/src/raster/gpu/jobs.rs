@@ -50,8 +50,8 @@ impl SortKey {
     }
 }
 
-/// Returns the least key of a depth, and how many bits keys have once it is subtracted. A key is the bits of a float between
-/// the near and the far plane: positive floats and their bits have the same order.
+/// Returns the least key of a depth, and how many bits keys have once it is subtracted. A key is the bits of a
+/// float between the near and the far plane: positive floats and their bits have the same order.
 pub fn depth_keys() -> (u32, u32) {
     let [least, most] = [NEAR_Z, FAR_Z].map(|z| (z as f32).to_bits());
     (least, bits_of(most - least + 1))
@@ -79,8 +79,8 @@ pub fn sort_job(key: SortKey, pass: u32) -> u64 {
     SCAN_JOBS + key as u64 * u64::from(MAX_PASSES) + u64::from(pass)
 }
 
-/// Returns the offset of the dispatch sizes for the items of a counter: one thread per item, or one workgroup per sort
-/// block.
+/// Returns the offset of the dispatch sizes for the items of a counter: one thread per item, or one workgroup per
+/// sort block.
 pub fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
     (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
 }

@@ -161,7 +161,8 @@ pub struct ViewBlock {
 }
 
 impl ViewBlock {
-    /// Prepares the band of a view with these rows of tiles; `origin_in_world` is the origin of the means on the device.
+    /// Prepares the band of a view with these rows of tiles; `origin_in_world` is the origin of the means on the
+    /// device.
     pub fn new(
         view: &RasterView,
         origin_in_world: DVec3,

@@ -1,11 +1,11 @@
 //! The GPU backend, on wgpu (Vulkan, Metal, DX12).
 //!
-//! The stages are those of the CPU; each shader has the name of its CPU twin. The result is the sorted sparse list of
-//! contributions. Contributions are integers and every order comes from a stable sort, so a device gives the same bits
-//! each time.
+//! The stages are those of the CPU; each shader has the name of its CPU twin. The result is the sorted sparse list
+//! of contributions. Contributions are integers and every order comes from a stable sort, so a device gives the
+//! same bits each time.
 //!
-//! Data beyond the limit of a binding is divided: the scene into chunks, the image into bands of tile rows. This changes
-//! no contribution, because tiles are independent and integers add up exactly.
+//! Data beyond the limit of a binding is divided: the scene into chunks, the image into bands of tile rows. This
+//! changes no contribution, because tiles are independent and integers add up exactly.
 
 mod band;
 mod bindings;
@@ -157,8 +157,8 @@ impl<'s> GpuScene<'s> {
     fn upload(&self, first: usize, n: usize) -> Option<wgpu::Buffer> {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
         let buffer = self.device.buffer("Gaussians", n as u64 * SCENE_GAUSSIAN_BYTES, usage)?;
-        // Uploads in pieces and waits for each. So the host duplicates little of the scene, and the host-visible memory
-        // of the device, which may be only 256 MiB, suffices.
+        // Uploads in pieces and waits for each. So the host duplicates little of the scene, and the host-visible
+        // memory of the device, which may be only 256 MiB, suffices.
         const PIECE: usize = 1 << 18;
         for start in (0..n).step_by(PIECE) {
             let rows: Vec<SceneGaussian> = (start..(start + PIECE).min(n))
@@ -311,7 +311,8 @@ impl<'s> GpuScene<'s> {
                 entries: count(Counter::Entries),
             };
             if needed.visible <= max.visible && needed.pairs <= max.pairs && needed.entries <= max.entries {
-                // An overflow truncates the counts of later stages, so capacities grow by a quarter and the band repeats.
+                // An overflow truncates the counts of later stages, so capacities grow by a quarter and the band
+                // repeats.
                 let grown = |needed: u32, now: u32, max: u32| {
                     if needed > now { needed.saturating_add(needed / 4).min(max) } else { now }
                 };
@@ -363,8 +364,8 @@ impl<'s> GpuScene<'s> {
     }
 }
 
-/// Returns a robust centre of a scene: the median of a sample along each axis, rounded to the scale of the scene so that
-/// most differences to it are exact.
+/// Returns a robust centre of a scene: the median of a sample along each axis, rounded to the scale of the scene
+/// so that most differences to it are exact.
 fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     const N_SAMPLES: usize = 4096;
     let sample: Vec<DVec3> = (0..scene.len())
@@ -513,7 +514,8 @@ mod tests {
         assert!(refused.contains("8388608"), "{refused}");
     }
 
-    /// Three views, and memory for one of them: the places of two are given up, the last one is kept, and none is made anew.
+    /// Three views, and memory for one of them: the places of two are given up, the last one is kept, and none is
+    /// made anew.
     #[test]
     fn fewer_views_are_in_flight_where_memory_does_not_suffice() {
         let Some(adapter) = adapters().into_iter().next() else {

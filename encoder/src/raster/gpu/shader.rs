@@ -167,8 +167,9 @@ impl Kernels {
                 unsafe_code,
                 reason = "wgpu counts the turns of every loop, which takes a seventh of the time"
             )]
-            // SAFETY: the caller must pass no loop without an end. The sources are constants of this program, and their loops
-            // count up to bounds that they read once (`loops_count_up`). All accesses are still checked.
+            // SAFETY: the caller must pass no loop without an end. The sources are constants of this program, and
+            // their loops count up to bounds that they read once (`loops_count_up`). All accesses are still
+            // checked.
             let module = unsafe { device.create_shader_module_trusted(descriptor, checks) };
             device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
                 label: Some(entry),

@@ -73,8 +73,8 @@ impl Workspace {
         n_tiles <= self.n_tiles && n_px <= self.n_px
     }
 
-    /// Runs all stages on a band and returns its counts. `take` is called once with the contributions, unless a count
-    /// exceeds its capacity, which makes them incomplete.
+    /// Runs all stages on a band and returns its counts. `take` is called once with the contributions, unless a
+    /// count exceeds its capacity, which makes them incomplete.
     pub fn contributions(
         &mut self,
         band: &Band<'_>,
@@ -339,8 +339,8 @@ mod tests {
         }
     }
 
-    /// Sorts entries by (member, region) on the device and on the host, at sizes around those of a workgroup and of a
-    /// block. Half of the keys repeat, which reveals an unstable sort.
+    /// Sorts entries by (member, region) on the device and on the host, at sizes around those of a workgroup and
+    /// of a block. Half of the keys repeat, which reveals an unstable sort.
     #[test]
     fn the_sort_is_stable_at_every_size() {
         let Some(adapter) = adapters().into_iter().next() else {

@@ -100,8 +100,8 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     Ok(named.collect())
 }
 
-/// Returns the masks of a photo: by its name; or else by the one entry whose name is an ending of the photo's, or the other
-/// way round, at a folder; or else by the name that Roboflow makes of it, `NAME_jpg.rf.HASH.jpg`.
+/// Returns the masks of a photo: by its name; or else by the one entry whose name is an ending of the photo's, or
+/// the other way round, at a folder; or else by the name that Roboflow makes of it, `NAME_jpg.rf.HASH.jpg`.
 pub(super) fn entry<'a>(masks_of_image: &'a MasksOfImage, name: &str) -> Option<&'a Vec<(usize, Rle)>> {
     let is_ending =
         |long: &str, short: &str| long.strip_suffix(short).is_some_and(|rest| rest.ends_with('/'));

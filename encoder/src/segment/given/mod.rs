@@ -16,11 +16,12 @@ use crate::masks::{Mask, NO_REGION, masks_of_labels};
 /// Masks from files.
 ///
 /// A folder has one file per photo: for `left/a.jpg`, one of `left/a.png`, `left/a.jpg.png`, `left/a.json` and
-/// `left/a.jpg.json`. A PNG (gray of up to 16 bits, or with a palette) contains ids: 0 is background, each other id a
-/// mask. A JSON file is a list of `{"segmentation": {"size": [height, width], "counts": ..}}`, as SAM's automatic
-/// generator writes it, or an object with such a list as `annotations`; its masks may overlap. A folder `left/a/` has a
-/// black and white PNG for each mask, as SAM's `amg.py` writes it. A JSON file in place of the folder is a COCO data set of
-/// all photos, whose `file_name` may lack folders of the photo's name or have further ones.
+/// `left/a.jpg.json`. A PNG (gray of up to 16 bits, or with a palette) contains ids: 0 is background, each other
+/// id a mask. A JSON file is a list of `{"segmentation": {"size": [height, width], "counts": ..}}`, as SAM's
+/// automatic generator writes it, or an object with such a list as `annotations`; its masks may overlap. A folder
+/// `left/a/` has a black and white PNG for each mask, as SAM's `amg.py` writes it. A JSON file in place of the
+/// folder is a COCO data set of all photos, whose `file_name` may lack folders of the photo's name or have further
+/// ones.
 ///
 /// Masks belong to the photos as taken and are undistorted with them.
 #[derive(Debug)]

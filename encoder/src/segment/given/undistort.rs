@@ -6,8 +6,8 @@ use crate::masks::{BoxPx, Mask, NO_REGION};
 
 /// Maps masks to the undistorted photo; masks outside it are dropped.
 ///
-/// Each pixel looks up its source once for all masks: the partition of the masks is mapped as one label image, and each
-/// mask is reassembled from its regions.
+/// Each pixel looks up its source once for all masks: the partition of the masks is mapped as one label image, and
+/// each mask is reassembled from its regions.
 pub(super) fn undistorted(
     masks: &[Mask],
     undistorter: &Undistorter,

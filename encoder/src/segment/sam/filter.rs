@@ -21,8 +21,8 @@ pub(super) struct Filters<'a> {
 }
 
 impl Filters<'_> {
-    /// Returns, in order, the proposals of prompts that show an object, which have a sufficient predicted IoU, are stable
-    /// and are not cut by the crop.
+    /// Returns, in order, the proposals of prompts that show an object, which have a sufficient predicted IoU, are
+    /// stable and are not cut by the crop.
     pub(super) fn candidates(&self, decoded: &Decoded, upsampler: &Upsampler, crop: BoxPx) -> Vec<Candidate> {
         let SamSettings { predicted_iou: least_iou, stability, stability_offset, .. } = *self.settings;
         let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
@@ -117,8 +117,8 @@ fn by_boxes(candidates: Vec<Candidate>, scores: Vec<f64>, most_iou: f64) -> Vec<
     suppress(candidates, scores, |a, b| box_iou(a.mask.box_px(), b.mask.box_px()) > most_iou)
 }
 
-/// Non-maximum suppression: in descending order of scores (equal ones in their order), keeps candidates that are no
-/// duplicate of a kept one.
+/// Non-maximum suppression: in descending order of scores (equal ones in their order), keeps candidates that are
+/// no duplicate of a kept one.
 fn suppress(
     candidates: Vec<Candidate>,
     scores: Vec<f64>,
@@ -135,8 +135,8 @@ fn suppress(
     kept
 }
 
-/// Returns the IoU of two boxes as computed by the reference implementation, in which areas exclude the last row and
-/// column; NaN for two lines.
+/// Returns the IoU of two boxes as computed by the reference implementation, in which areas exclude the last row
+/// and column; NaN for two lines.
 fn box_iou(a: BoxPx, b: BoxPx) -> f64 {
     let area = |b: BoxPx| f64::from(b.width_px() - 1) * f64::from(b.height_px() - 1);
     let overlap = |low: u32, high: u32| f64::from(high.saturating_sub(low + 1));

@@ -1,9 +1,10 @@
-//! Masks from Segment Anything and Segment Anything 2: automatic mask generation as defined by the first's paper (Kirillov
-//! et al. 2023, appendix B) and its reference implementation; prompts without an object, as the second tells, give none.
+//! Masks from Segment Anything and Segment Anything 2: automatic mask generation as defined by the first's paper
+//! (Kirillov et al. 2023, appendix B) and its reference implementation; prompts without an object, as the second
+//! tells, give none.
 //!
-//! Each point of a grid is one prompt, which gives three masks: whole, part and subpart. The image encoder runs once per
-//! image and crop, the decoder once per batch of points. While it decodes a batch, the masks of the previous batch are
-//! enlarged and filtered in parallel.
+//! Each point of a grid is one prompt, which gives three masks: whole, part and subpart. The image encoder runs
+//! once per image and crop, the decoder once per batch of points. While it decodes a batch, the masks of the
+//! previous batch are enlarged and filtered in parallel.
 
 mod candidate;
 mod filter;
@@ -48,8 +49,8 @@ pub struct SamSegmenter {
 }
 
 impl SamSegmenter {
-    /// Opens a model directory with a `[segment]` section in `model.toml`; `gpus`: those that share the photos, where the
-    /// session asks for GPUs.
+    /// Opens a model directory with a `[segment]` section in `model.toml`; `gpus`: those that share the photos,
+    /// where the session asks for GPUs.
     ///
     /// # Errors
     /// [`ModelError`] if a file is missing or does not match its description, or ONNX Runtime does not load.

@@ -129,8 +129,8 @@ struct Components {
     sizes_px: Vec<u64>,
 }
 
-/// Finds the connected components of runs in row-major order. Runs in neighbouring rows are connected if they overlap or
-/// touch at a corner.
+/// Finds the connected components of runs in row-major order. Runs in neighbouring rows are connected if they
+/// overlap or touch at a corner.
 fn components(runs: &[Run]) -> Components {
     let mut sets = UnionFind::new(runs.len());
     let mut above = 0;

@@ -41,8 +41,8 @@ mod tests {
     use crate::masks::BoxPx;
     use crate::segment::sam::runs::{Run, RunMask};
 
-    /// The rules of `mask_nms` in LangSplat's `preprocess.py`, restated over dense masks: matrices of IoU and of containment,
-    /// their maxima by column, then the thresholds. Returns the kept masks, best first.
+    /// The rules of `mask_nms` in LangSplat's `preprocess.py`, restated over dense masks: matrices of IoU and of
+    /// containment, their maxima by column, then the thresholds. Returns the kept masks, best first.
     fn langsplat(masks: &[Vec<bool>], scores: &[f64], filter: &ScoreFilter) -> Vec<usize> {
         let n = masks.len();
         let mut order: Vec<usize> = (0..n).collect();
@@ -86,7 +86,8 @@ mod tests {
         };
         let (mut n_kept, mut n_all, mut n_contained) = (0, 0, 0);
         for round in 0..60 {
-            // Boxes that repeat, nearly repeat and contain each other. In some rounds no score is above the threshold.
+            // Boxes that repeat, nearly repeat and contain each other. In some rounds no score is above the
+            // threshold.
             let mut boxes: Vec<[u32; 4]> = Vec::new();
             for _ in 0..2 + random(14) {
                 let (x, y) = (random(30) as u32, random(30) as u32);

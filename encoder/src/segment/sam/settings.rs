@@ -38,8 +38,8 @@ pub struct ScoreFilter {
     pub min_score: f64,
     /// A mask goes if its IoU with one of a higher score is above this.
     pub max_iou: f64,
-    /// A mask of which at least 85 % lie in another one, of which it covers less than half, goes if the product of the
-    /// two shares is below this.
+    /// A mask of which at least 85 % lie in another one, of which it covers less than half, goes if the product of
+    /// the two shares is below this.
     pub max_contained: f64,
 }
 
@@ -103,8 +103,8 @@ impl Default for SamSettings {
 }
 
 impl SamSettings {
-    /// The settings of the paper: LangSplat's mask generator (Qin et al. 2024, `preprocess.py`) on a grid of 16 x 16 points,
-    /// whole level only.
+    /// The settings of the paper: LangSplat's mask generator (Qin et al. 2024, `preprocess.py`) on a grid of 16 x
+    /// 16 points, whole level only.
     pub fn paper() -> Self {
         Self {
             points_per_side: 16,

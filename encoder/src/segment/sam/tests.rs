@@ -1,4 +1,5 @@
-//! Compares the filters with an independent recomputation on synthetic logits: float64, dense arrays, no shared code.
+//! Compares the filters with an independent recomputation on synthetic logits: float64, dense arrays, no shared
+//! code.
 
 mod langsplat;
 mod levels;
@@ -50,8 +51,8 @@ fn logits(blob: &Blob) -> Vec<f32> {
         .collect()
 }
 
-/// Returns synthetic answers to `n` prompts. Many objects repeat; some are soft, have a low predicted IoU, are cut, or
-/// have holes or islands.
+/// Returns synthetic answers to `n` prompts. Many objects repeat; some are soft, have a low predicted IoU, are
+/// cut, or have holes or islands.
 fn blobs(n: usize, seed: u64, extent: [f64; 2]) -> Vec<Blob> {
     let mut state = seed;
     let mut random = move || {

@@ -1,8 +1,9 @@
 //! Upsampling of the decoder's coarse logits to the pixels of an image.
 //!
 //! SAM enlarges the logits to its input square, crops the padding and scales the rest to the image; both steps are
-//! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step with at
-//! most three taps per axis, without the intermediate square. SAM 2 enlarges the logits to the image at once.
+//! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step
+//! with at most three taps per axis, without the intermediate square. SAM 2 enlarges the logits to the image at
+//! once.
 
 use slag_models::sam::Letterbox;
 
@@ -15,8 +16,8 @@ struct Axis {
     weights: Vec<[f32; 3]>,
 }
 
-/// Returns the two input neighbours of output pixel `at` and the weight of the second, when `n_in` pixels are resized to
-/// `n_out`. The source coordinate is (at + 1/2) n_in / n_out - 1/2, clamped to the input.
+/// Returns the two input neighbours of output pixel `at` and the weight of the second, when `n_in` pixels are
+/// resized to `n_out`. The source coordinate is (at + 1/2) n_in / n_out - 1/2, clamped to the input.
 fn neighbours(at: u32, n_in: u32, n_out: u32) -> ([u32; 2], f64) {
     let source = ((f64::from(at) + 0.5) * f64::from(n_in) / f64::from(n_out) - 0.5).max(0.0);
     let low = (source as u32).min(n_in - 1);
@@ -69,7 +70,8 @@ pub(super) struct Cut {
 }
 
 impl Upsampler {
-    /// Creates the upsampling for `logits_px` columns and rows of logits: at least 3, at most the size of the square.
+    /// Creates the upsampling for `logits_px` columns and rows of logits: at least 3, at most the size of the
+    /// square.
     pub(super) fn new(letterbox: &Letterbox, logits_px: [u32; 2]) -> Self {
         let axis = |k: usize| {
             let image_px = letterbox.image_px[k];
@@ -82,8 +84,8 @@ impl Upsampler {
         Self { n_columns: logits_px[0] as usize, x: axis(0), y: axis(1) }
     }
 
-    /// Enlarges `logits`, `[rows][columns]`, and thresholds them at 0; `None` if the mask is empty. `origin_px` is added
-    /// to the coordinates of the pixels.
+    /// Enlarges `logits`, `[rows][columns]`, and thresholds them at 0; `None` if the mask is empty. `origin_px` is
+    /// added to the coordinates of the pixels.
     pub(super) fn cut(&self, logits: &[f32], offset: f32, origin_px: [u32; 2]) -> Option<Cut> {
         // Weighted means of logits below -offset are below it too, so only the rest must be enlarged.
         let (mut rows, mut columns) = ((usize::MAX, 0), (usize::MAX, 0));

@@ -1,7 +1,7 @@
 //! Attributes that ignore a test: where the machine lacks what it needs, or outside the nightly checks.
 //!
-//! Macros of their own rather than a `cfg` from build scripts: a build script that watches a folder that does not exist
-//! runs at every build, and each crate's library would be compiled again with it.
+//! Macros of their own rather than a `cfg` from build scripts: a build script that watches a folder that does not
+//! exist runs at every build, and each crate's library would be compiled again with it.
 
 use std::path::{Path, PathBuf};
 
@@ -9,8 +9,8 @@ use proc_macro::TokenStream;
 
 /// Ignores a test where `../shared` is absent, except in CI. Stands above `#[test]`.
 ///
-/// The data is looked for when the test is compiled. Where it has arrived since, `cargo test -- --ignored` runs the
-/// test.
+/// The data is looked for when the test is compiled. Where it has arrived since, `cargo test -- --ignored` runs
+/// the test.
 #[proc_macro_attribute]
 pub fn needs_shared(_: TokenStream, test: TokenStream) -> TokenStream {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..");

@@ -3,13 +3,13 @@
 use super::measure::{Scale, falling};
 use super::solid::Solid;
 
-/// Distance, in metres, between a thing's bottom and the surface below it that still counts as touching: positions are
-/// those of Gaussians, and the box leaves out the outermost ones.
+/// Distance, in metres, between a thing's bottom and the surface below it that still counts as touching: positions
+/// are those of Gaussians, and the box leaves out the outermost ones.
 const TOUCHES_M: f64 = 0.1;
 /// Distance at which it surely does not touch.
 const APART_M: f64 = 0.25;
-/// Share of the support's height by which a thing's bottom may lie below its top: seats are lower than backs, and the
-/// masks of a support may take in what stands on it.
+/// Share of the support's height by which a thing's bottom may lie below its top: seats are lower than backs, and
+/// the masks of a support may take in what stands on it.
 const SUNK: f64 = 0.6;
 /// Share of a thing's outline that must lie over its support.
 const OVER: [f64; 2] = [0.6, 0.2];

@@ -1,5 +1,5 @@
-//! Relations as plain geometry of upright boxes: a file for each family. Each relation gives a degree from 0 to 1; at
-//! [`HOLDS`] and above it holds. `docs/api.md` has the definitions for users.
+//! Relations as plain geometry of upright boxes: a file for each family. Each relation gives a degree from 0 to 1;
+//! at [`HOLDS`] and above it holds. `docs/api.md` has the definitions for users.
 
 mod contact;
 mod distance;

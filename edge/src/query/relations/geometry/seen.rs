@@ -8,11 +8,11 @@ use super::measure::{Scale, falling};
 use super::solid::Solid;
 use crate::query::relations::phrase::Relation;
 
-/// Angles from the direction that is meant, in degrees: the relation holds fully up to the first, not at all from the
-/// second.
+/// Angles from the direction that is meant, in degrees: the relation holds fully up to the first, not at all from
+/// the second.
 const OFF_DEG: [f64; 2] = [30.0, 70.0];
-/// Distances of the outlines, in metres, from which the degree falls, and at which half of it is left: a thing at the far
-/// end of a hall is no answer to "left of the door" if there is another beside it.
+/// Distances of the outlines, in metres, from which the degree falls, and at which half of it is left: a thing at
+/// the far end of a hall is no answer to "left of the door" if there is another beside it.
 const REACH_M: [f64; 2] = [3.0, 12.0];
 
 /// Where the asker is, and where it looks.

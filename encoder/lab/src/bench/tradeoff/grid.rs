@@ -9,12 +9,14 @@
 //! }]}
 //! ```
 //!
-//! `axis` names the curve of the plots that a point belongs to. `views` are the flags of `encode` that change the views'
-//! contributions; `lift` are its other flags; `eval` are flags of `eval labelled`. The shards of `profile` are evaluated,
-//! measured and queried. All profiles are made, because the exact shards tell which Gaussian is which.
+//! `axis` names the curve of the plots that a point belongs to. `views` are the flags of `encode` that change the
+//! views' contributions; `lift` are its other flags; `eval` are flags of `eval labelled`. The shards of `profile`
+//! are evaluated, measured and queried. All profiles are made, because the exact shards tell which Gaussian is
+//! which.
 //!
-//! `{masks}` stands for the scene's folder of true masks, `{sam}` for the model directory of Segment Anything; without these
-//! a point is not run. Points of a scene with the same `views` share one store, and their contributions are computed once.
+//! `{masks}` stands for the scene's folder of true masks, `{sam}` for the model directory of Segment Anything;
+//! without these a point is not run. Points of a scene with the same `views` share one store, and their
+//! contributions are computed once.
 //!
 //! `ordered` names the axes whose points ascend: plots connect their points, in the grid's order.
 

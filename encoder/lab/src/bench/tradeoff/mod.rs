@@ -1,9 +1,9 @@
 //! `bench tradeoff`: cost and accuracy of each choice of settings, on labelled scenes.
 //!
-//! For each point of a [`grid`], the programs encode, evaluate and query the scene as a user runs them, each in its own
-//! process, so that threads and memory are those of the flags. A point leaves one JSON file; points with a file are not
-//! measured again. Points with the same contributions share a store: the seconds of the views are those of the first
-//! point, all other seconds are each point's own.
+//! For each point of a [`grid`], the programs encode, evaluate and query the scene as a user runs them, each in
+//! its own process, so that threads and memory are those of the flags. A point leaves one JSON file; points with a
+//! file are not measured again. Points with the same contributions share a store: the seconds of the views are
+//! those of the first point, all other seconds are each point's own.
 
 mod grid;
 mod measure;
@@ -33,8 +33,8 @@ pub(crate) struct TradeoffArgs {
     /// Folder for figures and plots; points measured there before are not measured again.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// What to measure: `full`; `quick`, a small grid with the scenes' own masks (ten minutes on two cores); `paper`,
-    /// the paper's four configurations of SAM's grid and image step (needs --segmenter); or a file: JSON,
+    /// What to measure: `full`; `quick`, a small grid with the scenes' own masks (ten minutes on two cores);
+    /// `paper`, the paper's four configurations of SAM's grid and image step (needs --segmenter); or a file: JSON,
     /// {"points": [..]} of axis, name, and flags (views, lift, eval, profile).
     #[arg(long, value_name = "full|quick|paper|FILE", default_value = "full")]
     grid: PathBuf,

@@ -106,15 +106,16 @@ fn means<'a>(
     figures.iter().filter(|f| Some(&f.scene.as_str()) == scenes.first()).filter_map(of_point).collect()
 }
 
-/// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate, and differs.
+/// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate,
+/// and differs.
 pub(super) fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
     let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
     points.iter().map(|point| !points.iter().any(|other| beats(other, point))).collect()
 }
 
 impl TradeoffReport {
-    /// Writes `tradeoff.json`, `tradeoff.md`, `front.json`, the plots (one per scene, cost and accuracy, and of several
-    /// scenes one of their mean), and `tradeoff.html`, which has the plots and tables in one page.
+    /// Writes `tradeoff.json`, `tradeoff.md`, `front.json`, the plots (one per scene, cost and accuracy, and of
+    /// several scenes one of their mean), and `tradeoff.html`, which has the plots and tables in one page.
     pub(super) fn write(&self, out: &Path) -> Result<()> {
         fs_err::write(out.join("tradeoff.json"), serde_json::to_vec_pretty(self)?)?;
         fs_err::write(out.join("tradeoff.md"), self.to_string())?;
@@ -145,8 +146,8 @@ impl TradeoffReport {
         scenes
     }
 
-    /// Returns the settings that no other beats in seconds or bytes, on the mean of the scenes; only those that a user
-    /// can give on any scene: without placeholders, flags of the evaluation, or a view of the machine.
+    /// Returns the settings that no other beats in seconds or bytes, on the mean of the scenes; only those that a
+    /// user can give on any scene: without placeholders, flags of the evaluation, or a view of the machine.
     fn front(&self) -> Front {
         let scenes = self.scenes();
         let of_views = |f: &Figures| f.views_seconds + f.coverage_seconds;
@@ -190,8 +191,8 @@ impl TradeoffReport {
         }
     }
 
-    /// Draws an accuracy against a cost, mean and standard deviation over scenes: a series per axis of the grid, and the
-    /// Pareto front as a staircase.
+    /// Draws an accuracy against a cost, mean and standard deviation over scenes: a series per axis of the grid,
+    /// and the Pareto front as a staircase.
     fn svg(&self, title: &str, scenes: &[&str], cost: &Measure, accuracy: &Measure) -> Option<String> {
         let means = means(&self.figures, scenes, cost.of, accuracy.of);
         if means.is_empty() {

@@ -1,5 +1,5 @@
-//! `eval goal`: places to stand, judged on generated scenes by their true surfaces: the voxels that are called free, and the
-//! poses that the robot's program gives for each thing.
+//! `eval goal`: places to stand, judged on generated scenes by their true surfaces: the voxels that are called
+//! free, and the poses that the robot's program gives for each thing.
 
 mod truth;
 mod voxels;
@@ -155,8 +155,8 @@ fn labels(scene: &Path, store: &Path) -> Result<Vec<Label>> {
     Ok(truth.background.iter().chain(&truth.things).map(label).collect())
 }
 
-/// Returns the object of each thing: of those that are the thing by more than half of their Gaussians, the one with most. Boxes are
-/// not compared: strays make them as large as the room.
+/// Returns the object of each thing: of those that are the thing by more than half of their Gaussians, the one
+/// with most. Boxes are not compared: strays make them as large as the room.
 fn objects_of_things(thing_of: &[u16], object_of: &[u32]) -> BTreeMap<u16, u32> {
     let (mut n_of_object, mut n_of_both) = (BTreeMap::new(), BTreeMap::new());
     for (thing, object) in thing_of.iter().zip(object_of).filter(|(_, object)| **object != NONE) {

@@ -21,7 +21,8 @@ pub(super) struct Seen {
     pub(super) masks_of_region: Vec<Vec<u32>>,
 }
 
-/// Best intersections over union of the first photos' masks with masks of the next, over the pixels that both photos show.
+/// Best intersections over union of the first photos' masks with masks of the next, over the pixels that both
+/// photos show.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Agreement {
     pub(super) ious: Ious,
@@ -108,7 +109,8 @@ mod tests {
         Seen { view, depth: vec![2.0; 80 * 60], regions, masks_of_region }
     }
 
-    /// By hand: half a metre to the right the wall moves 10 of 80 pixels to the left, so columns 10 to 80 are shared.
+    /// By hand: half a metre to the right the wall moves 10 of 80 pixels to the left, so columns 10 to 80 are
+    /// shared.
     #[test]
     fn masks_agree_where_both_photos_show_them() {
         let of = |second: &[(u32, u32)]| {

@@ -1,5 +1,5 @@
-//! `eval masks`: judges segmenters without words. On labelled photos by the best mask of each labelled segment; on all photos
-//! by the share of the scene that masks cover, and by agreement between views.
+//! `eval masks`: judges segmenters without words. On labelled photos by the best mask of each labelled segment; on
+//! all photos by the share of the scene that masks cover, and by agreement between views.
 
 mod agreement;
 mod counts;
@@ -59,7 +59,8 @@ pub(crate) struct MasksArgs {
     /// Folder for generated scenes; what an earlier run left there is used.
     #[arg(long, value_name = "DIR", default_value = "target/masks")]
     out: PathBuf,
-    /// Segmenters: auto (the built-in one), graph (it without its model), or the folder of a Segment Anything model.
+    /// Segmenters: auto (the built-in one), graph (it without its model), or the folder of a Segment Anything
+    /// model.
     #[arg(long, value_name = "auto|graph|DIR,...", value_delimiter = ',', default_value = "auto")]
     segmenter: Vec<PathBuf>,
     /// Most photos of a scene: pairs of neighbours, evenly spread [default: all].

@@ -99,8 +99,8 @@ mod tests {
         Mask { box_px, inside: vec![true; area_px as usize], area_px, level: 0 }
     }
 
-    /// By hand, on 100 x 40 pixels in columns of 20: thing 1 is a mask's; thing 2 is two masks'; thing 3 is half of a mask with
-    /// background 4; thing 5 has no mask; 255 is unlabelled.
+    /// By hand, on 100 x 40 pixels in columns of 20: thing 1 is a mask's; thing 2 is two masks'; thing 3 is half
+    /// of a mask with background 4; thing 5 has no mask; 255 is unlabelled.
     #[test]
     fn segments_are_found_split_merged_or_lost() {
         let ids: Vec<u16> = (0..4000).map(|i| [1, 2, 3, 4, 5][i % 100 / 20]).collect();

@@ -1,5 +1,5 @@
-//! Relations between things, judged on generated scenes: each question is asked of the robot's program as relations, as the
-//! plain phrase, and by the noun alone, and the answers are compared with the layout.
+//! Relations between things, judged on generated scenes: each question is asked of the robot's program as
+//! relations, as the plain phrase, and by the noun alone, and the answers are compared with the layout.
 
 mod truth;
 
@@ -119,8 +119,8 @@ fn middle(things: &[TrueThing]) -> DVec3 {
     all.centre().with_z(0.0)
 }
 
-/// Returns questions about the things of a scene: for each relation those with an answer and those without, evenly spread
-/// over all pairs of words.
+/// Returns questions about the things of a scene: for each relation those with an answer and those without, evenly
+/// spread over all pairs of words.
 fn questions(things: &[TrueThing], robot: DVec3) -> Vec<Question> {
     let is_shown = |thing: &&TrueThing| thing.train_pixels >= MIN_PIXELS;
     let nouns: BTreeSet<&str> = things.iter().filter(is_shown).map(|thing| thing.category.as_str()).collect();

@@ -1,5 +1,5 @@
-//! Which relations truly hold in a generated scene: by the boxes of its layout, with rules of their own, which share no code
-//! with the robot's.
+//! Which relations truly hold in a generated scene: by the boxes of its layout, with rules of their own, which
+//! share no code with the robot's.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -158,7 +158,8 @@ fn is_level(a: &TrueThing, b: &TrueThing) -> bool {
     shared >= 0.3 * lower
 }
 
-/// Returns whether a thing lies in a direction from another: degrees to the left of the line from the robot to that.
+/// Returns whether a thing lies in a direction from another: degrees to the left of the line from the robot to
+/// that.
 fn is_seen(thing: &TrueThing, of: &TrueThing, robot: DVec3, direction_deg: f64) -> bool {
     let sight = (of.centre() - robot).truncate();
     let offset = (thing.centre() - of.centre()).truncate();

@@ -42,8 +42,8 @@ fn segment(segmenter: &SamSegmenter, image: &image::RgbImage) -> Vec<Mask> {
     segmenter.segment(&input).expect("it segments")
 }
 
-/// The recorded prompts are a grid of 3 x 3; those with a logit below 0 show no object. Oracle: one bilinear step in
-/// float64 from the logits, which another test compares with PyTorch's.
+/// The recorded prompts are a grid of 3 x 3; those with a logit below 0 show no object. Oracle: one bilinear step
+/// in float64 from the logits, which another test compares with PyTorch's.
 #[test]
 fn masks_are_those_of_prompts_with_an_object() {
     let (segmenter, photo) = (open(all(3)), photo());
