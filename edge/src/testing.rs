@@ -63,12 +63,12 @@ pub struct TestObject {
 
 impl BuiltShard {
     /// Rewrites the shard with objects: boxes around the origin, photos named by their ids.
-    pub fn with_objects(&self, objects: &[TestObject], calibration: Calibration) -> Self {
+    pub(crate) fn with_objects(&self, objects: &[TestObject], calibration: Calibration) -> Self {
         self.with_objects_and_places(objects, calibration, None)
     }
 
     /// Rewrites the shard with objects, as [`Self::with_objects`] does, and with free and occupied places.
-    pub fn with_objects_and_places(
+    pub(crate) fn with_objects_and_places(
         &self,
         objects: &[TestObject],
         calibration: Calibration,
@@ -215,7 +215,7 @@ impl Axes {
     }
 
     /// Returns the count of texts that it encodes.
-    pub fn n_encoded(&self) -> Arc<AtomicUsize> {
+    pub(crate) fn n_encoded(&self) -> Arc<AtomicUsize> {
         Arc::clone(&self.n_encoded)
     }
 

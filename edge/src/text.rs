@@ -134,7 +134,7 @@ impl TextService {
     }
 
     /// Returns whether the encoder runs.
-    pub fn is_alive(&self) -> bool {
+    pub(crate) fn is_alive(&self) -> bool {
         self.is_alive.load(Ordering::Relaxed)
     }
 

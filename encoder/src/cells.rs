@@ -35,7 +35,7 @@ pub enum PositionError {
 
 impl PositionError {
     /// Returns one centimetre for a metric model, else the size of the Gaussians.
-    pub fn default_for(metric: bool) -> Self {
+    pub(crate) fn default_for(metric: bool) -> Self {
         if metric { Self::Within(0.01) } else { Self::OfSize }
     }
 
@@ -158,7 +158,7 @@ pub struct CellSplit {
 
 impl CellSplit {
     /// Returns the limits that decided the split: the same ones cut a scene in the same way.
-    pub fn deciding(&self, limits: CellLimits) -> (usize, Option<f64>, Option<PositionError>) {
+    pub(crate) fn deciding(&self, limits: CellLimits) -> (usize, Option<f64>, Option<PositionError>) {
         let precision = (self.n_for_precision > 0).then_some(limits.position_error);
         (limits.max_gaussians, limits.max_width, precision)
     }

@@ -58,7 +58,7 @@ impl Page {
         self.add(format_args!("<h2>{}</h2>\n", escaped(text)));
     }
 
-    pub fn paragraph(&mut self, text: &str) {
+    pub(crate) fn paragraph(&mut self, text: &str) {
         self.add(format_args!("<p>{}</p>\n", escaped(text)));
     }
 

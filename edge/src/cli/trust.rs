@@ -23,7 +23,7 @@ pub enum TrustCommand {
 
 impl TrustCommand {
     /// Returns whether JSON is asked for.
-    pub fn is_json(&self) -> bool {
+    pub(crate) fn is_json(&self) -> bool {
         match self {
             Self::Add(args) => args.json,
             Self::Show(args) => args.json,

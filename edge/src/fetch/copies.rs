@@ -100,7 +100,7 @@ impl Copies {
     }
 
     /// Makes a version that was read durable: a killed process may have left it unsynced.
-    pub fn settle(&self, files: &dyn Files, version: &Version) -> io::Result<()> {
+    pub(crate) fn settle(&self, files: &dyn Files, version: &Version) -> io::Result<()> {
         files.sync(&self.path(version.index))?;
         files.sync_dir(&self.dir)
     }

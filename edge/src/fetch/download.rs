@@ -68,7 +68,7 @@ impl<'a> Client<'a> {
     }
 
     /// Returns the bytes left by earlier fetches, and the number of attempts beyond the first.
-    pub fn resumed_bytes_and_retries(self) -> (u64, u64) {
+    pub(crate) fn resumed_bytes_and_retries(self) -> (u64, u64) {
         (self.http.resumed_bytes.into_inner(), self.http.retries.into_inner())
     }
 

@@ -204,7 +204,7 @@ impl Following {
     }
 
     /// Records that the follower itself failed, and returns how often it did in a row.
-    pub fn note_failure(&self, failure: &str) -> u64 {
+    pub(crate) fn note_failure(&self, failure: &str) -> u64 {
         let mut inbox = self.lock();
         inbox.status.failure = Some(failure.to_owned());
         inbox.n_failures_in_a_row += 1;
@@ -212,7 +212,7 @@ impl Following {
     }
 
     /// Records that following begins again.
-    pub fn note_restart(&self) {
+    pub(crate) fn note_restart(&self) {
         self.lock().status.n_restarts += 1;
     }
 

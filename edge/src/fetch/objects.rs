@@ -38,7 +38,7 @@ impl<'a> Check<'a> {
     }
 
     /// Returns whether an object belongs to the text model.
-    pub fn is_of_text_model(&self, hash: Hash32) -> bool {
+    pub(crate) fn is_of_text_model(&self, hash: Hash32) -> bool {
         self.text_model.contains(&hash)
     }
 
@@ -49,7 +49,7 @@ impl<'a> Check<'a> {
 
     /// Returns whether an object on board is what the manifest describes. It is read only where the manifest by
     /// which it came described it otherwise: readers find what rots, and mark it.
-    pub fn is_fit(&self, cache: &EdgeCache, on_board: Option<&Offer>, hash: Hash32) -> bool {
+    pub(crate) fn is_fit(&self, cache: &EdgeCache, on_board: Option<&Offer>, hash: Hash32) -> bool {
         let Some(cell) = self.cell(hash) else { return true };
         let described = |manifest: &Manifest| {
             let listed = store::cell_of(manifest, cell.cell_id)?;

@@ -138,7 +138,7 @@ impl Records {
     }
 
     /// Returns the SHA-256 of the root that was trusted first, hex.
-    pub fn first_root_sha256(&self) -> Option<&str> {
+    pub(crate) fn first_root_sha256(&self) -> Option<&str> {
         self.record.first_root_sha256.as_deref()
     }
 

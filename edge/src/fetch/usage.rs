@@ -43,7 +43,7 @@ impl Usage {
     }
 
     /// Lists the shards on board and removes other files in their folder.
-    pub fn held_shards(&self, cache: &EdgeCache) -> Result<BTreeMap<Hash32, Held>, FetchError> {
+    pub(crate) fn held_shards(&self, cache: &EdgeCache) -> Result<BTreeMap<Hash32, Held>, FetchError> {
         let dir = cache.dir().join("shards");
         let mut held = BTreeMap::new();
         for name in cache.files().list(&dir)? {

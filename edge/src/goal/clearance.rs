@@ -80,7 +80,7 @@ impl Clearance {
     }
 
     /// Returns which cells have a squared distance of at least `least`, 1 or more.
-    pub fn at_least(&self, least: u32) -> Vec<bool> {
+    pub(crate) fn at_least(&self, least: u32) -> Vec<bool> {
         let n_x = self.along_y.len().checked_div(self.n_y).unwrap_or(0) as i64;
         let reach = i64::from((least - 1).isqrt());
         let mut is_clear = vec![false; self.along_y.len()];

@@ -72,7 +72,7 @@ impl Ground {
     }
 
     /// Returns the highest surface of a cell that is at most at this height.
-    pub fn surface_below(&self, cell: usize, height: i32) -> Option<u8> {
+    pub(crate) fn surface_below(&self, cell: usize, height: i32) -> Option<u8> {
         let n = u32::try_from(height.checked_add(1)?).ok()?;
         let below = self.surfaces[cell] & low_bits(n.min(128));
         below.checked_ilog2().map(|z| z as u8)
@@ -81,7 +81,7 @@ impl Ground {
     /// Continues a surface from a cell: whatever a robot that climbs `step` voxels gets to over neighbours is
     /// ground at that height, even if the column has a lower surface, such as the furniture of the storey below.
     /// Returns which cells.
-    pub fn continue_from(&mut self, cell: usize, z: u8, step: u8) -> Vec<bool> {
+    pub(crate) fn continue_from(&mut self, cell: usize, z: u8, step: u8) -> Vec<bool> {
         let (n_y, n) = (self.n_y, self.floors.len());
         let mut is_met = vec![false; n];
         (self.floors[cell], is_met[cell]) = (Floor::At(z), true);
@@ -114,7 +114,7 @@ impl Ground {
 
     /// Makes ground that is too steep for the robot an obstacle: where the ground rises or falls along a line by
     /// more than `slope` times its length and a step besides, over at most a metre. Lines end at higher steps.
-    pub fn block_slopes(&mut self, slope: f64, step: u8, voxel: f64) {
+    pub(crate) fn block_slopes(&mut self, slope: f64, step: u8, voxel: f64) {
         let (n_y, floors) = (self.n_y, &self.floors);
         let n_x = floors.len() / n_y.max(1);
         let reach = (SLOPE_REACH_M / voxel).round().max(1.0) as usize;

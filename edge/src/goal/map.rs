@@ -78,7 +78,7 @@ impl FloorMap {
     ///
     /// # Errors
     /// Those of the writer.
-    pub fn write_pgm(&self, mut out: impl Write) -> io::Result<()> {
+    pub(crate) fn write_pgm(&self, mut out: impl Write) -> io::Result<()> {
         let [width, height] = self.size;
         write!(out, "P5\n{width} {height}\n255\n")?;
         let grey = |place: &Place| match place {

@@ -54,7 +54,7 @@ impl Window {
     }
 
     /// Returns the voxel of a point, counted from the window's smallest corner.
-    pub fn voxel_of(&self, point: DVec3) -> [i32; 3] {
+    pub(crate) fn voxel_of(&self, point: DVec3) -> [i32; 3] {
         let at = point / self.voxel;
         [0, 1, 2].map(|axis| (at[axis].floor() - f64::from(self.first[axis] * BLOCK_EDGE)) as i32)
     }
@@ -68,7 +68,7 @@ impl Window {
     }
 
     /// Returns the middle of a cell.
-    pub fn centre_of(&self, cell: usize) -> [f64; 2] {
+    pub(crate) fn centre_of(&self, cell: usize) -> [f64; 2] {
         let n_y = self.cells()[1];
         let at = |axis: usize, offset: usize| {
             (f64::from(self.first[axis] * BLOCK_EDGE) + offset as f64 + 0.5) * self.voxel
@@ -77,7 +77,7 @@ impl Window {
     }
 
     /// Returns the height of the lower side of a voxel, world frame.
-    pub fn height_of(&self, z: i32) -> f64 {
+    pub(crate) fn height_of(&self, z: i32) -> f64 {
         f64::from(self.first[2] * BLOCK_EDGE + z) * self.voxel
     }
 }

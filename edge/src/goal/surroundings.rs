@@ -35,7 +35,7 @@ pub struct Around<'a> {
 
 impl Around<'_> {
     /// Returns the distance of a cell to the nearest obstacle, metres.
-    pub fn clearance(&self, cell: usize) -> f64 {
+    pub(crate) fn clearance(&self, cell: usize) -> f64 {
         f64::from(self.clearance.squared(cell)).sqrt() * self.space.window.voxel
     }
 
@@ -45,7 +45,7 @@ impl Around<'_> {
     }
 
     /// Returns the height of the ground of a cell, world frame.
-    pub fn floor_height(&self, cell: usize) -> Option<f64> {
+    pub(crate) fn floor_height(&self, cell: usize) -> Option<f64> {
         match self.ground.floors[cell] {
             Floor::At(z) => {
                 let window = &self.space.window;

@@ -70,7 +70,8 @@ impl App {
     }
 
     /// Returns a counter of finished attempts to load another generation.
-    pub fn reload_attempts(&self) -> watch::Receiver<u64> {
+    #[cfg(test)]
+    pub(crate) fn reload_attempts(&self) -> watch::Receiver<u64> {
         self.n_reload_attempts.subscribe()
     }
 

@@ -32,7 +32,7 @@ pub struct Settings {
 impl Settings {
     /// Returns bounds for a machine with a few cores, with a budget of memory and time for each query. All queries
     /// together may use four times the memory.
-    pub fn with_budget(query_bytes: u64, query_timeout: Duration) -> Self {
+    pub(crate) fn with_budget(query_bytes: u64, query_timeout: Duration) -> Self {
         let connections = ConnectionLimits {
             n_connections: 512,
             n_per_peer: 384,

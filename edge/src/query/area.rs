@@ -55,7 +55,11 @@ impl Area {
     ///
     /// # Errors
     /// The part that is out of bounds, or geographic in a scene without a geographic reference.
-    pub fn restrict(&self, request: &mut QueryRequest, manifest: &Manifest) -> Result<(), RequestError> {
+    pub(crate) fn restrict(
+        &self,
+        request: &mut QueryRequest,
+        manifest: &Manifest,
+    ) -> Result<(), RequestError> {
         if let Some(AreaBall { centre, radius }) = self.ball {
             let centre_in_world = centre.in_world("region", manifest)?;
             request.ball = Some(Ball { centre_in_world, radius });

@@ -205,11 +205,6 @@ impl Outcome {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-
-    /// Returns whether the answers are Gaussians.
-    pub fn is_of_gaussians(&self) -> bool {
-        matches!(self, Self::Plain(Answers { answers: Answered::Gaussians(_), .. }))
-    }
 }
 
 fn related(

@@ -114,7 +114,7 @@ impl OnBoard {
     }
 
     /// Returns whether the text model runs.
-    pub fn text_is_alive(&self) -> bool {
+    pub(crate) fn text_is_alive(&self) -> bool {
         self.text.is_alive()
     }
 
@@ -168,7 +168,7 @@ impl Engine {
     ///
     /// # Errors
     /// Those of `otherwise`. A carried model that does not open is logged.
-    pub fn with_carried<E>(
+    pub(crate) fn with_carried<E>(
         cache: EdgeCache,
         options: SessionOptions,
         otherwise: impl FnOnce() -> Result<TextService, E>,
@@ -196,7 +196,7 @@ impl Engine {
 
     /// Returns whether the cache's `current` differs from the one loaded (one `stat` call), or loading it
     /// failed a while ago.
-    pub fn is_stale(&self) -> bool {
+    pub(crate) fn is_stale(&self) -> bool {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let retry = loaded.failed_at.is_some_and(|at| at.elapsed() >= RETRY_AFTER);
         retry || self.cache.current_stat().is_ok_and(|stat| stat != loaded.tried)

@@ -132,7 +132,13 @@ impl Engine {
     /// Returns the positions of Gaussians of an object on board, evenly spread over their order, at most `limit`:
     /// those of its largest cluster, inside the cluster's box. Objects have stray Gaussians, too, some nearly as
     /// many as their own.
-    pub fn object_points(&self, snapshot: &Snapshot, id: u64, limit: usize, budget: &Budget) -> Vec<DVec3> {
+    pub(crate) fn object_points(
+        &self,
+        snapshot: &Snapshot,
+        id: u64,
+        limit: usize,
+        budget: &Budget,
+    ) -> Vec<DVec3> {
         self.on_scene(snapshot, budget, |_, scene| {
             let Some(object) = number_of(scene, id) else { return Vec::new() };
             if !take_points(scene, object, budget) {

@@ -51,14 +51,14 @@ impl Scale {
         }
     }
 
-    pub fn to_score(self, shown: f32) -> f32 {
+    pub(crate) fn to_score(self, shown: f32) -> f32 {
         match self.0 {
             ScoreKind::Cosine => shown,
             ScoreKind::Relevancy => score_of_relevancy(shown),
         }
     }
 
-    pub fn error_bound(self, of_score: f32) -> f32 {
+    pub(crate) fn error_bound(self, of_score: f32) -> f32 {
         match self.0 {
             ScoreKind::Cosine => of_score,
             // A sigmoid is nowhere steeper than a quarter of its steepness at 0.

@@ -86,7 +86,7 @@ impl Engine {
 
     /// Returns the message of a cell's Gaussians, all or every few, or nothing if the cell is not on board or of
     /// another generation than `generation`, where that is given.
-    pub fn view_cell(
+    pub(crate) fn view_cell(
         &self,
         cell_id: u32,
         generation: Option<u64>,
@@ -107,7 +107,7 @@ impl Engine {
 
     /// Returns the words that the text model knows, each with the number of objects on board that it finds; of a
     /// model that takes any text, everyday words that find something.
-    pub fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
+    pub(crate) fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
         let snapshot = &on_board.snapshot;
@@ -144,7 +144,7 @@ impl Engine {
     }
 
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.
-    pub fn view_scores(
+    pub(crate) fn view_scores(
         &self,
         text: &str,
         negatives: Negatives,

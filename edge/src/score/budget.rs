@@ -91,7 +91,7 @@ impl Budget {
     }
 
     /// Gives back what was taken since `used_bytes` was this, except `kept` bytes.
-    pub fn give_back_to(&self, used_bytes: u64, kept: usize) {
+    pub(crate) fn give_back_to(&self, used_bytes: u64, kept: usize) {
         let Some(account) = &self.0 else { return };
         let bytes = self.used_bytes().saturating_sub(used_bytes.saturating_add(kept as u64));
         account.used.fetch_sub(bytes, Relaxed);

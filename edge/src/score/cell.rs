@@ -121,11 +121,11 @@ impl<'a> AskedQuestion<'a> {
 
 impl Cell<'_> {
     /// Returns whether a member's score may differ from its centroid's.
-    pub fn has_detail(&self) -> bool {
+    pub(crate) fn has_detail(&self) -> bool {
         !matches!(self.detail, Detail::Nothing)
     }
 
-    pub fn projections(&self) -> impl Iterator<Item = &Projection> {
+    pub(crate) fn projections(&self) -> impl Iterator<Item = &Projection> {
         self.asked.places.iter().map(|place| &self.scores.projections[*place])
     }
 
@@ -204,14 +204,14 @@ impl Cell<'_> {
     }
 
     /// Returns the largest difference between the score of a stored embedding and that of its centroid.
-    pub fn embedding_bound(&self, centroid: usize) -> f32 {
+    pub(crate) fn embedding_bound(&self, centroid: usize) -> f32 {
         let question = self.asked.question;
         let distance = self.shard.radii[centroid] + F16_ROUNDING;
         self.asked.steepness * distance + 2.0 * question.rounding_bound() + self.centroid_error(centroid)
     }
 
     /// Bounds the rounding error of a centroid's score.
-    pub fn centroid_error(&self, centroid: usize) -> f32 {
+    pub(crate) fn centroid_error(&self, centroid: usize) -> f32 {
         let error = |projection: &Projection| {
             // Members have unit length, so neither the centroid nor their distance from it is longer than 1.
             let length = 1.0 + self.shard.radii[centroid] + projection.mean_length;

@@ -38,7 +38,7 @@ pub(super) struct Gather {
 
 impl Gather {
     /// Returns the work done.
-    pub fn effort(&self) -> Effort {
+    pub(crate) fn effort(&self) -> Effort {
         let mut effort = Effort::default();
         self.shards.iter().for_each(|of_shard| effort += of_shard.found.effort);
         effort

@@ -144,7 +144,7 @@ impl Projection {
     }
 
     /// Scores a cell's centroids. `scores`: `[K]`.
-    pub fn score_centroids(
+    pub(crate) fn score_centroids(
         &self,
         instructions: InstructionSet,
         shard: &ShardView<'_>,
@@ -166,7 +166,7 @@ impl Projection {
     }
 
     /// Builds the vector that fine residuals are multiplied with.
-    pub fn set_fine(&mut self, fine: &Fine<'_>) {
+    pub(crate) fn set_fine(&mut self, fine: &Fine<'_>) {
         self.fine_components.clear();
         self.fine_components
             .extend(self.components.iter().zip(fine.steps).map(|(y, step)| y * f64::from(*step)));
@@ -174,7 +174,7 @@ impl Projection {
     }
 
     /// Builds the tables of a residual code.
-    pub fn set_tables(&mut self, residuals: &Residuals<'_>) {
+    pub(crate) fn set_tables(&mut self, residuals: &Residuals<'_>) {
         let n_subspaces = residuals.subspace_starts.len() - 1;
         let tables = &mut self.tables;
         let mut values = [[0.0f64; CODEWORDS]; slag_common::shard::MAX_SUBSPACES];

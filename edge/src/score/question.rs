@@ -48,7 +48,7 @@ impl Question {
 
     /// Returns the most that a score changes when an embedding moves by 1: the length of `q`, or of the
     /// longest `q - n_j`, because the score is the minimum of all `(q - n_j) · E`.
-    pub fn steepness(&self) -> f32 {
+    pub(crate) fn steepness(&self) -> f32 {
         let own = length(self.vector.iter().copied());
         let apart = |n: &Arc<[f32]>| length(self.vector.iter().zip(&**n).map(|(q, n)| q - n));
         let largest = self.negatives.iter().map(apart).reduce(f64::max).unwrap_or(own);
@@ -56,7 +56,7 @@ impl Question {
     }
 
     /// Bounds the error of scoring in f32.
-    pub fn rounding_bound(&self) -> f32 {
+    pub(crate) fn rounding_bound(&self) -> f32 {
         let of_dot = rounding_bound(self.vector.len());
         // The difference of two products, each at most 1, is rounded once more.
         if self.negatives.is_empty() { of_dot } else { 2.0 * of_dot + f32::EPSILON }

@@ -34,11 +34,6 @@ pub struct Region {
 }
 
 impl Region {
-    /// Returns whether the region is all of space.
-    pub fn is_everything(&self) -> bool {
-        *self == Self::default()
-    }
-
     /// Returns whether a point lies inside.
     pub fn contains(&self, point: DVec3) -> bool {
         self.ball.is_none_or(|ball| ball.contains(point))

@@ -29,7 +29,7 @@ pub struct Scratch {
 
 impl Scratch {
     /// Sets what the searches to come may use; without bounds by default.
-    pub fn set_budget(&mut self, budget: Budget) {
+    pub(crate) fn set_budget(&mut self, budget: Budget) {
         self.budget = budget;
     }
 
@@ -61,7 +61,7 @@ impl Scratch {
 
     /// Returns whether no centroids were scored in these buffers yet.
     #[cfg(test)]
-    pub fn is_untouched(&self) -> bool {
+    pub(crate) fn is_untouched(&self) -> bool {
         self.scored.shards.is_empty()
     }
 }
@@ -207,7 +207,7 @@ impl<'a> Search<'a> {
     /// Returns the score errors that were measured over a bank of texts, each the maximum over the shards
     /// searched, so that the likely one holds for each of them; `None` if answers are exact, or if a shard lacks
     /// measurements for the data read.
-    pub fn measured_errors(&self) -> Option<ScoreErrors> {
+    pub(crate) fn measured_errors(&self) -> Option<ScoreErrors> {
         let mut largest: Option<ScoreErrors> = None;
         for shard in self.searched() {
             let of_codes = match self.asked.precision {

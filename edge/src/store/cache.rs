@@ -44,7 +44,7 @@ impl Current {
     }
 
     /// Returns the shards of earlier generations that answer for bad cells.
-    pub fn old_shards(&self) -> impl Iterator<Item = (u32, OldShard)> + '_ {
+    pub(crate) fn old_shards(&self) -> impl Iterator<Item = (u32, OldShard)> + '_ {
         self.bad_cells.iter().filter_map(|bad| Some((bad.cell_id, bad.old?)))
     }
 }

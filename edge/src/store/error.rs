@@ -74,7 +74,7 @@ impl From<io::Error> for StoreError {
 
 impl StoreError {
     /// Returns whether a file is damaged, so that the next fetch must replace it.
-    pub fn is_damage(&self) -> bool {
+    pub(crate) fn is_damage(&self) -> bool {
         use StoreError::{Hash, Mismatch, Shard, Unreadable};
         matches!(self, Shard { .. } | Mismatch { .. } | Hash { .. } | Unreadable(_))
     }

@@ -76,7 +76,7 @@ impl ObjectIndex {
 
     /// Returns the objects with their first part in a shard: their number there, ascending, and the object.
     /// Every object is in exactly one shard's list.
-    pub fn first_in(&self, shard: usize) -> &[(u32, u32)] {
+    pub(crate) fn first_in(&self, shard: usize) -> &[(u32, u32)] {
         &self.shards[shard].first
     }
 

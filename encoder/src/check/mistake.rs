@@ -86,7 +86,7 @@ impl Mistake {
     }
 
     /// Returns the view with the mistake corrected.
-    pub fn corrected(self, view: &RasterView) -> RasterView {
+    pub(crate) fn corrected(self, view: &RasterView) -> RasterView {
         let mut corrected = *view;
         let (pose, camera) = (&mut corrected.camera_from_world, &mut corrected.intrinsics);
         let turned = |x, y, z| DAffine3::from_mat3(DMat3::from_diagonal(DVec3::new(x, y, z)));
@@ -125,7 +125,7 @@ impl Mistake {
 
     /// Returns the splat with the mistake corrected, with colours of degree 0; `None` if the mistake is not the
     /// splat's.
-    pub fn corrected_splat(self, scene: &Gaussians) -> Option<Gaussians> {
+    pub(crate) fn corrected_splat(self, scene: &Gaussians) -> Option<Gaussians> {
         let mut corrected = match self {
             Self::Mirrored(_) | Self::Activated { .. } => Gaussians {
                 means_in_world: scene.means_in_world.clone(),

@@ -35,7 +35,7 @@ pub struct TextBank {
 impl TextBank {
     /// Encodes a model's own vocabulary, or else everyday words; words that the model does not know are left out.
     /// Too few words are replaced by pseudo-random directions.
-    pub fn of_model(encoder: &mut dyn TextEncoder) -> Self {
+    pub(crate) fn of_model(encoder: &mut dyn TextEncoder) -> Self {
         let words: Vec<String> = match encoder.vocabulary() {
             Some(words) => words.to_vec(),
             None => everyday_texts().map(str::to_owned).collect(),

@@ -32,7 +32,7 @@ struct Cluster {
 
 impl Clusters {
     /// Drops the clusters without points, and renumbers the others.
-    pub fn drop_empty(&mut self, width: usize) {
+    pub(crate) fn drop_empty(&mut self, width: usize) {
         let mut numbers = vec![None; self.centres.len() / width];
         let mut kept = Vec::with_capacity(self.centres.len());
         for code in &mut self.codes {

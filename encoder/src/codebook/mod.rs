@@ -124,7 +124,7 @@ pub struct Codebook {
 }
 
 impl Codebook {
-    pub fn stored_basis(&self) -> shard::Basis<'_> {
+    pub(crate) fn stored_basis(&self) -> shard::Basis<'_> {
         shard::Basis { mean: &self.mean, vectors: &self.basis, steps: &self.basis_steps }
     }
 }

@@ -81,7 +81,7 @@ impl SharedEncoders {
         Self::with_lanes(gpus, LANES_PER_GPU, open)
     }
 
-    pub fn with_lanes(gpus: &[u32], n_lanes: usize, open: Box<OpenEncoder>) -> Self {
+    pub(crate) fn with_lanes(gpus: &[u32], n_lanes: usize, open: Box<OpenEncoder>) -> Self {
         let lanes = Lanes::new(gpus.iter().map(|gpu| (*gpu, (0..n_lanes).map(|_| None).collect())));
         let shared = Arc::new(Shared { open, lanes, queue: Mutex::default(), has_work: Condvar::new() });
         let work = |_| {
@@ -111,7 +111,10 @@ impl SharedEncoders {
     ///
     /// # Errors
     /// [`ModelError`] if the model does not open.
-    pub fn with_encoder<T>(&self, work: impl FnOnce(&mut dyn ImageEncoder) -> T) -> Result<T, ModelError> {
+    pub(crate) fn with_encoder<T>(
+        &self,
+        work: impl FnOnce(&mut dyn ImageEncoder) -> T,
+    ) -> Result<T, ModelError> {
         self.shared.opened(&mut self.shared.lanes.take()).map(work)
     }
 

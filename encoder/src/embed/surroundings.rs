@@ -18,13 +18,13 @@ pub struct Surroundings {
 
 impl Surroundings {
     /// Of masks in the patches of a photo, `per_side` along each of its sides: by the mask's pixels in each.
-    pub fn of_patches(masks: &[Mask], per_side: u32, (width_px, height_px): (u32, u32)) -> Self {
+    pub(crate) fn of_patches(masks: &[Mask], per_side: u32, (width_px, height_px): (u32, u32)) -> Self {
         let shares = |mask| patches::shares(mask, per_side, width_px, height_px);
         Self { share: SHARE_OF_PATCHES, of_mask: masks.iter().map(shares).collect() }
     }
 
     /// Of masks in windows over a photo: by the mask's pixels in each, each size of windows alike.
-    pub fn of_windows(masks: &[Mask], windows: &Windows) -> Self {
+    pub(crate) fn of_windows(masks: &[Mask], windows: &Windows) -> Self {
         let shares = |mask| windows.shares(mask);
         Self { share: SHARE_OF_WINDOWS, of_mask: masks.iter().map(shares).collect() }
     }
@@ -35,7 +35,7 @@ impl Surroundings {
 
     /// Mixes the direction of the mean of `of_photo`, `[vectors][dim]`, over each mask into its unit vector of
     /// `of_masks`, `[masks][dim]`, which remains one. A mean without a direction changes nothing.
-    pub fn mix(&self, of_masks: &mut [f32], of_photo: &[f32], dim: usize) {
+    pub(crate) fn mix(&self, of_masks: &mut [f32], of_photo: &[f32], dim: usize) {
         for (vector, shares) in of_masks.chunks_exact_mut(dim.max(1)).zip(&self.of_mask) {
             let mut mean = vec![0.0; dim];
             for &(k, share) in shares {

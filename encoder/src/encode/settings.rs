@@ -110,7 +110,7 @@ impl Regions {
     }
 
     /// Returns whether masks are made. Objects need them.
-    pub fn have_masks(self) -> bool {
+    pub(crate) fn have_masks(self) -> bool {
         self != Self::Patches
     }
 }
@@ -330,7 +330,7 @@ impl EncodeSettings {
     ///
     /// # Errors
     /// [`EncodeError::Setting`] with the first one that is out of its range.
-    pub fn validate(&self) -> Result<(), EncodeError> {
+    pub(crate) fn validate(&self) -> Result<(), EncodeError> {
         let Self { view, aggregation, cells, run, .. } = self;
         let codebook = &cells.shards.codebook;
         let is_positive = |x: f64| x > 0.0 && x.is_finite();

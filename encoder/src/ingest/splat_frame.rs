@@ -26,7 +26,7 @@ pub struct Activated {
 
 impl Activated {
     /// Brings a splat that was decoded as usual to the values of its file.
-    pub fn undo(self, scene: &mut Gaussians) {
+    pub(crate) fn undo(self, scene: &mut Gaussians) {
         if self != Self::default() {
             scene.deactivate(self.scales, self.opacities);
         }

@@ -136,19 +136,19 @@ impl ContributionIndex {
     }
 
     /// Returns the first region of each view, in the order of their names.
-    pub fn first_regions(&self) -> Vec<u32> {
+    pub(crate) fn first_regions(&self) -> Vec<u32> {
         self.views.iter().map(|view| view.first_region).collect()
     }
 
-    pub fn n_masks_of_view(&self) -> impl Iterator<Item = usize> + '_ {
+    pub(crate) fn n_masks_of_view(&self) -> impl Iterator<Item = usize> + '_ {
         self.views.iter().map(|view| view.n_masks)
     }
 
-    pub fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
+    pub(crate) fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
         self.views.iter().map(|view| view.file.n_regions())
     }
 
-    pub fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
+    pub(crate) fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
         self.views.iter().map(|view| view.file.n_entries())
     }
 
@@ -165,7 +165,7 @@ impl ContributionIndex {
     }
 
     /// Returns the bytes that the largest part takes while it is transposed: the smallest budget.
-    pub fn largest_part_bytes(&self) -> u64 {
+    pub(crate) fn largest_part_bytes(&self) -> u64 {
         self.parts.iter().map(part_bytes).max().unwrap_or(0)
     }
 

@@ -53,7 +53,7 @@ impl PartContributions {
 
     /// Returns the range of a Gaussian's entries.
     #[inline(always)]
-    pub fn entries_of(&self, k: usize) -> Range<usize> {
+    pub(crate) fn entries_of(&self, k: usize) -> Range<usize> {
         self.starts[k] as usize..self.starts[k + 1] as usize
     }
 }

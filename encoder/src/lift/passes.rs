@@ -110,7 +110,7 @@ impl ContributionIndex {
     }
 
     /// Starts a pass as [`Self::transposed_groups`] does, which hands out one part at a time.
-    pub fn transposed_parts<'a>(
+    pub(crate) fn transposed_parts<'a>(
         &'a self,
         table: &'a RegionTable,
         budget_bytes: u64,

@@ -54,7 +54,7 @@ impl MaskOutline {
 
     /// Returns 1 - truncation, 0 to 1: the share of the outline that the photo's edge does not cut off. The box's
     /// perimeter stands for the outline's length, because a ragged outline is no longer for it.
-    pub fn uncut_share(&self) -> f32 {
+    pub(crate) fn uncut_share(&self) -> f32 {
         let [x0, y0, x1, y1] = self.box_px.map(f64::from);
         (1.0 - f64::from(self.cut_px) / (2.0 * (x1 - x0 + y1 - y0))).max(0.0) as f32
     }

@@ -47,11 +47,6 @@ impl SuperpointSettings {
     pub fn coarse() -> Self {
         Self { scale: 20.0, min_gaussians: 60, ..Self::default() }
     }
-
-    /// Returns settings for superpoints of colour and shape alone.
-    pub fn of_looks() -> Self {
-        Self { colour: 1.0, ..Self::default() }
-    }
 }
 
 /// A partition of a scene's Gaussians.
@@ -145,7 +140,7 @@ impl Graph {
     }
 
     /// Partitions the scene. `settings`: scale and smallest size.
-    pub fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
+    pub(crate) fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
         let mut components = Components::new(self.n_gaussians, settings.scale);
         let edge = |(length, a, b): &Edge| (*a, *b, f32::from_bits(*length));
         components.join_all_similar(&self.edges, edge);
@@ -164,28 +159,6 @@ impl Superpoints {
         sizes
     }
 
-    /// Returns each superpoint's most frequent label, of equally many the first; `None` where it has none.
-    /// `labels`: of Gaussians, in any order.
-    pub fn most_frequent<L: Copy + Ord + Send>(
-        &self,
-        labels: impl ParallelIterator<Item = (u32, L)>,
-    ) -> Vec<Option<L>> {
-        let mut pairs: Vec<(u32, L)> = labels
-            .map(|(gaussian, label)| (self.of_gaussian[gaussian as usize], label))
-            .filter(|(superpoint, _)| *superpoint != NO_SUPERPOINT)
-            .collect();
-        pairs.par_sort_unstable();
-        let mut found = vec![(0, None); self.n];
-        for run in pairs.chunk_by(|a, b| a == b) {
-            let (superpoint, label) = run[0];
-            let most = &mut found[superpoint as usize];
-            if run.len() > most.0 {
-                *most = (run.len(), Some(label));
-            }
-        }
-        found.into_iter().map(|(_, label)| label).collect()
-    }
-
     /// Partitions a scene. The result does not depend on threads.
     pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
         Graph::new(scene, sketches, settings).superpoints(settings)
@@ -193,7 +166,7 @@ impl Superpoints {
 
     /// Returns the bytes that partitioning `n_gaussians` takes, at `n_scales` at once: neighbours while they are
     /// searched, then with the edges and what joins them.
-    pub fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
+    pub(crate) fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
         let n = settings.n_neighbours;
         let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);
         let joined =

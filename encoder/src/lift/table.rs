@@ -111,12 +111,12 @@ impl RegionTable {
     }
 
     /// Sets the weight of each mask. `weights`: `[n_masks]`, finite, not negative.
-    pub fn set_mask_weights(&mut self, weights: &[f32]) {
+    pub(crate) fn set_mask_weights(&mut self, weights: &[f32]) {
         self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
     }
 
     /// Sets the level of each mask, `[n_masks]`, 0 the coarsest.
-    pub fn set_levels(&mut self, levels: Vec<u8>) {
+    pub(crate) fn set_levels(&mut self, levels: Vec<u8>) {
         self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
     }
 

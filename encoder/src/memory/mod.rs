@@ -111,12 +111,12 @@ impl MemoryPlan {
     }
 
     /// Sets memory aside that the process holds already when its peak is planned.
-    pub fn reserve_held(&mut self, phase: Phase, purpose: &'static str, len_bytes: u64) {
+    pub(crate) fn reserve_held(&mut self, phase: Phase, purpose: &'static str, len_bytes: u64) {
         self.reserve_expecting(phase, purpose, len_bytes, 0);
     }
 
     /// Sets memory aside, of which a part is expected to be needed; more where nothing bounds it.
-    pub fn reserve_expecting(
+    pub(crate) fn reserve_expecting(
         &mut self,
         phase: Phase,
         purpose: &'static str,
@@ -127,7 +127,7 @@ impl MemoryPlan {
     }
 
     /// Returns the peak of a process that holds `held_bytes` now.
-    pub fn planned_peak(&self, held_bytes: u64) -> PlannedPeak {
+    pub(crate) fn planned_peak(&self, held_bytes: u64) -> PlannedPeak {
         let of_phase = |phase: Phase| {
             self.of_phase(phase).fold(held_bytes, |sum, r| sum.saturating_add(r.expected_bytes))
         };
@@ -136,13 +136,13 @@ impl MemoryPlan {
     }
 
     /// Marks the views as done: later reservations depend on their results.
-    pub fn views_are_done(&mut self) {
+    pub(crate) fn views_are_done(&mut self) {
         self.is_before_views = false;
     }
 
     /// Returns the bytes of the budget that are free during a phase. [`Self::rest`] are those that are free during
     /// all.
-    pub fn rest_of(&self, phase: Phase) -> u64 {
+    pub(crate) fn rest_of(&self, phase: Phase) -> u64 {
         self.available_bytes.saturating_sub(self.reserved_bytes(phase))
     }
 

@@ -39,21 +39,21 @@ pub struct ScreenGaussian {
 
 impl ScreenGaussian {
     /// Returns half the size of the bounding box of the footprint, pixels.
-    pub fn extent_px(&self) -> DVec2 {
+    pub(crate) fn extent_px(&self) -> DVec2 {
         let cov_yy = self.inv_height.powi(-2);
         let cov_xx = self.inv_width.powi(-2) + self.slope * self.slope * cov_yy;
         DVec2::new(cov_xx, cov_yy).map(|v| (f64::from(self.reach2) * v).sqrt())
     }
 
     /// Returns the highest and lowest y of the footprint, pixels.
-    pub fn y_range_px(&self) -> [f64; 2] {
+    pub(crate) fn y_range_px(&self) -> [f64; 2] {
         let extent = f64::from(self.reach2).sqrt() / self.inv_height;
         [self.mean_px.y - extent, self.mean_px.y + extent]
     }
 
     /// Returns the pixels `first..=last` of an axis with centres in `[low, high]` and in the image; `None` if
     /// there are none.
-    pub fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
+    pub(crate) fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
         let first = (low - 0.5).max(0.0);
         let last = (high - 0.5).min(f64::from(size_px) - 1.0);
         if first > last {

@@ -39,13 +39,13 @@ impl Published {
     }
 
     /// Returns the lengths of the shards, by hash.
-    pub fn shard_lens(&self) -> BTreeMap<Hash32, u64> {
+    pub(crate) fn shard_lens(&self) -> BTreeMap<Hash32, u64> {
         let shards = self.manifest.cells.iter().flat_map(|cell| cell.shards.values());
         shards.map(|shard| (shard.hash, shard.len_bytes)).collect()
     }
 
     /// Returns the lengths of all that robots may fetch, by hash: the shards and, if there is one, the text model.
-    pub fn object_lens(&self) -> BTreeMap<Hash32, u64> {
+    pub(crate) fn object_lens(&self) -> BTreeMap<Hash32, u64> {
         let text_model = self.manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
         let text_model = text_model.map(|object| (object.hash, object.len_bytes));
         self.shard_lens().into_iter().chain(text_model).collect()
@@ -121,7 +121,7 @@ impl StoreReader {
     }
 
     /// Returns whether the store still has the manifest that this reader read (one `stat`).
-    pub fn is_current(&self) -> bool {
+    pub(crate) fn is_current(&self) -> bool {
         Stamp::of(&self.dir.join(files::MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
     }
 
@@ -140,7 +140,7 @@ impl StoreReader {
     }
 
     /// Returns the generation before it, if there was one.
-    pub fn previous(&self) -> Option<&Published> {
+    pub(crate) fn previous(&self) -> Option<&Published> {
         self.previous.as_ref()
     }
 
@@ -149,7 +149,7 @@ impl StoreReader {
     }
 
     /// Returns where an object lies, whether or not it is there.
-    pub fn object_path(&self, hash: Hash32) -> PathBuf {
+    pub(crate) fn object_path(&self, hash: Hash32) -> PathBuf {
         object_path(&self.dir, hash)
     }
 

@@ -67,7 +67,7 @@ impl Store {
     }
 
     /// Returns the folder for working files of an encode, and creates it if it does not exist.
-    pub fn job_dir(&self) -> Result<PathBuf, StoreError> {
+    pub(crate) fn job_dir(&self) -> Result<PathBuf, StoreError> {
         let path = self.dir.join("job");
         files::ensure_folder(&path)?;
         Ok(path)
@@ -94,7 +94,7 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::Io`], from the callback too.
-    pub fn put_object(
+    pub(crate) fn put_object(
         &self,
         write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
     ) -> Result<(Hash32, u64), StoreError> {

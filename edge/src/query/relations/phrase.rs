@@ -111,7 +111,7 @@ impl Relation {
     }
 
     /// Returns whether it has a meaning only where up is known.
-    pub fn needs_up(self) -> bool {
+    pub(crate) fn needs_up(self) -> bool {
         !matches!(self, Self::In | Self::Near | Self::Between)
     }
 }
@@ -157,7 +157,7 @@ pub enum By {
 
 impl By {
     /// Returns whether distances are compared.
-    pub fn is_distance(self) -> bool {
+    pub(crate) fn is_distance(self) -> bool {
         matches!(self, Self::Nearest | Self::Farthest)
     }
 }
@@ -169,7 +169,7 @@ impl Phrase {
     }
 
     /// Returns whether it stands for the asker.
-    pub fn is_asker(&self) -> bool {
+    pub(crate) fn is_asker(&self) -> bool {
         ASKER.contains(&self.thing.as_str())
     }
 

@@ -117,7 +117,7 @@ impl PendingRefinement {
     }
 
     /// Returns the finer superpoints, if the settings ask for them.
-    pub fn superpoints(&self) -> Option<&Superpoints> {
+    pub(crate) fn superpoints(&self) -> Option<&Superpoints> {
         let has_fine = self.refinement.settings.has_fine_superpoints();
         self.scales.first().filter(|_| has_fine).map(|(_, superpoints)| superpoints)
     }

@@ -145,7 +145,12 @@ impl Stages {
     }
 
     /// Finds the range of each tile in the sorted pairs.
-    pub fn find_ranges(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, pair_order: usize) {
+    pub(crate) fn find_ranges(
+        &mut self,
+        device: &Device,
+        pass: &mut wgpu::ComputePass<'_>,
+        pair_order: usize,
+    ) {
         let bound = [
             (0, whole(&self.buffers.view)),
             (1, whole(&self.buffers.counters)),

@@ -33,7 +33,7 @@ impl Solid {
     }
 
     /// Takes a box along the world's axes.
-    pub fn of_aabb(bounds: &Aabb) -> Self {
+    pub(crate) fn of_aabb(bounds: &Aabb) -> Self {
         Self { centre: bounds.centre(), half: bounds.size() * 0.5, along: DVec2::X }
     }
 
@@ -84,7 +84,7 @@ impl Solid {
     }
 
     /// Returns whether most of the smaller of two boxes lies in the other, or sticks out by at most `slack`.
-    pub fn is_piece_of(&self, other: &Self, slack: f64) -> bool {
+    pub(crate) fn is_piece_of(&self, other: &Self, slack: f64) -> bool {
         let (small, large) = if self.volume() <= other.volume() { (self, other) } else { (other, self) };
         let large = large.grown(slack);
         let of_outline = small.shared_area(&large) / small.area().max(f64::MIN_POSITIVE);
@@ -93,17 +93,17 @@ impl Solid {
     }
 
     /// Returns the length that two height ranges share, negative if there is a gap.
-    pub fn shared_height(&self, other: &Self) -> f64 {
+    pub(crate) fn shared_height(&self, other: &Self) -> f64 {
         self.top().min(other.top()) - self.bottom().max(other.bottom())
     }
 
     /// Returns the area that two outlines share.
-    pub fn shared_area(&self, other: &Self) -> f64 {
+    pub(crate) fn shared_area(&self, other: &Self) -> f64 {
         outline::shared_area(&self.corners(), &other.corners())
     }
 
     /// Returns the horizontal distance between two outlines.
-    pub fn horizontal_gap(&self, other: &Self) -> f64 {
+    pub(crate) fn horizontal_gap(&self, other: &Self) -> f64 {
         outline::gap(&self.corners(), &other.corners())
     }
 
