@@ -7,7 +7,7 @@ use slag_tests::*;
 
 /// The programs, and the least number of pages that each has.
 const PROGRAMS: [(&str, usize); 5] =
-    [("slag-encoder", 20), ("slag-edge", 15), ("slag-mcap", 1), ("slag-mcp", 1), ("slag-ros", 1)];
+    [("slag-encoder", 20), ("slag-edge", 14), ("slag-mcap", 1), ("slag-mcp", 1), ("slag-ros", 1)];
 
 fn manual() -> tempfile::TempDir {
     let out = tempfile::tempdir().expect("a folder");

@@ -11,7 +11,7 @@ use slag_test_support::{needs_shared, onnx_runtime, workspace_root};
 fn a_library_is_found_where_it_lies() {
     let absent = PathBuf::from("no/such/libonnxruntime.so");
     let message = find_runtime(Some(&absent), &[]).expect_err("it is absent").to_string();
-    assert!(message.contains("no/such/libonnxruntime.so") && message.contains("give the path"), "{message}");
+    assert!(message.contains("no/such/libonnxruntime.so") && message.contains("--runtime"), "{message}");
     let folder = tempfile::tempdir().expect("a folder");
     let bare = find_runtime(None, &[folder.path().to_owned()]).expect("the system's loader is asked");
     assert_eq!(bare, Path::new("libonnxruntime.so"));

@@ -311,7 +311,13 @@ fn the_storey_below_is_not_the_ground() {
     let world = packed_in(VOXEL, -3.2, |p| if p.z < -0.1 { below(p) } else { upper(p) });
     let request = GoalRequest { limit: 5, ..GoalRequest::new(GoalTarget::Object(1)) };
     let found = stand(&world, &request, START, &points()).expect("poses");
-    assert_eq!(Ok(found), goals(|_| None), "as without a storey below");
+    // As without a storey below, but for rounding: the voxels of the two begin elsewhere.
+    let alone = goals(|_| None).expect("poses");
+    assert_eq!(found.len(), alone.len());
+    for (found, alone) in found.iter().zip(&alone) {
+        assert!(found.position_in_world.distance(alone.position_in_world) < 1e-9, "{found:?}\n{alone:?}");
+        assert_eq!(found.visible_share, alone.visible_share);
+    }
     // From below, the cupboard is in the way; the thing itself is upstairs.
     let found = stand(&world, &request, START.with_z(-2.8), &points());
     assert!(found.is_err(), "{found:?}");
@@ -324,8 +330,8 @@ fn steep_ramps_are_not_driven() {
         move |p: DVec3| (p.z < (0.9 - (p.x - 1.8).abs() * 1.0).max(0.0) * slope).then_some(At::Solid)
     };
     goals(ridge(0.3)).expect("over a gentle one");
-    assert_eq!(goals(ridge(1.0)), Err(NoGoal::Unreachable), "45 degrees");
-    let world = packed(hall(ridge(1.0)));
+    assert_eq!(goals(ridge(0.95)), Err(NoGoal::Unreachable), "43 degrees");
+    let world = packed(hall(ridge(0.95)));
     let able = GoalRequest { slope: 1.2, ..GoalRequest::new(GoalTarget::Object(1)) };
     goals_with(&world, &able).expect("a robot that climbs");
 }

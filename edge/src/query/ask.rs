@@ -4,7 +4,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::answer::{answer, object_answer};
-use super::answers::{Answers, ClusterAnswer, Found as Answered};
+use super::answers::{Answers, ClusterAnswer};
 use super::area::Area;
 use super::engine::{Engine, QueryError};
 use super::point::Point;

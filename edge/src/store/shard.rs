@@ -92,7 +92,11 @@ impl OpenShard {
         let path = cache.shard_path(at.hash);
         let stat = cache.files().stat(&path)?;
         let (cell, layout) = check_file(cache, &path, at, profile, manifest)?;
-        let bytes = cache.files().map(&path)?;
+        let bytes = match cache.files().map(&path) {
+            // A fetch may remove it between the two.
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
+            other => other?,
+        };
         if bytes.len() as u64 != at.len_bytes {
             return Err(StoreError::Missing { path });
         }

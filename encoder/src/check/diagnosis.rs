@@ -4,11 +4,11 @@ use glam::{DQuat, DVec3};
 use serde::Serialize;
 use slag_common::{Gaussians, Similarity};
 
+use super::error::CheckError;
 use super::mistake::{FrameCandidate, FrameCause, Mistake};
-use super::report::CheckReport;
+use super::options::CheckOptions;
 use super::suspicion::{at_per_mille, camera_spread, scene_diagonal};
 use super::view::{CheckView, at_width, mean};
-use super::{CheckError, CheckOptions};
 use crate::raster::{LoadedScene, Rasterizer};
 
 /// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain
@@ -55,6 +55,14 @@ pub struct Diagnosis {
     pub advice: Vec<String>,
 }
 
+/// Means over the views drawn.
+pub(super) struct Means {
+    pub(super) psnr_db: f64,
+    /// PSNR of photos against their mean colour.
+    pub(super) flat_psnr_db: f64,
+    pub(super) covered_share: f64,
+}
+
 /// Small copies of some views, and the positions of all cameras.
 pub(super) struct Samples {
     /// Indices of the sampled views, ascending.
@@ -87,7 +95,7 @@ impl Samples {
         scene: &Gaussians,
         loaded: &dyn LoadedScene,
         rasterizer: &dyn Rasterizer,
-        report: &CheckReport,
+        means: &Means,
         options: &CheckOptions,
     ) -> Result<Diagnosis, CheckError> {
         let search = Search {
@@ -110,7 +118,7 @@ impl Samples {
             camera_spread: camera_spread(&self.camera_positions),
             advice: Vec::new(),
         };
-        diagnosis.advice = advice(&diagnosis, report);
+        diagnosis.advice = advice(&diagnosis, means);
         Ok(diagnosis)
     }
 
@@ -235,7 +243,7 @@ fn moved(similarity: Similarity, direction: usize, step: f64, centre: DVec3, dia
     change.after(&similarity)
 }
 
-fn advice(diagnosis: &Diagnosis, report: &CheckReport) -> Vec<String> {
+fn advice(diagnosis: &Diagnosis, means: &Means) -> Vec<String> {
     let mut advice = Vec::new();
     match (diagnosis.mistake, diagnosis.tried.first()) {
         (Some(mistake), Some(best)) => advice.push(format!(
@@ -246,12 +254,12 @@ fn advice(diagnosis: &Diagnosis, report: &CheckReport) -> Vec<String> {
             advice.push(format!(
                 "no common mistake explains it (PSNR {:.1} dB, plain colour {:.1} dB); check that photos, poses and scene \
                  come from the same reconstruction, in one frame",
-                report.mean_psnr_db, report.mean_flat_psnr_db
+                means.psnr_db, means.flat_psnr_db
             ));
-            if report.mean_covered_share < 0.5 {
+            if means.covered_share < 0.5 {
                 advice.push(format!(
                     "the scene covers {:.0} % of the images; the cameras look away from it or are far from it",
-                    report.mean_covered_share * 100.0
+                    means.covered_share * 100.0
                 ));
             }
         }

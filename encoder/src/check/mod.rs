@@ -5,80 +5,30 @@
 
 mod align;
 mod diagnosis;
+mod error;
 mod mistake;
+mod options;
 mod report;
 mod suspicion;
 #[cfg(test)]
 mod tests;
 mod view;
 
-use std::path::PathBuf;
-
 use slag_common::Gaussians;
 
 use crate::ingest::IngestError;
-use crate::raster::{RasterError, Rasterizer};
-use diagnosis::{CLEAR_GAIN_DB, Samples};
+use crate::raster::Rasterizer;
+use diagnosis::{CLEAR_GAIN_DB, Means, Samples};
 use view::{at_width, mean, picture, picture_name};
 
 pub use align::{AlignError, Alignment, align};
 pub use diagnosis::{Diagnosis, Trial};
+pub use error::CheckError;
 pub use mistake::{FrameCandidate, FrameCause, Mistake, nerfstudio_defaults};
+pub use options::CheckOptions;
 pub use report::{CheckReport, ViewCheck};
 pub use suspicion::{Suspicion, suspicions};
 pub use view::{CheckView, psnr_db};
-
-/// Settings of a check.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CheckOptions {
-    /// Width at which views are compared, pixels. Photos are never enlarged.
-    pub width_px: u32,
-    /// Folder for a picture of each view (photo left, drawing right); `None` writes no pictures.
-    pub pictures_dir: Option<PathBuf>,
-    /// Width of the views in which mistakes are searched, pixels.
-    pub diagnosis_width_px: u32,
-    /// Number of views in which mistakes are searched, spread evenly over all views.
-    pub diagnosis_views: usize,
-    /// Similarities between the worlds of poses and splat that are tried beside common mistakes.
-    pub frames: Vec<FrameCandidate>,
-    /// What the data alone says against the inputs.
-    pub suspicions: Vec<Suspicion>,
-}
-
-impl Default for CheckOptions {
-    fn default() -> Self {
-        Self {
-            width_px: 800,
-            pictures_dir: None,
-            diagnosis_width_px: 240,
-            diagnosis_views: 4,
-            frames: Vec::new(),
-            suspicions: Vec::new(),
-        }
-    }
-}
-
-/// Reason why a check fails.
-#[derive(Debug, thiserror::Error)]
-pub enum CheckError {
-    #[error("no views to check; give at least one photo with its pose")]
-    NoViews,
-    #[error("none of the {n_views} sampled photos can be read, the first: {first}")]
-    NoPhotos { n_views: usize, first: IngestError },
-    #[error(
-        "view {view}: the photo has {} x {} px but its camera {} x {} px; give the photo that the camera describes",
-        image_px[0], image_px[1], camera_px[0], camera_px[1]
-    )]
-    ImageSize { view: String, image_px: [u32; 2], camera_px: [u32; 2] },
-    #[error("view {view}: {source}")]
-    Raster { view: String, source: RasterError },
-    #[error(transparent)]
-    Scene(#[from] RasterError),
-    #[error("view {view}: cannot encode its picture ({source}); choose a smaller width")]
-    Encode { view: String, source: image::ImageError },
-    #[error("{0}; choose another folder for the pictures")]
-    Write(#[from] std::io::Error),
-}
 
 /// Draws the views of a scene and compares them with their photos.
 ///
@@ -149,7 +99,12 @@ where
     };
     let fits = report.mean_psnr_db >= report.mean_flat_psnr_db + CLEAR_GAIN_DB;
     if !fits || options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some()) {
-        let found = samples.diagnose(scene, &*loaded, rasterizer, &report, options)?;
+        let means = Means {
+            psnr_db: report.mean_psnr_db,
+            flat_psnr_db: report.mean_flat_psnr_db,
+            covered_share: report.mean_covered_share,
+        };
+        let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;
         // Where the drawings match as they are, only a mistake that improves them counts.
         report.diagnosis = Some(found).filter(|found| !fits || found.mistake.is_some());
     }

@@ -5,7 +5,7 @@ use std::io::Cursor;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat, RgbImage};
 
-use super::CheckError;
+use super::error::CheckError;
 use crate::raster::{Drawing, LoadedScene, RasterView};
 
 /// A photo with its camera.

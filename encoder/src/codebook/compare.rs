@@ -5,7 +5,8 @@ use rayon::prelude::*;
 use slag_common::shard::ScoreErrors;
 use slag_math::matrix::{Panels, Rows};
 
-use super::{Members, measure};
+use super::measure;
+use super::members::Members;
 
 /// Embeddings decoded at a time.
 const CHUNK: usize = 1024;

@@ -11,10 +11,9 @@ pub mod cluster;
 mod compare;
 mod fine;
 pub mod measure;
+mod members;
 mod outliers;
 pub mod residual;
-
-use std::ops::Range;
 
 use half::f16;
 use rayon::prelude::*;
@@ -24,6 +23,7 @@ use basis::{Basis, MAX_COMPONENTS};
 use cluster::Clusters;
 use compare::{Decoder, Reference};
 use measure::ScoreMoments;
+use members::Members;
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 
@@ -214,34 +214,6 @@ impl Clustered {
             outliers::separate(embeddings, &basis, rows, &mut found, n_more, context.spread);
         }
         Self { basis, points, found }
-    }
-}
-
-/// Points in the order of their centroids.
-struct Members {
-    /// By place in that order: the point.
-    order: Vec<u32>,
-    /// `[K + 1]`: first place of each centroid.
-    starts: Vec<u32>,
-}
-
-impl Members {
-    fn new(codes: &[u32], n_centroids: usize) -> Self {
-        let mut starts = vec![0u32; n_centroids + 1];
-        codes.iter().for_each(|centroid| starts[*centroid as usize + 1] += 1);
-        (0..n_centroids).for_each(|centroid| starts[centroid + 1] += starts[centroid]);
-        let mut next = starts.clone();
-        let mut order = vec![0; codes.len()];
-        for (point, centroid) in codes.iter().enumerate() {
-            order[next[*centroid as usize] as usize] = point as u32;
-            next[*centroid as usize] += 1;
-        }
-        Self { order, starts }
-    }
-
-    /// Returns the places of a centroid's members.
-    fn places(&self, centroid: usize) -> Range<usize> {
-        self.starts[centroid] as usize..self.starts[centroid + 1] as usize
     }
 }
 

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::Engines;
 use super::context::RunContext;
+use super::engines::Engines;
 use super::error::EncodeError;
 use super::plan::Plan;
 use super::report::{SkippedView, StageReport};

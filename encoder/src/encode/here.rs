@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use slag_common::View;
 
-use super::Engines;
 use super::context::RunContext;
+use super::engines::Engines;
 use super::error::EncodeError;
 use super::executor::{Executor, ViewsRun};
 use super::pipeline;

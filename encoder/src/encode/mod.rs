@@ -18,6 +18,7 @@ mod cell;
 mod cells;
 mod context;
 pub mod coverage;
+mod engines;
 mod error;
 mod executor;
 pub mod front;
@@ -38,15 +39,13 @@ mod workers;
 
 use std::sync::atomic::AtomicBool;
 
-use slag_models::{ModelDir, SessionOptions};
-
 use crate::progress::Progress;
-use crate::raster::Rasterizer;
 use crate::store::Store;
 use context::{Phase, RunContext};
 use executor::Executor;
 
 pub use crate::memory::{MemoryError, Reservation};
+pub use engines::Engines;
 pub use error::EncodeError;
 pub use inputs::count_inputs;
 pub use job::{JobStatus, job_status};
@@ -72,22 +71,6 @@ pub(crate) mod fleet_parts {
     pub(crate) use super::report::LeftOut;
     pub(crate) use super::sink::{PhotoSource, ViewRecord, ViewSink};
     pub(crate) use super::view::{ViewStages, ViewTools};
-}
-
-/// What does the work of an encode.
-#[derive(Clone, Copy)]
-pub struct Engines<'a> {
-    /// Embeds crops and texts.
-    pub models: &'a ModelDir,
-    /// How ONNX Runtime runs models.
-    pub session: &'a SessionOptions,
-    pub rasterizer: &'a dyn Rasterizer,
-}
-
-impl<'a> Engines<'a> {
-    pub fn new(models: &'a ModelDir, session: &'a SessionOptions, rasterizer: &'a dyn Rasterizer) -> Self {
-        Self { models, session, rasterizer }
-    }
 }
 
 /// Encodes a scene into a store and publishes the result as its next generation.
@@ -117,7 +100,7 @@ pub(crate) fn encode_by(
     let store = Store::create_or_open(&settings.output.store)?;
     let inputs = inputs::Inputs::read(settings, &context)?;
     context.begin_phase(Phase::Plan);
-    let plan = plan::plan(settings, engines, &store, &inputs, executor, &context)?;
+    let plan = plan::plan(settings, engines, &store, &inputs, &executor.rasterizer(engines), &context)?;
     context.begin_phase(Phase::Views);
     plan.job.begin("views")?;
     let views = views::run_views(&plan, executor, &context)?;

@@ -8,11 +8,10 @@ use rayon::prelude::*;
 use slag_common::{Hash32, View};
 use slag_models::SessionOptions;
 
-use super::Engines;
 use super::context::RunContext;
 use super::coverage::{self, Coverage};
+use super::engines::Engines;
 use super::error::EncodeError;
-use super::executor::Executor;
 use super::identity;
 use super::inputs::{self, Inputs};
 use super::job::{Job, JobStatus, job_status};
@@ -92,7 +91,7 @@ pub(super) fn plan<'a>(
     engines: &'a Engines<'a>,
     store: &'a Store,
     inputs: &'a Inputs,
-    executor: &dyn Executor,
+    rasterizer: &str,
     context: &RunContext<'_>,
 ) -> Result<Plan<'a>, EncodeError> {
     let memory = memory_plan(settings, inputs, engines);
@@ -105,9 +104,8 @@ pub(super) fn plan<'a>(
     if let Some(without) = segmenter.check_views(&inputs.views, settings.run.strict)? {
         tracing::warn!("{without}");
     }
-    let rasterizer = executor.rasterizer(engines);
     let ids = context.time("identity", || {
-        let of = || identity::identities(settings, engines, segmenter.as_ref(), &rasterizer, inputs);
+        let of = || identity::identities(settings, engines, segmenter.as_ref(), rasterizer, inputs);
         context.install(of)
     })?;
     let id_of_view = inputs.views.iter().map(|view| view.name.clone()).zip(ids.of_view).collect();

@@ -11,8 +11,8 @@ use slag_common::View;
 use slag_models::preprocess::Preprocess;
 use slag_models::{Crop, ImageEncoder, ModelError, SessionOptions};
 
-use super::Engines;
 use super::context::RunContext;
+use super::engines::Engines;
 use super::error::EncodeError;
 use super::inputs;
 use super::pipeline::{self, Stage};

@@ -160,7 +160,9 @@ fn planted_mistakes_are_diagnosed() {
     let mut large = scene.clone();
     large.means_in_world.iter_mut().for_each(|mean| *mean *= 10.0);
     large.scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s * 10.0));
-    assert_eq!(diagnosed(&large, &|_| {}), Some(Mistake::SceneScale(10.0)));
+    // Refined by its drawings.
+    let found = diagnosed(&large, &|_| {});
+    assert!(matches!(found, Some(Mistake::SceneScale(f)) if (f - 10.0).abs() < 0.05), "{found:?}");
 
     let double_focal = |view: &mut RasterView| {
         view.intrinsics.focal_x_px *= 2.0;

@@ -4,7 +4,7 @@
 use glam::DVec3;
 
 use super::container::Ply;
-use super::sh_rest_properties;
+use super::sh_rest::sh_rest_properties;
 use crate::Gaussians;
 use crate::splat::columns::{ReadOptions, columns};
 use crate::splat::error::SplatError;

@@ -8,6 +8,7 @@
 mod compressed;
 mod container;
 mod points;
+mod sh_rest;
 mod write;
 
 use std::path::Path;
@@ -17,12 +18,13 @@ use glam::DVec3;
 pub use points::{Point, PointProperties};
 pub use write::{write, write_header, write_rows, write_to};
 
-use super::columns::{MAX_SH_DEGREE, ReadOptions, columns};
-use super::error::{Place, SplatError};
+use super::columns::{ReadOptions, columns};
+use super::error::SplatError;
 use super::input::Input;
 use super::values::{dc_of_colour, sigmoid, unit_rotation};
 use crate::Gaussians;
 use container::Ply;
+use sh_rest::sh_rest_properties;
 
 /// Advice for a PLY without the properties of a splat.
 const NOT_A_SPLAT: &str =
@@ -33,8 +35,6 @@ const GEOMETRY: [&str; 10] =
     ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0", "scale_1"];
 /// The third scale, which the flat Gaussians of 2DGS lack.
 const THIRD_SCALE: &str = "scale_2";
-/// A higher degree that some trainers write; it is cut to [`MAX_SH_DEGREE`].
-const HIGHER_SH_DEGREE: u8 = MAX_SH_DEGREE + 1;
 
 /// Reads a PLY file, plain or compressed.
 pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, SplatError> {
@@ -99,26 +99,4 @@ pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Ve
     let mut rows = Vec::with_capacity(ply.checked_count(vertex)?);
     ply.rows(&wanted, |row| rows.push(std::array::from_fn(|i| row[i])))?;
     Ok(rows)
-}
-
-/// Returns the degree of the spherical harmonics in the `f_rest_*` of an element, and the properties in the order
-/// of [`Gaussians::sh_rest`]; the file stores them channel by channel.
-fn sh_rest_properties(ply: &Ply, element: usize) -> Result<(u8, Vec<usize>), SplatError> {
-    let property = |i: usize| ply.elements[element].property(&format!("f_rest_{i}"));
-    let in_file: Vec<_> = (0..).map_while(property).collect();
-    let per_channel = in_file.len() / 3;
-    let of_degree = |degree: &u8| 3 * Gaussians::sh_rest_per_channel(*degree) == in_file.len();
-    let Some(degree) = (0..=HIGHER_SH_DEGREE).find(of_degree) else {
-        return Err(SplatError::Malformed {
-            path: ply.input.path().into(),
-            place: Place::Byte(0),
-            expected: "0, 9, 24, 45 or 72 properties f_rest_*".into(),
-            found: in_file.len().to_string(),
-            advice: "export with spherical harmonics of degree 0 to 3",
-        });
-    };
-    let degree = degree.min(MAX_SH_DEGREE);
-    let kept = 0..Gaussians::sh_rest_per_channel(degree);
-    let order = kept.flat_map(|i| (0..3).map(move |channel| channel * per_channel + i));
-    Ok((degree, order.map(|i| in_file[i]).collect()))
 }

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use serde::Deserialize;
 
+use super::limits::{check_size, too_large};
 use super::undistort::undistorted;
-use super::{check_size, too_large};
 use crate::masks::Mask;
 use crate::masks::rle::{Rle, RleError};
 use crate::segment::error::SegmentError;

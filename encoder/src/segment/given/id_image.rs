@@ -3,7 +3,7 @@
 use std::io::BufReader;
 use std::path::Path;
 
-use super::check_size;
+use super::limits::check_size;
 use crate::segment::error::SegmentError;
 use crate::segment::segmenter::SegmentInput;
 

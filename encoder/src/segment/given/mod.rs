@@ -2,6 +2,7 @@
 
 mod coco;
 mod id_image;
+mod limits;
 mod undistort;
 
 use std::path::{Path, PathBuf};
@@ -12,6 +13,7 @@ use super::error::SegmentError;
 use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
 use crate::masks::rle::Rle;
 use crate::masks::{Mask, NO_REGION, masks_of_labels};
+use limits::too_large;
 
 /// Masks from files.
 ///
@@ -215,19 +217,4 @@ fn hash_of_masks(path: &Path) -> Result<Hash32, SegmentError> {
     let (content, _) = Hash32::of_reader(fs_err::File::open(path)?)?;
     let ending = path.extension().unwrap_or_default().as_encoded_bytes();
     Ok(Hash32::of(&[ending, &content.0].concat()))
-}
-
-/// Returns the error for masks above [`MAX_MASK_BYTES`].
-fn too_large(path: &Path) -> SegmentError {
-    SegmentError::TooLarge { path: path.to_owned(), limit_bytes: MAX_MASK_BYTES }
-}
-
-/// Checks that masks have the size of the photo.
-fn check_size(path: &Path, [width, height]: [u32; 2], input: &SegmentInput<'_>) -> Result<(), SegmentError> {
-    let expected_px = [input.image.width(), input.image.height()];
-    if [width, height] == expected_px {
-        return Ok(());
-    }
-    let view = input.view.name.clone();
-    Err(SegmentError::Size { path: path.to_owned(), view, found_px: [width, height], expected_px })
 }

@@ -1,0 +1,31 @@
+//! The properties of view-dependent colour.
+
+use super::container::Ply;
+use crate::Gaussians;
+use crate::splat::columns::MAX_SH_DEGREE;
+use crate::splat::error::{Place, SplatError};
+
+/// A higher degree that some trainers write; it is cut to [`MAX_SH_DEGREE`].
+const HIGHER_SH_DEGREE: u8 = MAX_SH_DEGREE + 1;
+
+/// Returns the degree of the spherical harmonics in the `f_rest_*` of an element, and the properties in the order
+/// of [`Gaussians::sh_rest`]; the file stores them channel by channel.
+pub(super) fn sh_rest_properties(ply: &Ply, element: usize) -> Result<(u8, Vec<usize>), SplatError> {
+    let property = |i: usize| ply.elements[element].property(&format!("f_rest_{i}"));
+    let in_file: Vec<_> = (0..).map_while(property).collect();
+    let per_channel = in_file.len() / 3;
+    let of_degree = |degree: &u8| 3 * Gaussians::sh_rest_per_channel(*degree) == in_file.len();
+    let Some(degree) = (0..=HIGHER_SH_DEGREE).find(of_degree) else {
+        return Err(SplatError::Malformed {
+            path: ply.input.path().into(),
+            place: Place::Byte(0),
+            expected: "0, 9, 24, 45 or 72 properties f_rest_*".into(),
+            found: in_file.len().to_string(),
+            advice: "export with spherical harmonics of degree 0 to 3",
+        });
+    };
+    let degree = degree.min(MAX_SH_DEGREE);
+    let kept = 0..Gaussians::sh_rest_per_channel(degree);
+    let order = kept.flat_map(|i| (0..3).map(move |channel| channel * per_channel + i));
+    Ok((degree, order.map(|i| in_file[i]).collect()))
+}
