@@ -1,6 +1,6 @@
 //! The bytes of a store: shards of every profile, region tables and fields equal those that were recorded.
 //!
-//! `golden/store_bytes.txt` was recorded from commit 6575f8f, before the crates were split. To record a
+//! `golden/store_bytes.txt` was recorded when an object came to need more than half of a mask. To record a
 //! change that is meant: `SLAG_RECORD=1 cargo test -p slag-tests --test store_bytes`, and say in the commit why.
 
 use std::collections::BTreeMap;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::{Service, edge, encode_quickly, encoded_into, encoder, generated, run, text};
+use crate::{Service, edge, encode_room, encoded_into, encoder, generated, run, text};
 
 /// The room that most tests share.
 pub const ROOM: [&str; 2] = ["--n-views", "8"];
@@ -32,8 +32,8 @@ impl Site {
 
     /// Replaces the room by one with other things, and fetches this second generation.
     pub fn publish_another(&self) {
-        let other = generated(&["--n-views", "8", "--seed", "2"]);
-        run(encode_quickly(&other, &self.dir.path().join("store")).args(SITE));
+        let other = generated(&["--n-views", "12", "--seed", "2"]);
+        run(encode_room(&other, &self.dir.path().join("store")).args(SITE));
         run(edge(&["fetch", "--cache"]).arg(self.cache()));
     }
 

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use slag_common::Hash32;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{Manifest, TextModelRecord};
 use slag_models::{ModelDir, SessionOptions};
 
 use crate::store::{EdgeCache, StoreError, damaged};
@@ -37,8 +37,7 @@ pub(super) fn open(
     let Some(record) = &manifest.encoder.text_model else { return Ok(None) };
     let expected = record.description.hash;
     let path = cache.shard_path(expected);
-    // The next fetch downloads what is marked.
-    let mark = || record.objects().for_each(|object| damaged::mark(cache, object.hash));
+    let mark = || mark_damaged(cache, record);
     let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
     let bytes = read.inspect_err(|e| {
         if e.is_damage() {
@@ -60,4 +59,14 @@ pub(super) fn open(
         }
         CarriedError::Open { path, cause: Box::new(cause) }
     })
+}
+
+/// Marks the files that are not as listed; the next fetch downloads them again.
+fn mark_damaged(cache: &EdgeCache, record: &TextModelRecord) {
+    for object in record.objects() {
+        let read = cache.files().read(&cache.shard_path(object.hash), object.len_bytes);
+        if !read.is_ok_and(|bytes| Hash32::of(&bytes) == object.hash) {
+            damaged::mark(cache, object.hash);
+        }
+    }
 }
