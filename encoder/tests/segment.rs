@@ -469,7 +469,7 @@ fn a_loaded_photo_makes_the_input() {
 /// Masks that match no photo are refused by name; folders of `amg.py` and entries with other folders are found.
 #[test]
 fn masks_are_matched_with_their_photos() {
-    let dir = folder();
+    let dir = tempfile::tempdir().unwrap();
     let views = [view("a.jpg", 4, 3), view("b.jpg", 4, 3)];
     let check = |path: &Path, strict| {
         GivenMasks::open(path, Vec::new()).unwrap().check_views(&views, strict).map_err(|e| e.to_string())
