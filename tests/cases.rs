@@ -1,8 +1,8 @@
 //! Inputs as people have them: what `check` and `encode` make of files of kinds that people report trouble with.
 //!
 //! `../shared/cases` makes the inputs, small changes of the labelled house. A row says what a command does with
-//! one: its exit code and words of what it prints. The ordinary run does the rows marked `fast`; `cargo test --
-//! --ignored` does all.
+//! one: its exit code and words of what it prints. The ordinary run does the rows marked `fast`;
+//! `.ci/nightly` does all.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -248,8 +248,9 @@ fn the_fast_cases_end_as_expected() {
     run_cases(|is_fast| is_fast);
 }
 
+#[needs_shared]
+#[nightly("all inputs, several minutes")]
 #[test]
-#[ignore = "for nightly: all inputs, several minutes"]
 fn all_cases_end_as_expected() {
     run_cases(|_| true);
 }
@@ -260,8 +261,9 @@ fn a_stray_costs_no_precision() {
     strays_cost_no_precision(&["f_1_100000.ply"]);
 }
 
+#[needs_shared]
+#[nightly("fifteen encodes")]
 #[test]
-#[ignore = "for nightly: fifteen encodes"]
 fn strays_at_any_distance_cost_no_precision() {
     strays_cost_no_precision(&[
         "p18_far_floaters.ply",
