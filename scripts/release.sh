@@ -1,6 +1,6 @@
 #!/bin/sh
-# Makes a release: programs, both packages of the robot, the encoder's image, bills of materials, notes from
-# CHANGELOG.md, and checksums signed by a key of yours (ssh-keygen -t ed25519 makes one). Nothing is uploaded.
+# Makes a release: programs, packages and images of both, bills of materials, notes from CHANGELOG.md, and checksums
+# signed by a key of yours (ssh-keygen -t ed25519 makes one). Nothing is uploaded.
 # usage: release.sh KEY OUT [--built DIR] [--without PART]...
 #   KEY            private key, in the form of ssh-keygen; one in an agent works by its public file
 #   --built DIR    takes the programs for this machine, slag-lab among them, from DIR, built before, instead of building them; a trial: CHANGELOG may have
@@ -79,18 +79,19 @@ done
 cp -r target/manual LICENSE-MIT LICENSE-APACHE "$work/$name/"
 tar --create --directory "$work" --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" "$name" |
     gzip -9n >"$out/$name.tar.gz"
-jetson/deb.sh amd64 "$built/slag-edge" "$out"
+for program in slag-encoder slag-edge; do packaging/deb.sh amd64 "$built/$program" "$out"; done
 if has arm64; then
     sh scripts/setup.sh cross
     jetson/build.sh
-    jetson/deb.sh arm64 target/aarch64-unknown-linux-gnu/dist/slag-edge "$out"
+    packaging/deb.sh arm64 target/aarch64-unknown-linux-gnu/dist/slag-edge "$out"
 fi
 if has image; then
     sh scripts/setup.sh image
-    encoder/deploy/image.sh amd64 "$built/slag-encoder" "$out"
+    for program in slag-encoder slag-edge; do packaging/image.sh amd64 "$built/$program" "$out"; done
     as_root=
     [ "$(id -u)" = 0 ] || as_root=sudo
-    $as_root encoder/deploy/test-image.sh "$out/slag-encoder_${version}_amd64.oci.tar" "$built/slag-lab"
+    $as_root packaging/test-image.sh "$out/slag-encoder_${version}_amd64.oci.tar" \
+        "$out/slag-edge_${version}_amd64.oci.tar" "$built/slag-lab"
 fi
 if has sbom; then
     sh scripts/supply-chain.sh

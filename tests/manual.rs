@@ -3,11 +3,12 @@
 use std::path::Path;
 use std::process::Command;
 
+use clap::CommandFactory;
 use slag_tests::*;
 
 /// The programs, and the least number of pages that each has.
 const PROGRAMS: [(&str, usize); 5] =
-    [("slag-encoder", 20), ("slag-edge", 14), ("slag-mcap", 1), ("slag-mcp", 1), ("slag-ros", 1)];
+    [("slag-encoder", 21), ("slag-edge", 16), ("slag-mcap", 1), ("slag-mcp", 1), ("slag-ros", 1)];
 
 fn manual() -> tempfile::TempDir {
     let out = tempfile::tempdir().expect("a folder");
@@ -23,7 +24,8 @@ fn words(text: &str) -> String {
 /// Returns what a program prints as its help, in long lines.
 fn help(path: &[&str]) -> String {
     let mut command = Command::new(program(path[0]));
-    command.args(&path[1..]).arg("--help").env("COLUMNS", "10000").env("SLAG_EDGE_CONFIG", "");
+    let flag = if ["slag-encoder", "slag-edge"].contains(&path[0]) { "--help-all" } else { "--help" };
+    command.args(&path[1..]).arg(flag).env("COLUMNS", "10000").env("SLAG_EDGE_CONFIG", "");
     String::from_utf8(run(&mut command).stdout).expect("text")
 }
 
@@ -130,4 +132,36 @@ fn bash_completes_commands_flags_and_values() {
         );
         assert!(line.starts_with(&format!("{program} {completed}")), "{program} {keys}: {line:?}");
     }
+}
+
+/// Every example of `--help` is a command line that the program takes.
+#[test]
+fn examples_of_help_parse() {
+    let mut n_examples = 0;
+    for (name, command) in
+        [("slag-encoder", slag_encoder::cli::Cli::command()), ("slag-edge", slag_edge::cli::Cli::command())]
+    {
+        let mut waiting = vec![command.clone()];
+        while let Some(below) = waiting.pop() {
+            waiting.extend(below.get_subcommands().cloned());
+            let examples = below.get_before_help().map(ToString::to_string).unwrap_or_default();
+            let lines: Vec<&str> = examples.lines().skip(1).collect();
+            assert!(lines.is_empty() || lines.len() == 3, "{}: {examples}", below.get_name());
+            for line in lines {
+                // What is between quotes is one word.
+                let parts = line.split('"').enumerate();
+                let words: Vec<&str> = parts
+                    .flat_map(
+                        |(at, part)| if at % 2 == 1 { vec![part] } else { part.split_whitespace().collect() },
+                    )
+                    .collect();
+                assert_eq!(words[0], name);
+                if let Err(error) = command.clone().try_get_matches_from(words) {
+                    panic!("{line}: {error}");
+                }
+                n_examples += 1;
+            }
+        }
+    }
+    assert_eq!(n_examples, 33);
 }

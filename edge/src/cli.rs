@@ -3,6 +3,7 @@
 mod args;
 mod changes;
 mod config;
+mod doctor;
 mod failure;
 mod fetch;
 mod follow;
@@ -21,9 +22,11 @@ mod trust;
 use std::ffi::OsString;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use slag_models::help;
 
 use changes::ChangesArgs;
 use config::ConfigError;
+use doctor::DoctorArgs;
 pub use failure::Exit;
 use failure::Failure;
 use fetch::FetchArgs;
@@ -66,11 +69,18 @@ enum Command {
     Changes(ChangesArgs),
     /// Show what is on board.
     Status(StatusArgs),
+    /// Find out whether this robot can answer, and what is missing.
+    Doctor(DoctorArgs),
     /// Whom this robot believes.
     #[command(subcommand)]
     Trust(TrustCommand),
     /// List, pull, verify and describe public text models.
     Models(ModelsArgs),
+    /// Print completions for a shell.
+    Completions {
+        #[arg(value_enum)]
+        shell: clap_complete::Shell,
+    },
 }
 
 /// Parses this process's command line, environment and configuration.
@@ -79,7 +89,7 @@ enum Command {
 /// The exit code: the error is told, or the help text that was asked for.
 pub fn parse() -> Result<Cli, Exit> {
     let line: Vec<OsString> = std::env::args_os().collect();
-    let parsed = config::parse(Cli::command(), &line, &args::variable);
+    let parsed = config::parse(help::layered(Cli::command()), &line, &args::variable);
     match parsed.and_then(|matches| Ok(Cli::from_arg_matches(&matches)?)) {
         Ok(cli) => Ok(cli),
         Err(ConfigError::Line(error)) => error.exit(),
@@ -108,8 +118,18 @@ impl Cli {
             Command::Goal(args) => (args.json, goal::run(args)),
             Command::Changes(args) => (args.json, changes::run(args)),
             Command::Status(args) => (args.json, status::run(args)),
+            Command::Doctor(args) => (args.json, doctor::run(args)),
             Command::Trust(command) => (command.is_json(), trust::run(command)),
             Command::Models(args) => (args.json, models::run(args)),
+            Command::Completions { shell } => {
+                clap_complete::generate(
+                    shell,
+                    &mut help::layered(Self::command()),
+                    "slag-edge",
+                    &mut std::io::stdout(),
+                );
+                return Exit::Done;
+            }
         };
         match result {
             Ok(()) => Exit::Done,

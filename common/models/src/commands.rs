@@ -54,14 +54,20 @@ pub const MODELS_HELP: &str = "Folder with model.toml, or name of a pulled model
 #[derive(Clone, Debug, Args)]
 pub struct RunArgs {
     /// ONNX Runtime library [default: beside this program, else on the system's library path].
-    #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH", help_heading = "Machine")]
     pub runtime: Option<PathBuf>,
     /// Devices to run models on, in order of preference: cpu, cuda, tensorrt, coreml, directml. Without cpu in the
     /// list, it is an error if none of them can be used.
-    #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "cpu")]
+    #[arg(
+        long,
+        value_name = "NAME,...",
+        value_delimiter = ',',
+        default_value = "cpu",
+        help_heading = "Machine"
+    )]
     pub provider: Vec<Provider>,
     /// Threads for each run of a model [default: 1 if views are encoded in parallel, else all cores, at most 4].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", help_heading = "Machine", hide_short_help = true)]
     pub model_threads: Option<NonZeroUsize>,
 }
 
@@ -128,12 +134,14 @@ pub fn open(
     })
 }
 
-/// Returns the folders that may hold ONNX Runtime, for the program `exe`: its own, `lib/slag` of its prefix, and
-/// the build folder above it.
+/// Returns the folders that may hold ONNX Runtime, for the program `exe`: its own, `lib/slag` and `lib/PROGRAM` of its
+/// prefix, and the build folder above it.
 pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
+    let packaged = Path::new("lib").join(exe.file_stem().unwrap_or_default());
     let built = Path::new("onnxruntime").join(std::env::consts::ARCH);
+    let within = [Path::new(""), Path::new("lib/slag"), &packaged, &built];
     let above = exe.ancestors().skip(1).take(3);
-    above.flat_map(|folder| [folder.to_owned(), folder.join("lib/slag"), folder.join(&built)]).collect()
+    above.flat_map(|folder| within.map(|below| folder.join(below))).collect()
 }
 
 /// Asks a question on the terminal; returns false without a terminal.

@@ -28,6 +28,7 @@ mod everyday;
 mod file_ref;
 mod floats;
 pub mod gpus;
+pub mod help;
 pub mod hub;
 pub mod image;
 mod levels;

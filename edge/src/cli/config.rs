@@ -116,11 +116,13 @@ fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
 /// Returns the flags of a command that a file may set: all but those that must be given on the command line each
 /// time.
 fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
-    let by_hand = |arg: &&Arg| {
-        let is_choice = |group: &&clap::ArgGroup| group.is_required_set();
+    let is_choice = |group: &&clap::ArgGroup| group.is_required_set();
+    let by_hand = move |arg: &&Arg| {
         !command.get_groups().filter(is_choice).any(|group| group.get_args().any(|id| id == arg.get_id()))
     };
-    command.get_arguments().filter(|arg| arg.get_long().is_some_and(|long| long != FILE_FLAG)).filter(by_hand)
+    let is_help = |arg: &&Arg| matches!(arg.get_action(), ArgAction::HelpShort | ArgAction::HelpLong);
+    let is_named = |arg: &&Arg| arg.get_long().is_some_and(|long| long != FILE_FLAG);
+    command.get_arguments().filter(is_named).filter(move |arg| !is_help(arg) && by_hand(arg))
 }
 
 struct Settings<'a> {

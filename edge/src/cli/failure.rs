@@ -49,6 +49,16 @@ impl Failure {
         move |error| Self::Failed(kind, error)
     }
 
+    /// Returns what went wrong, in one line.
+    pub fn text(&self) -> String {
+        match self {
+            Self::BrokenPipe => String::new(),
+            Self::Usage(error) | Self::Failed(_, error) | Self::Partial(error) | Self::Interrupted(error) => {
+                crate::error_line(&**error)
+            }
+        }
+    }
+
     /// Reports the error on stderr, or as JSON on stdout, and returns the exit code.
     pub fn report(self, json: bool) -> Exit {
         let (exit, kind, error) = match self {

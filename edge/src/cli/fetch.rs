@@ -17,7 +17,13 @@ use super::network::{failure, fetch_once};
 use super::output::print_json;
 use super::progress::{Bar, bad_cells, print_report};
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-edge fetch --from http://BASE:7733 --at 12.5,-3,0 --radius 50\n\
+    \x20 slag-edge fetch --from http://BASE:7733 --at-geo 46.842657,-91.994008\n\
+    \x20 slag-edge fetch\n";
+
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct FetchArgs {
     /// Address of the store [default: that of the last fetch].
     #[arg(long, value_name = "URL")]

@@ -14,7 +14,13 @@ use super::failure::{Failure, store_failure};
 use super::output::print_json;
 use super::text::{table, visible};
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-edge goal chair\n\
+    \x20 slag-edge goal chair --near 1,2,0\n\
+    \x20 slag-edge goal chair --near 1,2,0 --map map.pgm\n";
+
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct GoalArgs {
     /// The thing to go to, in words or by its id (o and 16 hex digits).
     pub thing: String,

@@ -16,7 +16,13 @@ use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-edge query chair\n\
+    \x20 slag-edge query \"mug on the table\" --near 12.5,-3,0\n\
+    \x20 slag-edge query chair --near 12.5,-3,0 --radius 10 --json\n";
+
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct QueryArgs {
     /// Text to look for.
     pub text: String,

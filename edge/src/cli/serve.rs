@@ -26,7 +26,13 @@ const ASYNC_THREADS: usize = 2;
 /// Blocking threads in addition to those of queries, for status and for loading a generation.
 const SPARE_BLOCKING_THREADS: usize = 8;
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-edge serve\n\
+    \x20 slag-edge serve --follow http://BASE:7733 --radius 50\n\
+    \x20 slag-edge serve --listen 0.0.0.0:7734 --token-file token\n";
+
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct ServeArgs {
     /// Address to listen on, or unix:PATH.
     #[arg(long, value_name = "IP:PORT|unix:PATH", default_value = "127.0.0.1:7734")]

@@ -31,7 +31,13 @@ impl TrustCommand {
     }
 }
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-edge trust add http://BASE:7733 --sha256 HEX\n\
+    \x20 slag-edge trust add --root 1.root.json\n\
+    \x20 slag-edge trust add http://BASE:7733 --trust-first\n";
+
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 #[command(group = ArgGroup::new("first").required(true).args(["root", "sha256", "trust_first"]))]
 pub struct AddArgs {
     /// Address of the store; not needed with --root.

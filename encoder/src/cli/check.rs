@@ -9,37 +9,44 @@ use slag_common::poses::SplatFrame;
 use slag_common::{View, durable, poses, splat};
 
 use super::common::{Exit, InputArgs, print};
+use super::next;
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
 use crate::ingest::{self, FoundFrame, LoadedImage, RotatedPhotos};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-encoder check --scene splat.ply --views sparse/0 --out look/\n\
+    \x20 slag-encoder check --scene splat.ply --views sparse/0 --images photos/ --samples 30\n\
+    \x20 slag-encoder check --scene splat.ply --views transforms.json --write-frame frame.json\n";
+
 /// `check`.
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct CheckArgs {
     /// Scene, poses, photos.
     #[command(flatten)]
     pub input: InputArgs,
     /// Views to render, evenly spread.
-    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..), help_heading = "Speed and accuracy")]
     pub samples: u32,
     /// Device to render on: auto, gpu, cpu, or numbers of adapters (`devices`).
-    #[arg(long, value_name = "DEVICE", default_value_t)]
+    #[arg(long, value_name = "DEVICE", default_value_t, help_heading = "Machine")]
     pub device: DeviceChoice,
     /// Width to render at, pixels.
-    #[arg(long, value_name = "PX", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    #[arg(long, value_name = "PX", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(16..=8192), help_heading = "Speed and accuracy", hide_short_help = true)]
     pub raster_width: u32,
     /// Folder for PNGs of each photo beside its rendering.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", help_heading = "Output")]
     pub out: Option<PathBuf>,
     /// A second set of poses of the same photos, in the splat's world: the similarity between both worlds follows
     /// from the camera centres, and is tried.
-    #[arg(long, value_name = "PATH")]
+    #[arg(long, value_name = "PATH", help_heading = "Inputs", hide_short_help = true)]
     pub also_poses: Option<PathBuf>,
     /// Where splat and poses differ by a similarity (rotation, scale, translation), writes it into this file, in
     /// the format of nerfstudio's dataparser_transforms.json; `encode --splat-frame FILE` applies it.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Output")]
     pub write_frame: Option<PathBuf>,
 }
 
@@ -105,7 +112,8 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         notes.push(write_frame(path, &report)?);
     }
     report.notes = notes;
-    print(json, &report, &report)?;
+    let next = if report.diagnosis.is_none() { next::of_check(args) } else { String::new() };
+    print(json, &report, format!("{report}{next}"))?;
     let is_partial = !missing.is_empty() || !report.unreadable.is_empty() || n_left_out > 0;
     Ok(match (&report.diagnosis, is_partial) {
         (Some(_), _) => Exit::Mismatch,

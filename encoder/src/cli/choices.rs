@@ -13,69 +13,75 @@ use super::common::parse_error;
 #[group(id = "choices", multiple = true)]
 pub struct ChoiceArgs {
     /// Bundle of choices; other flags override single choices.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_enum, default_value_t, help_heading = "Speed and accuracy")]
     pub preset: Preset,
     /// Which parts of a photo get vectors: `masks`, from their crops and from what the photo shows in and around
     /// them (the image model's patches, or windows over the photo: image.patches and image.windows in model.toml);
     /// `crops`, masks from their crops alone; `patches`, without masks, so no objects are found [default: the
     /// preset's].
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, help_heading = "Speed and accuracy", hide_short_help = true)]
     regions: Option<Regions>,
     /// Weight that is summed; `falloff` is the paper's formula as printed [default: the preset's].
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, help_heading = "Speed and accuracy", hide_short_help = true)]
     weights: Option<WeightKind>,
     /// Number or share of the views to use: the first ones of --view-order [default: the preset's].
-    #[arg(long, value_name = "N|P%", value_parser = parse_views_limit)]
+    #[arg(long, value_name = "N|P%", value_parser = parse_views_limit, help_heading = "Speed and accuracy")]
     views_limit: Option<ViewsLimit>,
     /// Order in which views are taken [default: coverage with a limit or a budget, else names].
-    #[arg(long, value_enum, value_name = "ORDER")]
+    #[arg(
+        long,
+        value_enum,
+        value_name = "ORDER",
+        help_heading = "Speed and accuracy",
+        hide_short_help = true
+    )]
     view_order: Option<ViewOrder>,
     /// Number of scales at which the built-in segmenter looks, coarsest first [default: the preset's].
-    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=4))]
+    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=4), help_heading = "Speed and accuracy", hide_short_help = true)]
     mask_levels: Option<usize>,
     /// Masks with fewer pixels are left out [default: the preset's].
-    #[arg(long, value_name = "PX")]
+    #[arg(long, value_name = "PX", help_heading = "Speed and accuracy", hide_short_help = true)]
     min_mask_px: Option<u32>,
     /// Keeps slivers, which ragged edges of overlapping masks leave, as regions; without it they join their
     /// neighbours.
-    #[arg(long)]
+    #[arg(long, help_heading = "Speed and accuracy", hide_short_help = true)]
     keep_slivers: bool,
     /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024,
     /// or `twice` for twice that width [default: the preset's].
-    #[arg(long, value_name = "photo|twice|PX", value_parser = parse_raster_width)]
+    #[arg(long, value_name = "photo|twice|PX", value_parser = parse_raster_width, help_heading = "Speed and accuracy", hide_short_help = true)]
     raster_width: Option<RasterWidth>,
     /// Skips the search for objects: masks of different views that show the same Gaussians.
-    #[arg(long)]
+    #[arg(long, help_heading = "Speed and accuracy", hide_short_help = true)]
     no_objects: bool,
     /// Drops views in which a Gaussian has less than this share of its weight in its best view
-    #[arg(long, value_name = "SHARE", value_parser = share)]
+    #[arg(long, value_name = "SHARE", value_parser = share, help_heading = "Speed and accuracy", hide_short_help = true)]
     min_view_share: Option<f32>,
     /// Each mask counts (1 - truncation)^POWER; truncation is the share of its outline that the photo's edge cuts
     /// off
-    #[arg(long, value_name = "POWER", value_parser = amount)]
+    #[arg(long, value_name = "POWER", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
     truncation_power: Option<f32>,
     /// Weight of the superpoint's mean, relative to the Gaussian's own
-    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    #[arg(long, value_name = "TIMES", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
     superpoint: Option<f32>,
     /// Weight of the larger superpoint's mean, relative to the result so far
-    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    #[arg(long, value_name = "TIMES", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
     coarse: Option<f32>,
     /// Weight of the mean of the Gaussian's object, relative to the result so far
-    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    #[arg(long, value_name = "TIMES", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
     object: Option<f32>,
     /// Whether Gaussians without evidence take their superpoint's mean
-    #[arg(long, value_name = "BOOL")]
+    #[arg(long, value_name = "BOOL", help_heading = "Speed and accuracy", hide_short_help = true)]
     fill: Option<bool>,
     /// Mean error of scores that the compact profile may have, relative to the spread of scores [default: the
     /// preset's].
-    #[arg(long, value_name = "E", value_parser = parse_error)]
+    #[arg(long, value_name = "E", value_parser = parse_error, help_heading = "Speed and accuracy", hide_short_help = true)]
     compact_error: Option<f32>,
     /// The same for the balanced profile.
-    #[arg(long, value_name = "E", value_parser = parse_error)]
+    #[arg(long, value_name = "E", value_parser = parse_error, help_heading = "Speed and accuracy", hide_short_help = true)]
     balanced_error: Option<f32>,
     /// Most components of a vector in compact and balanced shards, even [default: as many as the errors need, at
     /// most 128].
-    #[arg(long, value_name = "N", value_parser = parse_components)]
+    #[arg(long, value_name = "N", value_parser = parse_components, help_heading = "Speed and accuracy", hide_short_help = true)]
     max_components: Option<usize>,
 }
 

@@ -91,7 +91,7 @@ pub struct ModelArgs {
     /// Folder with model.toml, or name of a pulled model (`models list`). `colours` knows colours and shapes only,
     /// and needs no ONNX Runtime [default: the embedded models; for queries, those that the store was encoded
     /// with].
-    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR", help_heading = "Models")]
     pub models: Option<PathBuf>,
     /// How models run.
     #[command(flatten)]
@@ -102,29 +102,29 @@ pub struct ModelArgs {
 #[derive(Clone, Debug, Args)]
 pub struct InputArgs {
     /// Splat: .ply, .spz, compressed .ply, .sog (file or folder) or .splat.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Inputs")]
     pub scene: PathBuf,
     /// Poses: the folder of a COLMAP model, a nerfstudio transforms.json, or a ScanNet scene folder (color/,
     /// pose/, intrinsic/).
-    #[arg(long, value_name = "PATH")]
+    #[arg(long, value_name = "PATH", help_heading = "Inputs")]
     pub views: PathBuf,
     /// Folder of the photos, if they are not beside the poses.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", help_heading = "Inputs")]
     pub images: Option<PathBuf>,
     /// Takes every Nth frame, counted by the numbers in the file names.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", help_heading = "Inputs")]
     pub every: Option<NonZeroU32>,
     /// Says how the splat's frame follows from that of the poses: `auto` for dataparser_transforms.json beside the
     /// splat, where nerfstudio's export lies with the file of its training run; `none` where both have one frame;
     /// or a file in that format, as `check --write-frame` makes it.
-    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
+    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame, help_heading = "Inputs", hide_short_help = true)]
     pub splat_frame: FrameChoice,
     /// What the splat file has in place of logarithms of scales and logits of opacities: `scales`, `opacities` or
     /// `scales,opacities`, as some exporters write them; `check` tells.
-    #[arg(long, value_name = "WHICH", default_value = "none", value_parser = parse_activated)]
+    #[arg(long, value_name = "WHICH", default_value = "none", value_parser = parse_activated, help_heading = "Inputs", hide_short_help = true)]
     pub activated: Activated,
     /// Treats a missing or unreadable photo or mask as an error instead of leaving the view out.
-    #[arg(long)]
+    #[arg(long, help_heading = "Inputs")]
     pub strict: bool,
 }
 

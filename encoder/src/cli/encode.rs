@@ -14,6 +14,7 @@ use super::common::{
     print, profile_parser, warn_of_expiry,
 };
 use super::memory::{default_memory_bytes, parse_memory};
+use super::next;
 use super::sam::SamArgs;
 use super::summary::lines;
 use super::target::TargetArgs;
@@ -26,8 +27,14 @@ use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::report::{self, Recorder};
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-encoder encode --scene splat.ply --views sparse/0 --store STORE\n\
+    \x20 slag-encoder encode --scene splat.ply --views sparse/0 --store STORE --models clip-vit-base-patch32-int8 --text-model\n\
+    \x20 slag-encoder encode --scene splat.ply --views transforms.json --store STORE --preset fast --time-budget 60\n";
+
 /// `encode`.
 #[derive(Clone, Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct EncodeArgs {
     /// Scene, poses, photos.
     #[command(flatten)]
@@ -36,18 +43,18 @@ pub struct EncodeArgs {
     #[command(flatten)]
     models: ModelArgs,
     /// Store to publish into; made if absent.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", help_heading = "Output")]
     store: PathBuf,
     /// Where masks come from: `auto` for a model (the embedded one, or --segmenter), `graph` for the segmenter
     /// without a model, which needs no ONNX Runtime, or your own masks: a folder of id PNGs or RLE JSON, or a COCO
     /// file.
-    #[arg(long, value_name = "auto|graph|DIR", default_value = "auto")]
+    #[arg(long, value_name = "auto|graph|DIR", default_value = "auto", help_heading = "Models")]
     masks: String,
     /// Segment Anything instead of the built-in segmenter.
     #[command(flatten)]
     sam: SamArgs,
     /// Ids in mask PNGs that are no masks; 0 never is one.
-    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    #[arg(long, value_name = "ID", value_delimiter = ',', help_heading = "Models", hide_short_help = true)]
     ignore_mask_ids: Vec<u32>,
     /// A preset, and single choices.
     #[command(flatten)]
@@ -56,91 +63,91 @@ pub struct EncodeArgs {
     #[command(flatten)]
     target: TargetArgs,
     /// Seconds after which no further view is begun; the finished views are published.
-    #[arg(long, value_name = "SECS", value_parser = parse_secs)]
+    #[arg(long, value_name = "SECS", value_parser = parse_secs, help_heading = "Speed and accuracy")]
     time_budget: Option<Duration>,
     /// Poses of further photos in the same world, in one file of poses or several: the scene is encoded from these
     /// and those of --views, and only views that the store does not keep are segmented, embedded and rasterised.
     /// Keeps the contributions of views, as --keep-views does.
-    #[arg(long = "add", value_name = "POSES")]
+    #[arg(long = "add", value_name = "POSES", help_heading = "Inputs")]
     added: Vec<PathBuf>,
     /// Leaves out a view, by its name in the poses file; nothing else is segmented, embedded and rasterised again.
     /// Keeps the contributions of views, as --keep-views does.
-    #[arg(long = "drop", value_name = "VIEW")]
+    #[arg(long = "drop", value_name = "VIEW", help_heading = "Inputs", hide_short_help = true)]
     dropped: Vec<String>,
     /// Keeps the contributions of views, so that another encode of the same views (with another codebook, say) is
     /// quick
-    #[arg(long)]
+    #[arg(long, help_heading = "Inputs", hide_short_help = true)]
     keep_views: bool,
     /// Where weights are rasterised: auto (all GPUs, else the CPU), gpu, cpu, or numbers of `slag-encoder devices`
     /// such as 0,1. --gpus names the GPUs of models.
-    #[arg(long, value_name = "DEVICE", default_value_t)]
+    #[arg(long, value_name = "DEVICE", default_value_t, help_heading = "Machine")]
     pub(super) device: DeviceChoice,
     /// NVIDIA GPUs that share the work of models, where --provider names cuda or tensorrt: all, or numbers such as
     /// 0,1.
-    #[arg(long, value_name = "all|N,...", default_value_t)]
+    #[arg(long, value_name = "all|N,...", default_value_t, help_heading = "Machine", hide_short_help = true)]
     gpus: GpuChoice,
     /// Threads [default: all cores].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024), help_heading = "Machine")]
     threads: Option<u32>,
     /// Memory for the scene, photos and lists: a number with MiB or GiB, MB or GB [default: half of the free
     /// memory].
-    #[arg(long, value_name = "BYTES", value_parser = parse_memory)]
+    #[arg(long, value_name = "BYTES", value_parser = parse_memory, help_heading = "Machine")]
     memory: Option<u64>,
     /// Name of the scene [default: the name of the store's folder].
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", help_heading = "Output", hide_short_help = true)]
     name: Option<String>,
     /// World units are metres; a geo-reference implies it.
-    #[arg(long)]
+    #[arg(long, help_heading = "Inputs")]
     metric: bool,
     /// Geo-reference JSON, {"origin": {"lat", "lon", "alt"}}, of the world's east-north-up frame [default:
     /// geo.json beside the scene, if it exists].
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Inputs")]
     geo: Option<PathBuf>,
     /// Most Gaussians in a cell.
-    #[arg(long, value_name = "N", default_value_t = MAX_CELL_GAUSSIANS as u32, value_parser = clap::value_parser!(u32).range(1..=MAX_CELL_GAUSSIANS as i64))]
+    #[arg(long, value_name = "N", default_value_t = MAX_CELL_GAUSSIANS as u32, value_parser = clap::value_parser!(u32).range(1..=MAX_CELL_GAUSSIANS as i64), help_heading = "Output", hide_short_help = true)]
     cell_gaussians: u32,
     /// Largest width of a cell, metres, in metric scenes.
-    #[arg(long, value_name = "M", default_value_t = DEFAULT_CELL_WIDTH_M)]
+    #[arg(long, value_name = "M", default_value_t = DEFAULT_CELL_WIDTH_M, help_heading = "Output", hide_short_help = true)]
     cell_width_m: f64,
     /// Shards to make.
-    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL, value_parser = profile_parser())]
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL, value_parser = profile_parser(), help_heading = "Output")]
     profiles: Vec<Profile>,
     /// Largest error of positions, world units [default: 0.01 in metric scenes, else a quarter of the size of a
     /// cell's small Gaussians].
-    #[arg(long, value_name = "E")]
+    #[arg(long, value_name = "E", help_heading = "Output", hide_short_help = true)]
     position_error: Option<f64>,
     /// Compact and balanced shards say which Gaussian of the splat file each of theirs is, as exact ones always
     /// do: at most 4 bytes a Gaussian, 2.5 in a scene of a million.
-    #[arg(long)]
+    #[arg(long, help_heading = "Output", hide_short_help = true)]
     input_indices: bool,
     /// Shards tell how their Gaussians look, so that the page at /view shows colours on a robot, too: 10 bytes a
     /// Gaussian in every profile.
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     appearance: bool,
     /// Shards say which places are free, occupied or unknown, so that robots find places to stand; with a value:
     /// the edge of a voxel, metres, 0.02 to 0.5. For metric scenes.
-    #[arg(long, value_name = "M", num_args = 0..=1, default_missing_value = "0.05")]
+    #[arg(long, value_name = "M", num_args = 0..=1, default_missing_value = "0.05", help_heading = "Output")]
     occupancy: Option<f64>,
     /// Shards say where their photos were taken, so that the page at /view shows cameras on a robot, too: 44 bytes
     /// and the name a photo in every profile. Pictures are not published.
-    #[arg(long)]
+    #[arg(long, help_heading = "Output", hide_short_help = true)]
     photo_poses: bool,
     /// The store carries the text side of --models, signed as all else: robots fetch it with the scene and need no
     /// --models. Refused unless the licence in model.toml permits passing the weights on.
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     text_model: bool,
     /// Publishes a generation in which no Gaussian has an embedding, too: nothing is found in it.
-    #[arg(long)]
+    #[arg(long, help_heading = "Output", hide_short_help = true)]
     allow_empty: bool,
     /// Views by other machines.
     #[command(flatten)]
     fleet: super::fleet::CoordinatorArgs,
     /// Writes a report of the encode, one HTML file: views, masks, objects, cells, errors by profile, what was
     /// left out and why.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Output")]
     report: Option<PathBuf>,
     /// Drops an unfinished encode of another splat or with other settings in the store.
-    #[arg(long)]
+    #[arg(long, help_heading = "Output", hide_short_help = true)]
     restart: bool,
 }
 
@@ -226,7 +233,8 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let progress = recorder.as_ref().map_or(progress, |recorder| recorder as &dyn Progress);
     let summary = args.fleet.encode(&settings, &engines, progress, cancel.as_ref())?;
     let lines = lines(&settings, &summary, expected.as_ref());
-    print(json, &summary, lines)?;
+    let next = if json { String::new() } else { next::of_store(&settings.output.store)? };
+    print(json, &summary, lines + &next)?;
     warn_of_expiry(&settings.output.store);
     if let (Some(path), Some(recorder)) = (&args.report, &recorder) {
         fs_err::write(path, report::of_encode(&settings.output.scene_name, &summary, recorder)?)?;

@@ -24,22 +24,28 @@ use crate::raster::gpu::GpuOptions;
 #[command(next_help_heading = "Fleet")]
 pub struct QueueArgs {
     /// NATS server with JetStream that hands out the work; without it, workers have shares. TLS with tls://.
-    #[arg(long, value_name = "nats://HOST:PORT")]
+    #[arg(long, value_name = "nats://HOST:PORT", hide_short_help = true)]
     fleet: Option<String>,
     /// Credentials file for the NATS server.
-    #[arg(long, value_name = "FILE", requires = "fleet", env = "NATS_CREDS")]
+    #[arg(long, value_name = "FILE", requires = "fleet", env = "NATS_CREDS", hide_short_help = true)]
     nats_credentials: Option<PathBuf>,
     /// File with the seed of an nkey for the NATS server.
-    #[arg(long, value_name = "FILE", requires = "fleet", conflicts_with = "nats_credentials")]
+    #[arg(
+        long,
+        value_name = "FILE",
+        requires = "fleet",
+        conflicts_with = "nats_credentials",
+        hide_short_help = true
+    )]
     nats_nkey: Option<PathBuf>,
     /// Certificates of the authority that signed the NATS server's.
-    #[arg(long, value_name = "FILE", requires = "fleet")]
+    #[arg(long, value_name = "FILE", requires = "fleet", hide_short_help = true)]
     nats_ca: Option<PathBuf>,
     /// Seconds without a sign of life after which a worker's view goes to another.
-    #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_secs)]
+    #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_secs, hide_short_help = true)]
     ack_wait: Duration,
     /// Times that a view is handed out; then it is left out.
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000), hide_short_help = true)]
     max_deliver: u32,
 }
 
@@ -62,7 +68,7 @@ impl QueueArgs {
 pub struct CoordinatorArgs {
     /// Bucket over which workers do the views: file:///FOLDER that all machines see, or s3://BUCKET/PREFIX,
     /// with credentials in the usual variables. Start `slag-encoder worker` with the same bucket.
-    #[arg(long, value_name = "URL", conflicts_with = "time_budget")]
+    #[arg(long, value_name = "URL", conflicts_with = "time_budget", hide_short_help = true)]
     blobs: Option<String>,
     /// The queue.
     #[command(flatten)]

@@ -10,6 +10,7 @@ mod encode;
 mod fleet;
 mod keys;
 pub mod memory;
+mod next;
 pub mod progress;
 #[cfg(feature = "qdrant")]
 mod push;
@@ -22,10 +23,11 @@ mod target;
 mod view;
 
 use anyhow::Result;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use serde_json::json;
 use slag_common::error_line;
 use slag_models::commands::{self, ModelsCommand};
+use slag_models::help;
 use slag_models::hub::Side;
 
 use crate::encode::EncodeError;
@@ -103,6 +105,12 @@ pub enum Command {
     Push(push::PushCommand),
     /// Lists the GPUs that can rasterise.
     Devices,
+    /// Prints completions for a shell.
+    Completions {
+        /// The shell.
+        #[arg(value_enum)]
+        shell: clap_complete::Shell,
+    },
 }
 
 /// Runs the program and says how it ended.
@@ -124,6 +132,11 @@ pub fn run(cli: Cli) -> Exit {
         #[cfg(feature = "qdrant")]
         Command::Push(PushCommand::Qdrant(args)) => push::run(&args, progress.as_ref(), json),
         Command::Devices => devices::run(json),
+        Command::Completions { shell } => {
+            let mut command = help::layered(Cli::command());
+            clap_complete::generate(shell, &mut command, "slag-encoder", &mut std::io::stdout());
+            Ok(Exit::Done)
+        }
     };
     exit_of(result, json)
 }
@@ -173,8 +186,6 @@ fn is_broken_pipe(error: &anyhow::Error) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
 
     #[test]

@@ -16,8 +16,14 @@ use crate::store::StoreReader;
 
 const MAX_PICTURE_WIDTH_PX: u32 = 1600;
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-encoder query --store STORE \"fire extinguisher\"\n\
+    \x20 slag-encoder query --store STORE chair --json\n\
+    \x20 slag-encoder query --store STORE chair --ply found.ply\n";
+
 /// `query`.
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct QueryArgs {
     /// Store.
     #[arg(long, value_name = "DIR")]

@@ -16,57 +16,57 @@ use crate::segment::{SamLevels, SamSettings, ScoreFilter};
 pub struct SamArgs {
     /// SAM, SAM 2, MobileSAM, EdgeTAM or another model of that kind: a folder with model.toml, or the name of a
     /// pulled model (`models list`).
-    #[arg(long, value_name = "NAME|DIR")]
+    #[arg(long, value_name = "NAME|DIR", help_heading = "Models")]
     segmenter: Option<PathBuf>,
     /// Points along each side of the grid of prompts: 8, 16, 32, 64 [default: the preset's].
     #[arg(long, value_name = "N",
-        value_parser = clap::value_parser!(u32).range(1..=256))]
+        value_parser = clap::value_parser!(u32).range(1..=256), help_heading = "Speed and accuracy", hide_short_help = true)]
     points_per_side: Option<u32>,
     /// Points per run of the model: more are faster on GPUs and take more memory.
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_batch,
-        value_parser = clap::value_parser!(u32).range(1..=1024))]
+        value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
     sam_points_per_batch: u32,
     /// Least IoU that the model predicts for a mask, 0 to 1 [default: the preset's].
-    #[arg(long, value_name = "IOU", value_parser = parse_f32_ratio)]
+    #[arg(long, value_name = "IOU", value_parser = parse_f32_ratio, hide_short_help = true)]
     sam_predicted_iou: Option<f32>,
     /// Least IoU of a mask with itself under a higher and a lower threshold, 0 to 1 [default: the preset's].
-    #[arg(long, value_name = "IOU", value_parser = parse_ratio)]
+    #[arg(long, value_name = "IOU", value_parser = parse_ratio, hide_short_help = true)]
     sam_stability: Option<f64>,
     /// Distance of those thresholds from 0, logits.
-    #[arg(long, value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset)]
+    #[arg(long, value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset, hide_short_help = true)]
     sam_stability_offset: f32,
     /// IoU of boxes from which two masks are the same.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio)]
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
     sam_box_nms: f64,
     /// IoU of pixels from which two masks are the same; 1 compares boxes only.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio)]
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
     sam_mask_nms: f64,
     /// Layers of crops, to find small things: layer i segments 4^i crops besides the whole image [default: the
     /// preset's].
     #[arg(long, value_name = "N",
-        value_parser = clap::value_parser!(u32).range(0..=4))]
+        value_parser = clap::value_parser!(u32).range(0..=4), hide_short_help = true)]
     sam_crop_layers: Option<u32>,
     /// IoU of boxes from which masks of two crops are the same.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio)]
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
     sam_crop_nms: f64,
     /// Overlap of neighbouring crops, relative to the image's shorter edge.
-    #[arg(long, value_name = "RATIO", default_value_t = SamSettings::default().crop_overlap, value_parser = parse_ratio)]
+    #[arg(long, value_name = "RATIO", default_value_t = SamSettings::default().crop_overlap, value_parser = parse_ratio, hide_short_help = true)]
     sam_crop_overlap: f64,
     /// Divisor of the points along a side from one layer of crops to the next.
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_points_divisor,
-        value_parser = clap::value_parser!(u32).range(1..=16))]
+        value_parser = clap::value_parser!(u32).range(1..=16), hide_short_help = true)]
     sam_crop_points_divisor: u32,
     /// Fills holes and drops islands of masks with fewer pixels [default: the preset's].
-    #[arg(long, value_name = "PX")]
+    #[arg(long, value_name = "PX", hide_short_help = true)]
     sam_min_region_px: Option<u32>,
     /// Which of the three masks of each prompt are used [default: the preset's].
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, hide_short_help = true)]
     sam_levels: Option<SamLevels>,
     /// Filter of each level's masks at the end [default: the preset's].
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, hide_short_help = true)]
     sam_score_filter: Option<ScoreFilterArg>,
     /// Threads within the model; masks may depend on their number in the last bits [default: all cores].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
     sam_threads: Option<u32>,
 }
 

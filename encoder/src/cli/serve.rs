@@ -9,6 +9,7 @@ use slag_service::listen::Listen;
 use slag_service::tls::TlsFiles;
 
 use super::common::{Exit, ModelArgs, runtime, stopped, warn_of_expiry};
+use super::next;
 use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
 use crate::view::{self, Viewed, Viewer};
@@ -16,8 +17,14 @@ use crate::view::{self, Viewed, Viewer};
 /// Time between two looks whether metadata expires soon.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(86_400);
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-encoder serve --store STORE\n\
+    \x20 slag-encoder serve --store STORE --listen 0.0.0.0:7733\n\
+    \x20 slag-encoder serve --store STORE --listen 0.0.0.0:7733 --tls-cert cert.pem --tls-key key.pem\n";
+
 /// `serve`.
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct ServeArgs {
     /// Store.
     #[arg(long, value_name = "DIR")]
@@ -52,7 +59,14 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
     let tls = args.listen.tls(files.map(|(cert, key)| TlsFiles { cert, key }))?;
     runtime()?.block_on(async {
         // On stdout: with port 0 this is where a script learns the port.
-        let listening = |url| println!("listening on {url}");
+        let listening = |url: String| {
+            println!("listening on {url}");
+            if tracing::enabled!(tracing::Level::INFO)
+                && let Ok(lines) = next::of_robot(&args.store, &url)
+            {
+                eprint!("{lines}");
+            }
+        };
         let limits = serve::Limits::default();
         let open_text = open_text(args.models.clone());
         let shown =

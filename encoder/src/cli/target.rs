@@ -16,13 +16,13 @@ use crate::encode::{InputSettings, count_inputs};
 pub struct TargetArgs {
     /// Picks the most accurate measured setting that is expected to take at most this many seconds. The
     /// expectation holds for the machine, models and size of photos that the front was measured with.
-    #[arg(long, value_name = "S", value_parser = parse_seconds, requires = "front", conflicts_with_all = ["choices", "segmenter"])]
+    #[arg(long, value_name = "S", value_parser = parse_seconds, requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]
     target_seconds: Option<f64>,
     /// Picks the most accurate measured setting whose compact shards are expected to have at most this many bytes.
-    #[arg(long, value_name = "BYTES", requires = "front", conflicts_with_all = ["choices", "segmenter"])]
+    #[arg(long, value_name = "BYTES", requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]
     target_bytes: Option<ByteSize>,
     /// Front to pick from: front.json, as `slag-lab bench tradeoff` writes it for your machine and scenes.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
     front: Option<PathBuf>,
 }
 

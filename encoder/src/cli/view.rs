@@ -16,8 +16,14 @@ use crate::ingest::{self, FrameChoice};
 use crate::publish::serve::{self, Access};
 use crate::view::{OpenText, Splat, Viewed, Viewer, router, up_of};
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-encoder view --store STORE\n\
+    \x20 slag-encoder view --store STORE --scene splat.ply --views sparse/0\n\
+    \x20 slag-encoder view --scene splat.ply\n";
+
 /// `view`.
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct ViewArgs {
     /// Store to draw and to ask.
     #[arg(long, value_name = "DIR", required_unless_present = "scene")]

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use clap::{Command, CommandFactory, Parser};
 use clap_complete::Shell;
+use slag_models::help;
 
 /// Writes manual pages and shell completions of slag-encoder, slag-edge, slag-mcap, slag-mcp and slag-ros.
 ///
@@ -22,8 +23,8 @@ fn main() -> Result<()> {
     let Args { out } = Args::parse();
     fs_err::create_dir_all(&out)?;
     for program in [
-        slag_encoder::cli::Cli::command(),
-        slag_edge::cli::Cli::command(),
+        help::layered(slag_encoder::cli::Cli::command()),
+        help::layered(slag_edge::cli::Cli::command()),
         slag_mcap::Args::command(),
         slag_mcp::Args::command(),
         slag_ros::Args::command(),

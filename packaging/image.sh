@@ -1,19 +1,24 @@
 #!/bin/sh
-# Lays out an OCI image of slag-encoder without a container service: a Debian 12 base by mmdebstrap, the program
+# Lays out an OCI image of slag-encoder or slag-edge without a container service: a Debian 12 base by mmdebstrap, the program
 # with ONNX Runtime above it. The same files and the same state of the mirror make the same digests. Needs
 # mmdebstrap and root, or user namespaces.
-# usage: image.sh amd64|arm64 BINARY OUT      OUT/slag-encoder_VERSION_ARCH.oci.tar is written, and its path printed
+# usage: image.sh amd64|arm64 BINARY OUT      OUT/PROGRAM_VERSION_ARCH.oci.tar is written, and its path printed
 #   IMAGE_PACKAGES: more Debian packages, such as "libvulkan1 mesa-vulkan-drivers" for a GPU that mesa drives
-# Load it: skopeo copy oci-archive:FILE docker://registry.example/slag-encoder:VERSION, or podman load --input FILE
+# Load it: skopeo copy oci-archive:FILE docker://registry.example/PROGRAM:VERSION, or podman load --input FILE
 set -eu
-cd "$(dirname "$0")/../.."
-[ $# = 3 ] || { echo "usage: encoder/deploy/image.sh amd64|arm64 BINARY OUT" >&2; exit 2; }
+cd "$(dirname "$0")/.."
+[ $# = 3 ] || { echo "usage: packaging/image.sh amd64|arm64 BINARY OUT" >&2; exit 2; }
 case $1 in
 amd64) machine=x86_64 ;;
 arm64) machine=aarch64 ;;
 *) echo "image: no image for '$1', expected amd64 or arm64" >&2; exit 2 ;;
 esac
 arch=$1 binary=$2 out=$3
+program=$(basename "$binary")
+case $program in
+slag-encoder | slag-edge) ;;
+*) echo "image: no image for '$program', expected slag-encoder or slag-edge" >&2; exit 2 ;;
+esac
 command -v mmdebstrap >/dev/null || { echo "image: needs mmdebstrap (Debian: apt-get install mmdebstrap)" >&2; exit 1; }
 version=$(sh scripts/version.sh)
 # The time of all files and of the image; a commit's own where git knows it.
@@ -46,10 +51,10 @@ mmdebstrap --quiet --architectures="$arch" --variant=essential --include="libstd
 put() {
     install -D -m "$1" "$2" "$work/program/$3"
 }
-put 755 "$binary" usr/bin/slag-encoder
-put 644 "$runtime" usr/lib/slag/libonnxruntime.so
-put 644 LICENSE-MIT usr/share/doc/slag-encoder/LICENSE-MIT
-put 644 LICENSE-APACHE usr/share/doc/slag-encoder/LICENSE-APACHE
+put 755 "$binary" "usr/bin/$program"
+put 644 "$runtime" "usr/lib/$program/libonnxruntime.so"
+put 644 LICENSE-MIT "usr/share/doc/$program/LICENSE-MIT"
+put 644 LICENSE-APACHE "usr/share/doc/$program/LICENSE-APACHE"
 find "$work/program" -type d -exec chmod 755 {} +
 tar --create --file "$work/program.tar" --directory "$work/program" --sort=name --owner=0 --group=0 --numeric-owner \
     --mtime="@$SOURCE_DATE_EPOCH" --format=gnu usr
@@ -61,7 +66,7 @@ for layer in base program; do
     layers="$layers${layers:+,}{\"mediaType\":\"application/vnd.oci.image.layer.v1.tar+gzip\",$(blob "$work/$layer.tar.gz")}"
 done
 cat >"$work/config" <<JSON
-{"created":"$created","architecture":"$arch","os":"linux","config":{"Entrypoint":["slag-encoder"],"Cmd":["--help"],"Env":["PATH=/usr/sbin:/usr/bin:/sbin:/bin","ORT_DYLIB_PATH=/usr/lib/slag/libonnxruntime.so"],"Labels":{"org.opencontainers.image.title":"slag-encoder","org.opencontainers.image.version":"$version","org.opencontainers.image.licenses":"Apache-2.0 OR MIT"}},"rootfs":{"type":"layers","diff_ids":[$diff_ids]},"history":[{"created":"$created","created_by":"mmdebstrap bookworm"},{"created":"$created","created_by":"encoder/deploy/image.sh"}]}
+{"created":"$created","architecture":"$arch","os":"linux","config":{"Entrypoint":["$program"],"Cmd":["--help"],"Env":["PATH=/usr/sbin:/usr/bin:/sbin:/bin"],"Labels":{"org.opencontainers.image.title":"$program","org.opencontainers.image.version":"$version","org.opencontainers.image.licenses":"Apache-2.0 OR MIT"}},"rootfs":{"type":"layers","diff_ids":[$diff_ids]},"history":[{"created":"$created","created_by":"mmdebstrap bookworm"},{"created":"$created","created_by":"packaging/image.sh"}]}
 JSON
 config=$(blob "$work/config")
 cat >"$work/manifest" <<JSON
@@ -69,11 +74,11 @@ cat >"$work/manifest" <<JSON
 JSON
 manifest=$(blob "$work/manifest")
 cat >"$layout/index.json" <<JSON
-{"schemaVersion":2,"manifests":[{"mediaType":"application/vnd.oci.image.manifest.v1+json",$manifest,"platform":{"architecture":"$arch","os":"linux"},"annotations":{"org.opencontainers.image.ref.name":"slag-encoder:$version"}}]}
+{"schemaVersion":2,"manifests":[{"mediaType":"application/vnd.oci.image.manifest.v1+json",$manifest,"platform":{"architecture":"$arch","os":"linux"},"annotations":{"org.opencontainers.image.ref.name":"$program:$version"}}]}
 JSON
 echo '{"imageLayoutVersion":"1.0.0"}' >"$layout/oci-layout"
 mkdir -p "$out"
-image=$out/slag-encoder_${version}_$arch.oci.tar
+image=$out/${program}_${version}_$arch.oci.tar
 tar --create --file "$image" --directory "$layout" --sort=name --owner=0 --group=0 --numeric-owner \
     --mtime="@$SOURCE_DATE_EPOCH" blobs index.json oci-layout
 echo "$image"

@@ -1,0 +1,61 @@
+//! `--help` of the programs: one screen of what most people need; `--help-all` has every flag, in full.
+
+use clap::builder::StyledStr;
+use clap::{Arg, ArgAction, Command};
+
+/// What stands before the flags; examples come first.
+const TEMPLATE: &str = "{about-with-newline}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
+
+/// Makes the help of a command and those below it short: the first sentence of each flag, without those that hide
+/// from the short help.
+pub fn layered(command: Command) -> Command {
+    let below: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_owned()).collect();
+    let command = below.iter().fold(command, |command, name| command.mut_subcommand(name, layered));
+    let short =
+        Arg::new("help").short('h').long("help").action(ArgAction::HelpShort).help("Prints this help");
+    let long = Arg::new("help-all").long("help-all").action(ArgAction::HelpLong);
+    command
+        .mut_args(first_sentence_first)
+        .disable_help_flag(true)
+        .help_template(TEMPLATE)
+        .arg(short)
+        .arg(long.help("Prints every flag, and all about it"))
+}
+
+fn first_sentence_first(arg: Arg) -> Arg {
+    let Some(all) = arg.get_help().map(StyledStr::to_string) else { return arg };
+    let long = arg.get_long_help().map_or_else(|| all.clone(), StyledStr::to_string);
+    let end = all.find(". ").into_iter().chain(all.find("; ")).chain(all.find(": ")).min();
+    // Texts end with the default where the program chooses it.
+    let default = all.rfind(" [default:").map_or("", |at| &all[at..]);
+    match end {
+        Some(end) if end + default.len() < all.len() => arg.help(format!("{}{default}", &all[..end])),
+        _ => arg,
+    }
+    .long_help(long)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Command;
+
+    use super::*;
+
+    #[test]
+    fn short_help_has_first_sentences_and_all_has_everything() {
+        let rare = Arg::new("rare").long("rare").help("Rarely turned.").hide_short_help(true);
+        let long = Arg::new("often").long("often").help("Turned often. With care [default: the preset's].");
+        let command = Command::new("slag").about("Does it.").before_help("Examples").arg(rare).arg(long);
+        let help = |flag: &str| {
+            let line = ["slag", "below", flag];
+            let command = layered(Command::new("slag").subcommand(command.clone().name("below")));
+            command.try_get_matches_from(line).expect_err("help").to_string()
+        };
+        let (short, all) = (help("--help"), help("--help-all"));
+        assert_eq!(short, help("-h"));
+        assert!(short.contains("Turned often [default: the preset's]."), "{short}");
+        assert!(!short.contains("rare") && !short.contains("With care"), "{short}");
+        assert!(all.contains("Rarely turned.") && all.contains("With care"), "{all}");
+        assert!(short.find("Examples") < short.find("Usage"), "{short}");
+    }
+}

@@ -1,0 +1,182 @@
+//! `doctor`: can this robot answer, and what is missing?
+
+use std::io::{self, Write};
+
+use anyhow::anyhow;
+use clap::Args;
+use serde::Serialize;
+use slag_common::ByteSize;
+use slag_common::tuf::format_utc;
+
+use super::args::{CacheArgs, ModelArgs, engine};
+use super::failure::{Failure, store_failure};
+use super::output::print_json;
+use super::text::visible;
+use crate::error_line;
+use crate::fetch::accepted;
+use crate::query::Status;
+use crate::store::{EdgeCache, Snapshot, StoreError};
+
+/// Free space below which a fetch may not fit.
+const LITTLE_BYTES: u64 = 256 << 20;
+
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-edge doctor\n\
+    \x20 slag-edge doctor --json\n\
+    \x20 slag-edge doctor --cache /var/lib/slag\n";
+
+#[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
+pub struct DoctorArgs {
+    #[command(flatten)]
+    cache: CacheArgs,
+    #[command(flatten)]
+    models: ModelArgs,
+    /// Print the findings as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// How one thing stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Verdict {
+    Ok,
+    /// It answers, but not all it could.
+    Note,
+    /// It cannot answer.
+    Missing,
+}
+
+#[derive(Debug, Serialize)]
+struct Finding {
+    what: &'static str,
+    verdict: Verdict,
+    /// What was found; for what is missing, also what to do.
+    text: String,
+}
+
+impl Finding {
+    fn new(what: &'static str, verdict: Verdict, text: impl Into<String>) -> Self {
+        Self { what, verdict, text: text.into() }
+    }
+}
+
+pub fn run(args: DoctorArgs) -> Result<(), Failure> {
+    let cache = args.cache.open()?;
+    let mut findings = vec![disk(&cache), trust(&cache)];
+    findings.extend(on_board(&cache));
+    findings.push(text_model(&cache, &args.models));
+    match args.json {
+        true => print_json(&findings)?,
+        false => print(&findings)?,
+    }
+    match findings.iter().filter(|finding| finding.verdict == Verdict::Missing).count() {
+        0 => Ok(()),
+        n => Err(Failure::Failed("doctor", anyhow!("this robot cannot answer yet: {n} missing"))),
+    }
+}
+
+fn print(findings: &[Finding]) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    for Finding { what, verdict, text } in findings {
+        let verdict = match verdict {
+            Verdict::Ok => "ok",
+            Verdict::Note => "note",
+            Verdict::Missing => "MISSING",
+        };
+        writeln!(out, "{verdict:<8} {what:<11} {}", visible(text))?;
+    }
+    Ok(())
+}
+
+fn disk(cache: &EdgeCache) -> Finding {
+    let dir = cache.dir();
+    // A folder that no fetch has made yet: the disk is that of the nearest one above.
+    let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(dir);
+    match cache.files().free_bytes(there) {
+        Err(error) => Finding::new("disk", Verdict::Missing, format!("{error}; give another --cache")),
+        Ok(None) => Finding::new("disk", Verdict::Ok, dir.display().to_string()),
+        Ok(Some(free)) => {
+            let verdict = if free < LITTLE_BYTES { Verdict::Note } else { Verdict::Ok };
+            Finding::new("disk", verdict, format!("{} free for {}", ByteSize(free), dir.display()))
+        }
+    }
+}
+
+fn trust(cache: &EdgeCache) -> Finding {
+    let Some(accepted) = accepted(cache) else {
+        let advice = "no store; the cloud's `slag-encoder serve` prints the line: slag-edge trust add URL --sha256 HEX";
+        return Finding::new("trust", Verdict::Missing, advice);
+    };
+    let root = format!("root {} {}", accepted.root_version, accepted.root_sha256);
+    match accepted.expires_unix_secs {
+        Some(expires) if expires <= crate::now_unix_secs() => {
+            let text = format!("{root}; its news ended {}: fetch again", format_utc(expires));
+            Finding::new("trust", Verdict::Note, text)
+        }
+        expires => {
+            let until = expires.map_or(String::new(), |at| format!(", current until {}", format_utc(at)));
+            Finding::new("trust", Verdict::Ok, root + &until)
+        }
+    }
+}
+
+fn on_board(cache: &EdgeCache) -> Vec<Finding> {
+    let snapshot = match Snapshot::open(cache) {
+        Ok(snapshot) => snapshot,
+        Err(StoreError::Empty { .. }) => {
+            let advice = "nothing fetched yet: slag-edge fetch --from URL --at X,Y,Z --radius 50";
+            return vec![Finding::new("scene", Verdict::Missing, advice)];
+        }
+        Err(error) => {
+            let text = format!("{}; fetch again", error_line(&error));
+            return vec![Finding::new("scene", Verdict::Missing, text)];
+        }
+    };
+    let status = Status::of(&snapshot);
+    let unit = if status.metric { "m" } else { "world units" };
+    let (n, of) = (status.shards.len(), status.n_cells_in_scene);
+    let scene = format!(
+        "{}, generation {}, {n} of {of} cells, {} Gaussians, {}",
+        status.scene,
+        status.generation,
+        status.n_gaussians,
+        ByteSize(status.len_bytes)
+    );
+    let place = format!("{} {unit} around {:.2}", status.radius, status.centre_in_world);
+    let mut findings =
+        vec![Finding::new("scene", Verdict::Ok, scene), Finding::new("place", Verdict::Ok, place)];
+    if let Some(signed) = accepted(cache).and_then(|accepted| accepted.signed_unix_secs) {
+        let hours = crate::now_unix_secs().saturating_sub(signed) as f64 / 3600.0;
+        findings.push(Finding::new("age", Verdict::Ok, format!("the store signed it {hours:.1} hours ago")));
+    }
+    let mut note = |what, text: &str| findings.push(Finding::new(what, Verdict::Note, text));
+    if !status.bad_cells.is_empty() {
+        note("cells", &format!("{} could not be fetched; fetch again", status.bad_cells.len()));
+    }
+    if status.geo_reference.is_none() {
+        note("latitude", "none: the scene has no geo-reference, so positions are in its world");
+    }
+    if snapshot.shards.iter().all(|shard| shard.occupancy().is_none()) {
+        note("goal", "no places to stand: the scene was encoded without --occupancy");
+    }
+    findings
+}
+
+fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
+    let opened = engine(cache.clone(), models).and_then(|engine| {
+        match engine.reload() {
+            // Without a scene there is nothing to fit.
+            Err(StoreError::Empty { .. }) => return Ok("opens".to_owned()),
+            other => other.map_err(store_failure)?,
+        }
+        let on_board = engine.on_board()?;
+        on_board.check()?;
+        Ok(format!("{} opens and fits the scene", Status::of(&on_board.snapshot).encoder_name))
+    });
+    match opened {
+        Ok(text) => Finding::new("text model", Verdict::Ok, text),
+        Err(failure) => Finding::new("text model", Verdict::Missing, failure.text()),
+    }
+}

@@ -1,0 +1,125 @@
+//! What to do next, as commands ready to paste.
+
+use std::fmt::Write;
+use std::fs;
+use std::path::Path;
+
+use anyhow::Result;
+use glam::DVec3;
+use slag_common::frames::Aabb;
+use slag_common::manifest::Manifest;
+
+use super::check::CheckArgs;
+use crate::store::StoreReader;
+use crate::store::ceremony::default_root_folder;
+use crate::store::metadata::MetadataReader;
+
+/// Share of the Gaussians that the extent leaves out on each side of each axis: strays lie far away.
+const STRAY_SHARE: f64 = 0.02;
+/// Port at which `serve` listens by default.
+const PORT: u16 = 7733;
+
+/// Returns the lines of a published store: extent, `query` and `serve` here, `trust` and `fetch` on the robot.
+pub(super) fn of_store(store: &Path) -> Result<String> {
+    let here = shell_word(store);
+    let mut lines = String::from("\nnext\n");
+    writeln!(lines, "  slag-encoder query --store {here} \"chair\"")?;
+    writeln!(lines, "  slag-encoder view --store {here}")?;
+    writeln!(lines, "  slag-encoder serve --store {here} --listen 0.0.0.0:{PORT}")?;
+    Ok(lines + &of_robot(store, &format!("http://0.0.0.0:{PORT}"))?)
+}
+
+/// Returns the lines for a robot, and the extent of what it can fetch. `url`: where the store is served.
+pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
+    let reader = StoreReader::open(store)?;
+    let manifest = reader.manifest();
+    let root = MetadataReader::new(store).keys_status(&default_root_folder(store))?.root_sha256;
+    let (extent, at) = extent_and_place(manifest);
+    let unit = if manifest.metric { "m" } else { "world units" };
+    let size = extent.max - extent.min;
+    let base = ["0.0.0.0", "[::]"].iter().fold(url.to_owned(), |url, any| url.replace(any, &host_name()));
+    let mut lines = String::from("on the robot\n");
+    writeln!(lines, "  slag-edge trust add {base} --sha256 {root}")?;
+    writeln!(lines, "  slag-edge fetch --from {base} --at {:.2},{:.2},{:.2} --radius 50", at.x, at.y, at.z)?;
+    writeln!(lines, "  slag-edge query \"chair\"")?;
+    writeln!(
+        lines,
+        "The scene is {:.1} x {:.1} x {:.1} {unit}, from {} to {} without strays.",
+        size.x,
+        size.y,
+        size.z,
+        point(extent.min),
+        point(extent.max)
+    )?;
+    Ok(lines)
+}
+
+/// Returns the lines of inputs that fit.
+pub(super) fn of_check(args: &CheckArgs) -> String {
+    let input = &args.input;
+    let images = input.images.as_ref().map_or(String::new(), |dir| format!(" --images {}", shell_word(dir)));
+    format!(
+        "\nnext\n  slag-encoder encode --scene {} --views {}{images} --store STORE\n",
+        shell_word(&input.scene),
+        shell_word(&input.views)
+    )
+}
+
+/// Returns the extent without strays, and the centre of the cell in the middle of the Gaussians.
+fn extent_and_place(manifest: &Manifest) -> (Aabb, DVec3) {
+    let total: f64 = manifest.cells.iter().map(|cell| f64::from(cell.n_gaussians)).sum();
+    // The coordinate below which a share of the Gaussians lies, each at its cell's side.
+    let quantile = |axis: usize, share: f64, side: fn(&Aabb) -> DVec3| {
+        let mut sides: Vec<(f64, f64)> = (manifest.cells.iter())
+            .map(|cell| (side(&cell.bounds)[axis], f64::from(cell.n_gaussians)))
+            .collect();
+        sides.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut below = 0.0;
+        let found = sides.iter().find(|(_, n)| {
+            below += n;
+            below >= share * total
+        });
+        found.or(sides.last()).map_or(0.0, |(at, _)| *at)
+    };
+    let all = |share: f64, side: fn(&Aabb) -> DVec3| {
+        DVec3::from_array([0, 1, 2].map(|axis| quantile(axis, share, side)))
+    };
+    let extent = Aabb { min: all(STRAY_SHARE, |b| b.min), max: all(1.0 - STRAY_SHARE, |b| b.max) };
+    let centre = |b: &Aabb| (b.min + b.max) / 2.0;
+    let middle = all(0.5, |b| (b.min + b.max) / 2.0);
+    let centres = manifest.cells.iter().map(|cell| centre(&cell.bounds));
+    let nearest = centres.min_by(|a, b| a.distance_squared(middle).total_cmp(&b.distance_squared(middle)));
+    (extent, nearest.unwrap_or(middle))
+}
+
+fn point(at: DVec3) -> String {
+    format!("({:.1}, {:.1}, {:.1})", at.x, at.y, at.z)
+}
+
+/// Returns the name of this machine, which robots of the same network may know it by.
+fn host_name() -> String {
+    let name = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let name = name.trim();
+    if name.is_empty() { "BASE".into() } else { name.into() }
+}
+
+/// Quotes a path for a shell where it needs it.
+fn shell_word(path: &Path) -> String {
+    let text = path.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+,:@%=".contains(c);
+    match !text.is_empty() && text.chars().all(is_plain) {
+        true => text,
+        false => format!("'{}'", text.replace('\'', "'\\''")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn odd_paths_are_quoted() {
+        assert_eq!(shell_word(Path::new("data/sparse/0")), "data/sparse/0");
+        assert_eq!(shell_word(Path::new("Bob's yard")), "'Bob'\\''s yard'");
+    }
+}
