@@ -14,10 +14,16 @@ import json
 import urllib.error
 import urllib.parse
 import urllib.request
-from dataclasses import dataclass, field, fields
-from typing import Any, Iterator, Mapping, Optional, Sequence, Union
+from dataclasses import dataclass, field, is_dataclass, replace
+from functools import lru_cache
+from typing import Any, Iterator, Mapping, Optional, Sequence, Union, get_args, get_origin, get_type_hints
+
+from .messages import Answer, Changed, Goal, Moved, Nothing, Reply, Result, Witness
 
 __all__ = ["Answer", "Event", "Nothing", "Reply", "Result", "Robot", "SlagError", "Witness", "relation", "thing"]
+
+_NAMES = {"before": "from", "now": "to"}
+"""Members that have other names in JSON."""
 
 Point = Union[Sequence[float], Mapping[str, float]]
 """x, y, z in the world frame, or {"lat": .., "lon": .., "height": ..}."""
@@ -37,90 +43,6 @@ class SlagError(Exception):
 
 
 @dataclass(frozen=True)
-class Witness:
-    """A thing that an answer is related to; `id` is absent for the asker."""
-
-    thing: str
-    position_in_world: Sequence[float]
-    id: Optional[str] = None
-    score: Optional[float] = None
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A thing, a cluster or a Gaussian. Members that only some kinds have are None on the others."""
-
-    rank: int
-    frame: str
-    generation: int
-    position_in_world: Sequence[float]
-    score: float
-    id: Optional[str] = None
-    relevance: Optional[float] = None
-    distance: Optional[float] = None
-    size: Optional[Sequence[float]] = None
-    box_min_in_world: Optional[Sequence[float]] = None
-    box_max_in_world: Optional[Sequence[float]] = None
-    n_gaussians: Optional[int] = None
-    degree: Optional[float] = None
-    related_to: Sequence[Witness] = ()
-    more: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """The whole answer as the robot sent it."""
-
-
-@dataclass(frozen=True)
-class Nothing:
-    """Why nothing was found. `thing`: the part of a phrase that failed."""
-
-    kind: str
-    detail: str
-    thing: Optional[str] = None
-    best_score: Optional[float] = None
-    best_degree: Optional[float] = None
-
-
-@dataclass(frozen=True)
-class Result:
-    """The answers to one question. `understood`: the phrase that its text was understood as."""
-
-    question: Mapping[str, Any]
-    kind: str
-    answers: Sequence[Answer]
-    none: Optional[Nothing]
-    understood: Optional[Mapping[str, Any]]
-    next_offset: Optional[int]
-    more: Mapping[str, Any] = field(default_factory=dict, repr=False)
-
-
-@dataclass(frozen=True)
-class Reply:
-    """The results of a request, one for each question: texts, then vectors, then phrases."""
-
-    scene: str
-    generation: int
-    frame: str
-    unit: str
-    results: Sequence[Result]
-
-
-@dataclass(frozen=True)
-class Goal:
-    """A pose to stand in: the ground below the robot's middle, x forward, y left, z up (REP-103). Lengths in
-    metres."""
-
-    position_in_world: Sequence[float]
-    yaw_rad: float
-    orientation_xyzw: Sequence[float]
-    sensor_in_world: Sequence[float]
-    clearance_m: float
-    visible_share: float
-    path_m: float
-    distance_m: float
-    cost_m: float
-    geographic: Optional[Mapping[str, float]] = None
-
-
-@dataclass(frozen=True)
 class Goals:
     """Places to stand near a thing, best first, or why there is none."""
 
@@ -130,30 +52,6 @@ class Goals:
     none: Optional[Nothing]
     more: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """The whole reply as the robot sent it."""
-
-
-@dataclass(frozen=True)
-class Changed:
-    """A thing as it is, or as it was. `like`: the text that it is most like, with the cosine, if texts were
-    given."""
-
-    id: str
-    position_in_world: Sequence[float]
-    box_min_in_world: Sequence[float]
-    box_max_in_world: Sequence[float]
-    n_gaussians_in_scene: int
-    photo: str
-    geographic: Optional[Mapping[str, float]] = None
-    like: Optional[Mapping[str, Any]] = None
-
-
-@dataclass(frozen=True)
-class Moved:
-    """A thing that lies elsewhere."""
-
-    before: Changed
-    now: Changed
-    distance: float
 
 
 @dataclass(frozen=True)
@@ -218,31 +116,22 @@ def _is_loopback(url: str) -> bool:
         return False
 
 
-def _known(made: Any, members: Mapping[str, Any]) -> dict[str, Any]:
-    names = {of.name for of in fields(made)}
-    return {name: value for name, value in members.items() if name in names}
+_hints = lru_cache(maxsize=None)(get_type_hints)
 
 
-def _answer(members: Mapping[str, Any]) -> Answer:
-    related = tuple(Witness(**_known(Witness, witness)) for witness in members.get("related_to", ()))
-    return Answer(**{**_known(Answer, members), "related_to": related, "more": members})
-
-
-def _changed(members: Mapping[str, Any]) -> Changed:
-    return Changed(**_known(Changed, members))
-
-
-def _result(members: Mapping[str, Any]) -> Result:
-    none = members["none"]
-    return Result(
-        question=members["question"],
-        kind=members["kind"],
-        answers=tuple(_answer(answer) for answer in members["answers"]),
-        none=None if none is None else Nothing(**_known(Nothing, none)),
-        understood=members["understood"],
-        next_offset=members["next_offset"],
-        more=members,
-    )
+def _read(kind: Any, value: Any) -> Any:
+    """Makes a value of a type of the messages out of JSON."""
+    parts = [part for part in get_args(kind) if part is not type(None)]
+    if is_dataclass(kind):
+        hints = _hints(kind)
+        keys = {name: _NAMES.get(name, name) for name in hints}
+        made = {name: _read(hints[name], value[key]) for name, key in keys.items() if key in value}
+        return kind(**made, **({"more": value} if "more" in hints else {}))
+    if not parts or value is None:
+        return value
+    if get_origin(kind) is Union:
+        return _read(parts[0], value)
+    return tuple(_read(parts[0], one) for one in value) if is_dataclass(parts[0]) else value
 
 
 class Robot:
@@ -258,9 +147,8 @@ class Robot:
 
     def ask(self, **request: Any) -> Reply:
         """Asks anything that `POST /v1/query` takes: texts, vectors, phrases, region, near, limit ..."""
-        reply = self._send("/v1/query", request)
-        results = tuple(_result(result) for result in reply["results"])
-        return Reply(reply["scene"], reply["generation"], reply["frame"], reply["unit"], results)
+        reply: Reply = _read(Reply, self._send("/v1/query", request))
+        return reply
 
     def find(self, text: str, near: Optional[Point] = None, **request: Any) -> Result:
         """Asks for one text, which may name relations."""
@@ -304,9 +192,8 @@ class Robot:
         """Returns places to stand near a thing: by text, or by id="o...", with radius_m, reach_m,
         sensor_height_m ..."""
         reply = self._send("/v1/goal?" + urllib.parse.urlencode(_pairs(near, {"text": text, **parameters})))
-        goals = tuple(Goal(**_known(Goal, goal)) for goal in reply["goals"])
-        none = None if reply["none"] is None else Nothing(**_known(Nothing, reply["none"]))
-        return Goals(reply["generation"], reply["frame"], goals, none, reply)
+        goals: Goals = _read(Goals, reply)
+        return goals
 
     def floor(self, near: Optional[Point] = None, **parameters: Any) -> dict[str, Any]:
         """Returns the ground around the robot as `GET /v1/floor` describes it."""
@@ -318,11 +205,10 @@ class Robot:
         `texts`: kinds of things; each changed thing names the one that it is most like."""
         pairs = [("text", text) for text in texts] + _pairs(near, parameters)
         reply = self._send("/v1/changes?" + urllib.parse.urlencode(pairs))
-        things = {name: tuple(_changed(of) for of in reply[name]) for name in ("appeared", "went")}
-        moved = tuple(Moved(_changed(of["from"]), _changed(of["to"]), of["distance"]) for of in reply["moved"])
-        none = None if reply["none"] is None else Nothing(**_known(Nothing, reply["none"]))
         earlier = None if reply["from"] is None else reply["from"]["generation"]
-        return Changes(earlier, reply["to"]["generation"], reply["frame"], **things, moved=moved, none=none, more=reply)
+        generations = {"from_generation": earlier, "to_generation": reply["to"]["generation"]}
+        changes: Changes = _read(Changes, {**reply, **generations})
+        return replace(changes, more=reply)
 
     def events(self, timeout_secs: float = 60.0) -> Iterator[Event]:
         """Yields events as they happen. The robot is heard at least every 15 s; silence longer than that is an

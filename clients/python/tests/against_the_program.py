@@ -1,14 +1,21 @@
 """Checks the client against a running slag-edge: python3 against_the_program.py URL THING"""
 
+import json
 import sys
+import urllib.request
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
 
+import generate  # noqa: E402
 from slag_robot import Robot, SlagError, relation, thing  # noqa: E402
 
 
 def main(url: str, word: str) -> None:
+    with urllib.request.urlopen(f"{url}/openapi.json") as description:
+        messages = generate.module(json.load(description))
+    assert (ROOT / "slag_robot" / "messages.py").read_text() == messages, f"run generate.py {url}"
     robot = Robot(url)
     place = robot.map()
     things = list(robot.objects(limit=3))

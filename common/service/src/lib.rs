@@ -9,7 +9,7 @@
 //! | head | [`listener`] | length of the request head, and time for it |
 //! | request | [`request`], [`access`] | id, log line, counters, error body; `Host`, `Origin`, bearer token, CORS |
 //! | route | [`routes`] | path and method; type and length of a request body, and time for it |
-//! | handler | the service's own | parameters, admission of expensive work, the answer |
+//! | handler | [`params`], the service's own | parameters, admission of expensive work, the answer |
 //!
 //! [`openapi`] describes routes and their types for programs, [`replies`] what handlers return, [`listen`] has the
 //! addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags,
@@ -22,6 +22,7 @@ pub mod listen;
 pub mod listener;
 pub mod metrics;
 pub mod openapi;
+pub mod params;
 mod permits;
 pub mod problem;
 pub mod range;

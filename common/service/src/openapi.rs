@@ -3,6 +3,7 @@
 
 mod schemas;
 
+use std::fmt::Write;
 use std::sync::{Arc, OnceLock};
 
 use axum::http::header;
@@ -13,7 +14,10 @@ use serde_json::{Map, Value, json};
 use self::schemas::{Schemas, tidied};
 use crate::problem::ProblemBody;
 use crate::replies::As;
-use crate::routes::{Parameter, Place, Route, Routes, help};
+use crate::routes::{Parameter, Route, Routes};
+
+/// Column in which the help text's summaries begin.
+const SUMMARY_COLUMN: usize = 36;
 
 /// A service, as its description and help text name it.
 #[derive(Clone, Copy, Debug)]
@@ -82,9 +86,13 @@ fn operation(route: &Route, of_all: &[(u16, &'static str)], problem: &Value, sch
     if let Some(details) = route.details {
         operation["description"] = details.into();
     }
-    if !route.parameters.is_empty() {
-        operation["parameters"] =
-            route.parameters.iter().map(|parameter| described(parameter, schemas)).collect();
+    let query = query_of(route, schemas);
+    let takes_query = !query.is_empty();
+    let mut parameters: Vec<Value> =
+        route.parameters.iter().map(|parameter| described(parameter, schemas)).collect();
+    parameters.extend(query);
+    if !parameters.is_empty() {
+        operation["parameters"] = parameters.into();
     }
     let mut responses = Map::new();
     for reply in schemas.replies(route.replies) {
@@ -114,10 +122,10 @@ fn operation(route: &Route, of_all: &[(u16, &'static str)], problem: &Value, sch
             json!({ "required": true, "content": { "application/json": { "schema": schema } } });
         let of_bodies = OF_BODIES.iter().filter(|(status, _)| *status != 401 || !route.reads);
         of_bodies.for_each(|(status, description)| refuse(*status, description));
-    } else if route.parameters.iter().any(|parameter| parameter.place != Place::Header) {
+    } else if takes_query || route.parameters.iter().any(|parameter| parameter.place == "path") {
         refuse(400, "A parameter is invalid.");
     }
-    if route.query().next().is_some() {
+    if takes_query {
         // It is refused before anything can write a problem.
         let description = "The request's head is longer than the service takes.";
         responses.insert("431".into(), json!({ "description": description }));
@@ -127,24 +135,34 @@ fn operation(route: &Route, of_all: &[(u16, &'static str)], problem: &Value, sch
 }
 
 fn described(parameter: &Parameter, schemas: &mut Schemas) -> Value {
+    let Parameter { name, place, summary, limits, .. } = parameter;
     let mut schema = schemas.of_request(parameter.schema);
     if let Some(members) = schema.as_object_mut() {
-        members.extend(parameter.limits.clone());
+        members.extend(limits.clone());
     }
-    if let Some(most) = parameter.most {
-        schema = json!({ "type": "array", "items": schema, "maxItems": most });
-        if parameter.is_required {
-            schema["minItems"] = 1.into();
+    let is_required = *place == "path";
+    let description = sentence(summary);
+    json!({ "name": name, "in": place, "required": is_required, "description": description, "schema": schema })
+}
+
+/// Describes the parameters of a route's query string: the members of a struct, or of all structs of a tuple.
+fn query_of(route: &Route, schemas: &mut Schemas) -> Vec<Value> {
+    let Some(query) = route.query else { return Vec::new() };
+    let query = schemas.of_request(query);
+    let mut parameters = Vec::new();
+    for of in query["prefixItems"].as_array().unwrap_or(&vec![query.clone()]) {
+        let is_required =
+            |name: &str| of["required"].as_array().is_some_and(|all| all.contains(&name.into()));
+        for (name, schema) in of["properties"].as_object().into_iter().flatten() {
+            let mut schema = schema.clone();
+            let description = schema.as_object_mut().and_then(|members| members.remove("description"));
+            parameters.push(json!({
+                "name": name, "in": "query", "required": is_required(name), "description": description,
+                "schema": schema,
+            }));
         }
     }
-    let mut description = sentence(&parameter.summary);
-    if let Some(details) = parameter.details {
-        description = format!("{description} {details}").trim_start().to_owned();
-    }
-    json!({
-        "name": parameter.name, "in": parameter.place.name(), "required": parameter.is_required,
-        "description": description, "schema": schema,
-    })
+    parameters
 }
 
 /// The errors of every route with a body.
@@ -163,6 +181,35 @@ const OF_BODIES: [(u16, &str); 6] = [
 pub(crate) fn sentence(summary: &str) -> String {
     let mut letters = summary.chars();
     letters.next().map(|first| format!("{}{}.", first.to_uppercase(), letters.as_str())).unwrap_or_default()
+}
+
+/// Returns the text for people: every route and parameter.
+fn help(title: &str, table: &[Route]) -> String {
+    let mut text = format!("{title}\n\n");
+    let mut line = |what: String, summary: &str| {
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "{}", format!("{what:SUMMARY_COLUMN$} {summary}").trim_end());
+    };
+    for route in table {
+        line(format!("{} {}", route.method, route.path), route.summary);
+        for parameter in query_of(route, &mut Schemas::default()) {
+            let (name, schema) = (parameter["name"].as_str().unwrap_or_default(), &parameter["schema"]);
+            let example = schema["examples"][0].as_array().map_or(&schema["examples"][0], |list| &list[0]);
+            let default = schema.get("default").filter(|default| !default.is_array());
+            let default = default.map(|default| format!(" Default: {}.", shown(default)));
+            let description = parameter["description"].as_str().unwrap_or_default();
+            line(
+                format!("    {name}={}", shown(example)),
+                &format!("{description}{}", default.unwrap_or_default()),
+            );
+        }
+    }
+    text
+}
+
+/// Returns a value as a URL has it.
+fn shown(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
 #[cfg(test)]

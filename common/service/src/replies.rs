@@ -1,9 +1,11 @@
-//! What handlers return, as the description of the service says it.
+//! What handlers take and return, as the description of the service says it.
 
 use std::marker::PhantomData;
 
 use axum::Json;
-use axum::http::StatusCode;
+use axum::body::Bytes;
+use axum::extract::{Path, State};
+use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 
@@ -100,20 +102,47 @@ impl<D: Described> Described for As<D> {
     }
 }
 
-/// A handler that says what it returns.
+/// An argument of a handler, as the description of the service says it.
+pub trait Taken {
+    /// Describes the struct whose members are the parameters of the query string.
+    fn query() -> Option<SchemaOf> {
+        None
+    }
+}
+
+impl<T: Taken, E> Taken for Result<T, E> {
+    fn query() -> Option<SchemaOf> {
+        T::query()
+    }
+}
+
+impl<S> Taken for State<S> {}
+impl<T> Taken for Path<T> {}
+impl Taken for HeaderMap {}
+impl Taken for Method {}
+impl Taken for Bytes {}
+
+/// A handler that says what it takes and returns.
 pub trait Answering<T> {
     type Answer: Described;
+
+    /// Describes the struct whose members are the parameters of the query string.
+    fn query() -> Option<SchemaOf>;
 }
 
 macro_rules! answering {
     ($($argument:ident),*) => {
-        impl<F, Answer, Marker, $($argument),*> Answering<(Marker, $($argument,)*)> for F
+        impl<F, Answer, Marker, $($argument: Taken),*> Answering<(Marker, $($argument,)*)> for F
         where
             F: FnOnce($($argument),*) -> Answer,
             Answer: Future,
             Answer::Output: Described,
         {
             type Answer = Answer::Output;
+
+            fn query() -> Option<SchemaOf> {
+                None::<SchemaOf>$(.or_else($argument::query))*
+            }
         }
     };
 }

@@ -56,7 +56,8 @@ pub enum TlsError {
 /// The versions of both files, read without their content.
 type Stamps = [Option<(SystemTime, u64)>; 2];
 
-struct State {
+/// A certificate with its key, as last read.
+struct ReadPair {
     stamps: Stamps,
     key: Arc<CertifiedKey>,
 }
@@ -65,7 +66,7 @@ struct State {
 struct Certificate {
     files: TlsFiles,
     provider: Arc<CryptoProvider>,
-    state: Mutex<State>,
+    state: Mutex<ReadPair>,
 }
 
 /// Makes TLS connections out of accepted ones.
@@ -83,7 +84,7 @@ impl Tls {
     pub fn open(files: TlsFiles) -> Result<Self, TlsError> {
         let provider = Arc::new(ring::default_provider());
         let stamps = stamps_of(&files);
-        let state = Mutex::new(State { stamps, key: Arc::new(read(&files, &provider)?) });
+        let state = Mutex::new(ReadPair { stamps, key: Arc::new(read(&files, &provider)?) });
         let certificate = Arc::new(Certificate { files, provider: Arc::clone(&provider), state });
         let config = versions(provider).with_no_client_auth().with_cert_resolver(certificate);
         Ok(Self(TlsAcceptor::from(Arc::new(config))))

@@ -7,7 +7,7 @@ use crate::query::{
     AnswerKind, Answers, DEFAULT_MIN_COUNT, Format, Found, Negatives, QueryRequest, Reply, ThresholdSource,
     parse_box, parse_point,
 };
-use crate::score::{Budget, Precision};
+use crate::score::{Ball, Budget, Precision, Region};
 use clap::Args;
 use glam::DVec3;
 use slag_common::frames::Aabb;
@@ -74,27 +74,26 @@ pub struct QueryArgs {
 }
 
 pub fn run(args: QueryArgs) -> Result<(), Failure> {
+    let around = args.near.zip(args.radius);
+    let ball = around.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
     let request = QueryRequest {
-        texts: vec![args.text],
         negatives: args.negatives,
         limit: args.limit,
         threshold: args.threshold,
         near: args.near,
-        radius: args.radius,
-        ball: None,
-        bounds: args.bounds,
-        polygon: None,
+        region: Region { ball, bounds: args.bounds, polygon: None },
         kind: args.kind,
         voxel: args.voxel,
         min_count: args.min_count,
         precision: args.precision,
         members: args.ply.is_some(),
+        ..QueryRequest::new(args.text)
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
-    let reply = engine.answer(&request, &Budget::default())?;
+    let reply = engine.answer(request, &Budget::default())?;
     if let Some(path) = &args.ply {
         write_ply(&reply, path)?;
     }
@@ -121,7 +120,7 @@ fn write_json(reply: Reply) -> Result<(), Failure> {
 
 /// Prints a reply's answers as tables, and notes about them on stderr.
 fn print_reply(reply: &Reply) -> Result<(), Failure> {
-    reply.answers.iter().try_for_each(|answers| print_answers(reply, answers))
+    reply.answers().try_for_each(|answers| print_answers(reply, answers))
 }
 
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
@@ -129,29 +128,30 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
         writeln!(io::stderr(), "{}", reason.detail)?;
         return Ok(());
     }
-    let exactness = match answers.is_exact {
+    let found = &answers.searched;
+    let exactness = match found.is_exact {
         true => "exactly".to_owned(),
-        false => match answers.score_error_likely {
+        false => match found.score_error_likely {
             Some(likely) => format!(
                 "99 of 100 scores within ±{likely:.3} (for 95 of 100 questions), all within ±{:.3}",
-                answers.score_error_bound
+                found.score_error_bound
             ),
-            None => format!("scores within ±{:.3}", answers.score_error_bound),
+            None => format!("scores within ±{:.3}", found.score_error_bound),
         },
     };
-    let (n, threshold) = (answers.n_matching, answers.threshold);
-    let source = match answers.threshold_source {
+    let (n, threshold) = (found.n_matching, found.threshold);
+    let source = match found.threshold_source {
         ThresholdSource::Request => "as requested",
         ThresholdSource::Scene => "calibrated on the scene",
         ThresholdSource::Encoder => "the encoder's default",
         ThresholdSource::Relevancy => "closer than any negative",
     };
-    let searched = answers.n_searched;
+    let searched = found.n_searched;
     writeln!(io::stderr(), "{n} Gaussians of {searched} reach {threshold}, {source} ({exactness})")?;
-    if answers.area_fetched == Some(false) {
+    if found.area_fetched == Some(false) {
         writeln!(io::stderr(), "part of that area is not on board; fetch it for a complete answer")?;
     }
-    for bad in &answers.bad_cells {
+    for bad in &found.bad_cells {
         let id = bad.cell_id;
         match bad.generation {
             Some(old) => {

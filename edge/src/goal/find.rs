@@ -8,7 +8,7 @@ use super::error::GoalError;
 use super::reply::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use super::request::{GoalRequest, GoalTarget};
 use super::surroundings::{START_M, Surroundings};
-use crate::query::{Ask, Asked, Engine, Outcome, Point, QueryRequest, object_id, relations};
+use crate::query::{Ask, Engine, Outcome, Point, object_id};
 use crate::score::Budget;
 use crate::store::Snapshot;
 
@@ -112,16 +112,9 @@ fn things(
         }
         GoalTarget::Text(text) => text,
     };
-    let phrase = relations::understand(text).filter(|phrase| phrase.check().is_ok());
-    let ask = Ask {
-        asked: vec![phrase.map_or_else(|| Asked::Text(text.clone()), Asked::Phrase)],
-        request: QueryRequest { limit: Some(MAX_THINGS), ..QueryRequest::new("") },
-        area: Default::default(),
-        near: Some(Point::World(near.to_array())),
-        heading_rad: None,
-        offset: 0,
-    };
-    let found = engine.ask(&ask, budget)?;
+    let near = Some(Point::World(near.to_array()));
+    let ask = Ask { texts: vec![text.clone()], near, limit: Some(MAX_THINGS), ..Ask::default() };
+    let found = engine.ask(ask, budget)?;
     let thing = |answer: &crate::query::ClusterAnswer| {
         let thing = TargetThing {
             id: answer.id.clone(),

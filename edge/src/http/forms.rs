@@ -1,107 +1,115 @@
-//! Parameters that several routes have, and the forms of their values.
+//! Values of parameters that have a form of their own, and parameters that several routes have.
 
-use schemars::JsonSchema;
-use slag_service::routes::Parameter;
+use glam::DVec3;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::de::{Deserialize, Deserializer, Error};
+use slag_common::frames::Aabb;
 
-use crate::query::{DEFAULT_MIN_COUNT, OBJECT_ID, RELEVANCY_THRESHOLD};
-use crate::score::{MAX_COORDINATE, MAX_CORNERS, Precision};
-use crate::text::MAX_TEXT_BYTES;
+use crate::query::{
+    Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, object_id, parse_box, parse_point,
+};
+use crate::score::MAX_CORNERS;
 
 /// A number as it stands between commas.
 const NUMBER: &str = r"-?[0-9]{1,9}(\.[0-9]{1,9})?";
 /// A latitude and a longitude.
 const LAT_LON: &str = r"-?[0-8]?[0-9](\.[0-9]{1,9})?,-?(1[0-7][0-9]|[0-9]{1,2})(\.[0-9]{1,9})?";
 
-/// At most 512 bytes of UTF-8, without control characters.
-#[derive(JsonSchema)]
-#[schemars(rename = "Text")]
-#[expect(dead_code, reason = "the schema of texts, which handlers take as strings")]
-pub struct Words(
-    #[schemars(
-        length(min = 1, max = MAX_TEXT_BYTES),
-        regex(
-            pattern = r"^[^\u0000-\u001f\u007f-\u009f]*[^\s\u0000-\u001f\u007f-\u009f][^\u0000-\u001f\u007f-\u009f]*$"
-        )
-    )]
-    String,
-);
+/// Defines types of texts of a form: the value, the form as a regular expression, and the parser.
+macro_rules! texts {
+    ($($name:ident($value:ty), $form:expr, $parse:expr;)+) => { $(
+        pub struct $name(pub $value);
 
-/// Returns the form of `n` numbers with commas between them.
-fn numbers(n: usize) -> String {
-    format!("^{NUMBER}(,{NUMBER}){{{}}}$", n - 1)
+        impl<'de> Deserialize<'de> for $name {
+            fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+                $parse(&String::deserialize(from)?).map(Self).map_err(D::Error::custom)
+            }
+        }
+
+        impl JsonSchema for $name {
+            fn inline_schema() -> bool {
+                true
+            }
+
+            fn schema_name() -> std::borrow::Cow<'static, str> {
+                stringify!($name).into()
+            }
+
+            fn json_schema(_: &mut SchemaGenerator) -> Schema {
+                json_schema!({ "type": "string", "pattern": $form })
+            }
+        }
+    )+ };
 }
 
-/// The parameter `text`.
-pub fn text(example: &'static str, summary: &str) -> Parameter {
-    Parameter::new::<Words>("text", example, summary)
+texts! {
+    XyzText(DVec3), several(NUMBER, 3, 3), parse_point;
+    LatLonText(LatLon), format!("^{LAT_LON}(,{NUMBER})?$"), lat_lon;
+    BoxText(Aabb), several(NUMBER, 6, 6), parse_box;
+    PolygonText(Vec<Corner>), several(&format!("{NUMBER},{NUMBER}"), 3, MAX_CORNERS), polygon;
+    LatLonPolygonText(Vec<Corner>), several(LAT_LON, 3, MAX_CORNERS), lat_lon_polygon;
+    ObjectIdText(u64), OBJECT_ID, id;
+    NegativesText(Negatives), r"^[^\u0000-\u001f\u007f-\u009f]+$", str::parse;
 }
 
-/// The parameter `id`: an object's.
-pub fn object_id(name: &'static str, summary: &str) -> Parameter {
-    Parameter::new::<String>(name, "o0123456789abcdef", summary).of_form(OBJECT_ID)
+/// Returns the form of `least` to `most` values with commas between them.
+fn several(value: &str, least: usize, most: usize) -> String {
+    format!("^{value}(,{value}){{{},{}}}$", least - 1, most - 1)
 }
 
-/// The parameter `near`.
-pub fn near(summary: &str) -> Parameter {
-    Parameter::new::<String>("near", "x,y,z", summary).of_form(numbers(3))
+fn numbers(text: &str) -> Option<Vec<f64>> {
+    text.split(',').map(|number| number.trim().parse().ok()).collect()
 }
 
-/// The parameter `near_lat_lon`.
-pub fn near_lat_lon() -> Parameter {
-    Parameter::new::<String>("near_lat_lon", "lat,lon", "the same on the earth, or lat,lon,height")
-        .details("WGS 84; for scenes with a place on the earth.")
-        .of_form(format!("^{LAT_LON}(,{NUMBER})?$"))
+fn lat_lon(text: &str) -> Result<LatLon, &'static str> {
+    match numbers(text).as_deref() {
+        Some([lat, lon]) => Ok(LatLon { lat: *lat, lon: *lon, height: None }),
+        Some([lat, lon, height]) => Ok(LatLon { lat: *lat, lon: *lon, height: Some(*height) }),
+        _ => Err("lat,lon or lat,lon,height"),
+    }
 }
 
-/// A length, world units.
-pub fn length(name: &'static str, example: &'static str, summary: &str) -> Parameter {
-    Parameter::new::<f64>(name, example, summary)
-        .limit("exclusiveMinimum", 0)
-        .limit("maximum", MAX_COORDINATE)
+fn polygon(text: &str) -> Result<Vec<Corner>, &'static str> {
+    Ok(pairs(text)?.into_iter().map(Corner::World).collect())
 }
 
-/// The parameter `box`.
-pub fn bounds() -> Parameter {
-    Parameter::new::<String>("box", "x,y,z,x,y,z", "only between two opposite corners").of_form(numbers(6))
+fn lat_lon_polygon(text: &str) -> Result<Vec<Corner>, &'static str> {
+    let corner = |[lat, lon]: [f64; 2]| Corner::Geographic(LatLon { lat, lon, height: None });
+    Ok(pairs(text)?.into_iter().map(corner).collect())
 }
 
-/// The parameter `polygon`.
-pub fn polygon() -> Parameter {
-    let corner = format!("{NUMBER},{NUMBER}");
-    Parameter::new::<String>("polygon", "x,y,x,y,x,y", "only inside this outline, seen from above")
-        .details("3 to 256 corners.")
-        .of_form(format!("^{corner}(,{corner}){{2,{}}}$", MAX_CORNERS - 1))
+fn pairs(text: &str) -> Result<Vec<[f64; 2]>, &'static str> {
+    let numbers = numbers(text).filter(|numbers| numbers.len() % 2 == 0);
+    let numbers = numbers.ok_or("pairs of numbers, separated by commas")?;
+    Ok(numbers.chunks_exact(2).map(|pair| [pair[0], pair[1]]).collect())
 }
 
-/// The parameter `polygon_lat_lon`.
-pub fn polygon_lat_lon() -> Parameter {
-    Parameter::new::<String>("polygon_lat_lon", "lat,lon,...", "the same on the earth")
-        .of_form(format!("^{LAT_LON}(,{LAT_LON}){{2,{}}}$", MAX_CORNERS - 1))
+fn id(text: &str) -> Result<u64, &'static str> {
+    object_id(text).ok_or("o and 16 hex digits")
 }
 
-/// The parameter for the least score of a match.
-pub fn least_score(name: &'static str) -> Parameter {
-    let summary = format!(
-        "least cosine, or with negatives least relevancy, of a match (default: the scene's, or {RELEVANCY_THRESHOLD})"
-    );
-    Parameter::new::<f32>(name, "0.1", summary).within(-1, 1)
+/// Returns the point that is given in one of two ways.
+///
+/// # Errors
+/// It is given in both.
+pub fn point(near: Option<XyzText>, near_lat_lon: Option<LatLonText>) -> Result<Option<Point>, RequestError> {
+    let world = near.map(|XyzText(point)| Point::World(point.to_array()));
+    match (world, near_lat_lon.map(|LatLonText(point)| Point::Geographic(point))) {
+        (Some(_), Some(_)) => Err(RequestError::new("near_lat_lon", "near as well", "one of the two")),
+        (world, geographic) => Ok(world.or(geographic)),
+    }
 }
 
-/// The parameter `voxel`.
-pub fn voxel() -> Parameter {
-    length("voxel", "v", "edge of the voxels that join Gaussians to clusters, world units")
-}
-
-/// The parameter `min_count`.
-pub fn min_count() -> Parameter {
-    Parameter::new::<u64>("min_count", "n", "least Gaussians of an answer; smaller clusters are counted")
-        .limit("minimum", 1)
-        .or(DEFAULT_MIN_COUNT)
-}
-
-/// The parameter `precision`.
-pub fn precision() -> Parameter {
-    let names = Precision::ALL.map(Precision::name).join(", ");
-    Parameter::new::<Precision>("precision", "measured", format!("data that scores come from: {names}"))
-        .or(Precision::default().name())
+/// Returns the ball of a point and a radius, both of which may be absent.
+///
+/// # Errors
+/// One is there without the other, or the radius is not positive.
+pub fn ball<P>(near: Option<P>, radius: Option<f64>) -> Result<Option<(P, f64)>, RequestError> {
+    match (near, radius) {
+        (None, None) => Ok(None),
+        (Some(near), Some(radius)) if radius > 0.0 && radius.is_finite() => Ok(Some((near, radius))),
+        (Some(_), Some(radius)) => Err(RequestError::new("radius", &radius.to_string(), "more than 0")),
+        (None, Some(_)) => Err(RequestError::new("near", "nothing", "x,y,z, because there is a radius")),
+        (Some(_), None) => Err(RequestError::new("radius", "nothing", "a number, because there is near")),
+    }
 }

@@ -1,10 +1,10 @@
 //! The robot's own HTTP service: questions, status, health and metrics.
 
 mod app;
+mod ask;
 mod follower;
 mod forms;
 mod metrics;
-mod params;
 mod position;
 mod problem;
 mod query;

@@ -12,7 +12,7 @@ use slag_service::problem::Problem;
 use slag_service::replies::{As, Described, Reply};
 
 use super::app::App;
-use super::problem::{follower_failed, not_following, parameter_problem};
+use super::problem::{follower_failed, not_following};
 use crate::fetch::NotAPosition;
 use crate::fetch::Position;
 use crate::query::RequestError;
@@ -38,7 +38,7 @@ impl Described for Accepted {
 pub async fn position(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Accepted>, Problem> {
     let Some(following) = &app.following else { return Err(not_following()) };
     let text = String::from_utf8_lossy(&body);
-    let refused = |e: NotAPosition| parameter_problem(RequestError::new("body", &e.found, EXPECTED));
+    let refused = |e: NotAPosition| RequestError::new("body", &e.found, EXPECTED);
     let position: Position = text.parse().map_err(refused)?;
     // Kept even if nobody follows just now: the next follower starts from it.
     following.post(position);

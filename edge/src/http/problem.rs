@@ -7,6 +7,7 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::Hash32;
 use slag_models::InferenceError;
+use slag_service::params::ParameterMembers;
 use slag_service::problem::Problem;
 
 use crate::query::{QueryError, RequestError};
@@ -42,15 +43,8 @@ pub const NO_PLACES: (u16, &str) =
 /// What this service's problems tell beyond RFC 9457.
 #[derive(Default, Serialize, JsonSchema)]
 pub struct Members {
-    /// The parameter that is refused.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    parameter: Option<String>,
-    /// Its value.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    found: Option<String>,
-    /// Values that are taken.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    expected: Option<String>,
+    #[serde(flatten)]
+    parameter: ParameterMembers,
     /// Words that the model knows.
     #[serde(skip_serializing_if = "Option::is_none")]
     suggestions: Option<Vec<String>>,
@@ -111,18 +105,6 @@ pub fn follower_failed(failure: &str) -> Problem {
         .retry_after(FOLLOWER_RETRY_SECS)
 }
 
-/// Returns the problem of a parameter that is refused.
-pub fn parameter_problem(error: RequestError) -> Problem {
-    Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", error.to_string()).with(
-        &Members {
-            parameter: Some(error.parameter),
-            found: Some(error.found),
-            expected: Some(error.expected),
-            ..Members::default()
-        },
-    )
-}
-
 /// Returns the problem of a query that has no answer.
 pub fn query_problem(error: QueryError) -> Problem {
     let (kind, detail) = (error.kind(), error.to_string());
@@ -132,15 +114,17 @@ pub fn query_problem(error: QueryError) -> Problem {
     let parameter = if matches!(error, QueryError::Negatives(_)) { "negatives" } else { "text" };
     let unknown_words = |found: String, expected: String, suggestions: Vec<String>| {
         Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Unknown words", detail.clone()).with(&Members {
-            parameter: Some(parameter.into()),
-            found: Some(found),
-            expected: Some(expected),
+            parameter: ParameterMembers {
+                parameter: Some(parameter.into()),
+                found: Some(found),
+                expected: Some(expected),
+            },
             suggestions: Some(suggestions),
             ..Members::default()
         })
     };
     match error {
-        QueryError::Request(error) => parameter_problem(error),
+        QueryError::Request(error) => error.into(),
         QueryError::NoScene => unavailable("No scene"),
         QueryError::Text(TextError::Busy) | QueryError::Negatives(TextError::Busy) => {
             unavailable("Overloaded")
@@ -160,11 +144,9 @@ pub fn query_problem(error: QueryError) -> Problem {
         }
         QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
             match error {
-                InferenceError::EmptyText => parameter_problem(RequestError::new(
-                    parameter,
-                    "nothing to look for",
-                    "words to look for",
-                )),
+                InferenceError::EmptyText => {
+                    RequestError::new(parameter, "nothing to look for", "words to look for").into()
+                }
                 InferenceError::UnknownPhrase { text, n_known, near } => {
                     unknown_words(text, format!("one of {n_known} phrases"), near)
                 }

@@ -1,4 +1,4 @@
-//! `GET /query`: short answers whole, long ones piece by piece.
+//! `GET /query`, `GET` and `POST /v1/query`: short answers whole, long ones piece by piece.
 
 use std::io;
 use std::pin::Pin;
@@ -7,67 +7,86 @@ use std::sync::atomic::Ordering;
 use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
+use axum::Json;
 use axum::body::{Body, Bytes};
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Query, State};
+use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, Uri, header};
+use axum::response::Response;
 use hyper::body::Frame;
 use schemars::SchemaGenerator;
+use slag_service::params::Params;
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Binary, Described, Reply};
 use tokio::sync::mpsc::{Receiver, Sender, channel};
 
 use super::app::App;
-use super::params;
-use super::problem::{parameter_problem, query_problem};
-use crate::query::{AnswersOrBatch, Format, QueryRequest, RequestError};
+use super::ask::{AskParams, ShortParams};
+use super::problem::query_problem;
+use crate::query::{AnswersOrBatch, Ask, Format, Page, RequestError};
 
+/// Longest body: 32 vectors of 2048 components as text.
+pub const MAX_BODY_BYTES: usize = 1 << 20;
 /// Pieces made ahead of the client.
 const PIECES_AHEAD: usize = 2;
 
+#[cfg(feature = "arrow")]
 const ARROW: &str = "Columns question (u32, of a batch), x, y, z (f64), score (f32), cell, index (u32). Metadata: scene, generation, frame, unit, score_kind, threshold, score_error_bound, questions (JSON: Answers of each text, without answers), geo_reference.";
 const PLY: &str = "format=ply: a binary little-endian PLY with an element vertex of uint question (of a batch), answer (rank of the answer, from 1), double x, y, z, float score, uint cell, index, and input_index (in the input splat file) if every shard knows it. Comments: text, scene, generation, unit.";
 
-type Pairs = Query<Vec<(String, String)>>;
-
-fn no_pairs(found: &str) -> RequestError {
-    RequestError::new("query string", found, "name=value pairs")
-}
-
-/// Reads the query string of `/query`; [`QueryRequest::check`] checks the values.
+/// Reads the query string of `/query`, without the checks that a scene is needed for.
 ///
 /// # Errors
 /// The first wrong parameter, or the string if it is no query string.
-pub fn parse_query(query_string: &str) -> Result<QueryRequest, RequestError> {
+pub fn parse_query(query_string: &str) -> Result<Ask, RequestError> {
     let uri: Result<Uri, _> = format!("/query?{query_string}").parse();
-    let uri = uri.map_err(|e| no_pairs(&e.to_string()))?;
-    let pairs = Pairs::try_from_uri(&uri).map_err(|e| no_pairs(&e.body_text()))?;
-    Ok(params::parse(&pairs, &HeaderMap::new())?.0)
+    let uri = uri.map_err(|e| RequestError::new("query string", &e.to_string(), "name=value pairs"))?;
+    let (params, short) = Params::<(AskParams, ShortParams)>::parse(&uri)?;
+    short.ask(params, &HeaderMap::new())
 }
 
-pub async fn query(
+pub async fn short(
     State(app): State<Arc<App>>,
     headers: HeaderMap,
-    pairs: Result<Pairs, QueryRejection>,
+    params: Result<Params<(AskParams, ShortParams)>, Problem>,
 ) -> Result<As<Formats>, Problem> {
+    let ask = params.and_then(|Params((params, short))| Ok(short.ask(params, &headers)?));
+    answer(&app, ask).await.map(As::new)
+}
+
+pub async fn get(
+    State(app): State<Arc<App>>,
+    params: Result<Params<AskParams>, Problem>,
+) -> Result<As<Json<Page<'static>>>, Problem> {
+    answer(&app, params.and_then(|Params(params)| Ok(params.ask()?))).await.map(As::new)
+}
+
+pub async fn post(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Json<Page<'static>>>, Problem> {
+    let ask = serde_json::from_slice(&body).map_err(|e| {
+        RequestError::new("body", &e.to_string(), "a request as GET /openapi.json describes it").into()
+    });
+    answer(&app, ask).await.map(As::new)
+}
+
+async fn answer(app: &Arc<App>, ask: Result<Ask, Problem>) -> Result<Response, Problem> {
     let started = Instant::now();
-    let answer = answer(&app, &headers, pairs).await;
+    let answer = match ask {
+        Ok(ask) => answer_within_limits(app, ask).await,
+        Err(problem) => Err(problem),
+    };
     app.metrics.query_times.observe(started.elapsed());
     answer
 }
 
-async fn answer(
-    app: &Arc<App>,
-    headers: &HeaderMap,
-    pairs: Result<Pairs, QueryRejection>,
-) -> Result<As<Formats>, Problem> {
-    let Query(pairs) = pairs.map_err(|e| parameter_problem(no_pairs(&e.body_text())))?;
-    let (request, format) = params::parse(&pairs, headers).map_err(parameter_problem)?;
-    request.check().map_err(parameter_problem)?;
-    let answering = app.within_limits(None, move |app, budget| {
-        let reply = app.engine.answer(&request, budget).map_err(query_problem)?;
-        let n_empty = reply.answers.iter().filter(|answers| answers.answers.is_empty()).count();
+async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Problem> {
+    let format = ask.format;
+    // Before time runs: a budget of nothing is refused, not overrun.
+    let answering = app.within_limits(ask.time_budget()?, move |app, budget| {
+        let reply = app.engine.ask(ask, budget).map_err(query_problem)?;
+        let n_empty = reply.outcomes.iter().filter(|outcome| outcome.is_empty()).count();
         app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
+        let Some(format) = format else {
+            return Ok((serde_json::to_vec(&Page::of(&reply)).map_err(Problem::internal)?, None));
+        };
         let mut pieces = reply.pieces(format).peekable();
         let first = pieces.next().transpose().map_err(Problem::internal)?.unwrap_or_default();
         let is_whole = pieces.peek().is_none();
@@ -87,7 +106,10 @@ async fn answer(
             Body::new(Pieces { receiver, is_complete: false })
         }
     };
-    Ok(As::new(([(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()))], body)))
+    let mut response = Response::new(body);
+    let media_type = HeaderValue::from_static(format.unwrap_or_default().media_type());
+    response.headers_mut().insert(header::CONTENT_TYPE, media_type);
+    Ok(response)
 }
 
 /// Answers in any format of this build.
@@ -95,22 +117,18 @@ pub struct Formats;
 
 impl Described for Formats {
     fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
-        let formats = Format::available().iter().map(|format| {
-            let mut bytes = Binary::schema();
-            let schema = match format {
-                Format::Json => schemas.subschema_for::<AnswersOrBatch>(),
-                Format::Arrow => {
-                    bytes.insert("description".into(), ARROW.into());
-                    bytes
-                }
-                Format::Ply => {
-                    bytes.insert("description".into(), PLY.into());
-                    bytes
-                }
-            };
-            (format.media_type(), schema)
-        });
-        vec![Reply { content: formats.collect(), ..Reply::ok("", Binary::schema()) }]
+        let bytes = |description: &str| {
+            let mut schema = Binary::schema();
+            schema.insert("description".into(), description.into());
+            schema
+        };
+        let content = vec![
+            (Format::Json.media_type(), schemas.subschema_for::<AnswersOrBatch>()),
+            #[cfg(feature = "arrow")]
+            (Format::Arrow.media_type(), bytes(ARROW)),
+            (Format::Ply.media_type(), bytes(PLY)),
+        ];
+        vec![Reply { content, ..Reply::ok("", Binary::schema()) }]
     }
 }
 

@@ -11,8 +11,8 @@ use slag_service::request::observed;
 use slag_service::routes::{Route, Routes};
 
 use super::app::App;
-use super::problem::{Members, SCENE, TEXTS};
-use super::{params, position, query, status, v1};
+use super::problem::{Members, SCENE, TEXTS, TIME_BUDGET};
+use super::{position, query, status, v1};
 use crate::fetch::Spoken;
 
 /// This service, as its help text and description name it.
@@ -26,11 +26,13 @@ pub(super) const ABOUT: About = About {
 
 fn routes() -> Routes<Arc<App>> {
     v1::routes(Routes::default())
-        .get("/query", "objects, clusters or Gaussians that match texts, best first", query::query)
-        .details("Long answers are sent in chunks; a cut-off answer ends without the last chunk.")
-        .parameters(params::parameters())
+        .get("/query", "objects, clusters or Gaussians that match texts, best first", query::short)
+        .details(
+            "The same as /v1/query, with answers that come at once, to texts as they are. Long answers are sent in chunks; a cut-off answer ends without the last chunk.",
+        )
         .errors(&SCENE)
         .errors(&TEXTS)
+        .errors(&[TIME_BUDGET])
         .get(
             "/status",
             "scene, generation, encoder, shards, and whether the scene is past its expiry",

@@ -185,7 +185,7 @@ async fn refusals_are_problem_details() {
         );
         for member in ["type", "title", "detail", "found", "expected"] {
             assert!(
-                body[member].as_str().is_some_and(|text| !text.is_empty() && text.len() < 200),
+                body[member].as_str().is_some_and(|text| !text.is_empty() && text.len() < 300),
                 "{shown}: {body}"
             );
         }

@@ -3,14 +3,14 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, Whole};
+use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, Searched, Whole};
 use super::cluster::{Cluster, Grouping, cluster};
 use super::extent::Extent;
 use super::frame::unit;
 use super::objects::{self, FoundObject};
 use super::rank::{Order, Ranked};
 use super::reason;
-use super::request::{AnswerKind, DEFAULT_LIMIT, QueryRequest};
+use super::request::{AnswerKind, QueryRequest};
 use super::scale::Scale;
 use super::scene::{Scene, alignment, default_voxel};
 use super::threshold::ThresholdSource;
@@ -20,8 +20,8 @@ use crate::score::{
 use crate::store::{BadCell, cell_of};
 use slag_common::manifest::Manifest;
 
-/// Answers a checked request about a scene: one answer for each question, in their order. `questions`: the
-/// vectors of the request's texts, each with those of its negatives.
+/// Answers a checked request about a scene: one answer for each question, in their order. `questions`: their
+/// names, and their vectors, each with those of its negatives.
 ///
 /// The same scene, vectors and request give the same answers for any number of threads, asked alone or
 /// together. `scratch`: buffers of earlier answers, or new ones, and what the request may use.
@@ -30,10 +30,10 @@ use slag_common::manifest::Manifest;
 pub fn answer(
     scratch: &mut Scratch,
     scene: &Scene<'_>,
-    questions: &[Question],
+    (labels, questions): (&[&str], &[Question]),
     request: &QueryRequest,
 ) -> Result<Vec<Answers>, ScoreError> {
-    let asked = request.texts.iter().map(String::as_str).zip(questions);
+    let asked = labels.iter().copied().zip(questions);
     let kind = request.kind.unwrap_or(if scene.index.is_empty() {
         AnswerKind::Clusters
     } else {
@@ -51,7 +51,8 @@ pub fn answer(
         };
         return asked.zip(&scored).map(answer).collect();
     }
-    let searches = Search::batch(scratch, scene.shards, questions, request.region(), request.precision)?;
+    let searches =
+        Search::batch(scratch, scene.shards, questions, request.region.clone(), request.precision)?;
     let budget = scratch.budget();
     let answer = |((text, question), search)| {
         let used_bytes = budget.used_bytes();
@@ -72,11 +73,11 @@ fn answer_objects(
     budget: &Budget,
     request: &QueryRequest,
 ) -> Answers {
-    let (manifest, scale, region) = (scene.manifest, Scale::of(question), request.region());
+    let (manifest, scale, region) = (scene.manifest, Scale::of(question), &request.region);
     let calibration = objects::calibration(scene.objects);
     let threshold = scale.threshold(request, manifest, calibration);
     let of_score = scale.to_score(threshold.0);
-    let found = objects::matching(scene, &scored.scores, of_score, &region, request.min_count);
+    let found = objects::matching(scene, &scored.scores, of_score, region, request.min_count);
     let n_matching = found.iter().map(|object| object.n_gaussians).sum();
     let key = |object: &FoundObject<'_>| (scale.shown(object.score), object.extent().position_in_world);
     let order = Order::new(scale.base(calibration), manifest, request);
@@ -87,19 +88,23 @@ fn answer_objects(
     let described = ranked.into_par_iter().filter_map(|ranked| {
         let bytes = ranked.found.n_gaussians as usize * of_gaussian + size_of::<ClusterAnswer>();
         let score = scale.shown(ranked.found.score);
-        budget.take(bytes).then(|| object_answer(scene, ranked, score, &region, request.members))
+        budget.take(bytes).then(|| object_answer(scene, ranked, score, region, request.members))
     });
     let found = Found::Clusters(described.collect());
     let best = objects::best(&scored.scores);
     let best = best.map(|best| (scale.shown(scored.scores[best]), objects::record(scene, best).position()));
-    let searched = scene.shards.iter().filter(|shard| region.touches(&shard.position_box()));
+    let shards = scene.shards.iter().filter(|shard| region.touches(&shard.position_box()));
+    let empty = empty(scene, (text, AnswerKind::Objects), scale, threshold, request);
     Answers {
-        n_searched: searched.map(|shard| shard.n_with_evidence() as u64).sum(),
-        n_matching,
-        score_error_bound: scale.error_bound(scored.error_bound),
+        searched: Searched {
+            n_searched: shards.map(|shard| shard.n_with_evidence() as u64).sum(),
+            n_matching,
+            score_error_bound: scale.error_bound(scored.error_bound),
+            ..empty.searched
+        },
         reason: found.is_empty().then(|| reason::of_objects(request, threshold.0, best)),
         answers: found,
-        ..empty(scene, (text, AnswerKind::Objects), scale, threshold, request)
+        ..empty
     }
 }
 
@@ -119,7 +124,7 @@ fn answer_gaussians(
     let mut clustering = None;
     let n_matching;
     let found = if kind == AnswerKind::Gaussians {
-        let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
+        let limit = request.n_ranked();
         budget
             .take(limit.min(search.searched().map(|shard| shard.n_with_evidence()).sum()) * size_of::<Hit>());
         let mut hits = search.best(limit, score_threshold, request.near);
@@ -160,16 +165,20 @@ fn answer_gaussians(
     // With negatives a score is the difference of two products.
     let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
     let measured = search.measured_errors();
+    let empty = empty(scene, (text, kind), scale, (threshold, threshold_source), request);
     Answers {
-        n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
-        n_matching,
-        is_exact: search.is_exact(),
-        score_error_bound,
-        score_error_likely: measured.map(|errors| scale.error_bound(n_products * errors.likely)),
-        clustering,
+        searched: Searched {
+            n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
+            n_matching,
+            is_exact: search.is_exact(),
+            score_error_bound,
+            score_error_likely: measured.map(|errors| scale.error_bound(n_products * errors.likely)),
+            clustering,
+            ..empty.searched
+        },
         reason: found.is_empty().then(|| reason::of_gaussians(search, scale, request, threshold, n_matching)),
         answers: found,
-        ..empty(scene, (text, kind), scale, (threshold, threshold_source), request)
+        ..empty
     }
 }
 
@@ -182,14 +191,9 @@ fn empty(
     request: &QueryRequest,
 ) -> Answers {
     let manifest = scene.manifest;
-    let bad_cells = bad_cells(scene, &request.region());
-    Answers {
-        text: text.to_owned(),
+    let bad_cells = bad_cells(scene, &request.region);
+    let searched = Searched {
         negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
-        kind,
-        scene: manifest.scene.clone(),
-        generation: manifest.generation,
-        unit: unit(manifest),
         score_kind: scale.0,
         threshold,
         threshold_source,
@@ -202,6 +206,14 @@ fn empty(
             .map(|is_fetched| is_fetched && bad_cells.iter().all(|bad| bad.generation.is_some())),
         bad_cells,
         clustering: None,
+    };
+    Answers {
+        text: text.to_owned(),
+        kind,
+        scene: manifest.scene.clone(),
+        generation: manifest.generation,
+        unit: unit(manifest),
+        searched,
         reason: None,
         answers: Found::Clusters(Vec::new()),
     }
@@ -219,7 +231,7 @@ fn bad_cells(scene: &Scene<'_>, region: &Region) -> Vec<BadCellAnswer> {
 /// Returns whether the whole region asked for was fetched: certainly if all of the ball or all of the box
 /// was, since only their intersection is asked for.
 fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Option<bool> {
-    let region = request.region();
+    let region = &request.region;
     let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);
     let bounds = region.bounds.map(|b| (b.min - centre).abs().max((b.max - centre).abs()).length() <= radius);
     ball.into_iter().chain(bounds).reduce(|a, b| a || b)

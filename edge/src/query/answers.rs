@@ -28,9 +28,6 @@ pub enum ScoreKind {
 pub struct Answers {
     /// The question.
     pub text: String,
-    /// Negative prompts.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub negatives: Vec<String>,
     /// Kind of the answers.
     pub kind: AnswerKind,
     /// Name of the scene.
@@ -40,6 +37,24 @@ pub struct Answers {
     /// Unit of every position and length: `m`, or `world` if the scene is not metric.
     #[schemars(extend("enum" = UNITS))]
     pub unit: &'static str,
+    #[serde(flatten)]
+    pub searched: Searched,
+    /// Reason for an empty answer.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<Reason>,
+    /// The answers, best first.
+    // Serialised as an empty list, which `Reply::pieces` fills.
+    #[serde(serialize_with = "empty_list")]
+    #[schemars(with = "Vec<AnyAnswer>")]
+    pub answers: Found,
+}
+
+/// How a text or vector was searched for.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+pub struct Searched {
+    /// Negative prompts.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub negatives: Vec<String>,
     /// Meaning of scores.
     pub score_kind: ScoreKind,
     /// Score at or above which a Gaussian matches.
@@ -69,14 +84,6 @@ pub struct Answers {
     /// How matches were clustered; only for `kind=clusters`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clustering: Option<Clustering>,
-    /// Reason for an empty answer.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reason: Option<Reason>,
-    /// The answers, best first.
-    // Serialised as an empty list, which `Reply::pieces` fills.
-    #[serde(serialize_with = "empty_list")]
-    #[schemars(with = "Vec<AnyAnswer>")]
-    pub answers: Found,
 }
 
 /// A cell whose shard could not be fetched.

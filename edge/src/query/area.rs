@@ -8,8 +8,8 @@ use slag_common::frames::Aabb;
 use slag_common::manifest::Manifest;
 
 use super::point::{Corner, Point};
-use super::request::{QueryRequest, RequestError};
-use crate::score::{Ball, MAX_COORDINATE, MAX_CORNERS, Polygon};
+use super::request::RequestError;
+use crate::score::{Ball, MAX_COORDINATE, MAX_CORNERS, Polygon, Region};
 
 /// A ball, a box and a polygon, each optional; what lies in all of them is asked for.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -51,23 +51,20 @@ pub struct AreaBox {
 slag_common::named_members!(Area, AreaBall, AreaBox; Serialize);
 
 impl Area {
-    /// Restricts a request to this area.
+    /// Returns the area in the world frame.
     ///
     /// # Errors
     /// The part that is out of bounds, or geographic in a scene without a geographic reference.
-    pub(crate) fn restrict(
-        &self,
-        request: &mut QueryRequest,
-        manifest: &Manifest,
-    ) -> Result<(), RequestError> {
-        if let Some(AreaBall { centre, radius }) = self.ball {
-            let centre_in_world = centre.in_world("region", manifest)?;
-            request.ball = Some(Ball { centre_in_world, radius });
-        }
-        if let Some(AreaBox { from, to }) = self.bounds {
-            let (from, to) = (from.in_world("region", manifest)?, to.in_world("region", manifest)?);
-            request.bounds = Some(Aabb { min: from.min(to), max: from.max(to) });
-        }
+    pub(crate) fn in_world(&self, manifest: &Manifest) -> Result<Region, RequestError> {
+        let point = |point: Point| point.in_world("region", manifest);
+        let ball = self.ball.map(|AreaBall { centre, radius }| {
+            Ok::<_, RequestError>(Ball { centre_in_world: point(centre)?, radius })
+        });
+        let bounds = self.bounds.map(|AreaBox { from, to }| {
+            let (from, to) = (point(from)?, point(to)?);
+            Ok::<_, RequestError>(Aabb { min: from.min(to), max: from.max(to) })
+        });
+        let mut region = Region { ball: ball.transpose()?, bounds: bounds.transpose()?, polygon: None };
         if !self.polygon.is_empty() {
             let corners = self.polygon.iter().map(|corner| corner.in_world("region", manifest));
             let corners = corners.collect::<Result<Vec<_>, _>>()?;
@@ -76,8 +73,8 @@ impl Area {
                 let expected = format!("a polygon of 3 to {MAX_CORNERS} corners within bounds");
                 RequestError::new("region", &found, expected)
             };
-            request.polygon = Some(Arc::new(Polygon::new(corners).ok_or_else(refused)?));
+            region.polygon = Some(Arc::new(Polygon::new(corners).ok_or_else(refused)?));
         }
-        Ok(())
+        Ok(region)
     }
 }

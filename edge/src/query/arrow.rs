@@ -50,7 +50,7 @@ impl Pieces {
             self.writer = Some(writer);
             return Ok(piece);
         };
-        let gaussians = |question: usize| match self.reply.answers.get(question).map(|a| &a.answers) {
+        let gaussians = |question: usize| match self.reply.answers().nth(question).map(|a| &a.answers) {
             Some(Found::Gaussians(hits)) => Some(&hits[..]),
             Some(Found::Clusters(_)) => Some(&[][..]),
             None => None,
@@ -89,7 +89,7 @@ impl Iterator for Pieces {
 fn schema(reply: &Reply) -> Schema {
     let column = |name: &str, kind: DataType| Field::new(name, kind, false);
     let mut columns = Vec::new();
-    if reply.answers.len() != 1 {
+    if reply.outcomes.len() != 1 {
         columns.push(column("question", DataType::UInt32));
     }
     columns.extend(["x", "y", "z"].map(|name| column(name, DataType::Float64)));
@@ -103,15 +103,15 @@ fn schema(reply: &Reply) -> Schema {
         ("scene".to_owned(), manifest.scene.clone()),
         ("generation".to_owned(), manifest.generation.to_string()),
         ("frame".to_owned(), "world".to_owned()),
-        ("questions".to_owned(), json(serde_json::to_string(&reply.answers))),
+        ("questions".to_owned(), json(serde_json::to_string(&reply.answers().collect::<Vec<_>>()))),
     ]);
-    if let Some(first) = reply.answers.first() {
-        let kind = serde_json::to_value(first.score_kind).ok();
+    if let Some(first) = reply.answers().next() {
+        let kind = serde_json::to_value(first.searched.score_kind).ok();
         let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default();
         metadata.insert("unit".into(), first.unit.into());
         metadata.insert("score_kind".into(), kind.into());
-        metadata.insert("threshold".into(), first.threshold.to_string());
-        metadata.insert("score_error_bound".into(), first.score_error_bound.to_string());
+        metadata.insert("threshold".into(), first.searched.threshold.to_string());
+        metadata.insert("score_error_bound".into(), first.searched.score_error_bound.to_string());
     }
     if let Some(geo_reference) = &manifest.geo_reference {
         metadata.insert("geo_reference".into(), json(serde_json::to_string(geo_reference)));
@@ -125,9 +125,9 @@ fn batch(
     question: usize,
     items: std::ops::Range<usize>,
 ) -> Result<RecordBatch, ArrowError> {
-    let hits = match &reply.answers[question].answers {
-        Found::Gaussians(hits) => &hits[items],
-        Found::Clusters(_) => &[],
+    let hits = match reply.answers().nth(question).map(|answers| &answers.answers) {
+        Some(Found::Gaussians(hits)) => &hits[items],
+        _ => &[],
     };
     let views: Vec<_> = reply.snapshot.shards.iter().map(|shard| shard.view()).collect();
     let shard = |hit: &crate::score::Hit| &views[hit.shard as usize];
@@ -136,7 +136,7 @@ fn batch(
         Arc::new(Float64Array::from_iter_values(positions.iter().map(|position| position[axis])))
     };
     let mut columns: Vec<ArrayRef> = Vec::new();
-    if reply.answers.len() != 1 {
+    if reply.outcomes.len() != 1 {
         columns.push(Arc::new(UInt32Array::from_value(question as u32, hits.len())));
     }
     columns.extend((0..3).map(|axis| along(axis) as ArrayRef));

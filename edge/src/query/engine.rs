@@ -10,12 +10,11 @@ use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
 use slag_models::{InferenceError, SessionOptions};
 
-use super::answer::answer;
 use super::carried;
-use super::reply::Reply;
-use super::request::{QueryRequest, RequestError, check_text};
+use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
-use crate::score::{Budget, OverBudget, Question, ScoreError, Scratch};
+use super::words::check_text;
+use crate::score::{Budget, OverBudget, ScoreError, Scratch};
 use crate::store::files::Stat;
 use crate::store::{EdgeCache, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextService};
@@ -253,21 +252,6 @@ impl Engine {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
         Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text) })
-    }
-
-    /// Answers a request from the loaded generation. Blocks for milliseconds of computing, at most as long as the
-    /// budget says.
-    pub fn answer(&self, request: &QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
-        request.check()?;
-        let on_board = self.on_board()?;
-        on_board.check()?;
-        let negatives = on_board.encode_negatives(request)?;
-        let question =
-            |text: &String| Ok(Question { vector: on_board.encode(text)?, negatives: negatives.clone() });
-        let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, QueryError>>()?;
-        let work = |scratch: &mut Scratch, scene: &Scene<'_>| answer(scratch, scene, &questions, request);
-        let answers = self.on_scene(&on_board.snapshot, budget, work)?;
-        Ok(Reply { snapshot: on_board.snapshot, near: request.near, answers })
     }
 
     /// Runs work on a generation, with buffers of earlier answers.

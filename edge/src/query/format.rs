@@ -2,65 +2,39 @@
 
 use std::io;
 
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
 #[cfg(feature = "arrow")]
 use super::arrow;
 use super::json;
 use super::ply;
 use super::reply::Reply;
 
-/// Format of a reply.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+/// Format of answers that come at once.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
 pub enum Format {
     /// One object; for several questions, `{"batch":[…]}`.
     #[default]
     Json,
-    /// Columns as an Arrow IPC stream; Gaussians only.
+    /// Columns as an Arrow IPC stream; Gaussians only. `Accept: application/vnd.apache.arrow.stream` has the same
+    /// effect.
+    #[cfg(feature = "arrow")]
     Arrow,
     /// The Gaussians of all answers as a PLY of points.
     Ply,
 }
 
 impl Format {
-    /// Returns the formats of this build.
-    pub fn available() -> &'static [Self] {
-        if cfg!(feature = "arrow") { &[Self::Json, Self::Arrow, Self::Ply] } else { &[Self::Json, Self::Ply] }
-    }
-
-    /// Returns the name used in URLs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Json => "json",
-            Self::Arrow => "arrow",
-            Self::Ply => "ply",
-        }
-    }
-
     pub fn media_type(self) -> &'static str {
         match self {
             Self::Json => "application/json",
+            #[cfg(feature = "arrow")]
             Self::Arrow => "application/vnd.apache.arrow.stream",
             // PLY has no registered type.
             Self::Ply => "application/octet-stream",
         }
-    }
-}
-
-impl std::fmt::Display for Format {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-impl std::str::FromStr for Format {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let found = Self::available().iter().copied().find(|format| format.name() == text);
-        found.ok_or_else(|| {
-            let names = Self::available().iter().map(|format| format.name()).collect::<Vec<_>>().join(", ");
-            let built = if cfg!(feature = "arrow") { "" } else { " (this program is built without Arrow)" };
-            format!("one of {names}{built}")
-        })
     }
 }
 
@@ -81,10 +55,6 @@ impl Reply {
             Format::Ply => Box::new(ply::Pieces::new(self)),
             #[cfg(feature = "arrow")]
             Format::Arrow => Box::new(arrow::Pieces::new(self)),
-            #[cfg(not(feature = "arrow"))]
-            Format::Arrow => {
-                Box::new(std::iter::once(Err(io::Error::other("this program is built without Arrow"))))
-            }
         }
     }
 }

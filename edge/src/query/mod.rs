@@ -1,6 +1,7 @@
 //! From a question to ranked answers.
 
 mod answer;
+mod answering;
 mod answers;
 mod area;
 #[cfg(feature = "arrow")]
@@ -18,6 +19,8 @@ mod json;
 mod map;
 mod objects;
 mod oriented;
+mod outcome;
+mod page;
 mod ply;
 mod point;
 mod rank;
@@ -30,14 +33,15 @@ mod scene;
 mod status;
 mod threshold;
 mod view;
+mod words;
 
 pub use answer::answer;
 pub use answers::{
     Answers, AnswersOrBatch, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, GaussianAnswer,
-    Reason, ReasonKind, ScoreKind,
+    Reason, ReasonKind, ScoreKind, Searched,
 };
 pub use area::{Area, AreaBall, AreaBox};
-pub use ask::{Ask, AskReply, Asked, MAX_PAGE, Outcome, RelatedAnswers};
+pub use ask::Ask;
 pub use changes::{
     ChangedThing, ChangesError, ChangesReply, ChangesRequest, ComparedGeneration, Likeness, MovedThing,
     NotCompared,
@@ -48,16 +52,19 @@ pub use frame::{FRAME, UNITS, unit};
 pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOnBoard, ObjectPage, object_id};
 pub use map::{MapCell, MapStatus, MissingCell};
 pub use oriented::{Alignment, OrientedBox};
+pub use outcome::{Outcome, RelatedAnswers};
+pub use page::Page;
 pub use point::{Corner, LatLon, Point};
 pub use rank::relevance;
 pub use reply::Reply;
 pub use request::{
-    AnswerKind, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_CLUSTERS, MAX_GAUSSIANS,
-    MAX_NEGATIVES, MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
+    AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_CLUSTERS, MAX_GAUSSIANS,
+    MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
 };
 pub use scene::{Scene, default_voxel};
 pub use status::{ShardStatus, Status};
 pub use threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
+pub use words::Words;
 
 #[cfg(test)]
 mod tests;

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use slag_common::manifest::Manifest;
 
-use super::request::{DEFAULT_LIMIT, QueryRequest};
+use super::request::QueryRequest;
 use super::scene::default_voxel;
 
 /// Distance, in default voxels, at which an answer's relevance is halved (10 m in a metric scene).
@@ -38,7 +38,7 @@ pub struct Ranked<T> {
 impl Order {
     pub fn new(base: f32, manifest: &Manifest, request: &QueryRequest) -> Self {
         let half = VOXELS_TO_HALF_RELEVANCE * default_voxel(manifest);
-        Self { base, half, near: request.near, limit: request.limit.unwrap_or(DEFAULT_LIMIT) }
+        Self { base, half, near: request.near, limit: request.n_ranked() }
     }
 
     /// Ranks answers, keeps equals in their order, and returns as many as are asked for. `key`: score as reported,

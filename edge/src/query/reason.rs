@@ -10,7 +10,7 @@ use crate::score::Search;
 
 /// Returns why no object was found. `best`: score and position of the best object on board.
 pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVec3)>) -> Reason {
-    let place = request.region();
+    let place = &request.region;
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
@@ -45,7 +45,7 @@ pub fn of_gaussians(
     threshold: f32,
     n_matching: u64,
 ) -> Reason {
-    let place = request.region();
+    let place = &request.region;
     let best = search.best(1, f32::NEG_INFINITY, request.near).first().map(|hit| {
         (scale.shown(hit.score), search.shards()[hit.shard as usize].position_in_world(hit.index as usize))
     });

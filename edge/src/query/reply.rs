@@ -2,25 +2,34 @@
 
 use std::sync::Arc;
 
-use glam::DVec3;
 use slag_common::manifest::Manifest;
 
 use super::answers::{Answers, Found, GaussianAnswer};
+use super::outcome::Outcome;
+use super::request::QueryRequest;
 use crate::score::Hit;
 use crate::store::Snapshot;
 
 /// The answers to a request, and the generation they refer to.
 pub struct Reply {
     pub(super) snapshot: Arc<Snapshot>,
-    pub(super) near: Option<DVec3>,
-    /// One for each text, in their order.
-    pub answers: Vec<Answers>,
+    pub(super) request: QueryRequest,
+    /// One for each question, in their order.
+    pub outcomes: Vec<Outcome>,
 }
 
 impl Reply {
     /// Returns the manifest of the generation that answered.
     pub fn manifest(&self) -> &Manifest {
         &self.snapshot.manifest
+    }
+
+    /// Returns the answers to texts and vectors, in their order.
+    pub fn answers(&self) -> impl Iterator<Item = &Answers> {
+        self.outcomes.iter().filter_map(|outcome| match outcome {
+            Outcome::Plain(answers) => Some(answers),
+            Outcome::Related(_) => None,
+        })
     }
 
     /// Describes an answer's Gaussians; empty for other kinds.
@@ -31,6 +40,6 @@ impl Reply {
 
     /// Describes one Gaussian. `at`: its index in the list.
     pub(super) fn gaussian(&self, at: usize, hit: &Hit) -> GaussianAnswer {
-        GaussianAnswer::new(at, hit, &self.snapshot.shards[hit.shard as usize].view(), self.near)
+        GaussianAnswer::new(at, hit, &self.snapshot.shards[hit.shard as usize].view(), self.request.near)
     }
 }

@@ -2,20 +2,26 @@
 
 use std::fmt;
 use std::str::FromStr;
-use std::sync::Arc;
 
 use glam::DVec3;
 use schemars::JsonSchema;
+use serde::de::IntoDeserializer;
+use serde::de::value::Error;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 
-use crate::score::{Ball, MAX_COORDINATE, Polygon, Precision, Region};
-use crate::text::MAX_TEXT_BYTES;
+use super::relations::Phrase;
+use super::words::check_text;
+use crate::score::{Ball, MAX_COORDINATE, Precision, Region};
+
+pub use slag_service::params::RequestError;
 
 /// Most clusters or objects in a request, over all its texts.
 pub const MAX_CLUSTERS: usize = 10_000;
 /// Most Gaussians in a request, over all its texts: 12 MB while they are sent.
 pub const MAX_GAUSSIANS: usize = 1_000_000;
+/// Most answers in a page, over all questions.
+pub const MAX_PAGE: usize = MAX_CLUSTERS;
 /// Most texts in a request.
 pub const MAX_TEXTS: usize = 32;
 /// Most negatives in a request.
@@ -26,27 +32,6 @@ pub const CANONICAL_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "textur
 pub const DEFAULT_LIMIT: usize = 10;
 /// Least members of a cluster unless the request sets another number.
 pub const DEFAULT_MIN_COUNT: u64 = 10;
-
-/// An invalid part of a request.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{parameter}: found {found}, expected {expected}")]
-pub struct RequestError {
-    pub parameter: String,
-    /// The value found.
-    pub found: String,
-    /// The values allowed.
-    pub expected: String,
-}
-
-impl RequestError {
-    /// Names a parameter, the value found (cut to 80 characters, control characters escaped) and the values
-    /// expected.
-    pub fn new(parameter: &str, found: &str, expected: impl Into<String>) -> Self {
-        let cut: String = found.chars().take(80).collect();
-        let dots = if cut.len() < found.len() { "…" } else { "" };
-        Self { parameter: parameter.to_owned(), found: format!("{cut:?}{dots}"), expected: expected.into() }
-    }
-}
 
 /// Kind of answers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -61,37 +46,23 @@ pub enum AnswerKind {
     Gaussians,
 }
 
-impl AnswerKind {
-    /// Every kind, coarsest first.
-    pub const ALL: [Self; 3] = [Self::Objects, Self::Clusters, Self::Gaussians];
-
-    /// Returns the name used in URLs, flags and JSON.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Objects => "objects",
-            Self::Clusters => "clusters",
-            Self::Gaussians => "gaussians",
-        }
-    }
-}
-
 impl fmt::Display for AnswerKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
+        self.serialize(f)
     }
 }
 
 impl FromStr for AnswerKind {
-    type Err = String;
+    type Err = Error;
 
-    fn from_str(text: &str) -> Result<Self, String> {
-        let found = Self::ALL.into_iter().find(|kind| kind.name() == text);
-        found.ok_or_else(|| format!("one of {}", Self::ALL.map(Self::name).join(", ")))
+    fn from_str(text: &str) -> Result<Self, Error> {
+        Self::deserialize(text.into_deserializer())
     }
 }
 
 /// Negative prompts.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(from = "Vec<String>")]
 pub enum Negatives {
     /// None: scores are cosines.
     #[default]
@@ -108,6 +79,16 @@ impl Negatives {
             Self::None => Vec::new(),
             Self::Canonical => CANONICAL_NEGATIVES.to_vec(),
             Self::Phrases(phrases) => phrases.iter().map(String::as_str).collect(),
+        }
+    }
+}
+
+impl From<Vec<String>> for Negatives {
+    fn from(phrases: Vec<String>) -> Self {
+        match phrases.as_slice() {
+            [] => Self::None,
+            [one] if one == "canonical" => Self::Canonical,
+            _ => Self::Phrases(phrases),
         }
     }
 }
@@ -155,45 +136,88 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
     }
 }
 
-/// Checks a text that the text model is to encode. `parameter`: its name, for the error.
-///
-/// # Errors
-/// It is too long, has no words, or control characters.
-pub fn check_text(parameter: &str, text: &str) -> Result<(), RequestError> {
-    if text.len() > MAX_TEXT_BYTES {
-        let found = format!("{} bytes", text.len());
-        return Err(RequestError::new(parameter, &found, format!("at most {MAX_TEXT_BYTES} bytes")));
-    }
-    if text.trim().is_empty() {
-        return Err(RequestError::new(parameter, text, "words to look for"));
-    }
-    if text.chars().any(|c| c.is_control() && !c.is_whitespace()) {
-        return Err(RequestError::new(parameter, text, "no control characters"));
-    }
-    Ok(())
+/// What is looked for.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Asked {
+    /// A text, for the text model.
+    Text(String),
+    /// A vector of the scene's embedding space, by its place in the request; its length does not count.
+    Vector { at: usize, vector: Vec<f32> },
+    /// Things by their relations, and the text that was understood so.
+    Phrase { text: Option<String>, phrase: Phrase },
 }
 
-/// One or several questions of the same kind.
+impl Asked {
+    /// Returns what stands for the question where a text is expected.
+    pub fn label(&self) -> &str {
+        match self {
+            Self::Text(text) => text,
+            Self::Vector { .. } => "vector",
+            Self::Phrase { phrase, .. } => &phrase.thing,
+        }
+    }
+
+    /// Checks every limit that does not depend on the scene.
+    fn check(&self, request: &QueryRequest) -> Result<(), RequestError> {
+        match self {
+            Self::Text(text) => check_text("text", text),
+            Self::Vector { vector, .. } => match unit_vector(vector) {
+                Some(_) => Ok(()),
+                None => {
+                    let expected = "finite numbers that are not all 0";
+                    Err(RequestError::new("vectors", "a vector without a direction", expected))
+                }
+            },
+            Self::Phrase { phrase, .. } => {
+                phrase.check()?;
+                if let Some(kind) = request.kind.filter(|kind| *kind != AnswerKind::Objects) {
+                    let expected = "objects, since relations are between objects";
+                    return Err(RequestError::new("kind", &kind.to_string(), expected));
+                }
+                let [needs_position, needs_heading] = phrase.needs();
+                if needs_position && request.near.is_none() {
+                    let expected = "where the asker is, since the phrase depends on it";
+                    return Err(RequestError::new("near", "nothing", expected));
+                }
+                if needs_heading && request.heading_rad.is_none() {
+                    let expected = "where the asker looks, since the phrase depends on it";
+                    return Err(RequestError::new("heading_rad", "nothing", expected));
+                }
+                Ok(())
+            }
+        }
+    }
+}
+
+/// Returns a vector at unit length; `None` if it has no direction.
+pub fn unit_vector(vector: &[f32]) -> Option<Vec<f32>> {
+    let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    (length > 0.0 && length.is_finite())
+        .then(|| vector.iter().map(|v| (f64::from(*v) / length) as f32).collect())
+}
+
+/// Questions that share everything but what is looked for, as the engine understands them: in the world frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueryRequest {
-    /// Texts to look for; each is answered separately.
-    pub texts: Vec<String>,
+    /// What is looked for; each is answered separately.
+    pub asked: Vec<Asked>,
     /// Negative prompts.
     pub negatives: Negatives,
-    /// Most answers to each text; [`DEFAULT_LIMIT`] if absent.
+    /// Most answers to each question; [`DEFAULT_LIMIT`] if absent.
     pub limit: Option<usize>,
+    /// Whether answers come in pages: `offset` is allowed, and one more answer is ranked than a page has, which
+    /// tells whether there is a next one.
+    pub paged: bool,
+    /// Answers to each question before the page.
+    pub offset: usize,
     /// Least score of a match: a cosine, or with negatives a relevancy; the scene's own if absent.
     pub threshold: Option<f32>,
     /// Position of the asker: answers carry their distance from it, and nearer ones rank higher.
     pub near: Option<DVec3>,
-    /// Restricts the search to this distance from `near`, world units.
-    pub radius: Option<f64>,
-    /// Restricts the search to this ball, whatever `near` is; instead of `radius`.
-    pub ball: Option<Ball>,
-    /// Restricts the search to this box.
-    pub bounds: Option<Aabb>,
-    /// Restricts the search to this polygon.
-    pub polygon: Option<Arc<Polygon>>,
+    /// The asker's heading, from x towards y, radians.
+    pub heading_rad: Option<f64>,
+    /// The part of space to search.
+    pub region: Region,
     /// Kind of answers; if absent, objects where the scene has them, else clusters.
     pub kind: Option<AnswerKind>,
     /// Edge of the voxels used for clustering, world units; the scene's own if absent.
@@ -210,15 +234,15 @@ impl QueryRequest {
     /// Makes a request for a text, with defaults otherwise.
     pub fn new(text: impl Into<String>) -> Self {
         Self {
-            texts: vec![text.into()],
+            asked: vec![Asked::Text(text.into())],
             negatives: Negatives::None,
             limit: None,
+            paged: false,
+            offset: 0,
             threshold: None,
             near: None,
-            radius: None,
-            ball: None,
-            bounds: None,
-            polygon: None,
+            heading_rad: None,
+            region: Region::default(),
             kind: None,
             voxel: None,
             min_count: DEFAULT_MIN_COUNT,
@@ -227,19 +251,30 @@ impl QueryRequest {
         }
     }
 
-    /// Checks every limit.
+    /// Returns the answers to each question of a page.
+    pub fn page(&self) -> usize {
+        self.limit.unwrap_or(DEFAULT_LIMIT)
+    }
+
+    /// Returns the answers that are ranked for each question.
+    pub fn n_ranked(&self) -> usize {
+        self.offset + self.page() + usize::from(self.paged)
+    }
+
+    /// Checks every limit that does not depend on the scene.
     ///
     /// # Errors
     /// The first parameter outside its limits.
     pub fn check(&self) -> Result<(), RequestError> {
         let positive = |v: f64| v > 0.0 && v <= MAX_COORDINATE;
+        let within = |v: DVec3| v.is_finite() && v.abs().max_element() <= MAX_COORDINATE;
         let refuse = |parameter: &str, found: &dyn ToString, expected: String| {
             Err(RequestError::new(parameter, &found.to_string(), expected))
         };
-        if !(1..=MAX_TEXTS).contains(&self.texts.len()) {
+        if !(1..=MAX_TEXTS).contains(&self.asked.len()) {
             return refuse(
                 "text",
-                &format!("{} of them", self.texts.len()),
+                &format!("{} of them", self.asked.len()),
                 format!("1 to {MAX_TEXTS} texts"),
             );
         }
@@ -248,18 +283,9 @@ impl QueryRequest {
             let found = format!("{} of them", negatives.len());
             return refuse("negatives", &found, format!("at most {MAX_NEGATIVES} phrases"));
         }
-        let texts = self.texts.iter().map(|text| ("text", text.as_str()));
-        for (parameter, text) in texts.chain(negatives.iter().map(|text| ("negatives", *text))) {
-            check_text(parameter, text)?;
-        }
-        let most = match self.kind {
-            Some(AnswerKind::Gaussians) => MAX_GAUSSIANS,
-            _ => MAX_CLUSTERS,
-        } / self.texts.len();
-        if let Some(limit) = self.limit.filter(|limit| !(1..=most).contains(limit)) {
-            let answers = self.kind.map_or("answers".to_owned(), |kind| kind.to_string());
-            return refuse("limit", &limit, format!("1 to {most} {answers} per text"));
-        }
+        negatives.iter().try_for_each(|text| check_text("negatives", text))?;
+        self.asked.iter().try_for_each(|asked| asked.check(self))?;
+        self.check_page()?;
         let (thresholds, expected) = match self.negatives {
             Negatives::None => (-1.0..=1.0, "a cosine, -1 to 1"),
             _ => (0.0..=1.0, "a relevancy, 0 to 1, because there are negatives"),
@@ -267,33 +293,24 @@ impl QueryRequest {
         if let Some(threshold) = self.threshold.filter(|t| !thresholds.contains(t)) {
             return refuse("threshold", &threshold, expected.into());
         }
-        if let Some(bounds) = self.bounds.filter(|b| {
-            !(b.min.cmple(b.max).all() && b.min.abs().max(b.max.abs()).max_element() <= MAX_COORDINATE)
-        }) {
-            let found = format!("{} to {}", bounds.min, bounds.max);
-            return refuse(
-                "box",
-                &found,
-                format!("two corners, the lower first, within ±{MAX_COORDINATE:e}"),
-            );
+        if let Some(heading) = self.heading_rad.filter(|heading| !heading.is_finite()) {
+            return refuse("heading_rad", &heading, "a number".into());
         }
-        if let Some(near) =
-            self.near.filter(|near| !(near.abs().max_element() <= MAX_COORDINATE && near.is_finite()))
-        {
+        if let Some(near) = self.near.filter(|near| !within(*near)) {
             return refuse("near", &near, format!("three numbers X,Y,Z within ±{MAX_COORDINATE:e}"));
         }
-        if let Some(radius) = self.radius.filter(|radius| !positive(*radius)) {
-            return refuse("radius", &radius, format!("more than 0, at most {MAX_COORDINATE:e}"));
+        let is_box = |b: &Aabb| b.min.cmple(b.max).all() && within(b.min) && within(b.max);
+        if let Some(bounds) = self.region.bounds.filter(|bounds| !is_box(bounds)) {
+            let found = format!("{} to {}", bounds.min, bounds.max);
+            return refuse("box", &found, format!("two corners within ±{MAX_COORDINATE:e}"));
         }
-        if let Some(ball) = self.ball.filter(|ball| {
-            let centre = ball.centre_in_world;
-            !(positive(ball.radius) && centre.is_finite() && centre.abs().max_element() <= MAX_COORDINATE)
-        }) {
-            let found = format!("{} around {}", ball.radius, ball.centre_in_world);
-            return refuse("region", &found, format!("a radius and a centre within ±{MAX_COORDINATE:e}"));
-        }
-        if let (Some(radius), None) = (self.radius, self.near) {
-            return refuse("near", &"nothing", format!("X,Y,Z, because radius is {radius}"));
+        if let Some(Ball { centre_in_world, radius }) = self.region.ball {
+            if !positive(radius) {
+                return refuse("radius", &radius, format!("more than 0, at most {MAX_COORDINATE:e}"));
+            }
+            if !within(centre_in_world) {
+                return refuse("region", &centre_in_world, format!("a centre within ±{MAX_COORDINATE:e}"));
+            }
         }
         if let Some(voxel) = self.voxel.filter(|voxel| !positive(*voxel)) {
             return refuse("voxel", &voxel, format!("more than 0, at most {MAX_COORDINATE:e}"));
@@ -304,11 +321,26 @@ impl QueryRequest {
         Ok(())
     }
 
-    /// Returns the part of space asked for.
-    pub fn region(&self) -> Region {
-        let around = self.near.zip(self.radius);
-        let around = around.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
-        Region { ball: self.ball.or(around), bounds: self.bounds, polygon: self.polygon.clone() }
+    fn check_page(&self) -> Result<(), RequestError> {
+        let n = self.asked.len();
+        let (most, answers) = match self.kind {
+            Some(AnswerKind::Gaussians) => (MAX_GAUSSIANS / n, "gaussians"),
+            _ => (MAX_CLUSTERS / n, "answers"),
+        };
+        let of_page = if self.paged { most.min(MAX_PAGE / n) } else { most };
+        if !(1..=of_page).contains(&self.page()) {
+            let expected = format!("1 to {of_page} {answers} to each of {n} questions");
+            return Err(RequestError::new("limit", &self.page().to_string(), expected));
+        }
+        if self.offset > 0 && !self.paged {
+            let expected = "0, since all answers come at once; /v1/query has pages";
+            return Err(RequestError::new("offset", &self.offset.to_string(), expected));
+        }
+        if self.offset.saturating_add(self.page()) > most {
+            let found = format!("{} after {}", self.page(), self.offset);
+            return Err(RequestError::new("limit", &found, format!("to end within {most} {answers}")));
+        }
+        Ok(())
     }
 }
 
@@ -318,17 +350,20 @@ mod tests {
 
     #[test]
     fn poison_is_refused_by_name() {
+        fn text(text: &str) -> Asked {
+            Asked::Text(text.into())
+        }
         let refused = |edit: fn(&mut QueryRequest)| {
             let mut request = QueryRequest::new("chair");
             assert_eq!(request.check(), Ok(()));
             edit(&mut request);
             request.check().expect_err("must be refused").parameter
         };
-        assert_eq!(refused(|r| r.texts = vec![" \t ".into()]), "text");
-        assert_eq!(refused(|r| r.texts.push("x".repeat(513))), "text");
-        assert_eq!(refused(|r| r.texts.push("a\u{1b}[2Jb".into())), "text");
-        assert_eq!(refused(|r| r.texts.clear()), "text");
-        assert_eq!(refused(|r| r.texts = vec!["a".into(); MAX_TEXTS + 1]), "text");
+        assert_eq!(refused(|r| r.asked = vec![text(" \t ")]), "text");
+        assert_eq!(refused(|r| r.asked.push(text(&"x".repeat(513)))), "text");
+        assert_eq!(refused(|r| r.asked.push(text("a\u{1b}[2Jb"))), "text");
+        assert_eq!(refused(|r| r.asked.clear()), "text");
+        assert_eq!(refused(|r| r.asked = vec![text("a"); MAX_TEXTS + 1]), "text");
         assert_eq!(refused(|r| r.negatives = Negatives::Phrases(vec!["\0".into()])), "negatives");
         assert_eq!(
             refused(|r| r.negatives = Negatives::Phrases(vec!["a".into(); MAX_NEGATIVES + 1])),
@@ -343,14 +378,15 @@ mod tests {
         assert_eq!(
             refused(|r| {
                 (r.kind, r.limit) = (Some(AnswerKind::Gaussians), Some(MAX_GAUSSIANS / 2 + 1));
-                r.texts.push("table".into());
+                r.asked.push(text("table"));
             }),
             "limit"
         );
         let bounds = |min: f64, max: f64| Some(Aabb { min: DVec3::splat(min), max: DVec3::splat(max) });
         let boxes = [bounds(1.0, 0.0), bounds(f64::NAN, 0.0), bounds(0.0, f64::INFINITY), bounds(-1e10, 0.0)];
         for bounds in boxes {
-            let request = QueryRequest { bounds, ..QueryRequest::new("chair") };
+            let region = Region { bounds, ..Region::default() };
+            let request = QueryRequest { region, ..QueryRequest::new("chair") };
             assert_eq!(request.check().expect_err("must be refused").parameter, "box");
         }
         assert_eq!(refused(|r| r.limit = Some(0)), "limit");
@@ -359,9 +395,14 @@ mod tests {
         assert_eq!(refused(|r| r.threshold = Some(1.5)), "threshold");
         assert_eq!(refused(|r| r.near = Some(DVec3::new(0.0, f64::INFINITY, 0.0))), "near");
         assert_eq!(refused(|r| r.near = Some(DVec3::new(0.0, 0.0, f64::NAN))), "near");
-        assert_eq!(refused(|r| r.radius = Some(5.0)), "near");
-        assert_eq!(refused(|r| (r.near, r.radius) = (Some(DVec3::ZERO), Some(f64::NAN))), "radius");
-        assert_eq!(refused(|r| (r.near, r.radius) = (Some(DVec3::ZERO), Some(-1.0))), "radius");
+        fn ball(x: f64, radius: f64) -> Option<Ball> {
+            Some(Ball { centre_in_world: DVec3::new(x, 0.0, 0.0), radius })
+        }
+        assert_eq!(refused(|r| r.region.ball = ball(0.0, f64::NAN)), "radius");
+        assert_eq!(refused(|r| r.region.ball = ball(0.0, -1.0)), "radius");
+        assert_eq!(refused(|r| r.region.ball = ball(f64::NAN, 1.0)), "region");
+        assert_eq!(refused(|r| r.offset = 1), "offset");
+        assert_eq!(refused(|r| (r.paged, r.offset) = (true, MAX_CLUSTERS)), "limit");
         assert_eq!(refused(|r| r.voxel = Some(0.0)), "voxel");
         assert_eq!(refused(|r| r.min_count = 0), "min_count");
     }

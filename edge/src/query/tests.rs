@@ -3,7 +3,7 @@ use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::{Calibration, Manifest};
 
 use super::*;
-use crate::score::{Precision, Question, Scratch};
+use crate::score::{Ball, Precision, Question, Scratch};
 use crate::store::objects::ObjectIndex;
 use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
 
@@ -32,9 +32,10 @@ fn ask_about(
     let (mut request, mut manifest) = (QueryRequest::new("thing"), manifest_of(built, 7));
     edit(&mut request, &mut manifest);
     request.check().expect("a sound request");
+    let labels: Vec<&str> = request.asked.iter().map(Asked::label).collect();
     on_scene_of(built, &manifest, |scene| {
         let mut scratch = Scratch::default();
-        let answers = answer(&mut scratch, scene, questions, &request).expect("answers");
+        let answers = answer(&mut scratch, scene, (&labels, questions), &request).expect("answers");
         assert!(
             answers.iter().all(|answers| (answers.kind == AnswerKind::Objects) == scratch.is_untouched())
         );
@@ -82,12 +83,15 @@ fn yard() -> Vec<BuiltShard> {
 fn clusters_are_ranked_nearest_best() {
     let yard = yard();
     let answers = ask(&yard, |_, _| ());
-    assert_eq!((answers.n_searched, answers.n_matching, answers.unit), (724, 224, "m"));
-    assert_eq!((answers.reason.as_ref(), answers.area_fetched, answers.is_exact), (None, None, false));
+    assert_eq!((answers.searched.n_searched, answers.searched.n_matching, answers.unit), (724, 224, "m"));
+    assert_eq!(
+        (answers.reason.as_ref(), answers.searched.area_fetched, answers.searched.is_exact),
+        (None, None, false)
+    );
     let found = clusters(&answers);
     // Equal things and no place to measure from: ordered by first Gaussian. The four Gaussians are too few.
     assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0", "5-0"]);
-    let clustering = answers.clustering.as_ref().expect("clusters");
+    let clustering = answers.searched.clustering.as_ref().expect("clusters");
     assert_eq!((clustering.n_small_clusters, clustering.n_gaussians_in_small_clusters), (1, 4));
     let first = &found[0];
     assert_eq!((first.rank, first.n_gaussians, first.distance), (1, 100, None));
@@ -172,18 +176,18 @@ fn empty_answers_say_why() {
 
     let ball = |at: DVec3, radius: f64| {
         move |request: &mut QueryRequest, _: &mut Manifest| {
-            (request.near, request.radius) = (Some(at), Some(radius));
+            (request.near, request.region.ball) = (Some(at), Some(Ball { centre_in_world: at, radius }));
         }
     };
     let small = ask(&yard, ball(DVec3::new(0.0, 0.0, 9.0), 2.0));
     assert_eq!(small.reason.as_ref().expect("too small").kind, ReasonKind::ClustersTooSmall);
-    assert_eq!((small.n_matching, small.area_fetched), (4, Some(true)));
+    assert_eq!((small.searched.n_matching, small.searched.area_fetched), (4, Some(true)));
     let nothing = ask(&yard, ball(DVec3::new(49.0, 49.0, 0.0), 2.0));
     let reason = nothing.reason.expect("nothing there");
     assert_eq!((reason.kind, reason.best_score), (ReasonKind::NothingThere, None));
-    assert_eq!(nothing.area_fetched, Some(false));
+    assert_eq!(nothing.searched.area_fetched, Some(false));
     let sticking_out = ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0));
-    assert_eq!(sticking_out.area_fetched, Some(false));
+    assert_eq!(sticking_out.searched.area_fetched, Some(false));
     let gaussians =
         ask(&yard, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(1.0)));
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
@@ -201,7 +205,10 @@ fn gaussians_come_best_then_nearest_first() {
     // Cell 6 has the best scores, its Gaussians in order of x; then the two things tie, and the nearer one
     // comes first.
     assert_eq!(names, [(6, 3), (6, 2), (6, 1), (6, 0), (3, 35), (3, 36), (3, 34)]);
-    assert_eq!((answers.n_matching, found[0].input_index, answers.clustering.is_none()), (224, None, true));
+    assert_eq!(
+        (answers.searched.n_matching, found[0].input_index, answers.searched.clustering.is_none()),
+        (224, None, true)
+    );
 }
 
 #[test]
@@ -209,7 +216,11 @@ fn exact_shards_answer_exactly() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
     let clusters_of = ask(&exact, |_, _| ());
     let gaussians = ask(&exact, |request, _| request.kind = Some(AnswerKind::Gaussians));
-    assert!(clusters_of.is_exact && gaussians.is_exact && gaussians.score_error_bound < 1e-5);
+    assert!(
+        clusters_of.searched.is_exact
+            && gaussians.searched.is_exact
+            && gaussians.searched.score_error_bound < 1e-5
+    );
     let found = described(&exact, &gaussians, None);
     assert_eq!((found.len(), found[2].input_index), (DEFAULT_LIMIT, Some(7)));
 }
@@ -224,9 +235,9 @@ fn exactness_is_a_choice() {
     let compact = [thing(1, DVec3::ZERO, 30, 0.7).build(false)];
     assert_eq!(by_centroids, ask(&compact, |request, _| request.kind = Some(AnswerKind::Gaussians)));
     assert!(
-        !by_centroids.is_exact && by_centroids.score_error_bound > 1e-5,
+        !by_centroids.searched.is_exact && by_centroids.searched.score_error_bound > 1e-5,
         "{}",
-        by_centroids.score_error_bound
+        by_centroids.searched.score_error_bound
     );
 }
 
@@ -247,18 +258,24 @@ fn negatives_make_relevancies() {
         1.0 / (1.0 + (-10.0 * (cosine - other)).exp())
     };
     let answers = ask(|_| ());
-    assert_eq!((answers.score_kind, answers.threshold), (ScoreKind::Relevancy, 0.5));
-    assert_eq!((answers.threshold_source, &answers.negatives[0][..]), (ThresholdSource::Relevancy, "other"));
+    assert_eq!((answers.searched.score_kind, answers.searched.threshold), (ScoreKind::Relevancy, 0.5));
+    assert_eq!(
+        (answers.searched.threshold_source, &answers.searched.negatives[0][..]),
+        (ThresholdSource::Relevancy, "other")
+    );
     // 0.7 is nearer to the other axis.
-    assert_eq!(answers.n_matching, 204);
+    assert_eq!(answers.searched.n_matching, 204);
     let found = clusters(&answers);
     assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0"]);
-    let bound = f64::from(answers.score_error_bound);
+    let bound = f64::from(answers.searched.score_error_bound);
     assert!((f64::from(found[0].score) - expected(0.9)).abs() <= bound && bound < 0.02, "{bound}");
     let answers = ask(|request| request.threshold = Some(0.4));
-    assert_eq!((answers.n_matching, answers.threshold_source), (224, ThresholdSource::Request));
+    assert_eq!(
+        (answers.searched.n_matching, answers.searched.threshold_source),
+        (224, ThresholdSource::Request)
+    );
     let all = ask(|request| (request.threshold, request.kind) = (Some(0.0), Some(AnswerKind::Gaussians)));
-    assert_eq!(all.n_matching, 724);
+    assert_eq!(all.searched.n_matching, 724);
     let best = &described(&yard, &all, None)[0];
     assert!((f64::from(best.score) - expected(0.95)).abs() <= bound, "{best:?}");
     let none = ask(|request| request.threshold = Some(1.0)).reason.expect("nothing is certain");
@@ -284,13 +301,13 @@ fn relevancies_keep_within_their_bound_and_use_it() {
         answers.remove(0)
     };
     // No relevancy is off by more than the whole scale.
-    assert_eq!(ask(&built(0.7)).score_error_bound, 1.0);
+    assert_eq!(ask(&built(0.7)).searched.score_error_bound, 1.0);
     let built = built(0.02);
     let answers = ask(&built);
     for (angle, found) in angles(0.02).iter().zip(described(&built, &answers, None)) {
         let truth = 1.0 / (1.0 + (-10.0 * (angle.cos() - angle.sin())).exp());
-        let share = (f64::from(found.score) - truth).abs() / f64::from(answers.score_error_bound);
-        assert!((0.9..=1.0).contains(&share), "{share} of {}", answers.score_error_bound);
+        let share = (f64::from(found.score) - truth).abs() / f64::from(answers.searched.score_error_bound);
+        assert!((0.9..=1.0).contains(&share), "{share} of {}", answers.searched.score_error_bound);
     }
 }
 
@@ -305,12 +322,14 @@ fn batches_answer_as_single_questions_do() {
     ] {
         let texts = ["thing", "other", "third"].map(str::to_owned);
         let together = ask_about(&scene, &questions, |request, _| {
-            (request.texts, request.kind, request.limit) = (texts.to_vec(), kind, Some(120));
+            (request.asked, request.kind, request.limit) =
+                (texts.clone().map(Asked::Text).to_vec(), kind, Some(120));
         });
         assert_eq!(together.len(), 3);
         for ((answers, question), text) in together.iter().zip(&questions).zip(&texts) {
             let alone = ask_about(&scene, std::slice::from_ref(question), |request, _| {
-                (request.texts, request.kind, request.limit) = (vec![text.clone()], kind, Some(120));
+                (request.asked, request.kind, request.limit) =
+                    (vec![Asked::Text(text.clone())], kind, Some(120));
             });
             assert_eq!(&alone[0], answers);
             assert!(!answers.answers.is_empty());
@@ -322,18 +341,19 @@ fn batches_answer_as_single_questions_do() {
 fn boxes_bound_what_is_searched() {
     let yard = yard();
     let bounds = |min: [f64; 3], max: [f64; 3]| Some(Aabb { min: min.into(), max: max.into() });
-    let answers = ask(&yard, |request, _| request.bounds = bounds([-6.0, -1.0, -1.0], [-4.501, 1.0, 1.0]));
+    let answers =
+        ask(&yard, |request, _| request.region.bounds = bounds([-6.0, -1.0, -1.0], [-4.501, 1.0, 1.0]));
     // Points at -5, -4.99, ..: 50 of them lie below -4.501.
-    assert_eq!((answers.n_matching, answers.area_fetched), (50, Some(true)));
-    let far = ask(&yard, |request, _| request.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]));
-    assert_eq!(far.area_fetched, Some(false));
+    assert_eq!((answers.searched.n_matching, answers.searched.area_fetched), (50, Some(true)));
+    let far = ask(&yard, |request, _| request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]));
+    assert_eq!(far.searched.area_fetched, Some(false));
     // The intersection of box and ball was fetched if either was.
     let both = ask(&yard, |request, _| {
-        request.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]);
-        (request.near, request.radius) = (Some(DVec3::new(20.0, 0.0, 0.0)), Some(0.105));
+        request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]);
+        request.region.ball = Some(Ball { centre_in_world: DVec3::new(20.0, 0.0, 0.0), radius: 0.105 });
     });
-    assert_eq!((both.area_fetched, both.n_matching), (Some(true), 11));
-    let nothing = ask(&yard, |request, _| request.bounds = bounds([60.0; 3], [61.0; 3])).reason;
+    assert_eq!((both.searched.area_fetched, both.searched.n_matching), (Some(true), 11));
+    let nothing = ask(&yard, |request, _| request.region.bounds = bounds([60.0; 3], [61.0; 3])).reason;
     assert!(nothing.expect("nothing there").detail.contains("in the box [60, 60, 60] to [61, 61, 61]"));
 }
 
@@ -358,10 +378,16 @@ fn boxes_are_upright_where_up_is_known() {
 #[test]
 fn thresholds_say_where_they_come_from() {
     let answers = ask(&yard(), |request, _| request.threshold = Some(0.2));
-    assert_eq!((answers.threshold, answers.threshold_source), (0.2, ThresholdSource::Request));
+    assert_eq!(
+        (answers.searched.threshold, answers.searched.threshold_source),
+        (0.2, ThresholdSource::Request)
+    );
     let answers = ask(&yard(), |_, manifest| manifest.encoder.default_threshold = 0.8);
-    assert_eq!((answers.threshold, answers.threshold_source), (0.8, ThresholdSource::Encoder));
-    assert_eq!((answers.n_matching, answers.score_kind), (204, ScoreKind::Cosine));
+    assert_eq!(
+        (answers.searched.threshold, answers.searched.threshold_source),
+        (0.8, ThresholdSource::Encoder)
+    );
+    assert_eq!((answers.searched.n_matching, answers.searched.score_kind), (204, ScoreKind::Cosine));
 }
 
 #[test]

@@ -146,17 +146,17 @@ impl Engine {
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.
     pub(crate) fn view_scores(
         &self,
-        text: &str,
+        text: String,
         negatives: Negatives,
         budget: &Budget,
     ) -> Result<Vec<u8>, QueryError> {
-        let request = QueryRequest { negatives, ..QueryRequest::new(text) };
+        let request = QueryRequest { negatives, ..QueryRequest::new(text.as_str()) };
         request.check()?;
         let on_board = self.on_board()?;
         on_board.check()?;
         let snapshot = &on_board.snapshot;
         let question =
-            Question { vector: on_board.encode(text)?, negatives: on_board.encode_negatives(&request)? };
+            Question { vector: on_board.encode(&text)?, negatives: on_board.encode_negatives(&request)? };
         let generation = snapshot.manifest.generation;
         let message = self.on_scene(snapshot, budget, |scratch, scene| {
             scores_message(scratch, scene.shards, &question, generation)

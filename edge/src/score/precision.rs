@@ -1,10 +1,15 @@
 //! The data that scores come from.
 
+use std::fmt;
+use std::str::FromStr;
+
 use schemars::JsonSchema;
-use serde::Serialize;
+use serde::de::IntoDeserializer;
+use serde::de::value::Error;
+use serde::{Deserialize, Serialize};
 
 /// The data that scores come from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
     /// Codebook centroids only: fastest; every score is within the stated bound.
@@ -18,32 +23,16 @@ pub enum Precision {
     Exact,
 }
 
-impl Precision {
-    /// Every precision, fastest first.
-    pub const ALL: [Self; 3] = [Self::Centroids, Self::Measured, Self::Exact];
-
-    /// Returns the name used in URLs and flags.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Centroids => "centroids",
-            Self::Measured => "measured",
-            Self::Exact => "exact",
-        }
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
     }
 }
 
-impl std::fmt::Display for Precision {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.name())
-    }
-}
+impl FromStr for Precision {
+    type Err = Error;
 
-impl std::str::FromStr for Precision {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let names = || Self::ALL.map(Self::name).join(", ");
-        let found = Self::ALL.into_iter().find(|precision| precision.name() == text);
-        found.ok_or_else(|| format!("{text:?} is not a precision; choose one of {}", names()))
+    fn from_str(text: &str) -> Result<Self, Error> {
+        Self::deserialize(text.into_deserializer())
     }
 }

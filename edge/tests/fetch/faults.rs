@@ -74,9 +74,9 @@ fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     let request =
         QueryRequest { kind: Some(AnswerKind::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };
     let reply = engine
-        .answer(&request, &slag_edge::score::Budget::default())
+        .answer(request, &slag_edge::score::Budget::default())
         .map_err(|e| slag_edge::error_line(&e))?;
-    let answers = &reply.answers[0];
+    let answers = reply.answers().next().expect("of one text");
     let found = reply.gaussians(answers).iter().map(|g| place(g.position_in_world.into())).collect();
     Ok((answers.generation, found))
 }

@@ -2,6 +2,7 @@ use axum::extract::Path;
 use serde::{Deserialize, Serialize};
 
 use super::*;
+use crate::params::Params;
 use crate::problem::{NoMembers, Problem};
 use crate::replies::Binary;
 use crate::routes::{Parameter, Routes};
@@ -44,15 +45,43 @@ struct Things {
     next: Option<u32>,
 }
 
+/// Which.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[expect(dead_code, reason = "only described")]
+struct Which {
+    /// Words.
+    #[schemars(length(min = 1, max = 2))]
+    text: Vec<String>,
+    /// How it is placed.
+    place: Option<Place>,
+}
+
+/// Where.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[expect(dead_code, reason = "only described")]
+struct Where {
+    /// Metres.
+    /// A circle.
+    #[serde(default = "three")]
+    #[schemars(range(min = 0, max = 9), example = 2.5)]
+    radius: f64,
+}
+
+fn three() -> f64 {
+    3.0
+}
+
+async fn things(_: Path<String>, _: Params<(Which, Where)>) -> Result<Json<Things>, Problem> {
+    Ok(Json(Things { things: Vec::new(), next: None }))
+}
+
 fn described() -> Value {
     let routes = Routes::<()>::default()
-        .get("/things/{id}", "things", async |Path(_): Path<String>| -> Result<Json<Things>, Problem> {
-            Ok(Json(Things { things: Vec::new(), next: None }))
-        })
+        .get("/things/{id}", "things", things)
         .parameters([
             Parameter::of_path::<u8>("id", "a number"),
-            Parameter::new::<String>("text", "chair", "words").repeated(2).required(),
-            Parameter::new::<f64>("radius", "r", "metres").within(0, 9).or(3).details("A circle."),
             Parameter::of_header("If-None-Match", "the etag"),
         ])
         .errors(&[(404, "No such thing.")])
@@ -85,14 +114,18 @@ fn operations_come_from_routes() {
     let parameter = |name: &str, place: &str, required: bool, description: &str, schema: Value| json!({ "name": name, "in": place, "required": required, "description": description, "schema": schema });
     let words = json!({ "type": "array", "items": { "type": "string" }, "minItems": 1, "maxItems": 2 });
     let number = json!({ "type": "integer", "format": "uint8", "minimum": 0, "maximum": 255 });
-    let radius = json!({ "type": "number", "format": "double", "minimum": 0, "maximum": 9, "default": 3 });
+    let place = json!({ "$ref": "#/components/schemas/Place" });
+    let radius = json!({
+        "type": "number", "format": "double", "minimum": 0, "maximum": 9, "default": 3.0, "examples": [2.5],
+    });
     let expected = json!({
         "summary": "Things.",
         "parameters": [
             parameter("id", "path", true, "A number.", number),
-            parameter("text", "query", true, "Words.", words),
-            parameter("radius", "query", false, "Metres (default: 3). A circle.", radius),
             parameter("If-None-Match", "header", false, "The etag.", json!({ "type": "string" })),
+            parameter("place", "query", false, "How it is placed.", place),
+            parameter("text", "query", true, "Words.", words),
+            parameter("radius", "query", false, "Metres. A circle.", radius),
         ],
         "responses": {
             "200": { "description": "Things.", "content": { "application/json": things } },

@@ -1,9 +1,11 @@
 use axum::body::{Body, Bytes, to_bytes};
 use axum::http::{Request, StatusCode};
+use serde::Deserialize;
 use tower::ServiceExt;
 
 use super::*;
 use crate::openapi::About;
+use crate::params::Params;
 use crate::problem::NoMembers;
 use crate::replies::As;
 
@@ -15,9 +17,27 @@ const ABOUT: About = About {
     errors: &[(503, "Too busy.")],
 };
 
+/// The asker.
+#[derive(Deserialize, JsonSchema)]
+#[serde(default)]
+struct Asker {
+    /// Rank by distance too.
+    #[schemars(example = &"1,2,3")]
+    near: String,
+}
+
+impl Default for Asker {
+    fn default() -> Self {
+        Self { near: "0,0,0".into() }
+    }
+}
+
 fn routes() -> Routes<()> {
-    let near = Parameter::new::<String>("near", "x,y,z", "rank by distance too").or("0,0,0");
-    let route = Routes::default().get("/query", "things that match", async || "found").parameters([near]);
+    let found = async |Params(Asker { near }): Params<Asker>| {
+        assert_eq!(near, "0,0,0");
+        "found"
+    };
+    let route = Routes::default().get("/query", "things that match", found);
     route.post::<[u8; 3], _, _>("/position", "where the robot is", 4, async |body: Bytes| {
         As::<&'static str>::new(body)
     })
@@ -43,7 +63,7 @@ async fn the_help_lists_what_the_router_serves() {
         assert!(lines.contains(&vec![format!("{method} {path}").as_str(), summary]), "{help}");
     }
     assert!(
-        help.contains("\n    near=x,y,z  ") && help.contains(" rank by distance too (default: 0,0,0)\n"),
+        help.contains("\n    near=1,2,3  ") && help.contains(" Rank by distance too. Default: 0,0,0.\n"),
         "{help}"
     );
     assert_eq!(ask(&Method::POST, "/position", "1 2 3").await.0, StatusCode::PAYLOAD_TOO_LARGE);

@@ -4,44 +4,59 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
-use axum::extract::rejection::QueryRejection;
 use axum::http::StatusCode;
+use schemars::JsonSchema;
+use serde::Deserialize;
+use slag_service::params::Params;
 use slag_service::problem::Problem;
-use slag_service::routes::Parameter;
 
-use super::params::{self, Pairs, lat_lon, number};
 use crate::http::app::App;
-use crate::http::forms;
-use crate::http::problem::{parameter_problem, query_problem};
-use crate::query::{ChangesError, ChangesReply, ChangesRequest, MAX_TEXTS, Point, RequestError, parse_point};
+use crate::http::forms::{self, LatLonText, XyzText};
+use crate::http::problem::query_problem;
+use crate::query::{ChangesError, ChangesReply, ChangesRequest, MAX_TEXTS, RequestError, Words};
+use crate::score::MAX_COORDINATE;
 
-/// Returns the parameters of `/v1/changes`.
-pub fn parameters() -> [Parameter; 6] {
-    [
-        Parameter::new::<u64>(
-            "from",
-            "3",
-            "the earlier generation (default: the newest before the later one that is remembered)",
-        ),
-        Parameter::new::<u64>("to", "4", "the later generation (default: that on board)"),
-        forms::near("with radius: only changes within this distance; of a move, one end counts"),
-        forms::near_lat_lon(),
-        forms::length("radius", "r", "with near"),
-        forms::text("chair", "a kind of thing: each thing names the one it is most like; may be repeated")
-            .repeated(MAX_TEXTS),
-    ]
+/// Which changes are asked for.
+#[derive(Deserialize, JsonSchema)]
+pub struct ChangesParams {
+    /// The earlier generation; by default the newest before the later one that is remembered.
+    #[schemars(example = 3)]
+    from: Option<u64>,
+    /// The later generation; by default that on board.
+    #[schemars(example = 4)]
+    to: Option<u64>,
+    /// With radius: only changes within this distance; of a move, one end counts.
+    #[schemars(example = &"2,1.5,0")]
+    near: Option<XyzText>,
+    /// The same on the earth, WGS 84: lat,lon or lat,lon,height.
+    #[schemars(example = &"46.8,-92.1")]
+    near_lat_lon: Option<LatLonText>,
+    /// With near, world units.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
+    radius: Option<f64>,
+    /// A kind of thing: each thing names the one it is most like; may be repeated.
+    #[serde(default)]
+    #[schemars(with = "Vec<Words>", length(max = MAX_TEXTS), example = ["chair"])]
+    text: Vec<String>,
 }
 
 pub async fn changes(
     State(app): State<Arc<App>>,
-    pairs: Result<Pairs, QueryRejection>,
+    Params(params): Params<ChangesParams>,
 ) -> Result<Json<ChangesReply>, Problem> {
-    let (mut request, near, radius) = parse(&params::pairs(pairs)?).map_err(parameter_problem)?;
+    let ChangesParams { from, to, near, near_lat_lon, radius, text: texts } = params;
+    if texts.len() > MAX_TEXTS {
+        let (found, expected) = (texts.len().to_string(), format!("at most {MAX_TEXTS} texts"));
+        return Err(RequestError::new("text", &found, expected).into());
+    }
+    let ball = forms::ball(forms::point(near, near_lat_lon)?, radius)?;
     let answering = app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let near = near.map(|near| near.in_world("near", &snapshot.manifest)).transpose();
-        request.ball = near.map_err(parameter_problem)?.zip(radius);
-        app.engine.changes(&request, budget).map(Json).map_err(problem)
+        let ball = match ball {
+            Some((near, radius)) => Some((near.in_world("near", &snapshot.manifest)?, radius)),
+            None => None,
+        };
+        app.engine.changes(&ChangesRequest { from, to, ball, texts }, budget).map(Json).map_err(problem)
     });
     answering.await
 }
@@ -56,39 +71,5 @@ fn problem(error: ChangesError) -> Problem {
         ChangesError::Encoders { .. } | ChangesError::NoObjects(_) => {
             Problem::new(StatusCode::CONFLICT, kind, "Generations do not compare", detail)
         }
-    }
-}
-
-type Parsed = (ChangesRequest, Option<Point>, Option<f64>);
-
-fn parse(pairs: &[(String, String)]) -> Result<Parsed, RequestError> {
-    params::check_names(pairs, &parameters())?;
-    let (mut request, mut near, mut radius) = (ChangesRequest::default(), None, None);
-    for (name, value) in pairs {
-        let refused = |expected: String| RequestError::new(name, value, expected);
-        match name.as_str() {
-            "from" => request.from = Some(number(name, value, "a whole number")?),
-            "to" => request.to = Some(number(name, value, "a whole number")?),
-            "near" => near = Some(Point::World(parse_point(value).map_err(refused)?.to_array())),
-            "near_lat_lon" => near = Some(Point::Geographic(lat_lon(name, value)?)),
-            "radius" => {
-                let given = number::<f64>(name, value, "a number")?;
-                if !(given > 0.0 && given.is_finite()) {
-                    return Err(refused("more than 0".into()));
-                }
-                radius = Some(given);
-            }
-            "text" => request.texts.push(value.clone()),
-            _ => {}
-        }
-    }
-    if request.texts.len() > MAX_TEXTS {
-        let found = request.texts.len().to_string();
-        return Err(RequestError::new("text", &found, format!("at most {MAX_TEXTS} texts")));
-    }
-    match (near, radius) {
-        (Some(_), None) => Err(RequestError::new("radius", "nothing", "a number, because there is near")),
-        (None, Some(_)) => Err(RequestError::new("near", "nothing", "x,y,z, because there is a radius")),
-        _ => Ok((request, near, radius)),
     }
 }

@@ -4,100 +4,121 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
-use axum::extract::rejection::QueryRejection;
 use axum::http::StatusCode;
 use glam::DVec3;
 use schemars::JsonSchema;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use slag_service::params::Params;
 use slag_service::problem::Problem;
-use slag_service::routes::Parameter;
 
-use super::params::{self, Pairs, lat_lon, number};
-use crate::goal::{self, FloorMap, GoalError, GoalReply, GoalRequest, GoalTarget, Place, request};
+use crate::goal::request::{
+    HEIGHT_M, MAX_POSES, MIN_VISIBLE, RADIUS_M, RANGE_M, REACH_M, SENSOR_HEIGHT_M, SLOPE, STEP_M,
+};
+use crate::goal::{self, FloorMap, GoalError, GoalReply, GoalRequest, GoalTarget, Place};
 use crate::http::app::App;
-use crate::http::forms;
-use crate::http::problem::{parameter_problem, query_problem};
-use crate::query::{FRAME, Point, RequestError, object_id, parse_point};
+use crate::http::forms::{self, LatLonText, ObjectIdText, XyzText};
+use crate::http::problem::query_problem;
+use crate::query::{FRAME, Point, RequestError, Words};
 use crate::score::Budget;
 
-/// Returns the parameters of `/v1/goal`.
-pub fn parameters() -> Vec<Parameter> {
-    let usual = GoalRequest::new(GoalTarget::Text(String::new()));
-    let of_goal = [
-        forms::text("chair", "the thing to go to; may name relations"),
-        forms::object_id("id", "the same by its id, instead of text"),
-        length("reach_m", "0.8", "largest horizontal distance to the thing's surface", request::REACH_M)
-            .or(usual.reach_m),
-        Parameter::new::<f64>(
-            "min_visible",
-            "0.05",
-            "least share of the thing's Gaussians that the sensor must see",
-        )
-        .within(request::MIN_VISIBLE[0], request::MIN_VISIBLE[1])
-        .or(usual.min_visible),
-        Parameter::new::<usize>("limit", "3", "most poses, at most 20")
-            .within(1, request::MAX_POSES)
-            .or(usual.limit),
-    ];
-    of_goal.into_iter().chain(floor_parameters()).collect()
+/// The thing to go to, and how near.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+pub struct GoalParams {
+    /// The thing to go to; may name relations.
+    #[schemars(with = "Option<Words>", example = &"chair")]
+    text: Option<String>,
+    /// The same by its id, instead of text.
+    #[schemars(example = &"o0123456789abcdef")]
+    id: Option<ObjectIdText>,
+    /// Largest horizontal distance to the thing's surface.
+    #[schemars(range(min = REACH_M[0], max = REACH_M[1]), extend("default" = usual().reach_m), example = 0.8)]
+    reach_m: Option<f64>,
+    /// Least share of the thing's Gaussians that the sensor must see.
+    #[schemars(range(min = MIN_VISIBLE[0], max = MIN_VISIBLE[1]), extend("default" = usual().min_visible), example = 0.05)]
+    min_visible: Option<f64>,
+    /// Most poses.
+    #[schemars(range(min = 1, max = MAX_POSES), extend("default" = usual().limit), example = 3)]
+    limit: Option<usize>,
 }
 
-/// Returns the parameters of `/v1/floor`.
-pub fn floor_parameters() -> Vec<Parameter> {
-    let usual = GoalRequest::new(GoalTarget::Text(String::new()));
-    vec![
-        forms::near(
-            "where the robot is (default: its last position if it is followed, else the middle of the area on board)",
-        ),
-        forms::near_lat_lon(),
-        length("radius_m", "0.3", "radius of the robot, seen from above", request::RADIUS_M)
-            .or(usual.radius_m),
-        length("sensor_height_m", "0.4", "height of its sensor above the ground", request::SENSOR_HEIGHT_M)
-            .or(usual.sensor_height_m),
-        length("height_m", "0.5", "height of the robot (default: 0.1 above the sensor)", request::HEIGHT_M),
-        length(
-            "step_m",
-            "0.1",
-            "highest step that it climbs, 1.5 of the scene's voxels or more (default: 0.1, or 0.15 with voxels of 0.1 m)",
-            request::STEP_M,
-        ),
-        Parameter::new::<f64>(
-            "slope",
-            "0.4",
-            "steepest ground that it drives on: rise for each metre of way",
-        )
-        .within(request::SLOPE[0], request::SLOPE[1])
-        .or(usual.slope),
-        length("range_m", "20", "how far around it ground is looked at", request::RANGE_M).or(usual.range_m),
-    ]
+/// The robot: its place and its size.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+pub struct RobotParams {
+    /// Where the robot is; by default its last position if it is followed, else the middle of the area on board.
+    #[schemars(example = &"2,1.5,0")]
+    near: Option<XyzText>,
+    /// The same on the earth, WGS 84: lat,lon or lat,lon,height.
+    #[schemars(example = &"46.8,-92.1")]
+    near_lat_lon: Option<LatLonText>,
+    /// Radius of the robot, seen from above.
+    #[schemars(range(min = RADIUS_M[0], max = RADIUS_M[1]), extend("default" = usual().radius_m), example = 0.3)]
+    radius_m: Option<f64>,
+    /// Height of its sensor above the ground.
+    #[schemars(
+        range(min = SENSOR_HEIGHT_M[0], max = SENSOR_HEIGHT_M[1]),
+        extend("default" = usual().sensor_height_m),
+        example = 0.4
+    )]
+    sensor_height_m: Option<f64>,
+    /// Height of the robot; by default 0.1 above the sensor.
+    #[schemars(range(min = HEIGHT_M[0], max = HEIGHT_M[1]), example = 0.5)]
+    height_m: Option<f64>,
+    /// Highest step that it climbs, 1.5 of the scene's voxels or more; by default 0.1, or 0.15 with voxels of 0.1 m.
+    #[schemars(range(min = STEP_M[0], max = STEP_M[1]), example = 0.1)]
+    step_m: Option<f64>,
+    /// Steepest ground that it drives on: rise for each metre of way.
+    #[schemars(range(min = SLOPE[0], max = SLOPE[1]), extend("default" = usual().slope), example = 0.4)]
+    slope: Option<f64>,
+    /// How far around it ground is looked at.
+    #[schemars(range(min = RANGE_M[0], max = RANGE_M[1]), extend("default" = usual().range_m), example = 20)]
+    range_m: Option<f64>,
 }
 
-fn length(name: &'static str, example: &'static str, summary: &str, [low, high]: [f64; 2]) -> Parameter {
-    Parameter::new::<f64>(name, example, summary).within(low, high)
+fn usual() -> GoalRequest {
+    GoalRequest::new(GoalTarget::Text(String::new()))
+}
+
+impl RobotParams {
+    /// Returns a request with this robot, and its place.
+    fn request(self) -> Result<(GoalRequest, Option<Point>), RequestError> {
+        let usual = usual();
+        let request = GoalRequest {
+            radius_m: self.radius_m.unwrap_or(usual.radius_m),
+            sensor_height_m: self.sensor_height_m.unwrap_or(usual.sensor_height_m),
+            height_m: self.height_m,
+            step_m: self.step_m,
+            slope: self.slope.unwrap_or(usual.slope),
+            range_m: self.range_m.unwrap_or(usual.range_m),
+            ..usual
+        };
+        Ok((request, forms::point(self.near, self.near_lat_lon)?))
+    }
 }
 
 pub async fn goal(
     State(app): State<Arc<App>>,
-    pairs: Result<Pairs, QueryRejection>,
+    Params((of_goal, robot)): Params<(GoalParams, RobotParams)>,
 ) -> Result<Json<GoalReply>, Problem> {
-    let pairs = params::pairs(pairs)?;
-    params::check_names(&pairs, &parameters()).map_err(parameter_problem)?;
-    let (request, near) = parse(&pairs).map_err(parameter_problem)?;
-    let is_text = matches!(&request.target, GoalTarget::Text(text) if text.trim().is_empty());
-    if is_text {
-        let refused = RequestError::new("text", "nothing", "the thing to go to, or its id as id");
-        return Err(parameter_problem(refused));
-    }
+    let (mut request, near) = robot.request()?;
+    request.target = match (of_goal.text, of_goal.id) {
+        (Some(text), None) if !text.trim().is_empty() => GoalTarget::Text(text),
+        (None, Some(ObjectIdText(id))) => GoalTarget::Object(id),
+        (Some(_), Some(_)) => return Err(RequestError::new("id", "text as well", "one of the two").into()),
+        _ => return Err(RequestError::new("text", "nothing", "the thing to go to, or its id as id").into()),
+    };
+    request.reach_m = of_goal.reach_m.unwrap_or(request.reach_m);
+    request.min_visible = of_goal.min_visible.unwrap_or(request.min_visible);
+    request.limit = of_goal.limit.unwrap_or(request.limit);
     answer(&app, near, request, |app, request, budget| goal::find(&app.engine, request, budget)).await
 }
 
 pub async fn floor(
     State(app): State<Arc<App>>,
-    pairs: Result<Pairs, QueryRejection>,
+    Params(robot): Params<RobotParams>,
 ) -> Result<Json<Floor>, Problem> {
-    let pairs = params::pairs(pairs)?;
-    params::check_names(&pairs, &floor_parameters()).map_err(parameter_problem)?;
-    let (request, near) = parse(&pairs).map_err(parameter_problem)?;
+    let (request, near) = robot.request()?;
     answer(&app, near, request, |app, request, budget| {
         let generation = app.engine.snapshot()?.manifest.generation;
         Ok(Floor::new(generation, &goal::floor_map(&app.engine, request, budget)?))
@@ -111,11 +132,11 @@ async fn answer<T: Send + 'static>(
     mut request: GoalRequest,
     work: impl FnOnce(&App, &GoalRequest, &Budget) -> Result<T, GoalError> + Send + 'static,
 ) -> Result<Json<T>, Problem> {
+    request.check()?;
     let answering = app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let in_world = |near: Point| near.in_world("near", &snapshot.manifest);
         request.near = match near {
-            Some(near) => Some(in_world(near).map_err(parameter_problem)?),
+            Some(near) => Some(near.in_world("near", &snapshot.manifest)?),
             None => app.last_position(&snapshot.manifest),
         };
         work(app, &request, budget).map(Json).map_err(problem)
@@ -169,35 +190,4 @@ impl Floor {
             runs: runs.collect(),
         }
     }
-}
-
-/// Reads the parameters that both have; names were checked before.
-fn parse(pairs: &[(String, String)]) -> Result<(GoalRequest, Option<Point>), RequestError> {
-    let mut request = GoalRequest::new(GoalTarget::Text(String::new()));
-    let mut near = None;
-    for (name, value) in pairs {
-        let refused = |expected: String| RequestError::new(name, value, expected);
-        let metres = || number::<f64>(name, value, "a number");
-        match name.as_str() {
-            "text" => request.target = GoalTarget::Text(value.clone()),
-            "id" => {
-                let id = object_id(value).ok_or_else(|| refused("o and 16 hex digits".into()))?;
-                request.target = GoalTarget::Object(id);
-            }
-            "near" => near = Some(Point::World(parse_point(value).map_err(refused)?.to_array())),
-            "near_lat_lon" => near = Some(Point::Geographic(lat_lon(name, value)?)),
-            "radius_m" => request.radius_m = metres()?,
-            "reach_m" => request.reach_m = metres()?,
-            "sensor_height_m" => request.sensor_height_m = metres()?,
-            "height_m" => request.height_m = Some(metres()?),
-            "step_m" => request.step_m = Some(metres()?),
-            "slope" => request.slope = metres()?,
-            "range_m" => request.range_m = metres()?,
-            "min_visible" => request.min_visible = metres()?,
-            "limit" => request.limit = number(name, value, "a whole number")?,
-            _ => {}
-        }
-    }
-    request.check()?;
-    Ok((request, near))
 }

@@ -1,14 +1,10 @@
 //! The API for programs, version 1: one shape of reply for every question.
 
-mod body;
 mod changes;
 mod events;
 mod goal;
 mod map;
 mod objects;
-mod params;
-mod query;
-mod reply;
 mod view;
 
 use std::sync::Arc;
@@ -16,8 +12,10 @@ use std::sync::Arc;
 use slag_service::routes::{Parameter, Routes};
 
 use super::app::App;
+use super::forms::ObjectIdText;
 use super::problem::{BUDGET, NO_PLACES, SCENE, TEXTS, TIME_BUDGET};
-use crate::query::OBJECT_ID;
+use super::query;
+use crate::query::Ask;
 
 /// Adds the routes.
 pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
@@ -27,14 +25,13 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
             "things that match texts or relations, best first, in one shape of reply",
             query::get,
         )
-        .parameters(params::query_parameters())
         .errors(&SCENE)
         .errors(&TEXTS)
         .errors(&[TIME_BUDGET])
-        .post::<body::Body, _, _>(
+        .post::<Ask, _, _>(
             "/v1/query",
             "the same, asked in JSON: texts, vectors, phrases, areas",
-            body::MAX_BODY_BYTES,
+            query::MAX_BODY_BYTES,
             query::post,
         )
         .reads()
@@ -42,17 +39,15 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .errors(&TEXTS)
         .errors(&[TIME_BUDGET])
         .get("/v1/objects", "all things on board, by id, in pages", objects::list)
-        .parameters(objects::parameters())
         .errors(&SCENE)
         .errors(&[BUDGET])
         .get("/v1/objects/{id}", "one thing on board", objects::one)
-        .parameters([Parameter::of_path::<String>("id", "o and 16 hex digits").of_form(OBJECT_ID)])
+        .parameters([Parameter::of_path::<ObjectIdText>("id", "o and 16 hex digits")])
         .errors(&SCENE)
         .errors(&[(404, "No such thing is on board."), BUDGET])
         .get("/v1/map", "the area on board, its age, and what is missing", map::map)
         .errors(&SCENE)
         .get("/v1/changes", "things that appeared, went or moved between two generations", changes::changes)
-        .parameters(changes::parameters())
         .errors(&SCENE)
         .errors(&[
             (404, "The robot does not remember a generation."),
@@ -60,11 +55,9 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
             TEXTS[1],
         ])
         .get("/v1/goal", "places to stand near a thing: reached, clear, and in sight of it", goal::goal)
-        .parameters(goal::parameters())
         .errors(&SCENE)
         .errors(&[NO_PLACES, TEXTS[1]])
         .get("/v1/floor", "the ground around the robot: unknown, obstacle, ground, reached", goal::floor)
-        .parameters(goal::floor_parameters())
         .errors(&SCENE)
         .errors(&[NO_PLACES, BUDGET]);
     to.get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
@@ -87,7 +80,6 @@ fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
     .details(
         "Little-endian: the bytes SLGS, version 1 (u32), least and largest score (f32 each), number of cells and generation (u32 each); for each cell its id and number of Gaussians (u32 each); then a byte b for each Gaussian: 0 if no view shows it, else its centroid's score is least + b / 255 * (largest - least). With negatives, scores are relevancies.",
     )
-    .parameters(view::scores_parameters())
     .errors(&SCENE)
     .errors(&TEXTS)
     .get("/v1/view/words", "words to ask for, and how many things on board each finds", view::words)
@@ -100,8 +92,7 @@ fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
     .details(
         "Little-endian: the bytes SLGG, version 1 and number of Gaussians N (u32 each), origin in the world (f32 x 3), flags (u32; 1: the appearance is known), step (u32); then columns: centres less the origin (f16 x 3), colours (u8 x 3), opacities (u8), sizes and rotations (u8 x 3 each, see docs/formats.md).",
     )
-    .parameters([Parameter::of_path::<u32>("id", "the cell's id").within(0, u32::MAX)])
-    .parameters(view::cell_parameters())
+    .parameters([Parameter::of_path::<u32>("id", "the cell's id").limit("maximum", u32::MAX)])
     .errors(&SCENE)
     .errors(&[
         (404, "The cell is not on board, or another generation is."),

@@ -3,42 +3,74 @@
 use std::sync::Arc;
 
 use axum::Json;
-use axum::extract::rejection::QueryRejection;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
+use schemars::JsonSchema;
+use serde::Deserialize;
+use slag_service::params::Params;
 use slag_service::problem::Problem;
-use slag_service::routes::Parameter;
 
-use super::params::{self, Pairs, number};
 use crate::http::app::App;
-use crate::http::forms;
-use crate::http::problem::{parameter_problem, query_problem};
-use crate::query::{ObjectFilter, ObjectOnBoard, ObjectPage, RequestError, object_id, parse_point};
+use crate::http::forms::{self, ObjectIdText, XyzText};
+use crate::http::problem::query_problem;
+use crate::query::{ObjectFilter, ObjectOnBoard, ObjectPage, RequestError, object_id};
+use crate::score::MAX_COORDINATE;
 
 /// Objects in a page unless the request says otherwise.
 const DEFAULT_PAGE: usize = 100;
 /// Most objects in a page.
 const MAX_PAGE: usize = 1000;
 
-/// Returns the parameters of `/v1/objects`.
-pub fn parameters() -> [Parameter; 5] {
-    [
-        Parameter::new::<usize>("limit", "100", "objects in a page, at most 1000")
-            .within(1, MAX_PAGE)
-            .or(DEFAULT_PAGE),
-        forms::object_id("after", "the id that the page begins after: next_after of the page before"),
-        forms::near("with radius: only objects with their position within this distance"),
-        forms::length("radius", "r", "with near"),
-        Parameter::new::<f64>("min_size", "0.5", "least length of the box's longest edge, world units")
-            .limit("minimum", 0),
-    ]
+/// Which objects are listed.
+#[derive(Deserialize, JsonSchema)]
+pub struct ListParams {
+    /// Objects in a page.
+    #[serde(default = "default_page")]
+    #[schemars(range(min = 1, max = MAX_PAGE), example = 100)]
+    limit: usize,
+    /// The id that the page begins after: next_after of the page before.
+    #[schemars(example = &"o0123456789abcdef")]
+    after: Option<ObjectIdText>,
+    /// With radius: only objects with their position within this distance.
+    #[schemars(example = &"2,1.5,0")]
+    near: Option<XyzText>,
+    /// With near, world units.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
+    radius: Option<f64>,
+    /// Least length of the box's longest edge, world units.
+    #[serde(default)]
+    #[schemars(range(min = 0), example = 0.5)]
+    min_size: f64,
+}
+
+fn default_page() -> usize {
+    DEFAULT_PAGE
+}
+
+impl ListParams {
+    fn filter(self) -> Result<ObjectFilter, RequestError> {
+        let refuse =
+            |parameter, found: String, expected: String| Err(RequestError::new(parameter, &found, expected));
+        if !(1..=MAX_PAGE).contains(&self.limit) {
+            return refuse("limit", self.limit.to_string(), format!("1 to {MAX_PAGE}"));
+        }
+        if !(self.min_size >= 0.0 && self.min_size.is_finite()) {
+            return refuse("min_size", self.min_size.to_string(), "0 or more".into());
+        }
+        Ok(ObjectFilter {
+            after: self.after.map(|ObjectIdText(id)| id),
+            ball: forms::ball(self.near.map(|XyzText(near)| near), self.radius)?,
+            min_size: self.min_size,
+        })
+    }
 }
 
 pub async fn list(
     State(app): State<Arc<App>>,
-    pairs: Result<Pairs, QueryRejection>,
+    Params(params): Params<ListParams>,
 ) -> Result<Json<ObjectPage>, Problem> {
-    let (filter, limit) = parse(&params::pairs(pairs)?).map_err(parameter_problem)?;
+    let limit = params.limit;
+    let filter = params.filter()?;
     app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
         app.engine.objects(&snapshot, &filter, limit, budget).map(Json).map_err(query_problem)
@@ -50,7 +82,7 @@ pub async fn one(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
 ) -> Result<Json<ObjectOnBoard>, Problem> {
-    let refused = || parameter_problem(RequestError::new("id", &id, "o and 16 hex digits"));
+    let refused = || RequestError::new("id", &id, "o and 16 hex digits");
     let wanted = object_id(&id).ok_or_else(refused)?;
     app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
@@ -65,47 +97,4 @@ pub async fn one(
         Ok(Json(object))
     })
     .await
-}
-
-fn parse(pairs: &[(String, String)]) -> Result<(ObjectFilter, usize), RequestError> {
-    params::check_names(pairs, &parameters())?;
-    let (mut filter, mut limit, mut near) = (ObjectFilter::default(), DEFAULT_PAGE, None);
-    let mut radius = None;
-    for (name, value) in pairs {
-        let refused = |expected: String| RequestError::new(name, value, expected);
-        match name.as_str() {
-            "limit" => {
-                limit = number(name, value, "a whole number")?;
-                if !(1..=MAX_PAGE).contains(&limit) {
-                    return Err(refused(format!("1 to {MAX_PAGE}")));
-                }
-            }
-            "after" => {
-                filter.after = Some(object_id(value).ok_or_else(|| refused("o and 16 hex digits".into()))?);
-            }
-            "near" => near = Some(parse_point(value).map_err(refused)?),
-            "radius" => radius = Some(number::<f64>(name, value, "a number")?),
-            "min_size" => {
-                filter.min_size = number(name, value, "a number")?;
-                if !(filter.min_size >= 0.0 && filter.min_size.is_finite()) {
-                    return Err(refused("0 or more".into()));
-                }
-            }
-            _ => {}
-        }
-    }
-    filter.ball = match (near, radius) {
-        (None, None) => None,
-        (Some(near), Some(radius)) if radius > 0.0 && f64::is_finite(radius) => Some((near, radius)),
-        (Some(_), Some(radius)) => {
-            return Err(RequestError::new("radius", &radius.to_string(), "more than 0"));
-        }
-        (None, Some(_)) => {
-            return Err(RequestError::new("near", "nothing", "x,y,z, because there is a radius"));
-        }
-        (Some(_), None) => {
-            return Err(RequestError::new("radius", "nothing", "a number, because there is near"));
-        }
-    };
-    Ok((filter, limit))
 }

@@ -3,43 +3,44 @@
 use std::sync::Arc;
 
 use axum::Json;
-use axum::extract::rejection::QueryRejection;
 use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
+use schemars::JsonSchema;
+use serde::Deserialize;
+use slag_service::params::Params;
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Binary};
-use slag_service::routes::Parameter;
-use slag_view::{Description, Step, Words};
+use slag_view::{Description, Step};
 
-use super::body;
-use super::params::{self, Pairs, number};
 use crate::http::app::App;
-use crate::http::forms;
-use crate::http::problem::{parameter_problem, query_problem};
-use crate::query::{Negatives, QueryError, RequestError};
+use crate::http::problem::query_problem;
+use crate::query::{MAX_NEGATIVES, QueryError, RequestError, Words};
 use crate::score::Budget;
 
 /// Largest generation that a request can name: the largest integer that every client of JSON keeps.
 const MAX_GENERATION: u64 = (1 << 53) - 1;
 
-/// Returns the parameters of `/v1/view/scores`.
-pub fn scores_parameters() -> [Parameter; 2] {
-    [forms::text("mug", "what to look for").required(), params::negative()]
+/// The question that the scene is coloured by.
+#[derive(Deserialize, JsonSchema)]
+pub struct ScoresParams {
+    /// What to look for.
+    #[schemars(with = "Words", example = &"mug")]
+    text: String,
+    /// A negative prompt, commas included; may be repeated; or canonical alone: object, things, stuff, texture.
+    #[serde(default)]
+    #[schemars(with = "Vec<Words>", length(max = MAX_NEGATIVES), example = ["wall, floor"])]
+    negative: Vec<String>,
 }
 
-/// Returns the parameters of the query string of `/v1/view/cells/{id}`.
-pub fn cell_parameters() -> [Parameter; 2] {
-    [
-        Parameter::new::<u64>(
-            "generation",
-            "12",
-            "the generation that must be on board: 404 if another one is",
-        )
-        .within(0, MAX_GENERATION),
-        Parameter::new::<usize>("step", "8", "sends every so many-th Gaussian, each larger; 1 sends all")
-            .within(1, Step::MAX)
-            .or(1),
-    ]
+/// Which Gaussians of a cell are sent.
+#[derive(Deserialize, JsonSchema)]
+pub struct CellParams {
+    /// The generation that must be on board: 404 if another one is.
+    #[schemars(range(min = 0, max = MAX_GENERATION), example = 12)]
+    generation: Option<u64>,
+    /// Sends every so many-th Gaussian, each larger; 1 sends all.
+    #[schemars(with = "Option<usize>", range(min = 1, max = Step::MAX), extend("default" = 1), example = 8)]
+    step: Option<String>,
 }
 
 pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, Problem> {
@@ -53,22 +54,26 @@ pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, 
 
 pub async fn scores(
     State(app): State<Arc<App>>,
-    pairs: Result<Pairs, QueryRejection>,
+    Params(params): Params<ScoresParams>,
 ) -> Result<As<Binary>, Problem> {
-    let (text, negatives) = parse_scores(&params::pairs(pairs)?).map_err(parameter_problem)?;
-    message(&app, move |app, budget| Ok(Some(app.engine.view_scores(&text, negatives, budget)?))).await
+    let ScoresParams { text, negative } = params;
+    message(&app, move |app, budget| Ok(Some(app.engine.view_scores(text, negative.into(), budget)?))).await
 }
 
 pub async fn cell(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
-    pairs: Result<Pairs, QueryRejection>,
+    Params(CellParams { generation, step }): Params<CellParams>,
 ) -> Result<As<Binary>, Problem> {
-    let (cell_id, generation, step) = parse_cell(&id, &params::pairs(pairs)?).map_err(parameter_problem)?;
+    let cell_id =
+        id.parse::<u32>().map_err(|_| RequestError::new("id", &id, "a cell's id, a whole number"))?;
+    let step = step.map_or(Ok(Step::ALL), |value| {
+        Step::parse(&value).map_err(|expected| RequestError::new("step", &value, expected))
+    })?;
     message(&app, move |app, budget| app.engine.view_cell(cell_id, generation, step, budget)).await
 }
 
-pub async fn words(State(app): State<Arc<App>>) -> Result<Json<Words>, Problem> {
+pub async fn words(State(app): State<Arc<App>>) -> Result<Json<slag_view::Words>, Problem> {
     app.within_limits(None, |app, budget| app.engine.view_words(budget).map(Json).map_err(query_problem))
         .await
 }
@@ -87,25 +92,4 @@ async fn message(
         })
     });
     Ok(As::new(([(header::CONTENT_TYPE, "application/octet-stream")], making.await?)))
-}
-
-fn parse_scores(pairs: &[(String, String)]) -> Result<(String, Negatives), RequestError> {
-    params::check_names(pairs, &scores_parameters())?;
-    let of = |wanted: &'static str| {
-        pairs.iter().filter(move |(name, _)| name == wanted).map(|(_, value)| value.clone())
-    };
-    let text = of("text").next();
-    let text = text.ok_or_else(|| RequestError::new("text", "nothing", "words to look for"))?;
-    Ok((text, body::negatives(of("negative").collect())))
-}
-
-fn parse_cell(id: &str, pairs: &[(String, String)]) -> Result<(u32, Option<u64>, Step), RequestError> {
-    params::check_names(pairs, &cell_parameters())?;
-    let cell_id = number("id", id, "a cell's id, a whole number")?;
-    let of = |wanted: &str| pairs.iter().find(|(name, _)| name == wanted).map(|(_, value)| value);
-    let generation = of("generation").map(|value| number("generation", value, "a whole number"));
-    let step = of("step").map_or(Ok(Step::ALL), |value| {
-        Step::parse(value).map_err(|expected| RequestError::new("step", value, expected))
-    });
-    Ok((cell_id, generation.transpose()?, step?))
 }

@@ -97,7 +97,7 @@ fn candidates<'a>(
     let best_score = objects::best(&scored.scores).map(|best| scale.shown(scored.scores[best]));
     let base = scale.base(calibration);
     let margin = f64::from(best_score.unwrap_or(base) - base).max(f64::MIN_POSITIVE);
-    let (region, alignment) = (request.region(), alignment(scene.manifest));
+    let (region, alignment) = (&request.region, alignment(scene.manifest));
     let candidate = |found: FoundObject<'a>| {
         let oriented = objects::oriented_box(scene, &found, &everywhere, alignment);
         let score = scale.shown(found.score);
@@ -105,7 +105,7 @@ fn candidates<'a>(
             solid: Solid::of(&oriented, &found.record.bounds()),
             score,
             confidence: (f64::from(score - base) / margin).clamp(0.0, 1.0),
-            is_inside: objects::in_region(scene, found.object, &region, request.min_count),
+            is_inside: objects::in_region(scene, found.object, region, request.min_count),
             found,
         }
     };

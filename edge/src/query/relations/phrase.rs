@@ -4,8 +4,8 @@ use std::fmt;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use slag_service::params::RequestError;
 
-use crate::query::RequestError;
 use crate::text::MAX_TEXT_BYTES;
 
 /// Most things that a phrase may name.

@@ -22,7 +22,7 @@ fn a_budget_is_enough_or_is_named() {
     let pool = Pool::new(u64::MAX);
     for kind in [AnswerKind::Clusters, AnswerKind::Gaussians] {
         let request = QueryRequest {
-            texts: vec!["thing".into(), "other".into()],
+            asked: ["thing", "other"].map(|text| Asked::Text(text.into())).to_vec(),
             kind: Some(kind),
             threshold: Some(-1.0),
             voxel: Some(1e-9),
@@ -33,7 +33,7 @@ fn a_budget_is_enough_or_is_named() {
         let ask = |budget: Budget| {
             let mut scratch = Scratch::default();
             scratch.set_budget(budget);
-            answer(&mut scratch, &scene, &questions, &request)
+            answer(&mut scratch, &scene, (&["thing", "other"], &questions), &request)
         };
         let expected = ask(Budget::default()).expect("without bounds");
         let (mut n_refused, mut is_answered) = (0, false);

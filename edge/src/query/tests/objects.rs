@@ -32,26 +32,35 @@ fn objects_answer_first_and_once() {
         request.near = Some(DVec3::ZERO);
         manifest.encoder.calibration = Some(Calibration { score_mean: 0.5, score_spread: 0.2 });
     });
-    assert_eq!((answers.kind, answers.threshold_source), (AnswerKind::Objects, ThresholdSource::Scene));
+    assert_eq!(
+        (answers.kind, answers.searched.threshold_source),
+        (AnswerKind::Objects, ThresholdSource::Scene)
+    );
     // Of the objects, not of the Gaussians.
-    assert!((answers.threshold - 0.4).abs() < 1e-6, "{}", answers.threshold);
+    assert!((answers.searched.threshold - 0.4).abs() < 1e-6, "{}", answers.searched.threshold);
     let found = clusters(&answers);
     assert_eq!(found.len(), 1, "{found:?}");
     let object = &found[0];
-    assert!((object.score - 0.8).abs() <= answers.score_error_bound && answers.score_error_bound < 0.01);
+    assert!(
+        (object.score - 0.8).abs() <= answers.searched.score_error_bound
+            && answers.searched.score_error_bound < 0.01
+    );
     assert_eq!((object.id.as_str(), object.rank), ("o0000000000000015", 1));
-    assert_eq!((object.n_gaussians, object.n_gaussians_in_scene, answers.n_matching), (42, Some(50), 42));
+    assert_eq!(
+        (object.n_gaussians, object.n_gaussians_in_scene, answers.searched.n_matching),
+        (42, Some(50), 42)
+    );
     let evidence = Evidence { photo: "21.jpg".into(), box_px: [1, 2, 30, 40] };
     assert_eq!(object.evidence.as_ref(), Some(&evidence));
     assert_eq!((object.position_in_world, object.distance), (DVec3::new(21.0, 0.0, 0.0), Some(21.0)));
     assert_eq!(object.size, DVec3::splat(2.0));
     // From 20.10 to 22.16, without 2 % at either end.
     assert!((object.oriented_box.size.x - 2.06).abs() < 0.05, "{:?}", object.oriented_box);
-    assert!(!answers.is_exact && answers.clustering.is_none() && answers.reason.is_none());
+    assert!(!answers.searched.is_exact && answers.searched.clustering.is_none() && answers.reason.is_none());
 
     // Without a calibrated scene the encoder's own threshold applies; other kinds are unaffected.
     let answers = ask(&scene, |request, _| request.kind = Some(AnswerKind::Objects));
-    assert_eq!(answers.threshold_source, ThresholdSource::Encoder);
+    assert_eq!(answers.searched.threshold_source, ThresholdSource::Encoder);
     let clusters_of = |built: &[BuiltShard]| {
         ask(built, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Clusters), Some(0.5)))
             .answers
@@ -81,7 +90,7 @@ fn objects_abstain_and_keep_to_the_region() {
     let within =
         |min: f64, max: f64| Aabb { min: DVec3::new(min, -1.0, -1.0), max: DVec3::new(max, 1.0, 1.0) };
     let answers = ask_objects(&|request| {
-        (request.threshold, request.bounds) = (Some(0.5), Some(within(20.195, 20.9)));
+        (request.threshold, request.region.bounds) = (Some(0.5), Some(within(20.195, 20.9)));
     });
     let cut = &clusters(&answers)[0];
     assert_eq!(cut.n_gaussians, 20);
@@ -97,7 +106,8 @@ fn objects_abstain_and_keep_to_the_region() {
     let near = DVec3::new(20.0, 0.0, 0.0);
     for radius in [0.15, 0.3, 1.0, 2.05, 30.0] {
         let answers = ask_objects(&|request| {
-            (request.threshold, request.near, request.radius) = (Some(0.5), Some(near), Some(radius));
+            (request.threshold, request.near) = (Some(0.5), Some(near));
+            request.region.ball = Some(Ball { centre_in_world: near, radius });
             request.min_count = 1;
         });
         let object = &clusters(&answers)[0];
@@ -108,18 +118,18 @@ fn objects_abstain_and_keep_to_the_region() {
     // that cell.
     let answers = ask_objects(&|request| {
         let bounds = Aabb { min: DVec3::new(21.9, -1.0, -1.0), max: DVec3::splat(1e3) };
-        (request.threshold, request.bounds) = (Some(0.5), Some(bounds));
+        (request.threshold, request.region.bounds) = (Some(0.5), Some(bounds));
     });
-    assert_eq!((clusters(&answers)[0].n_gaussians, answers.n_searched), (12, 160));
+    assert_eq!((clusters(&answers)[0].n_gaussians, answers.searched.n_searched), (12, 160));
     // From 22.00 to 22.16: those of cell 3 are not in the box either.
     assert!((clusters(&answers)[0].oriented_box.size.x - 0.16).abs() < 0.011);
     // All matches are counted, and as many as asked for are returned.
     let answers = ask_about(&scene, &[Question::new([0.6, 0.8])], |request, _| request.limit = Some(1));
     let found = clusters(&answers[0]);
     assert_eq!((found.len(), found[0].rank, found[0].n_gaussians), (1, 1, 42));
-    assert_eq!((answers[0].n_matching, found[0].id.as_str()), (72, "o0000000000000015"));
+    assert_eq!((answers[0].searched.n_matching, found[0].id.as_str()), (72, "o0000000000000015"));
     let answers = ask_objects(&|request| {
-        (request.threshold, request.bounds) = (Some(0.5), Some(within(50.0, 60.0)));
+        (request.threshold, request.region.bounds) = (Some(0.5), Some(within(50.0, 60.0)));
     });
     assert_eq!(answers.reason.map(|r| r.kind), Some(ReasonKind::NothingThere));
     // With a negative the score is the difference of the object's scores: 0.8 - 0.9 for 21, 0 - 1 for 22.

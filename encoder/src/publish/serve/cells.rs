@@ -3,8 +3,7 @@
 use std::collections::BTreeMap;
 
 use axum::Json;
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Query, State};
+use axum::extract::State;
 use axum::http::header;
 use glam::DVec3;
 use schemars::{JsonSchema, SchemaGenerator};
@@ -14,6 +13,7 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{Manifest, ShardRecord};
 use slag_common::shard::Profile;
+use slag_service::params::{Params, RequestError};
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Described, Reply};
 
@@ -22,29 +22,38 @@ use super::state::{AppState, Snapshot};
 use crate::publish::geographic;
 
 /// A centre, in one of two frames, and a radius.
-#[derive(Clone, Copy, Debug, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
 pub(super) struct CellsQuery {
+    /// Centre in the world frame, with y and z.
+    #[schemars(example = 1)]
     x: Option<f64>,
+    /// See x.
+    #[schemars(example = 2)]
     y: Option<f64>,
+    /// See x.
+    #[schemars(example = 3)]
     z: Option<f64>,
+    /// Or centre on the earth, degrees WGS 84, with lon.
+    #[schemars(range(min = -90, max = 90), example = 46.8)]
     lat: Option<f64>,
+    /// See lat.
+    #[schemars(range(min = -180, max = 180), example = -92)]
     lon: Option<f64>,
+    /// Metres above the ellipsoid; by default the scene's origin.
+    #[schemars(example = 158.5)]
     height: Option<f64>,
-    radius: Option<f64>,
+    /// Distance from the centre, units of the world frame.
+    #[schemars(range(min = 0), example = 50)]
+    radius: f64,
 }
 
 impl CellsQuery {
     /// Returns centre and radius in the world frame.
     fn ball_in_world(self, manifest: &Manifest) -> Result<(DVec3, f64), Problem> {
-        let radius = match self.radius {
-            Some(radius) if radius >= 0.0 && radius.is_finite() => radius,
-            _ => {
-                let expected =
-                    "radius is required: a finite number, not negative, in units of the world frame";
-                return Err(bad_parameter(expected));
-            }
-        };
+        if !(self.radius >= 0.0 && self.radius.is_finite()) {
+            let expected = "a finite number, not negative, in units of the world frame";
+            return Err(RequestError::new("radius", &self.radius.to_string(), expected).into());
+        }
         let centre = match self {
             Self { x: Some(x), y: Some(y), z: Some(z), lat: None, lon: None, height: None, .. } => {
                 DVec3::new(x, y, z)
@@ -58,7 +67,7 @@ impl CellsQuery {
         if !centre.is_finite() {
             return Err(bad_parameter("the centre must be finite"));
         }
-        Ok((centre, radius))
+        Ok((centre, self.radius))
     }
 }
 
@@ -93,9 +102,8 @@ struct CellAnswer {
 
 pub(super) async fn cells(
     State(service): AppState,
-    query: Result<Query<CellsQuery>, QueryRejection>,
+    Params(query): Params<CellsQuery>,
 ) -> Result<Json<CellsAnswer>, Problem> {
-    let Query(query) = query.map_err(|e| bad_parameter(e.body_text()))?;
     let search = move |snapshot: &Snapshot| {
         let manifest = snapshot.world();
         let (centre, radius) = query.ball_in_world(manifest)?;

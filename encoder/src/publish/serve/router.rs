@@ -14,7 +14,8 @@ use slag_common::Hash32;
 use slag_service::access::Access;
 use slag_service::metrics::ResponseCounts;
 use slag_service::openapi::About;
-use slag_service::problem::{NoMembers, Problem};
+use slag_service::params::ParameterMembers;
+use slag_service::problem::Problem;
 use slag_service::request::observed;
 use slag_service::routes::{Parameter, Route, Routes};
 use tower::ServiceBuilder;
@@ -67,7 +68,7 @@ pub fn bounded(routes: Router, limits: Limits, access: Access) -> Router {
 
 /// Returns the routes with their descriptions, and their table.
 pub(super) fn described() -> (Router<Arc<Service>>, Vec<Route>) {
-    routes().described::<NoMembers>(ABOUT)
+    routes().described::<ParameterMembers>(ABOUT)
 }
 
 fn routes() -> Routes<Arc<Service>> {
@@ -102,22 +103,6 @@ fn routes() -> Routes<Arc<Service>> {
         ])
         .get("/v1/cells", "cells near a point, with distances and shards", cells::cells)
         .details("The point is x, y and z, or lat and lon.")
-        .parameters([
-            Parameter::new::<f64>("x", "1", "centre in the world frame, with y and z"),
-            Parameter::new::<f64>("y", "2", ""),
-            Parameter::new::<f64>("z", "3", ""),
-            Parameter::new::<f64>("lat", "46.8", "or centre on the earth, degrees WGS 84, with lon")
-                .within(-90, 90),
-            Parameter::new::<f64>("lon", "-92", "").within(-180, 180),
-            Parameter::new::<f64>(
-                "height",
-                "158.5",
-                "metres above the ellipsoid (default: the scene's origin)",
-            ),
-            Parameter::new::<f64>("radius", "50", "distance from the centre, units of the world frame")
-                .required()
-                .limit("minimum", 0),
-        ])
         .errors(&STORE)
         .get("/v1/coverage.geojson", "footprints of the cells on the earth (RFC 7946)", cells::coverage)
         .errors(&STORE)

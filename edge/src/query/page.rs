@@ -1,19 +1,20 @@
-//! The one shape of reply to `/v1/query`.
+//! A page of answers: the one shape of reply of version 1.
 
 use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Serialize;
 
-use crate::query::relations::{self, MissKind, Phrase, Witness};
-use crate::query::{
-    AnswerKind, Answers, BadCellAnswer, ClusterAnswer, Clustering, FRAME, Found, GaussianAnswer, Outcome,
-    ReasonKind, RelatedAnswers, Reply, ScoreKind, ThresholdSource, UNITS, unit,
-};
+use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, ReasonKind, Searched};
+use super::frame::{FRAME, UNITS, unit};
+use super::outcome::{Outcome, RelatedAnswers};
+use super::relations::{self, MissKind, Phrase, Witness};
+use super::reply::Reply;
+use super::request::{AnswerKind, Asked};
 
 /// The reply of version 1, to one question or many.
 #[derive(Serialize, JsonSchema)]
 #[schemars(rename = "Reply")]
-pub struct Replied<'a> {
+pub struct Page<'a> {
     /// Name of the scene.
     scene: &'a str,
     /// Generation that answers.
@@ -31,15 +32,15 @@ pub struct Replied<'a> {
 /// The answers to one question.
 #[derive(Serialize, JsonSchema)]
 #[schemars(rename = "Result")]
-pub struct Described<'a> {
+struct Described<'a> {
     /// The question.
-    question: AskedFor,
+    question: AskedFor<'a>,
     /// The phrase that a text was understood as, if it names a relation.
     understood: Option<&'a Phrase>,
     /// Kind of the answers.
     kind: AnswerKind,
     #[serde(flatten)]
-    searched: Option<Searched<'a>>,
+    searched: Option<&'a Searched>,
     /// For phrases: the things that they name.
     #[serde(skip_serializing_if = "Option::is_none")]
     parts: Option<&'a [relations::Found]>,
@@ -54,55 +55,16 @@ pub struct Described<'a> {
 /// A question as the client wrote it: one of the members.
 #[derive(Default, Serialize, JsonSchema)]
 #[schemars(rename = "Question")]
-pub struct AskedFor {
+struct AskedFor<'a> {
     /// A text.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub text: Option<String>,
+    text: Option<&'a str>,
     /// The index of a vector in the request.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub vector: Option<usize>,
+    vector: Option<usize>,
     /// A phrase.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub phrase: Option<Phrase>,
-}
-
-/// How a text or vector was searched for.
-#[derive(Serialize, JsonSchema)]
-struct Searched<'a> {
-    /// Negative prompts.
-    #[serde(skip_serializing_if = "is_empty")]
-    negatives: &'a [String],
-    /// Meaning of scores.
-    score_kind: ScoreKind,
-    /// Score at or above which a Gaussian matches.
-    threshold: f32,
-    /// Source of the threshold.
-    threshold_source: ThresholdSource,
-    /// Gaussians with an embedding in the shards searched.
-    n_searched: u64,
-    /// Gaussians that match.
-    n_matching: u64,
-    /// Whether the matches are exactly the Gaussians that reach the threshold.
-    is_exact: bool,
-    /// Bound of the error of every score.
-    score_error_bound: f32,
-    /// For 95 of 100 questions (90 with negatives), 99 of 100 scores of each shard err by no more, measured over
-    /// texts that the codebook was not made for; absent where answers are exact or it was not measured.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    score_error_likely: Option<f32>,
-    /// Whether all of the requested region is on board.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    area_fetched: Option<bool>,
-    /// Cells in the requested region whose shards could not be fetched; absent if there are none.
-    #[serde(skip_serializing_if = "is_empty")]
-    bad_cells: &'a [BadCellAnswer],
-    /// How matches were grouped.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    clustering: Option<&'a Clustering>,
-}
-
-fn is_empty<T>(list: &&[T]) -> bool {
-    list.is_empty()
+    phrase: Option<&'a Phrase>,
 }
 
 /// Why nothing was found.
@@ -169,22 +131,40 @@ struct AnsweredThing<'a> {
     related_to: Option<&'a [Witness]>,
 }
 
-impl<'a> Replied<'a> {
-    pub fn new(reply: &'a Reply, results: Vec<Described<'a>>) -> Self {
+impl<'a> Page<'a> {
+    /// Describes a reply, of the answers those in its page.
+    pub fn of(reply: &'a Reply) -> Self {
         let manifest = reply.manifest();
-        let unit = unit(manifest);
-        Self { scene: &manifest.scene, generation: manifest.generation, frame: FRAME, unit, results }
+        let results = reply.request.asked.iter().zip(&reply.outcomes);
+        Self {
+            scene: &manifest.scene,
+            generation: manifest.generation,
+            frame: FRAME,
+            unit: unit(manifest),
+            results: results.map(|(asked, outcome)| Described::new(reply, asked, outcome)).collect(),
+        }
+    }
+}
+
+impl<'a> AskedFor<'a> {
+    /// Returns a question, and the phrase that it was understood as.
+    fn new(asked: &'a Asked) -> (Self, Option<&'a Phrase>) {
+        let of_text = |text| Self { text: Some(text), ..Self::default() };
+        match asked {
+            Asked::Text(text) => (of_text(text), None),
+            Asked::Vector { at, .. } => (Self { vector: Some(*at), ..Self::default() }, None),
+            Asked::Phrase { text: Some(text), phrase } => (of_text(text), Some(phrase)),
+            Asked::Phrase { text: None, phrase } => {
+                (Self { phrase: Some(phrase), ..Self::default() }, Some(phrase))
+            }
+        }
     }
 }
 
 impl<'a> Described<'a> {
-    /// Describes the answers to a question: a page of them, from `offset`, of at most `limit`.
-    pub fn new(
-        reply: &Reply,
-        (question, understood): (AskedFor, Option<&'a Phrase>),
-        outcome: &'a Outcome,
-        (offset, limit): (usize, usize),
-    ) -> Self {
+    fn new(reply: &Reply, asked: &'a Asked, outcome: &'a Outcome) -> Self {
+        let (question, understood) = AskedFor::new(asked);
+        let (offset, limit) = (reply.request.offset, reply.request.page());
         let end = offset.saturating_add(limit);
         let page = Self {
             question,
@@ -213,7 +193,7 @@ impl<'a> Described<'a> {
                         page.map(|of| Answer::Gaussian(InFrame { frame: FRAME, generation, of })).collect()
                     }
                 };
-                let (searched, none) = (Some(Searched::new(answers)), Nothing::of_plain(answers));
+                let (searched, none) = (Some(&answers.searched), Nothing::of_plain(answers));
                 Self { kind: answers.kind, searched, none, answers: list, ..page }
             }
             Outcome::Related(related) => {
@@ -222,25 +202,6 @@ impl<'a> Described<'a> {
                 let (parts, none) = (Some(&*related.parts), Nothing::of_related(related));
                 Self { parts, none, answers: list.collect(), ..page }
             }
-        }
-    }
-}
-
-impl<'a> Searched<'a> {
-    fn new(answers: &'a Answers) -> Self {
-        Self {
-            negatives: &answers.negatives,
-            score_kind: answers.score_kind,
-            threshold: answers.threshold,
-            threshold_source: answers.threshold_source,
-            n_searched: answers.n_searched,
-            n_matching: answers.n_matching,
-            is_exact: answers.is_exact,
-            score_error_bound: answers.score_error_bound,
-            score_error_likely: answers.score_error_likely,
-            area_fetched: answers.area_fetched,
-            bad_cells: &answers.bad_cells,
-            clustering: answers.clustering.as_ref(),
         }
     }
 }

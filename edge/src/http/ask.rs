@@ -1,0 +1,197 @@
+//! The parameters of `/v1/query` and of `/query`.
+
+use axum::http::HeaderMap;
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::forms::{self, BoxText, LatLonPolygonText, LatLonText, NegativesText, PolygonText, XyzText};
+use crate::query::{
+    AnswerKind, Area, AreaBall, AreaBox, Ask, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Format, MAX_GAUSSIANS,
+    MAX_NEGATIVES, MAX_TEXTS, Negatives, Point, RequestError, Words,
+};
+use crate::score::{MAX_COORDINATE, Precision};
+
+/// Questions and what they share.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+pub struct AskParams {
+    /// What to look for; may be repeated. A text that names a relation (mug on the table) is understood as a phrase.
+    #[schemars(with = "Vec<Words>", length(min = 1, max = MAX_TEXTS), example = ["mug on the table"])]
+    text: Vec<String>,
+    /// off: take texts as they are, even if they name a relation.
+    #[schemars(example = &"off")]
+    #[serde(default)]
+    relations: Switch,
+    /// A negative prompt, commas included; may be repeated; or canonical alone: object, things, stuff, texture.
+    #[serde(default)]
+    #[schemars(with = "Vec<Words>", length(max = MAX_NEGATIVES), example = ["wall, floor"])]
+    negative: Vec<String>,
+    /// Kind of answers; by default objects where the scene has them, else clusters.
+    #[schemars(example = &"objects")]
+    kind: Option<AnswerKind>,
+    /// Most answers to a text. Over all texts at most 10,000, or 1,000,000 Gaussians that come at once.
+    #[schemars(range(min = 1, max = MAX_GAUSSIANS), extend("default" = DEFAULT_LIMIT), example = 10)]
+    limit: Option<usize>,
+    /// Answers to a text before the page.
+    #[serde(default)]
+    #[schemars(example = 0)]
+    offset: usize,
+    /// Least cosine, or with negatives least relevancy, of a match; by default the scene's, or 0.5.
+    #[schemars(range(min = -1, max = 1), example = 0.1)]
+    min_score: Option<f32>,
+    /// Where the asker is: answers have distances, nearer ones rank higher, and relations are seen from there.
+    #[schemars(example = &"2,1.5,0")]
+    near: Option<XyzText>,
+    /// The same on the earth, WGS 84: lat,lon or lat,lon,height; for scenes with a place on the earth.
+    #[schemars(example = &"46.8,-92.1")]
+    near_lat_lon: Option<LatLonText>,
+    /// Where the asker looks, from the world's x towards y.
+    #[schemars(example = 1.57)]
+    heading_rad: Option<f64>,
+    /// Only within this distance of the asker, world units.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
+    radius: Option<f64>,
+    /// Only between two opposite corners.
+    #[serde(rename = "box")]
+    #[schemars(example = &"0,0,0,4,3,2")]
+    bounds: Option<BoxText>,
+    /// Only inside this outline of 3 to 256 corners, seen from above.
+    #[schemars(example = &"0,0,4,0,4,3")]
+    polygon: Option<PolygonText>,
+    /// The same on the earth.
+    #[schemars(example = &"46.8,-92.1,46.8,-92,46.9,-92")]
+    polygon_lat_lon: Option<LatLonPolygonText>,
+    /// Least Gaussians of an answer; smaller clusters are counted.
+    #[schemars(range(min = 1), extend("default" = DEFAULT_MIN_COUNT), example = 10)]
+    min_count: Option<u64>,
+    /// Edge of the voxels that join Gaussians to clusters, world units.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 0.25)]
+    voxel: Option<f64>,
+    /// Data that scores come from.
+    #[serde(default)]
+    #[schemars(example = &"measured")]
+    precision: Precision,
+    /// Give up after this time.
+    #[schemars(range(min = 1), example = 500)]
+    time_budget_ms: Option<u64>,
+}
+
+#[derive(Default, PartialEq, Deserialize, serde::Serialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+#[schemars(inline)]
+enum Switch {
+    #[default]
+    On,
+    Off,
+}
+
+/// What `/query` takes besides.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+pub struct ShortParams {
+    /// Format of the answers. arrow: Gaussians as columns, only with kind=gaussians; Accept:
+    /// application/vnd.apache.arrow.stream has the same effect. ply: the answers' Gaussians as points.
+    #[schemars(extend("default" = Format::default()), example = &"json")]
+    format: Option<Format>,
+    /// Another name of min_score.
+    #[schemars(range(min = -1, max = 1), example = 0.1)]
+    threshold: Option<f32>,
+    /// none, canonical (object, things, stuff, texture) or a,b,c: all negative prompts in one text. Scores are then
+    /// LERF's relevancy, 1 / (1 + exp(-10 (q.E - max n.E))).
+    #[schemars(example = &"canonical")]
+    negatives: Option<NegativesText>,
+}
+
+impl AskParams {
+    /// Returns the questions as the body of a POST asks them.
+    pub fn ask(self) -> Result<Ask, RequestError> {
+        let near = forms::point(self.near, self.near_lat_lon)?;
+        let ball = match (self.radius, near) {
+            (None, _) => None,
+            (Some(radius), Some(centre)) => Some(AreaBall { centre, radius }),
+            (Some(radius), None) => {
+                let expected = format!("where the asker is, because radius is {radius}");
+                return Err(RequestError::new("near", "nothing", expected));
+            }
+        };
+        let bounds = self.bounds.map(|BoxText(bounds)| {
+            let [from, to] = [bounds.min, bounds.max].map(|corner| Point::World(corner.to_array()));
+            AreaBox { from, to }
+        });
+        let polygon = match (self.polygon, self.polygon_lat_lon) {
+            (Some(_), Some(_)) => {
+                let error = RequestError::new("polygon_lat_lon", "polygon as well", "one of the two");
+                return Err(error);
+            }
+            (world, geographic) => {
+                world.map(|PolygonText(corners)| corners).or(geographic.map(|of| of.0)).unwrap_or_default()
+            }
+        };
+        Ok(Ask {
+            texts: self.text,
+            relations: Some(self.relations == Switch::On),
+            negatives: self.negative.into(),
+            kind: self.kind,
+            region: Area { ball, bounds, polygon },
+            near,
+            heading_rad: self.heading_rad,
+            min_score: self.min_score,
+            limit: self.limit,
+            offset: self.offset,
+            min_count: self.min_count,
+            voxel: self.voxel,
+            precision: self.precision,
+            time_budget_ms: self.time_budget_ms,
+            ..Ask::default()
+        })
+    }
+}
+
+impl ShortParams {
+    /// Returns the questions of `/query`: what `/v1/query` takes, with answers that come at once.
+    pub fn ask(self, params: AskParams, headers: &HeaderMap) -> Result<Ask, RequestError> {
+        let mut ask = params.ask()?;
+        let twice = |parameter: &str, other: &str| {
+            Err(RequestError::new(parameter, &format!("{other} as well"), "one of the two"))
+        };
+        if let Some(threshold) = self.threshold
+            && ask.min_score.replace(threshold).is_some()
+        {
+            return twice("threshold", "min_score");
+        }
+        if let Some(NegativesText(negatives)) = self.negatives
+            && std::mem::replace(&mut ask.negatives, negatives) != Negatives::None
+        {
+            return twice("negatives", "negative");
+        }
+        let format = self.format.unwrap_or_else(|| accepted(headers));
+        #[cfg(feature = "arrow")]
+        if let (Format::Arrow, kind) = (format, ask.kind)
+            && kind != Some(AnswerKind::Gaussians)
+        {
+            let found = kind.unwrap_or_default().to_string();
+            return Err(RequestError::new("kind", &found, "gaussians, since format is arrow"));
+        }
+        ask.format = Some(format);
+        Ok(ask)
+    }
+}
+
+/// Returns the format of `Accept`: columns if it lists them, JSON otherwise.
+#[cfg_attr(
+    not(feature = "arrow"),
+    expect(unused_variables, reason = "JSON is the only format that it names")
+)]
+fn accepted(headers: &HeaderMap) -> Format {
+    #[cfg(feature = "arrow")]
+    {
+        let arrow = Format::Arrow.media_type();
+        let values =
+            headers.get_all(axum::http::header::ACCEPT).iter().filter_map(|value| value.to_str().ok());
+        let mut ranges = values.flat_map(|value| value.split(','));
+        if ranges.any(|range| range.split(';').next().is_some_and(|r| r.trim().eq_ignore_ascii_case(arrow))) {
+            return Format::Arrow;
+        }
+    }
+    Format::Json
+}

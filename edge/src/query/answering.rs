@@ -1,0 +1,133 @@
+//! From questions to their answers.
+
+use std::sync::Arc;
+
+use slag_service::params::RequestError;
+
+use super::answer::{answer, object_answer};
+use super::ask::Ask;
+use super::engine::{Engine, OnBoard, QueryError};
+use super::outcome::{Outcome, RelatedAnswers};
+use super::rank::Ranked;
+use super::relations::{self, Phrase, Scale, Things, Viewer};
+use super::reply::Reply;
+use super::request::{Asked, QueryRequest, unit_vector};
+use super::scene::Scene;
+use crate::score::{Budget, Question, Region, ScoreError, Scratch, score_objects};
+
+/// Memory for the candidates of a thing: 256 of a kilobyte.
+const CANDIDATES_BYTES: usize = 256 << 10;
+
+impl Engine {
+    /// Answers questions from the loaded generation. Blocks for milliseconds of computing, at most as long as the
+    /// budget says.
+    pub fn ask(&self, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
+        let on_board = self.on_board()?;
+        on_board.check()?;
+        let request = ask.understand(&on_board.snapshot)?;
+        self.answer_on(on_board, request, budget)
+    }
+
+    /// Answers a request that is in the world frame already, as [`Engine::ask`] does.
+    pub fn answer(&self, request: QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
+        request.check()?;
+        let on_board = self.on_board()?;
+        on_board.check()?;
+        self.answer_on(on_board, request, budget)
+    }
+
+    fn answer_on(
+        &self,
+        on_board: OnBoard,
+        request: QueryRequest,
+        budget: &Budget,
+    ) -> Result<Reply, QueryError> {
+        let snapshot = &on_board.snapshot;
+        let negatives = on_board.encode_negatives(&request)?;
+        let question = |vector: Arc<[f32]>| Question { vector, negatives: negatives.clone() };
+        let mut outcomes: Vec<Option<Outcome>> = request.asked.iter().map(|_| None).collect();
+        let (mut places, mut labels, mut plain) = (Vec::new(), Vec::new(), Vec::new());
+        for (at, asked) in request.asked.iter().enumerate() {
+            let vector = match asked {
+                Asked::Text(text) => on_board.encode(text)?,
+                Asked::Vector { vector, .. } => {
+                    let dim = snapshot.manifest.encoder.dim;
+                    if vector.len() != dim as usize {
+                        let found = format!("{} components", vector.len());
+                        let expected = format!("{dim}, as the scene's embeddings have");
+                        return Err(RequestError::new("vectors", &found, expected).into());
+                    }
+                    unit_vector(vector).unwrap_or_default().into()
+                }
+                Asked::Phrase { phrase, .. } => {
+                    let vectors =
+                        phrase.things().into_iter().map(|thing| Ok(question(on_board.encode(thing)?)));
+                    let vectors = vectors.collect::<Result<Vec<_>, QueryError>>()?;
+                    budget
+                        .take(vectors.len() * (snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES));
+                    budget.check().map_err(ScoreError::from)?;
+                    let related = self
+                        .on_scene(snapshot, budget, |_, scene| related(scene, phrase, &vectors, &request))?;
+                    budget.check().map_err(ScoreError::from)?;
+                    outcomes[at] = Some(Outcome::Related(related));
+                    continue;
+                }
+            };
+            places.push(at);
+            labels.push(asked.label());
+            plain.push(question(vector));
+        }
+        if !plain.is_empty() {
+            let work = |scratch: &mut Scratch, scene: &Scene<'_>| {
+                answer(scratch, scene, (labels.as_slice(), plain.as_slice()), &request)
+            };
+            for (at, answers) in places.into_iter().zip(self.on_scene(snapshot, budget, work)?) {
+                outcomes[at] = Some(Outcome::Plain(answers));
+            }
+        }
+        let outcomes = outcomes.into_iter().flatten().collect();
+        Ok(Reply { request, outcomes, snapshot: on_board.snapshot })
+    }
+}
+
+fn related(
+    scene: &Scene<'_>,
+    phrase: &Phrase,
+    questions: &[Question],
+    request: &QueryRequest,
+) -> Result<RelatedAnswers, QueryError> {
+    let has_up = scene.manifest.metric || scene.manifest.geo_reference.is_some();
+    if !has_up && needs_up(phrase) {
+        let expected =
+            "a relation that does not depend on up (near, in, between): this scene's up is not known";
+        return Err(RequestError::new("phrases", &phrase.thing, expected).into());
+    }
+    let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
+    let things = Things::find(scene, &phrase.things(), questions, &scored, request);
+    let metre = relations::metre(scene.manifest);
+    let parts = things.found();
+    let viewer =
+        request.near.map(|position_in_world| Viewer { position_in_world, heading_rad: request.heading_rad });
+    let found = match relations::relate(&things, phrase, viewer.as_ref(), Scale { metre }) {
+        Ok(found) => found,
+        Err(miss) => return Ok(RelatedAnswers { parts, miss: Some(miss), answers: Vec::new() }),
+    };
+    let of = things.of(&phrase.thing);
+    let described = found.into_iter().take(request.n_ranked()).enumerate().map(|(at, related)| {
+        let candidate = &of[related.candidate];
+        let place = candidate.found.record.position();
+        let ranked = Ranked {
+            found: candidate.found,
+            rank: at + 1,
+            relevance: related.score as f32,
+            distance: request.near.map(|near| near.distance(place)),
+        };
+        let answer = object_answer(scene, ranked, candidate.score, &Region::default(), false);
+        (answer, related.degree, related.to)
+    });
+    Ok(RelatedAnswers { parts, miss: None, answers: described.collect() })
+}
+
+fn needs_up(phrase: &Phrase) -> bool {
+    phrase.relation.as_ref().is_some_and(|place| place.is.needs_up()) || phrase.inner().any(needs_up)
+}

@@ -1,0 +1,37 @@
+//! The answers to a question, of either sort.
+
+use super::answers::{Answers, ClusterAnswer};
+use super::relations::{Found, Miss, Witness};
+
+/// The answers to one question.
+pub enum Outcome {
+    /// To a text or a vector.
+    Plain(Answers),
+    /// To a phrase.
+    Related(RelatedAnswers),
+}
+
+/// The answers to a phrase.
+pub struct RelatedAnswers {
+    /// What was found for each thing of the phrase.
+    pub parts: Vec<Found>,
+    /// The part that failed, if nothing was found.
+    pub miss: Option<Miss>,
+    /// The answers, best first, each with its degree and what it is related to.
+    pub answers: Vec<(ClusterAnswer, f64, Vec<Witness>)>,
+}
+
+impl Outcome {
+    /// Returns the number of answers.
+    pub fn len(&self) -> usize {
+        match self {
+            Self::Plain(answers) => answers.answers.len(),
+            Self::Related(related) => related.answers.len(),
+        }
+    }
+
+    /// Returns whether there is no answer.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
