@@ -111,7 +111,6 @@ enum AnyAnswer {
     Gaussian(GaussianAnswer),
 }
 
-/// Answers of either kind.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Found {
     Clusters(Vec<ClusterAnswer>),
@@ -120,7 +119,6 @@ pub enum Found {
 }
 
 impl Found {
-    /// Returns the number of answers.
     pub fn len(&self) -> usize {
         match self {
             Self::Clusters(answers) => answers.len(),
@@ -139,7 +137,6 @@ impl Found {
         }
     }
 
-    /// Returns whether there is no answer.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

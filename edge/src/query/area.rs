@@ -52,9 +52,6 @@ slag_common::named_members!(Area, AreaBall, AreaBox; Serialize);
 
 impl Area {
     /// Restricts a request to this area.
-    ///
-    /// # Errors
-    /// The part that is out of bounds, or geographic in a scene without a geographic reference.
     pub(crate) fn restrict(
         &self,
         request: &mut QueryRequest,

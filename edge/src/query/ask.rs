@@ -54,11 +54,9 @@ pub struct Ask {
 pub enum Outcome {
     /// To a text or a vector.
     Plain(Answers),
-    /// To a phrase.
     Related(RelatedAnswers),
 }
 
-/// The answers to a phrase.
 pub struct RelatedAnswers {
     /// What was found for each thing of the phrase.
     pub parts: Vec<Found>,
@@ -77,7 +75,6 @@ pub struct AskReply {
 }
 
 impl Ask {
-    /// Returns the answers of a page.
     pub fn page(&self) -> usize {
         self.request.limit.unwrap_or(DEFAULT_LIMIT)
     }

@@ -8,7 +8,6 @@ use super::json;
 use super::ply;
 use super::reply::Reply;
 
-/// Format of a reply.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Format {
     /// One object; for several questions, `{"batch":[…]}`.
@@ -72,9 +71,6 @@ impl Reply {
     }
 
     /// Returns the reply in pieces of at most a fraction of a megabyte, each made on demand.
-    ///
-    /// # Errors
-    /// A piece is an error if it cannot be written.
     pub fn pieces(self, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
         match format {
             Format::Json => Box::new(json::Pieces::new(self)),

@@ -16,9 +16,7 @@ use crate::text::MAX_TEXT_BYTES;
 pub const MAX_CLUSTERS: usize = 10_000;
 /// Most Gaussians in a request, over all its texts: 12 MB while they are sent.
 pub const MAX_GAUSSIANS: usize = 1_000_000;
-/// Most texts in a request.
 pub const MAX_TEXTS: usize = 32;
-/// Most negatives in a request.
 pub const MAX_NEGATIVES: usize = 16;
 /// LERF's canonical negatives (Kerr et al. 2023, section 3.3).
 pub const CANONICAL_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
@@ -32,9 +30,7 @@ pub const DEFAULT_MIN_COUNT: u64 = 10;
 #[error("{parameter}: found {found}, expected {expected}")]
 pub struct RequestError {
     pub parameter: String,
-    /// The value found.
     pub found: String,
-    /// The values allowed.
     pub expected: String,
 }
 
@@ -98,7 +94,6 @@ pub enum Negatives {
     None,
     /// [`CANONICAL_NEGATIVES`].
     Canonical,
-    /// These phrases.
     Phrases(Vec<String>),
 }
 
@@ -129,9 +124,6 @@ impl FromStr for Negatives {
 }
 
 /// Parses `X0,Y0,Z0,X1,Y1,Z1`: two opposite corners of a box.
-///
-/// # Errors
-/// The expected form.
 pub fn parse_box(text: &str) -> Result<Aabb, String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     match numbers.as_deref() {
@@ -144,9 +136,6 @@ pub fn parse_box(text: &str) -> Result<Aabb, String> {
 }
 
 /// Parses `X,Y,Z`.
-///
-/// # Errors
-/// The expected form.
 pub fn parse_point(text: &str) -> Result<DVec3, String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     match numbers.as_deref() {
@@ -156,9 +145,6 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
 }
 
 /// Checks a text that the text model is to encode. `parameter`: its name, for the error.
-///
-/// # Errors
-/// It is too long, has no words, or control characters.
 pub fn check_text(parameter: &str, text: &str) -> Result<(), RequestError> {
     if text.len() > MAX_TEXT_BYTES {
         let found = format!("{} bytes", text.len());
@@ -228,9 +214,6 @@ impl QueryRequest {
     }
 
     /// Checks every limit.
-    ///
-    /// # Errors
-    /// The first parameter outside its limits.
     pub fn check(&self) -> Result<(), RequestError> {
         let positive = |v: f64| v > 0.0 && v <= MAX_COORDINATE;
         let refuse = |parameter: &str, found: &dyn ToString, expected: String| {
