@@ -10,7 +10,6 @@ use slag_tests::root;
 use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
-/// Crates and their folders.
 const CRATES: [(&str, &str); 12] = [
     ("slag_math", "common/math"),
     ("slag_common", "common"),
@@ -29,7 +28,6 @@ const CRATES: [(&str, &str); 12] = [
 /// A module's path, the crate's name first.
 type ModulePath = Vec<String>;
 
-/// A module of the source.
 #[derive(Default)]
 struct Module {
     file: PathBuf,

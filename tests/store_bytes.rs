@@ -1,7 +1,7 @@
 //! The bytes of a store: shards of every profile, region tables and fields equal those that were recorded.
 //!
 //! `golden/store_bytes.txt` was recorded when an object came to need more than half of a mask. To record a
-//! change that is meant: `SLAG_RECORD=1 cargo test -p slag-tests --test store_bytes`, and say in the commit why.
+//! change that is meant: `SLAG_RECORD=1 cargo test --workspace --test system store_bytes::`, and say in the commit why.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -210,7 +210,6 @@ fn photos_are_added_and_withdrawn() {
     assert_eq!(summary()["lost_views"], Value::Null);
 }
 
-/// Returns the files in a folder and its subfolders.
 fn files(folder: &Path) -> Vec<std::path::PathBuf> {
     let entries = fs_err::read_dir(folder).expect("reads").map(|entry| entry.expect("reads").path());
     entries.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()

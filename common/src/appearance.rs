@@ -13,7 +13,6 @@ const LN_SIZE_MIN: f32 = -12.0;
 const LN_SIZE_MAX: f32 = 9.0;
 /// Codes of sizes beside 0, which is no extent at all: neighbouring ones differ by 8.6 %.
 const LAST_SIZE_STEP: f32 = 254.0;
-/// Largest value of a byte.
 const LARGEST: f32 = 255.0;
 /// Rotations by less have no axis.
 const LEAST_AXIS: f32 = 1e-6;

@@ -25,7 +25,6 @@ pub enum Distortion {
     },
 }
 
-/// The intrinsics of a camera.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
     /// Image width, pixels.
@@ -40,7 +39,6 @@ pub struct Intrinsics {
     pub centre_x_px: f64,
     /// Principal point, y, pixels.
     pub centre_y_px: f64,
-    /// Lens distortion.
     pub distortion: Distortion,
 }
 
@@ -196,7 +194,6 @@ pub struct View {
     pub name: String,
     /// The expected path of the image file.
     pub image_path: PathBuf,
-    /// The camera that took it.
     pub intrinsics: Intrinsics,
     /// The rigid transform from world to camera (OpenCV axes).
     pub camera_from_world: DAffine3,

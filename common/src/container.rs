@@ -10,7 +10,6 @@ use bytemuck::{AnyBitPattern, NoUninit};
 pub const ALIGNMENT_BYTES: usize = 64;
 /// Bytes before the section table.
 pub const PREAMBLE_BYTES: usize = 32;
-/// Bytes of one row of the section table.
 pub const SECTION_ROW_BYTES: usize = 32;
 /// Largest number of sections accepted: more than any format has.
 pub const MAX_SECTIONS: u32 = 64;
@@ -21,41 +20,24 @@ compile_error!("the on-disk columns are used in place and are little-endian");
 /// The fault of a container, and its place.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ContainerError {
-    /// The file is shorter than its header or its own stated length.
     #[error(
         "the file has {found_bytes} bytes, expected {expected_bytes}: it is truncated; delete it, and it is made or fetched again"
     )]
     Length { expected_bytes: u64, found_bytes: u64 },
-    /// The file is of another kind.
     #[error(
         "byte 0: magic {found:02x?}, expected {expected:02x?}: this is another kind of file; check the path"
     )]
     Magic { expected: [u8; 8], found: [u8; 8] },
-    /// The version is not supported.
     #[error(
         "byte 8: format version {found}, expected {expected}; use a program of the matching version, or encode again"
     )]
     Version { expected: u32, found: u32 },
-    /// A value is out of range or contradicts another.
     #[error("byte {offset_bytes}: {what}; the file is damaged: delete it, and it is made or fetched again")]
-    Damaged {
-        offset_bytes: u64,
-        /// The value found and the value expected.
-        what: String,
-    },
-    /// A section does not match its checksum.
+    Damaged { offset_bytes: u64, what: String },
     #[error(
         "section {id} at byte {offset_bytes}: checksum {found:#018x}, expected {expected:#018x}; the file is damaged: delete it, and it is made or fetched again"
     )]
-    Checksum {
-        id: u32,
-        offset_bytes: u64,
-        /// Checksum in the table.
-        expected: u64,
-        /// Checksum of its bytes.
-        found: u64,
-    },
-    /// A required section is missing.
+    Checksum { id: u32, offset_bytes: u64, expected: u64, found: u64 },
     #[error(
         "section {id} ({name}) is missing; the file was written by another version of this program: encode again"
     )]
@@ -110,9 +92,6 @@ pub struct Layout {
 
 impl Layout {
     /// Checks a whole container (bounds, table, every checksum) and returns the places of its sections.
-    ///
-    /// # Errors
-    /// [`ContainerError`], with the byte, for anything that [`write()`] does not write.
     pub fn check(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<Self, ContainerError> {
         let layout = Self::check_table(bytes, magic, version)?;
         for (row, (id, range)) in layout.sections.iter().enumerate() {
@@ -205,9 +184,6 @@ impl Layout {
     }
 
     /// Returns the place of a section of `expected_len` values of `T`.
-    ///
-    /// # Errors
-    /// [`ContainerError::Missing`], or [`ContainerError::Damaged`] if its length differs.
     pub fn column<T>(
         &self,
         id: u32,

@@ -143,7 +143,6 @@ impl Aabb {
         (self.min - point).max(point - self.max).max(DVec3::ZERO).length()
     }
 
-    /// Returns the centre of the box.
     pub fn centre(&self) -> DVec3 {
         (self.min + self.max) * 0.5
     }

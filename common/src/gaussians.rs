@@ -31,7 +31,6 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.means_in_world.len()
     }

@@ -19,18 +19,10 @@ impl Hash32 {
     }
 
     /// Returns the BLAKE3 hash and the length of a stream, read in chunks.
-    ///
-    /// # Errors
-    /// Those of the reader.
-    pub fn of_reader(mut reader: impl std::io::Read) -> std::io::Result<(Self, u64)> {
+    pub fn of_reader(reader: impl std::io::Read) -> std::io::Result<(Self, u64)> {
         let mut hasher = blake3::Hasher::new();
-        let mut buffer = vec![0; 1 << 16];
-        loop {
-            match reader.read(&mut buffer)? {
-                0 => return Ok((Self(*hasher.finalize().as_bytes()), hasher.count())),
-                n => hasher.update(&buffer[..n]),
-            };
-        }
+        hasher.update_reader(reader)?;
+        Ok((Self(*hasher.finalize().as_bytes()), hasher.count()))
     }
 }
 

@@ -6,7 +6,6 @@ use std::path::Path;
 use bytemuck::NoUninit;
 use fs_err::File;
 
-/// A type of elements.
 pub trait Element: NoUninit {
     /// Its NumPy description: byte order, kind and size.
     const DESCRIPTION: &str;

@@ -9,22 +9,15 @@ use fs_err::File;
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-/// An open archive.
 pub struct Npz(ZipArchive<BufReader<File>>);
 
 impl Npz {
     /// Opens an archive.
-    ///
-    /// # Errors
-    /// If the file cannot be read or is not a zip file.
     pub fn open(path: &Path) -> io::Result<Self> {
         Ok(Self(ZipArchive::new(BufReader::new(File::open(path)?))?))
     }
 
     /// Returns the bytes of an array, header included, decompressed as they are read; `None` if it is absent.
-    ///
-    /// # Errors
-    /// If the archive is damaged or compressed in a way that NumPy does not use.
     pub fn array(&mut self, name: &str) -> io::Result<Option<impl Read + '_>> {
         match self.0.by_name(&format!("{name}.npy")) {
             Ok(member) => Ok(Some(member)),

@@ -40,7 +40,6 @@ pub struct PhotoPose {
     pub name_end: u32,
 }
 
-/// The photos of a shard.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PhotoPoses<'a> {
     poses: &'a [PhotoPose],
@@ -48,14 +47,12 @@ pub struct PhotoPoses<'a> {
 }
 
 impl<'a> PhotoPoses<'a> {
-    /// Returns each photo with its name.
     pub fn iter(&self) -> impl Iterator<Item = (&'a PhotoPose, &'a str)> + use<'a> {
         let (poses, names) = (self.poses, self.names);
         let starts = std::iter::once(0).chain(poses.iter().map(|pose| pose.name_end as usize));
         poses.iter().zip(starts).map(move |(pose, start)| (pose, &names[start..pose.name_end as usize]))
     }
 
-    /// Returns the sections to write.
     pub(crate) fn sections(&self) -> [(u32, &'a [u8]); 2] {
         [(section::POSES, bytemuck::cast_slice(self.poses)), (section::NAMES, self.names.as_bytes())]
     }

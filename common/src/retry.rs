@@ -42,7 +42,6 @@ impl Retries {
         (self.n_failures < self.max_attempts).then(|| self.backoff.after(self.n_failures))
     }
 
-    /// Returns the number of failures in a row.
     pub fn n_failures(&self) -> u32 {
         self.n_failures
     }

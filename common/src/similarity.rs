@@ -23,7 +23,6 @@ impl Similarity {
         Self { rotation, ..Self::IDENTITY }
     }
 
-    /// Returns a change of scale.
     pub fn from_scale(scale: f64) -> Self {
         Self { scale, ..Self::IDENTITY }
     }

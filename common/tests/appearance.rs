@@ -1,39 +1,23 @@
 //! Shards with an appearance: it comes back, and columns of another length are refused.
 
+use glam::DVec3;
 use slag_common::appearance::Appearance;
 use slag_common::container::{self, AlignedBytes, Layout};
-use slag_common::shard::{
-    Additions, MAGIC, Positions, ScoreErrors, ShardHeader, ShardLayout, ShardView, VERSION, section,
-};
+use slag_common::frames::Aabb;
+use slag_common::shard::sample::{self, SampleShard};
+use slag_common::shard::{Additions, MAGIC, ShardHeader, ShardLayout, VERSION, section};
 
 fn written(appearance: Option<Appearance<'_>>) -> Vec<u8> {
-    let header = ShardHeader {
-        cell_id: 1,
-        n_gaussians: 2,
-        n_centroids: 1,
-        dim: 2,
-        n_components: 2,
-        n_subspaces: 0,
-        position_bits: [11, 11, 10, 0],
-        centroid_step: 0.5,
-        origin_in_world: [0.0; 3],
-        position_step: [0.1; 3],
-        box_min: [0.0; 3],
-        box_max: [1.0; 3],
-        errors: ScoreErrors::default(),
-        encoder_id: [0; 32],
+    let bounds = Aabb { min: DVec3::ZERO, max: DVec3::ONE };
+    let shard = SampleShard {
+        header: ShardHeader { centroid_step: 0.5, ..sample::header(1, 2, 1, 2, bounds) },
+        positions: vec![[0, 0, 0], [1, 0, 0]],
+        centroid_starts: vec![0, 2],
+        centroids: vec![1, -2],
+        radii: vec![0.0],
+        embeddings: None,
     };
-    let shard = ShardView {
-        header,
-        positions: Positions::Packed(&[0, 1]),
-        centroid_starts: &[0, 2],
-        centroids: &[1, -2],
-        radii: &[0.0],
-        basis: None,
-        residuals: None,
-        exact: None,
-        packed_indices: None,
-    };
+    let shard = shard.view();
     // By hand: the centroid is (0.5, -1).
     assert_eq!(shard.centroid_scores(&[1.0, 0.25]), [0.25]);
     let mut out = Vec::new();

@@ -1,10 +1,11 @@
 //! Fine residuals of exact shards: written, read, decoded as in docs/formats.md, and refused if invalid.
 
+use glam::DVec3;
 use half::f16;
 use slag_common::container::{AlignedBytes, ContainerError};
-use slag_common::shard::{
-    Basis, ExactColumns, Fine, Positions, ScoreErrors, ShardHeader, ShardLayout, ShardView,
-};
+use slag_common::frames::Aabb;
+use slag_common::shard::sample::{self, SampleShard};
+use slag_common::shard::{Basis, ExactColumns, Fine, ScoreErrors, ShardHeader, ShardLayout, ShardView};
 
 /// The parts of a shard that a test edits before it is written.
 struct Parts {
@@ -27,35 +28,23 @@ fn written(edit: impl FnOnce(&mut Parts)) -> AlignedBytes {
     let fine = Fine { errors: *errors, steps, scales, values };
     let mean = [0.5, 0.25, -0.5].map(f16::from_f32);
     let mut out = Vec::new();
+    let bounds = Aabb { min: DVec3::ZERO, max: DVec3::ONE };
+    let shard = SampleShard {
+        header: ShardHeader { n_components: 2, centroid_step: 0.125, ..sample::header(1, 4, 2, 3, bounds) },
+        positions: vec![[0; 3]; 4],
+        centroid_starts: vec![0, 1, 3],
+        centroids: vec![4, -8, 16, 2],
+        radii: vec![0.1, 0.2],
+        embeddings: None,
+    };
     ShardView {
-        header: ShardHeader {
-            cell_id: 1,
-            n_gaussians: 4,
-            n_centroids: 2,
-            dim: 3,
-            n_components: 2,
-            n_subspaces: 0,
-            position_bits: [16, 16, 16, 0],
-            centroid_step: 0.125,
-            origin_in_world: [0.0; 3],
-            position_step: [0.1; 3],
-            box_min: [0.0; 3],
-            box_max: [1.0; 3],
-            errors: ScoreErrors::default(),
-            encoder_id: [9; 32],
-        },
-        positions: Positions::Wide(&[[0; 3]; 4]),
-        centroid_starts: &[0, 1, 3],
-        centroids: &[4, -8, 16, 2],
-        radii: &[0.1, 0.2],
         basis: Some(Basis { mean: &mean, vectors: &[100, 0, 50, 0, -20, 10], steps: &[0.01, 0.02] }),
-        residuals: None,
         exact: Some(ExactColumns {
             input_indices: &[3, 2, 1, 0],
             embeddings: &[f16::from_f32(0.5); 9],
             fine: Some(fine),
         }),
-        packed_indices: None,
+        ..shard.view()
     }
     .write(&mut out)
     .expect("writes to memory");

@@ -13,7 +13,6 @@ use std::time::SystemTime;
 use anyhow::{Context, anyhow};
 use slag_common::tuf::{Kept, Source, Trusted, refresh};
 
-/// Most bytes of a downloaded file.
 const MAX_FILE_BYTES: u64 = 16 << 20;
 
 fn main() -> anyhow::Result<()> {

@@ -84,9 +84,6 @@ enum Command {
 }
 
 /// Parses this process's command line, environment and configuration.
-///
-/// # Errors
-/// The exit code: the error is told, or the help text that was asked for.
 pub fn parse() -> Result<Cli, Exit> {
     let line: Vec<OsString> = std::env::args_os().collect();
     let parsed = config::parse(help::layered(Cli::command()), &line, &args::variable);

@@ -29,7 +29,6 @@ pub struct Member {
     pub embedding: Vec<f32>,
 }
 
-/// Contents of a test shard.
 #[derive(Clone, Debug)]
 pub struct TestShard {
     pub cell_id: u32,
@@ -52,7 +51,6 @@ pub struct BuiltShard {
     pub embeddings: Vec<Vec<f32>>,
 }
 
-/// An object of a test shard.
 pub struct TestObject {
     pub id: u64,
     /// In components of the shard's centroids.
@@ -214,7 +212,6 @@ impl Axes {
         Self { dim, words, gate: Gate::default(), n_encoded: Arc::default() }
     }
 
-    /// Returns the count of texts that it encodes.
     pub(crate) fn n_encoded(&self) -> Arc<AtomicUsize> {
         Arc::clone(&self.n_encoded)
     }

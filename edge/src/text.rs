@@ -28,13 +28,10 @@ const MAX_CACHED: usize = 1024;
 /// Reasons for which a text cannot be encoded.
 #[derive(Debug, thiserror::Error)]
 pub enum TextError {
-    /// The encoder refuses the text, or fails.
     #[error(transparent)]
     Encode(#[from] InferenceError),
-    /// Too many texts wait.
     #[error("{MAX_WAITING} texts are already waiting for the text model; ask again in a second")]
     Busy,
-    /// The encoder's thread has stopped.
     #[error("the text model has stopped, and starts again by itself if it can; the log has the cause")]
     Stopped,
 }
@@ -42,10 +39,8 @@ pub enum TextError {
 /// Reasons for which a text encoder cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum TextOpenError {
-    /// The model does not open.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// The thread does not start.
     #[error("the text model's thread cannot start: {0}; free memory or raise the process limit")]
     Thread(#[from] io::Error),
 }
@@ -83,7 +78,6 @@ pub struct TextService {
 type Reopen = Box<dyn FnMut() -> Result<Box<dyn TextEncoder>, ModelError> + Send>;
 
 impl TextService {
-    /// Opens the text encoder of a model folder.
     pub fn open(models: &ModelDir, options: &SessionOptions) -> Result<Self, TextOpenError> {
         let encoder = models.text_encoder(options)?;
         let execution_provider = encoder.placement().map_or("none", |placement| placement.provider().name());
@@ -95,9 +89,6 @@ impl TextService {
     }
 
     /// Starts the thread that owns an encoder, which cannot be opened again.
-    ///
-    /// # Errors
-    /// The thread does not start.
     pub fn start(info: EncoderInfo, encoder: Box<dyn TextEncoder>) -> io::Result<Self> {
         Self::start_with(info, encoder, None)
     }
@@ -123,7 +114,6 @@ impl TextService {
         })
     }
 
-    /// Returns the encoder in use.
     pub fn info(&self) -> &EncoderInfo {
         &self.info
     }

@@ -1,5 +1,6 @@
 //! The real program over a real socket: fetch, status, query, serve, and exit codes.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpListener;
 use std::path::Path;
@@ -16,6 +17,9 @@ use slag_common::shard::{Profile, ShardHeader, quantise};
 use slag_common::tuf::{generate_key, one_key_repository};
 use slag_edge::text::TextService;
 use slag_models::{ModelDir, SessionOptions};
+
+use crate::fetch::scene::Published;
+use crate::fetch::server::Server;
 
 /// Returns the manifest and the one shard of a scene with 40 red Gaussians around x = 2 and 60 blue
 /// ones around x = 8, in the colour stand-in's space.
@@ -54,34 +58,13 @@ fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
     (manifest.to_bytes(), shard)
 }
 
-/// Serves the manifest, the metadata and the shard of a store from a thread for as long as the tests run; returns
-/// its address.
+/// Serves a scene of one shard for as long as the tests run; returns the store's address.
 fn store(listed: Vec<u8>, shard: Vec<u8>) -> String {
-    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
-    let address = format!("http://{}", listener.local_addr().expect("an address"));
+    let manifest = Manifest::parse(&listed).expect("valid");
     let metadata = one_key_repository(&generate_key(), 3, manifest::TARGET, &listed);
-    std::thread::spawn(move || {
-        for stream in listener.incoming() {
-            let mut stream = stream.expect("a connection");
-            let mut lines =
-                BufReader::new(stream.try_clone().expect("a handle")).lines().map_while(Result::ok);
-            let request = lines.next().unwrap_or_default();
-            lines.take_while(|line| !line.is_empty()).for_each(drop);
-            let path = request.split(' ').nth(1).and_then(|path| path.strip_prefix("/v1/")?.split_once('/'));
-            let body = match path {
-                Some(("metadata", name)) => metadata.get(name),
-                Some(("targets", _)) => Some(&listed),
-                _ => Some(&shard),
-            };
-            let status = if body.is_some() { "200 OK" } else { "404 Not Found" };
-            let body = body.map_or(&[][..], Vec::as_slice);
-            let head =
-                format!("HTTP/1.1 {status}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", body.len());
-            // The client may close early.
-            let _ = stream.write_all(&[head.as_bytes(), body].concat());
-        }
-    });
-    address
+    let objects = BTreeMap::from([(Hash32::of(&shard), shard)]);
+    let server = Server::start(Published { manifest, listed, metadata, objects });
+    Box::leak(Box::new(server)).url()
 }
 
 /// Starts a service; returns its process and its address.

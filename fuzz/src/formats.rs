@@ -265,7 +265,6 @@ pub fn tensors(data: &[u8]) -> bool {
     })
 }
 
-/// Phrases and their vectors.
 pub fn phrases(data: &[u8]) -> bool {
     let (phrases, vectors) = two_parts(data);
     in_folder(|folder| {

@@ -1,19 +1,17 @@
 //! Valid inputs to start from.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use glam::{DAffine3, DVec3};
 use half::f16;
 use slag_common::appearance::Appearance;
 use slag_common::frames::Aabb;
-use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::occupancy::{Block, BuiltOccupancy};
 use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors,
-    ShardHeader, ShardView,
+    ShardHeader, ShardView, sample,
 };
 use slag_common::{Distortion, Hash32, Intrinsics, View, container};
 use slag_edge::store::EdgeCache;
@@ -46,24 +44,7 @@ const V1_BODIES: &[&str] = &[
 /// components.
 pub fn write_scene(folder: &Path) {
     let bytes = shard(true);
-    let mut manifest = Manifest::parse(&manifest()).expect("a manifest");
-    let record = ShardRecord {
-        hash: Hash32::of(&bytes),
-        len_bytes: bytes.len() as u64,
-        n_centroids: 2,
-        score_error_bound: 0.1,
-        score_errors: ScoreErrors::default(),
-        position_error: 1e-3,
-    };
-    manifest.encoder.id = ENCODER;
-    manifest.encoder.dim = 3;
-    manifest.cells = vec![CellRecord {
-        cell_id: 5,
-        bounds: Aabb { min: DVec3::new(0.0, -3.0, 2.0), max: DVec3::new(66.0, 130.0, 4.0) },
-        n_gaussians: 6,
-        shards: BTreeMap::from([(Profile::Compact, record)]),
-    }];
-    let bytes_of_manifest = manifest.to_bytes();
+    let bytes_of_manifest = manifest(&bytes);
     let (hash, of_manifest) = (Hash32::of(&bytes), Hash32::of(&bytes_of_manifest));
     let current = format!(
         r#"{{"manifest_hash":"{of_manifest}","profile":"compact","centre_in_world":[0.0,0.0,0.0],"radius":50.0,"cells":[{{"cell_id":5,"hash":"{hash}","len_bytes":{}}}]}}"#,
@@ -85,7 +66,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
     let text = |text: &str| vec![text.as_bytes().to_vec()];
     let mut seeds = match target {
         "container" | "shard" => vec![shard(false), shard(true)],
-        "manifest" => vec![manifest()],
+        "manifest" => vec![manifest(&shard(true))],
         "current" => text(&format!(
             r#"{{"manifest_hash":"{0}","profile":"compact","centre_in_world":[0.0,1.0,2.5],"radius":50.0,"cells":[{{"cell_id":1,"hash":"{0}","len_bytes":7}}]}}"#,
             "ab".repeat(32)
@@ -168,21 +149,13 @@ fn shared_files(target: &str) -> &'static [&'static str] {
 const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nproperty float f_dc_0\nproperty float f_dc_1\nproperty float f_dc_2\nproperty float opacity\nproperty float scale_0\nproperty float scale_1\nproperty float scale_2\nproperty float rot_0\nproperty float rot_1\nproperty float rot_2\nproperty float rot_3\nend_header\n1 2 3 0.1 0.2 0.3 1 -2 -2 -2 1 0 0 0\n";
 
 fn shard(is_exact: bool) -> Vec<u8> {
+    let bounds = Aabb { min: DVec3::new(0.0, -3.0, 2.0), max: DVec3::new(66.0, 130.0, 4.0) };
     let header = ShardHeader {
-        cell_id: 5,
-        n_gaussians: 6,
-        n_centroids: 2,
-        dim: 3,
         n_components: 2,
         n_subspaces: if is_exact { 0 } else { 2 },
-        position_bits: [16, 16, 16, 0],
         centroid_step: 0.01,
-        origin_in_world: [1.0, -2.0, 3.0],
-        position_step: [0.001, 0.002, 0.0],
-        box_min: [0.0, -3.0, 2.0],
-        box_max: [66.0, 130.0, 4.0],
-        errors: ScoreErrors::default(),
         encoder_id: ENCODER.0,
+        ..sample::header(5, 6, 2, 3, bounds)
     };
     let embeddings = [f16::from_f32(0.5); 15];
     let mut out = Vec::new();
@@ -275,44 +248,8 @@ fn photo(name: &str) -> View {
     View { name: name.into(), image_path: name.into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 
-fn manifest() -> Vec<u8> {
-    let cell = |cell_id: u32| {
-        let record = ShardRecord {
-            hash: Hash32([cell_id as u8; 32]),
-            len_bytes: 100,
-            n_centroids: 2,
-            score_error_bound: 0.1,
-            score_errors: ScoreErrors::default(),
-            position_error: 1e-3,
-        };
-        CellRecord {
-            cell_id,
-            bounds: Aabb { min: DVec3::ZERO, max: DVec3::ONE },
-            n_gaussians: 5,
-            shards: BTreeMap::from([(Profile::Compact, record)]),
-        }
-    };
-    let manifest = Manifest {
-        version: manifest::VERSION,
-        scene: "yard".into(),
-        generation: 3,
-        created_unix_secs: 1_700_000_000,
-        metric: true,
-        geo_reference: None,
-        encoder: EncoderRecord {
-            name: "e".into(),
-            id: Hash32([7; 32]),
-            dim: 4,
-            default_threshold: 0.1,
-            calibration: None,
-            text_model: None,
-        },
-        n_gaussians: 10,
-        n_without_evidence: 1,
-        n_rejected: 0,
-        cells: vec![cell(1), cell(2)],
-    };
-    manifest.to_bytes()
+fn manifest(shard: &[u8]) -> Vec<u8> {
+    sample::manifest("yard", &[(Profile::Compact, shard)]).to_bytes()
 }
 
 /// An uncompressed file of version 2 with one Gaussian of zeros; the target compresses it.
@@ -369,7 +306,9 @@ fn sections(magic: &[u8; 8], version: u32, columns: &[Vec<u8>]) -> Vec<u8> {
 /// Contributions of a view as in docs/formats.md: two regions, two masks, one run of one entry.
 fn contributions() -> Vec<u8> {
     let entry = [u32s(&[1]), f32s(&[0.5])].concat();
-    let checksum = u64::from(crc32(&entry));
+    let mut crc = flate2::Crc::new();
+    crc.update(&entry);
+    let checksum = u64::from(crc.sum());
     let header = [u32s(&[2, 2, 2, 1]), u64s(&[3, 1])].concat();
     let run = [u32s(&[0, 0]), u64s(&[0, checksum])].concat();
     let columns = [header, u32s(&[0, 1, 3]), u32s(&[0, 0, 1]), f32s(&[1.0, 0.0, 0.0, 1.0]), run];
@@ -377,13 +316,6 @@ fn contributions() -> Vec<u8> {
 }
 
 /// CRC-32 (IEEE 802.3), bit by bit.
-fn crc32(bytes: &[u8]) -> u32 {
-    let fold = |crc: u32, byte: &u8| {
-        (0..8).fold(crc ^ u32::from(*byte), |crc, _| (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg()))
-    };
-    !bytes.iter().fold(!0, fold)
-}
-
 fn region_table() -> Vec<u8> {
     let columns = [u64s(&[2, 2, 2, 3]), f32s(&[1.0, 0.0, 0.0, 1.0]), u64s(&[0, 1, 3]), u32s(&[0, 0, 1])];
     sections(b"SLAGREGN", 2, &columns)

@@ -23,7 +23,6 @@ use super::seeds;
 
 /// Asks for little, and ends the connection; what comes before may be whole or not.
 const LAST: &[u8] = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
-/// Most bytes of an answer that are read.
 const MAX_ANSWER_BYTES: u64 = 1 << 20;
 
 /// Knows any text that begins with a letter.

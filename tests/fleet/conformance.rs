@@ -10,13 +10,10 @@ use super::support::*;
 pub trait Kind {
     fn scene(&self) -> &Scene;
 
-    /// Returns the command of an encode by workers.
     fn coordinator(&self, store: &str) -> Command;
 
-    /// Returns the command of one of two workers.
     fn worker(&self, number: usize) -> Command;
 
-    /// Returns the number of views in the bucket.
     fn n_views(&self) -> usize;
 }
 

@@ -3,7 +3,6 @@
 mod conformance;
 mod faults;
 mod folder;
-mod hosts;
 mod nats;
 mod network;
 #[cfg(feature = "nightly")]

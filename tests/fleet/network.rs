@@ -13,7 +13,6 @@ use slag_math::random::Random;
 /// Least time after which TCP sends a packet again (RFC 6298 in Linux's form).
 const RETRANSMISSION: Duration = Duration::from_millis(200);
 
-/// How a network is at present.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Weather {
     /// Time that each piece of data takes.

@@ -1,4 +1,4 @@
-//! A fleet over S3: two servers that nobody here wrote, with conditional puts.
+//! A fleet over S3: a server of another project, with conditional puts.
 
 use std::process::Command;
 
@@ -13,57 +13,8 @@ use super::support::*;
 const KEY: &str = "robot";
 const SECRET: &str = "secret";
 
-/// A server of S3 with a bucket named `scenes`.
-trait S3 {
-    /// Returns the port of this machine that it listens on.
-    fn port(&self) -> u16;
-
-    /// Returns its address.
-    fn endpoint(&self) -> String {
-        format!("http://127.0.0.1:{}", self.port())
-    }
-
-    /// Returns the number of objects whose key starts with a prefix that ends with `/` or is a key.
-    fn n_objects(&self, prefix: &str) -> usize;
-
-    /// Gives a command the credentials.
-    fn known_to(&self, mut command: Command) -> Command {
-        command.env("AWS_ENDPOINT", self.endpoint()).env("AWS_ALLOW_HTTP", "true");
-        command.env("AWS_ACCESS_KEY_ID", KEY).env("AWS_SECRET_ACCESS_KEY", SECRET);
-        command.env("AWS_REGION", "us-east-1");
-        command
-    }
-}
-
-/// moto, stopped when dropped. It believes every signature.
-struct Moto {
-    _server: Running,
-    port: u16,
-}
-
-impl Moto {
-    fn start() -> Self {
-        let port = free_port();
-        let args = ["--host", "127.0.0.1", "--port", &port.to_string()];
-        let moto = Self { _server: start_server("moto_server", port, &args), port };
-        ureq::put(format!("{}/scenes", moto.endpoint())).send_empty().expect("a bucket");
-        moto
-    }
-}
-
-impl S3 for Moto {
-    fn port(&self) -> u16 {
-        self.port
-    }
-
-    fn n_objects(&self, prefix: &str) -> usize {
-        let url = format!("{}/scenes?list-type=2&prefix={prefix}", self.endpoint());
-        let listed = ureq::get(url).call().expect("lists").body_mut().read_to_string().expect("text");
-        listed.matches("<Key>").count()
-    }
-}
-
-/// s3s-fs, in threads of this process. It checks signatures, and keeps an object as a file.
+/// s3s-fs with a bucket named `scenes`, in threads of this process. It checks signatures, and keeps an object as a
+/// file.
 struct S3s {
     runtime: Option<tokio::runtime::Runtime>,
     dir: tempfile::TempDir,
@@ -93,6 +44,20 @@ impl S3s {
         });
         Self { runtime: Some(runtime), dir, port }
     }
+
+    /// Returns the number of objects whose key starts with a prefix that ends with `/` or is a key.
+    fn n_objects(&self, prefix: &str) -> usize {
+        let path = self.dir.path().join("scenes").join(prefix);
+        if path.is_file() { 1 } else { n_objects(&path) }
+    }
+
+    /// Gives a command the address and credentials.
+    fn known_to(&self, mut command: Command) -> Command {
+        command.env("AWS_ENDPOINT", format!("http://127.0.0.1:{}", self.port)).env("AWS_ALLOW_HTTP", "true");
+        command.env("AWS_ACCESS_KEY_ID", KEY).env("AWS_SECRET_ACCESS_KEY", SECRET);
+        command.env("AWS_REGION", "us-east-1");
+        command
+    }
 }
 
 impl Drop for S3s {
@@ -102,24 +67,13 @@ impl Drop for S3s {
     }
 }
 
-impl S3 for S3s {
-    fn port(&self) -> u16 {
-        self.port
-    }
-
-    fn n_objects(&self, prefix: &str) -> usize {
-        let path = self.dir.path().join("scenes").join(prefix);
-        if path.is_file() { 1 } else { n_objects(&path) }
-    }
-}
-
 /// A bucket of S3, and shares.
-struct Shares<'a> {
+struct Shares {
     scene: Scene,
-    s3: &'a dyn S3,
+    s3: S3s,
 }
 
-impl Shares<'_> {
+impl Shares {
     fn coordinator_at(&self, bucket: &str, store: &str) -> Command {
         let mut command = self.s3.known_to(self.scene.encode(store));
         command.args(["--blobs", bucket]);
@@ -127,7 +81,7 @@ impl Shares<'_> {
     }
 }
 
-impl Kind for Shares<'_> {
+impl Kind for Shares {
     fn scene(&self) -> &Scene {
         &self.scene
     }
@@ -146,10 +100,11 @@ impl Kind for Shares<'_> {
 }
 
 /// A coordinator is fenced by a second one; puts of the bucket decide. Another fleet in the same bucket conforms.
-fn fences_and_conforms(s3: &dyn S3) {
-    let shares = Shares { scene: Scene::new(), s3 };
+#[test]
+fn a_bucket_of_s3_fences_and_conforms() {
+    let shares = Shares { scene: Scene::new(), s3: S3s::start() };
     let first = Running::start(&mut shares.coordinator_at("s3://scenes/fence", "first"));
-    wait_until("a plan", || s3.n_objects("fence/jobs/00000001/plan.json") == 1);
+    wait_until("a plan", || shares.s3.n_objects("fence/jobs/00000001/plan.json") == 1);
     let second = Running::start(&mut shares.coordinator_at("s3://scenes/fence", "second"));
     let fenced = first.output();
     let errors = String::from_utf8_lossy(&[fenced.stdout, fenced.stderr].concat()).into_owned();
@@ -158,14 +113,4 @@ fn fences_and_conforms(s3: &dyn S3) {
     assert!(errors.contains("superseded") && !is_published, "{errors}");
     drop(second);
     conforms(&shares);
-}
-
-#[test]
-fn moto_fences_and_conforms() {
-    fences_and_conforms(&Moto::start());
-}
-
-#[test]
-fn s3s_fences_and_conforms() {
-    fences_and_conforms(&S3s::start());
 }

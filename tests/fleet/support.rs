@@ -96,13 +96,6 @@ impl Running {
         Self { child: Some(child), what }
     }
 
-    /// As [`Self::start`]; what the program prints is discarded.
-    pub fn start_quiet(command: &mut Command) -> Self {
-        let what = format!("{command:?}");
-        let child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts");
-        Self { child: Some(child), what }
-    }
-
     fn child(&mut self) -> &mut Child {
         self.child.as_mut().expect("it runs")
     }
@@ -156,7 +149,6 @@ impl Drop for Running {
     }
 }
 
-/// Returns the number of objects in a folder of a bucket that is a folder.
 pub fn n_objects(folder: &Path) -> usize {
     // An object on its way has a `#` in its name; a killed worker leaves it so.
     let is_whole = |entry: &std::io::Result<std::fs::DirEntry>| {
@@ -183,7 +175,8 @@ pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
 /// prints.
 pub fn start_server(name: &str, port: u16, args: &[&str]) -> Running {
     let mut command = Command::new(python_with("tests/fleet").with_file_name(name));
-    let server = Running::start_quiet(command.args(args).stdin(Stdio::null()));
+    let child = command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let server = Running { child: Some(child.expect("starts")), what: name.to_owned() };
     wait_until(name, || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
     server
 }

@@ -33,9 +33,6 @@ impl Authority {
     }
 
     /// Asks a service, as a client that knows this authority alone.
-    ///
-    /// # Errors
-    /// No answer, or one of another authority.
     pub fn get(&self, url: &str) -> Result<String, ureq::Error> {
         let pem = fs_err::read(&self.file).expect("there");
         let root = ureq::tls::Certificate::from_pem(&pem).expect("a certificate");

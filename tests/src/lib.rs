@@ -52,7 +52,6 @@ pub fn encoder(args: &[&str]) -> Command {
     command("slag-encoder", args)
 }
 
-/// Returns a command of the laboratory.
 pub fn lab(args: &[&str]) -> Command {
     command("slag-lab", args)
 }

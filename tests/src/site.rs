@@ -42,7 +42,6 @@ impl Site {
         self.dir.path().join("cache")
     }
 
-    /// Starts the robot.
     pub fn robot(&self, args: &[&str]) -> Service {
         Service::start(edge(&["serve", "--models", "colours", "--cache", text(&self.cache())]).args(args))
     }

@@ -25,7 +25,6 @@ pub struct Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    /// All rows of a matrix.
     pub fn all(values: &'a [f32], width: usize) -> Self {
         Self { values, width, index: None }
     }

@@ -18,7 +18,6 @@ pub fn working_bytes_per_point(n_neighbours: usize) -> usize {
     size_of::<Item>() + size_of::<u8>() + size_of::<u32>() * (2 * n_neighbours + 1)
 }
 
-/// The neighbours of each point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Neighbours {
     n_neighbours: usize,

@@ -18,7 +18,6 @@ use pulp::{NullaryFnOnce, Scalar};
 pub trait Work<S> {
     /// Result of the work.
     type Output;
-    /// Does the work.
     fn run(self, simd: S) -> Self::Output;
 }
 

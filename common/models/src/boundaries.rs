@@ -28,14 +28,11 @@ const SLOPE_SCALE: f32 = 20.0;
 /// Neighbours of a pixel with a predicted boundary: right, below left, below, below right.
 pub const N_NEIGHBOURS: usize = 4;
 
-/// The opened model.
 #[derive(Debug)]
 pub struct Boundaries(Model);
 
 impl Boundaries {
     /// Opens the embedded model.
-    /// # Errors
-    /// [`SessionError`] if ONNX Runtime does not load.
     pub fn open(options: &SessionOptions) -> Result<Self, SessionError> {
         let model = Model::open(&ModelFile::embedded(Path::new("segment.onnx"), SEGMENT), options)?;
         model.expect_input(INPUT, TensorElementType::Float32, &[1, N_CHANNELS as i64, -1, -1])?;

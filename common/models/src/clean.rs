@@ -36,7 +36,6 @@ const LATIN_1_NAMES: &str = "nbsp iexcl cent pound curren yen brvbar sect uml co
     igrave iacute icirc iuml eth ntilde ograve oacute ocirc otilde ouml divide oslash ugrave uacute ucirc uuml yacute thorn \
     yuml";
 
-/// Other names in ordinary text.
 const OTHER_NAMES: [(&str, char); 14] = [
     ("amp", '&'),
     ("lt", '<'),

@@ -14,7 +14,6 @@ use crate::crop::Crop;
 use crate::encoder::{ImageEncoder, TextEncoder, normalise};
 use crate::error::InferenceError;
 
-/// The name of the space.
 pub const NAME: &str = "colour-shape-v1";
 
 /// A description for people.
@@ -53,7 +52,6 @@ pub const DIM: usize = N_COLOURS + SHAPES.len();
 /// its shape, above the threshold, and 0.88 for its colour.
 const SHAPE_WEIGHT: f32 = 0.5;
 
-/// Synonyms of the terms.
 const SYNONYMS: [(&str, &str); 24] = [
     ("gray", "grey"),
     ("silver", "grey"),
@@ -82,40 +80,8 @@ const SYNONYMS: [(&str, &str); 24] = [
 ];
 
 /// Words that say nothing about colour or shape.
-const STOP_WORDS: [&str; 32] = [
-    "a",
-    "an",
-    "the",
-    "and",
-    "or",
-    "of",
-    "with",
-    "in",
-    "is",
-    "are",
-    "that",
-    "this",
-    "some",
-    "any",
-    "all",
-    "thing",
-    "things",
-    "object",
-    "objects",
-    "item",
-    "items",
-    "coloured",
-    "colored",
-    "photo",
-    "something",
-    "anything",
-    "everything",
-    "one",
-    "ones",
-    "find",
-    "where",
-    "there",
-];
+const STOP_WORDS: &str = "a an the and or of with in is are that this some any all thing things object objects item items \
+    coloured colored photo something anything everything one ones find where there";
 
 /// The stand-in; both an image and a text encoder.
 #[derive(Clone, Copy, Debug, Default)]
@@ -145,7 +111,7 @@ impl TextEncoder for ColourShape {
                 }
             } else if let Some(shape) = SHAPES.iter().position(|&s| s == term) {
                 vector[N_COLOURS + shape] += 1.0;
-            } else if !STOP_WORDS.contains(&word) {
+            } else if STOP_WORDS.split(' ').all(|stop| stop != word) {
                 unknown.push(word.to_owned());
             }
         }

@@ -8,9 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use serde::Serialize;
 
-use crate::hub::{
-    Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, Source, cache_folder, models_folder,
-};
+use crate::hub::{Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, cache_folder, models_folder};
 use crate::session::SessionError;
 use crate::{ModelDir, Provider, SessionOptions, find_runtime};
 
@@ -74,8 +72,6 @@ pub struct RunArgs {
 impl RunArgs {
     /// Returns the session options, with `default_threads` unless the user sets a number; `beside`: folders to
     /// search for the runtime.
-    /// # Errors
-    /// [`SessionError::NoRuntime`] if the user's library does not exist.
     pub fn session_options(
         &self,
         beside: &[PathBuf],
@@ -107,8 +103,6 @@ fn options(variable: &dyn Fn(&str) -> Option<std::ffi::OsString>) -> Option<HubO
 }
 
 /// Returns the folder of a model, given as a folder or the name of a pulled model.
-/// # Errors
-/// [`HubError::NotPulled`] if it is a known model that is not pulled.
 pub fn resolve(
     model: &Path,
     variable: &dyn Fn(&str) -> Option<std::ffi::OsString>,
@@ -202,7 +196,6 @@ fn pull(hub: &Hub, name: &str, accepted: &[String], context: &Context<'_>) -> Re
     Ok(Pulled { name: name.to_owned(), licence, licence_url, licence_note, folder: hub.folder(entry), files })
 }
 
-/// The result of a command.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Report {
@@ -230,7 +223,6 @@ impl Listed {
     }
 }
 
-/// A model that was pulled.
 #[derive(Debug, Serialize)]
 pub struct Pulled {
     name: String,
@@ -264,14 +256,9 @@ impl fmt::Display for Report {
                 writeln!(f, "{} in {}", model.name, model.folder.display())?;
                 writeln!(f, "  licence {} ({}) {}", model.licence, model.licence_url, model.licence_note)?;
                 model.files.iter().try_for_each(|file| {
-                    let word = match file.hash_source {
-                        Source::Table => "matches the built-in table",
-                        Source::Hub => "matches the hub's hash",
-                        Source::FirstPull => "no published hash; recorded in models.lock",
-                        Source::PlacedByHand => "placed by hand; recorded in models.lock",
-                    };
                     let was_here = if file.was_here { ", already present" } else { "" };
-                    writeln!(f, "  {}  {} ({word}{was_here})", file.sha256, file.path)
+                    let source = file.hash_source;
+                    writeln!(f, "  {}  {} ({source}{was_here})", file.sha256, file.path)
                 })
             }),
             Self::Verified(models) if models.is_empty() => writeln!(f, "no models pulled"),

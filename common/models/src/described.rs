@@ -28,7 +28,6 @@ impl Described {
         }
     }
 
-    /// Returns the files with their roles.
     pub(crate) fn files(&self) -> Vec<(&'static str, &FileRef)> {
         match self {
             Self::Encoders(encoders) => encoders.files(),

@@ -72,7 +72,6 @@ pub use crate::file_ref::{FileRef, Sha256};
 use crate::preprocess::{Filter, Preprocess, Resize};
 pub use crate::score::ScoreDescription;
 
-/// The file name of the description in a model directory.
 pub const FILE_NAME: &str = "model.toml";
 
 /// Most patches along a side of the square.
@@ -82,41 +81,15 @@ const MAX_PATCHES_PER_SIDE: u16 = 256;
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
     #[error("{cause}; put the file there or correct the description")]
-    Read {
-        /// The operating system's error, with the path.
-        cause: std::io::Error,
-    },
+    Read { cause: std::io::Error },
     #[error("{}: {cause}; see the fields of {FILE_NAME} in its documentation", path.display())]
-    Format {
-        /// The description.
-        path: PathBuf,
-        /// The parser's error, with line and column.
-        cause: Box<toml::de::Error>,
-    },
+    Format { path: PathBuf, cause: Box<toml::de::Error> },
     #[error("{}: {cause}; use a robot program and an encoder of matching versions", path.display())]
-    Json {
-        /// The description.
-        path: PathBuf,
-        /// The parser's error.
-        cause: serde_json::Error,
-    },
+    Json { path: PathBuf, cause: serde_json::Error },
     #[error("{}: {field} is {found}, expected {expected}; correct it", path.display())]
-    Value {
-        /// The description.
-        path: PathBuf,
-        /// The field, with its table.
-        field: &'static str,
-        found: String,
-        expected: &'static str,
-    },
+    Value { path: PathBuf, field: &'static str, found: String, expected: &'static str },
     #[error("{}: SHA-256 is {found}, expected {expected}; fetch the file again or correct the description", path.display())]
-    Hash {
-        path: PathBuf,
-        /// The recorded hash.
-        expected: String,
-        /// The hash of the file.
-        found: String,
-    },
+    Hash { path: PathBuf, expected: String, found: String },
     #[error("{}: absent, and {FILE_NAME} records no sha256 for it; record it or put the file there", path.display())]
     NoHash { path: PathBuf },
 }
@@ -125,22 +98,18 @@ pub enum DescriptionError {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
-    /// The name of the space.
     pub name: String,
     /// What the model recognises and what not, for people.
     #[serde(default, skip_serializing)]
     pub about: String,
     /// Components of a vector.
     pub dim: u32,
-    /// The licence of the weights.
     #[serde(skip_serializing)]
     pub licence: String,
     /// Folder of the files, relative to the description's folder.
     #[serde(default = "here", skip_serializing)]
     pub files_root: PathBuf,
-    /// The image side.
     pub image: ImageDescription,
-    /// The text side.
     pub text: TextDescription,
     /// The mean subtracted from text vectors.
     pub text_centre: Option<CentreDescription>,
@@ -157,7 +126,6 @@ pub(crate) fn here() -> PathBuf {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageDescription {
-    /// The ONNX file.
     pub file: FileRef,
     /// The input, f32 or f16 `[n, 3, size_px, size_px]`.
     pub input: String,
@@ -167,7 +135,6 @@ pub struct ImageDescription {
     pub size_px: u16,
     /// How crops are resized to that square.
     pub resize: Resize,
-    /// The resampling filter.
     #[serde(default)]
     pub filter: Filter,
     /// Subtracted from level / 255, per channel.
@@ -220,11 +187,9 @@ pub enum TextDescription {
     Phrases(PhrasesText),
 }
 
-/// A text encoder in ONNX.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OnnxText {
-    /// The ONNX file.
     pub file: FileRef,
     /// The tokenizer, `tokenizer.json` of Hugging Face tokenizers.
     pub tokenizer: FileRef,
@@ -253,7 +218,6 @@ pub struct OnnxText {
 pub struct Padding {
     /// Length of every text in tokens, including begin and end tokens.
     pub n_tokens: u16,
-    /// The padding token.
     pub token_id: u32,
 }
 
@@ -263,7 +227,6 @@ pub struct Padding {
 pub struct PhrasesText {
     /// The phrases, UTF-8, one a line.
     pub file: FileRef,
-    /// The safetensors file of their vectors.
     pub vectors: FileRef,
     /// The tensor in it, `[phrases][dim]`.
     pub tensor: String,
@@ -273,7 +236,6 @@ pub struct PhrasesText {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CentreDescription {
-    /// The safetensors file.
     pub file: FileRef,
     /// The tensor in it, `[dim]`.
     pub tensor: String,
@@ -281,15 +243,11 @@ pub struct CentreDescription {
 
 impl Description {
     /// Reads and checks `path`.
-    /// # Errors
-    /// [`DescriptionError`] if it cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
         Self::parse(path, &read_text(path)?)
     }
 
     /// Parses and checks a description; `path` is for messages.
-    /// # Errors
-    /// [`DescriptionError`] if it is invalid.
     pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, DescriptionError> {
         let description: Self = parse_toml(path, text)?;
         description.check(path)?;

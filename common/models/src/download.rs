@@ -74,27 +74,21 @@ pub trait Watch: Sync {
 /// Reasons for a failed attempt.
 #[derive(Debug, thiserror::Error)]
 pub enum DownloadFailure {
-    /// The connection failed.
     #[error("{0}")]
     Transport(#[from] Box<ureq::Error>),
-    /// The server's certificate is refused, or TLS failed otherwise.
     #[error("TLS failed: {0}; give the authority that vouches for the server with --ca FILE")]
     Tls(String),
-    /// The body broke off.
     #[error("the body ended at byte {found_bytes} of {expected_bytes}")]
     Cut { expected_bytes: u64, found_bytes: u64 },
     /// The server refuses. `retry_after`: when to ask again (429 and 503).
     #[error("the server answered with status {status}")]
     Status { status: u16, retry_after: Option<Duration> },
-    /// The server redirects to an address that is not followed.
     #[error(
         "the server redirects to {location:?}, which is not followed; if that is the right place, give that address"
     )]
     Redirect { location: String },
-    /// The announced length or range is not the expected one.
     #[error("the server sends {found}, expected {expected}")]
     Length { expected: String, found: String },
-    /// The content does not have the expected hash.
     #[error("the content has hash {found}, expected {expected}")]
     Hash { expected: String, found: String },
 }
@@ -130,7 +124,6 @@ pub enum DownloadError {
     Failed { attempts: u32, failure: DownloadFailure },
     #[error("it is longer than {max_bytes} bytes, the most that is read of it")]
     TooLong { max_bytes: u64 },
-    /// A local file cannot be read or written.
     #[error(transparent)]
     Io(#[from] io::Error),
     #[error("cancelled")]
@@ -173,7 +166,6 @@ impl From<io::Error> for Stop {
 
 /// A local file that arrives in pieces.
 pub trait Part {
-    /// Returns the bytes there so far.
     fn len_bytes(&self) -> io::Result<u64>;
     /// Returns the strong entity tag of the content that they belong to; without one nothing is resumed.
     fn etag(&self) -> Option<String>;
@@ -190,7 +182,6 @@ pub trait Part {
     fn max_wrong(&self) -> u32;
 }
 
-/// The length of a download.
 #[derive(Clone, Copy, Debug)]
 pub enum Expected {
     Exactly(u64),
@@ -491,9 +482,6 @@ impl<'a> Client<'a> {
 }
 
 /// Returns whose certificates count: those of the authorities in a file (PEM), else the public ones.
-///
-/// # Errors
-/// One clause.
 pub fn tls(ca: Option<&Path>) -> Result<TlsConfig, String> {
     let Some(path) = ca else { return Ok(TlsConfig::default()) };
     let mut pem = Vec::new();

@@ -8,7 +8,6 @@ use crate::placement::Placement;
 
 /// Turns crops of photographs into unit vectors.
 pub trait ImageEncoder: Send {
-    /// Returns the number of components of a vector.
     fn dim(&self) -> usize;
 
     /// Returns the number of crops to encode together for the best throughput.
@@ -17,8 +16,6 @@ pub trait ImageEncoder: Send {
     /// Encodes `crops`: `[n]` in, `[n][dim]` out, unit vectors, row-major.
     ///
     /// Memory is bounded by the preferred batch, however many crops are given.
-    /// # Errors
-    /// [`InferenceError`] if a crop is empty or the model fails.
     fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError>;
 
     /// Returns the patches along each side of the square over which photos are stretched for
@@ -29,8 +26,6 @@ pub trait ImageEncoder: Send {
 
     /// Encodes the patches of a whole photo: `[patches_per_side^2][dim]`, unit vectors, row by row; `None` if the
     /// encoder has no vectors of patches.
-    /// # Errors
-    /// [`InferenceError`] if the photo is empty or the model fails.
     fn encode_patches(&mut self, _photo: &RgbImage) -> Result<Option<Vec<f32>>, InferenceError> {
         Ok(None)
     }
@@ -43,15 +38,11 @@ pub trait ImageEncoder: Send {
 
 /// Turns words into unit vectors of the image encoder's space.
 pub trait TextEncoder: Send {
-    /// Returns the name of the model.
     fn name(&self) -> &str;
 
-    /// Returns the number of components of a vector.
     fn dim(&self) -> usize;
 
     /// Encodes `text`: `[dim]`, a unit vector, centred if the description asks for it.
-    /// # Errors
-    /// [`InferenceError`] if the text is empty or unknown, or the model fails.
     fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError>;
 
     /// Returns the phrases or words that it accepts; `None` if it accepts any text.

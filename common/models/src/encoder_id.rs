@@ -9,7 +9,6 @@ use sha2::{Digest, Sha256};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EncoderId {
-    /// The name of the space.
     pub name: String,
     /// Components of a vector.
     pub dim: u32,

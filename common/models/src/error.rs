@@ -23,23 +23,15 @@ pub enum ModelError {
 #[derive(Debug, thiserror::Error)]
 pub enum TokenizerError {
     #[error("{cause}; put the tokenizer there or correct the description")]
-    Read {
-        /// The operating system's error, with the path.
-        cause: std::io::Error,
-    },
+    Read { cause: std::io::Error },
     #[error("{}: {reason}; fetch tokenizer.json again", path.display())]
-    Format {
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Format { path: PathBuf, reason: String },
     #[error(
         "{}: texts end in token {found:?}, but the model's end token is {expected}; use the model's own tokenizer",
         path.display()
     )]
     OtherVocabulary {
         path: PathBuf,
-        /// The end token of the description.
         expected: u32,
         /// The last token of a text, if any.
         found: Option<u32>,
@@ -48,42 +40,20 @@ pub enum TokenizerError {
         "{}: has token ids up to {largest}, which the model does not accept ({cause}); use the model's own tokenizer",
         path.display()
     )]
-    MoreTokens {
-        path: PathBuf,
-        /// Its largest id.
-        largest: u32,
-        /// The model's error for a text with that id.
-        cause: Box<SessionError>,
-    },
+    MoreTokens { path: PathBuf, largest: u32, cause: Box<SessionError> },
     #[error("{}: {reason}; use other words", path.display())]
-    Encode {
-        path: PathBuf,
-        /// The tokenizer's error.
-        reason: String,
-    },
+    Encode { path: PathBuf, reason: String },
 }
 
 /// Error of reading a list of phrases.
 #[derive(Debug, thiserror::Error)]
 pub enum PhrasesError {
     #[error("{cause}; put the file there or correct the description")]
-    Read {
-        /// The operating system's error, with the path.
-        cause: std::io::Error,
-    },
+    Read { cause: std::io::Error },
     #[error("{}: line {line} is empty; the list needs one phrase a line", path.display())]
-    EmptyLine {
-        path: PathBuf,
-        /// The line, from 1.
-        line: usize,
-    },
+    EmptyLine { path: PathBuf, line: usize },
     #[error("{}: line {line}: the vector of {phrase:?} is zero after centring; remove the phrase", path.display())]
-    NoDirection {
-        path: PathBuf,
-        /// The line, from 1.
-        line: usize,
-        phrase: String,
-    },
+    NoDirection { path: PathBuf, line: usize, phrase: String },
 }
 
 /// Error of encoding a text or crops.
@@ -93,45 +63,23 @@ pub enum InferenceError {
     EmptyText,
     #[error("{text:?} is not one of the {n_known} phrases this model knows; {}", suggestion(near))]
     UnknownPhrase {
-        /// The normalised text.
         text: String,
-        /// Number of known phrases.
         n_known: usize,
         /// Similar known phrases, nearest first.
         near: Vec<String>,
     },
     #[error("the built-in model knows no {}; use words of: {}", unknown.join(", "), known.join(", "))]
-    UnknownWords {
-        /// The unknown words.
-        unknown: Vec<String>,
-        /// All known words.
-        known: Vec<String>,
-    },
+    UnknownWords { unknown: Vec<String>, known: Vec<String> },
     #[error("crop {index} has no pixels to encode; drop empty masks first")]
-    EmptyCrop {
-        /// Its index among the crops given.
-        index: usize,
-    },
+    EmptyCrop { index: usize },
     #[error(transparent)]
     Tokenizer(#[from] TokenizerError),
     #[error(transparent)]
     Session(#[from] SessionError),
     #[error("vector {index} of {model} is zero or not finite; the model file does not fit its description")]
-    NoDirection {
-        /// The model's name.
-        model: String,
-        /// Index of the vector.
-        index: usize,
-    },
+    NoDirection { model: String, index: usize },
     #[error("vector {index} of {model} has length {norm}, expected 1; set image.normalise = true")]
-    NotUnit {
-        /// The model's name.
-        model: String,
-        /// Index of the vector.
-        index: usize,
-        /// Its length.
-        norm: f64,
-    },
+    NotUnit { model: String, index: usize, norm: f64 },
 }
 
 fn suggestion(near: &[String]) -> String {

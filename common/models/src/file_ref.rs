@@ -6,7 +6,6 @@ use std::path::PathBuf;
 use serde::ser::{Error as _, Serializer};
 use serde::{Deserialize, Serialize};
 
-/// A file of the model.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FileRef {

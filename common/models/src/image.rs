@@ -67,8 +67,6 @@ struct OnGpu {
 
 impl OnnxImageEncoder {
     /// Opens `file` according to `description`; `dim`: components of a vector.
-    /// # Errors
-    /// [`ModelError::Session`] if the runtime does not load or the file is not as described.
     pub fn open(
         name: &str,
         dim: usize,
@@ -122,8 +120,6 @@ impl OnnxImageEncoder {
     }
 
     /// Sets the batch size if the description leaves it open: to `measured`, which is measured if absent.
-    /// # Errors
-    /// [`SessionError`] if the model does not run.
     pub(crate) fn settle_batch(&mut self, measured: &mut Option<usize>) -> Result<(), SessionError> {
         if self.batch.is_none() {
             self.batch = Some(match *measured {

@@ -1,5 +1,5 @@
 use std::{
-    io::{self, Read},
+    io,
     path::{Path, PathBuf},
     sync::{Arc, Mutex, PoisonError},
 };
@@ -84,8 +84,6 @@ impl ModelDir {
     /// Opens the directory `path` with a [`description`](crate::description) in `model.toml`.
     ///
     /// Files with a recorded hash are read and checked only when an encoder needs them.
-    /// # Errors
-    /// [`ModelError::Description`] if the description is invalid, or a file without a recorded hash is absent.
     pub fn open(path: &Path) -> Result<Self, ModelError> {
         let file = path.join(FILE_NAME);
         let document = description::read_text(&file)?;
@@ -96,8 +94,6 @@ impl ModelDir {
 
     /// Returns the encoders embedded in the program: trained on generated scenes, poor on real photos
     /// (`embedded/CARD.md`). They need ONNX Runtime too.
-    /// # Errors
-    /// [`ModelError::Description`] if the embedded description is invalid, which tests rule out.
     pub fn embedded() -> Result<Self, ModelError> {
         let description = Description::parse(Path::new("(embedded)/model.toml"), embedded::DESCRIPTION)?;
         Self::with(Documented { document: embedded::DESCRIPTION.to_owned(), description }, Files::Embedded)
@@ -106,8 +102,6 @@ impl ModelDir {
     /// Opens the text side that a store carries. `description`: [`TextSide::description`]; `path`: of the
     /// description, for messages; `folder`: where its files lie, by their hashes. Their content is compared with
     /// the description when the encoder is opened.
-    /// # Errors
-    /// [`ModelError::Description`] if the description is invalid.
     pub fn carried(description: &[u8], path: &Path, folder: &Path) -> Result<Self, ModelError> {
         let description = Description::from_json(path, description)?;
         let described = Documented { document: String::new(), description };
@@ -115,8 +109,6 @@ impl ModelDir {
     }
 
     /// Returns the text side, for a store to carry.
-    /// # Errors
-    /// [`TextSideError`]: the licence does not permit it, or files are not as described.
     pub fn text_side(&self) -> Result<TextSide, TextSideError> {
         let built_in = || TextSideError::BuiltIn { model: self.id.name.clone() };
         let Source::Files { files: files @ Files::Folder(root), description, .. } = &self.source else {
@@ -198,8 +190,6 @@ impl ModelDir {
     }
 
     /// Opens the image encoder.
-    /// # Errors
-    /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
     pub fn image_encoder(&self, options: &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError> {
         let Source::Files { files, description, batch } = &self.source else {
             return Ok(Box::new(colours::ColourShape));
@@ -222,8 +212,6 @@ impl ModelDir {
     }
 
     /// Opens the text encoder; loads ONNX Runtime only if the text side is ONNX.
-    /// # Errors
-    /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
     pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
         let Source::Files { files, description, .. } = &self.source else {
             return Ok(Box::new(colours::ColourShape));
@@ -286,15 +274,9 @@ pub(crate) fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, Desc
 
 /// Returns the SHA-256 of a file.
 pub(crate) fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
-    let mut file = fs_err::File::open(path)?;
     let mut hasher = Sha256::new();
-    let mut buffer = vec![0; 1 << 20];
-    loop {
-        match file.read(&mut buffer)? {
-            0 => return Ok(hasher.finalize().into()),
-            n => hasher.update(&buffer[..n]),
-        }
-    }
+    io::copy(&mut fs_err::File::open(path)?, &mut hasher)?;
+    Ok(hasher.finalize().into())
 }
 
 #[cfg(test)]

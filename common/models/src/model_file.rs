@@ -24,9 +24,6 @@ impl ModelFile {
     }
 
     /// Opens it for reading from its start.
-    ///
-    /// # Errors
-    /// The operating system's error, with the path.
     pub fn reader(&self) -> io::Result<Box<dyn Read>> {
         Ok(match self.embedded {
             Some(bytes) => Box::new(bytes),
@@ -35,9 +32,6 @@ impl ModelFile {
     }
 
     /// Returns its bytes.
-    ///
-    /// # Errors
-    /// The operating system's error, with the path.
     pub fn read(&self) -> io::Result<Cow<'static, [u8]>> {
         match self.embedded {
             Some(bytes) => Ok(Cow::Borrowed(bytes)),

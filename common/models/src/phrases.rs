@@ -27,8 +27,6 @@ impl PhraseEncoder {
     /// Reads the phrases, one a line, and their vectors, (file, tensor) `[phrases][dim]`; `centre`: `[dim]`.
     ///
     /// If two lines are the same phrase, the first one counts.
-    /// # Errors
-    /// [`ModelError::Phrases`] or [`ModelError::Tensors`] if a file is not as described.
     pub fn open(
         name: &str,
         dim: usize,

@@ -19,7 +19,6 @@ pub enum Resize {
     Pad,
 }
 
-/// The resampling filter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Filter {
@@ -54,9 +53,7 @@ impl Filter {
 /// A part of a resized image, in pixels of the resized image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Window {
-    /// Left edge.
     pub left_px: u64,
-    /// Top edge.
     pub top_px: u64,
     pub width_px: u32,
     pub height_px: u32,

@@ -23,7 +23,6 @@ pub enum Provider {
 }
 
 impl Provider {
-    /// All providers.
     pub const ALL: [Self; 5] = [Self::Cpu, Self::Cuda, Self::TensorRt, Self::CoreMl, Self::DirectMl];
 
     /// Returns its name in options and reports, in lower case.
@@ -92,7 +91,6 @@ pub(crate) fn names(providers: &[Provider]) -> String {
 #[derive(Debug, thiserror::Error)]
 #[error("{found:?} is not an execution provider; use one of cpu, cuda, tensorrt, coreml, directml")]
 pub struct NoProvider {
-    /// The name.
     found: String,
 }
 

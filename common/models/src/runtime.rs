@@ -12,8 +12,6 @@ use crate::session_error::SessionError;
 
 /// Returns the library's path: `explicit`, else in the first of the folders `beside` that has it, else its bare
 /// name, which the system's loader resolves.
-/// # Errors
-/// [`SessionError::NoRuntime`] if `explicit` is not a file.
 pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathBuf, SessionError> {
     if let Some(path) = explicit {
         return if path.is_file() {

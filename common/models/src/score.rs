@@ -12,7 +12,6 @@ pub struct ScoreDescription {
     threshold: Option<f32>,
     /// The factor from cosine to logit.
     logit_scale: Option<f64>,
-    /// The bias added to the logit.
     logit_bias: Option<f64>,
     /// The probability from which something counts as found, by default.
     probability: Option<f64>,

@@ -14,82 +14,39 @@ pub enum SessionError {
         "ONNX Runtime: {cause}; version 1.17 or newer is needed: `scripts/get-onnxruntime.sh` downloads it and prints its \
          path, which --runtime takes; beside the program it is found by itself"
     )]
-    Runtime {
-        /// The loader's error, with the path.
-        cause: Box<ort::LoadDynamicError>,
-    },
+    Runtime { cause: Box<ort::LoadDynamicError> },
     #[error("ONNX Runtime is already loaded from {}, but {} is requested; use one per process", loaded.display(), asked.display())]
-    OtherRuntime {
-        /// The library in use.
-        loaded: PathBuf,
-        /// The requested library.
-        asked: PathBuf,
-    },
+    OtherRuntime { loaded: PathBuf, asked: PathBuf },
     #[error("ONNX Runtime does not start: {cause}; check its version (1.17 or newer)")]
-    Start {
-        /// The runtime's error.
-        cause: ort::Error,
-    },
+    Start { cause: ort::Error },
     #[error(
         "ONNX Runtime cannot use {provider}: {cause}; install its drivers and a libonnxruntime built with it \
          (onnxruntime-gpu for cuda and tensorrt), or allow the CPU as well: {provider},cpu"
     )]
-    Provider {
-        /// The accelerator.
-        provider: Provider,
-        /// The runtime's error.
-        cause: ort::Error,
-    },
+    Provider { provider: Provider, cause: ort::Error },
     #[error(
         "{}: runs on {placement} only, but {} is requested; use another export of the model, or add cpu to \
          allow the CPU as well", path.display(), names(asked)
     )]
-    NotPlaced {
-        path: PathBuf,
-        /// The requested accelerators.
-        asked: Vec<Provider>,
-        /// Where its nodes run.
-        placement: Placement,
-    },
+    NotPlaced { path: PathBuf, asked: Vec<Provider>, placement: Placement },
     #[error("{cause}; put the model file there or correct the description")]
-    Read {
-        /// The operating system's error, with the path.
-        cause: std::io::Error,
-    },
+    Read { cause: std::io::Error },
     #[error("{}: {cause}; fetch the model file again", path.display())]
-    Load {
-        path: PathBuf,
-        /// The runtime's error.
-        cause: ort::Error,
-    },
+    Load { path: PathBuf, cause: ort::Error },
     #[error(
         "{}: {cause}; give a newer libonnxruntime, or export the model for an older opset (all support 17)",
         path.display()
     )]
-    Version {
-        path: PathBuf,
-        /// The runtime's error.
-        cause: ort::Error,
-    },
+    Version { path: PathBuf, cause: ort::Error },
     #[error("{}: no {role} {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
-    NoTensor {
-        path: PathBuf,
-        /// "input" or "output".
-        role: &'static str,
-        /// The name in the description.
-        name: String,
-        /// The model's names.
-        found: Vec<String>,
-    },
+    NoTensor { path: PathBuf, role: &'static str, name: String, found: Vec<String> },
     #[error(
         "{}: the description names no {role}, and not exactly one of {} is {expected}; name it in the description",
         path.display(), found.join(", ")
     )]
     Unnamed {
         path: PathBuf,
-        /// "input" or "output".
         role: &'static str,
-        /// The model's inputs or outputs, with types and shapes.
         found: Vec<String>,
         /// Expected type and shape; -1 is any size.
         expected: String,
@@ -97,26 +54,14 @@ pub enum SessionError {
     #[error("{}: {role} {name:?} is {found}, expected {expected}; correct the description", path.display())]
     Shape {
         path: PathBuf,
-        /// "input" or "output".
         role: &'static str,
         name: String,
-        /// Its type and shape.
         found: String,
         /// Expected type and shape; -1 is any size.
         expected: String,
     },
     #[error("{}: {found}; expected {expected}; use the files of one export, each in its field", path.display())]
-    Layout {
-        path: PathBuf,
-        /// The layout found.
-        found: String,
-        /// The layout expected.
-        expected: String,
-    },
+    Layout { path: PathBuf, found: String, expected: String },
     #[error("{}: the model fails to run: {cause}; check that the file fits its description", path.display())]
-    Run {
-        path: PathBuf,
-        /// The runtime's error.
-        cause: ort::Error,
-    },
+    Run { path: PathBuf, cause: ort::Error },
 }

@@ -9,40 +9,16 @@ use safetensors::{Dtype, SafeTensors};
 #[derive(Debug, thiserror::Error)]
 pub enum TensorsError {
     #[error("{cause}; put the file there or correct the description")]
-    Read {
-        /// The operating system's error, with the path.
-        cause: std::io::Error,
-    },
+    Read { cause: std::io::Error },
     #[error("{}: {cause}; fetch the file again", path.display())]
-    Format {
-        path: PathBuf,
-        /// What is wrong.
-        cause: safetensors::SafeTensorError,
-    },
+    Format { path: PathBuf, cause: safetensors::SafeTensorError },
     #[error("{}: no tensor {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
-    Missing {
-        path: PathBuf,
-        /// The requested tensor.
-        name: String,
-        /// The tensors in the file.
-        found: Vec<String>,
-    },
+    Missing { path: PathBuf, name: String, found: Vec<String> },
     #[error("{}: tensor {name:?} is {dtype:?} {found:?}, expected F16 or F32 {expected}; correct the description, or fetch its files again", path.display())]
-    Shape {
-        path: PathBuf,
-        /// The tensor.
-        name: String,
-        /// Its element type.
-        dtype: Dtype,
-        /// Its shape.
-        found: Vec<usize>,
-        /// The expected shape.
-        expected: String,
-    },
+    Shape { path: PathBuf, name: String, dtype: Dtype, found: Vec<usize>, expected: String },
     #[error("{}: tensor {name:?}: element {index} is not finite; fetch the file again", path.display())]
     NotFinite {
         path: PathBuf,
-        /// The tensor.
         name: String,
         /// Index of the element, row-major.
         index: usize,
@@ -50,8 +26,6 @@ pub enum TensorsError {
 }
 
 /// Reads tensor `name` as f32, row-major; `n_rows`: `None` for a vector `[dim]`, else a matrix `[n_rows][dim]`.
-/// # Errors
-/// [`TensorsError`] if the file or the tensor is not as described.
 pub fn read(path: &Path, name: &str, n_rows: Option<usize>, dim: usize) -> Result<Vec<f32>, TensorsError> {
     let bytes = fs_err::read(path).map_err(|cause| TensorsError::Read { cause })?;
     let tensors = SafeTensors::deserialize(&bytes)

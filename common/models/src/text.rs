@@ -27,8 +27,6 @@ pub struct Tokens {
 impl Tokens {
     /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last of them `end_token_id`
     /// if there is one.
-    /// # Errors
-    /// [`TokenizerError`] if the file is not a tokenizer, or ends texts with another token.
     pub fn open(
         file: &ModelFile,
         max_tokens: usize,
@@ -71,8 +69,6 @@ impl Tokens {
     ///
     /// A text that is too long is truncated before the end token. CLIP's attention is causal and its vector is
     /// read at the first end token, so padding after it would have no effect.
-    /// # Errors
-    /// [`TokenizerError::Encode`] if the tokenizer fails.
     pub fn ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
         let mut ids = self.raw_ids(text)?;
         ids.truncate(self.max_tokens);
@@ -107,8 +103,6 @@ impl OnnxTextEncoder {
     /// Opens `model` and `tokenizer` according to `description`; `dim`: components of a vector; `centre`: `[dim]`.
     ///
     /// Runs a text with the tokenizer's largest id, to detect a tokenizer of another model at once.
-    /// # Errors
-    /// [`ModelError`] if the runtime does not load or a file is not as described.
     pub fn open(
         name: &str,
         dim: usize,

@@ -35,18 +35,11 @@ pub enum TextSideError {
     )]
     Licence { model: String, licence: String },
     #[error("{}: its weights lie in a file of their own, which a store cannot carry; save the model as one file", path.display())]
-    SeparateWeights {
-        /// The ONNX file.
-        path: PathBuf,
-    },
+    SeparateWeights { path: PathBuf },
     #[error(transparent)]
     Description(#[from] DescriptionError),
     #[error("{model}: its description does not survive as JSON ({what}); report this with the model.toml")]
-    Other {
-        model: String,
-        /// What differs.
-        what: String,
-    },
+    Other { model: String, what: String },
 }
 
 /// The text side of a model: its files, and the description without their new names.
@@ -57,10 +50,8 @@ pub struct TextSide {
     files: Vec<TextFile>,
 }
 
-/// A file of the text side.
 #[derive(Debug)]
 struct TextFile {
-    /// Where the description names it.
     pointers: Vec<&'static str>,
     file: ModelFile,
     sha256: Sha256,
@@ -135,9 +126,6 @@ impl TextSide {
     }
 
     /// Returns the description in JSON. `names`: BLAKE3 of each of [`Self::files`].
-    ///
-    /// # Errors
-    /// [`TextSideError::Other`] if it is not one of the same space, which would be a fault of this program.
     pub fn description(&self, names: &[Hash32]) -> Result<Vec<u8>, TextSideError> {
         let mut description = self.description.clone();
         let other = |what: String| TextSideError::Other { model: self.id.name.clone(), what };

@@ -13,7 +13,6 @@ use crate::shard::{Profile, ScoreErrors};
 pub const VERSION: u32 = 2;
 /// Path of the manifest among a store's targets.
 pub const TARGET: &str = "manifest";
-/// Most files of a text model.
 pub const MAX_TEXT_FILES: usize = 16;
 /// Largest manifest read: a cell takes about 600 bytes, so this allows 100,000 cells.
 pub const MAX_BYTES: u64 = 64 << 20;

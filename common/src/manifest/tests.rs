@@ -1,48 +1,18 @@
-use std::collections::BTreeMap;
-
 use glam::DVec3;
 use proptest::prelude::*;
 
 use super::*;
 use crate::frames::Aabb;
 use crate::hash::Hash32;
-use crate::shard::{Profile, ScoreErrors};
+use crate::shard::sample;
 
 fn manifest(n_cells: u32) -> Manifest {
-    Manifest {
-        version: VERSION,
-        scene: "yard \"7\"\n".into(),
-        generation: 3,
-        created_unix_secs: 1_700_000_000,
-        metric: true,
-        geo_reference: None,
-        encoder: EncoderRecord {
-            name: "e".into(),
-            id: Hash32([7; 32]),
-            dim: 512,
-            default_threshold: 0.1,
-            calibration: None,
-            text_model: None,
-        },
-        n_gaussians: 10,
-        n_without_evidence: 1,
-        n_rejected: 0,
-        cells: (0..n_cells)
-            .map(|cell_id| {
-                let min = DVec3::new(f64::from(cell_id) / 3.0, 0.1, -1e6);
-                let record = ShardRecord {
-                    hash: Hash32::of(b"x"),
-                    len_bytes: 9,
-                    n_centroids: 2,
-                    score_error_bound: 0.1,
-                    score_errors: ScoreErrors::default(),
-                    position_error: 1e-3,
-                };
-                let shards = BTreeMap::from([(Profile::Compact, record)]);
-                CellRecord { cell_id, bounds: Aabb { min, max: min + DVec3::ONE }, n_gaussians: 5, shards }
-            })
-            .collect(),
-    }
+    let cell = |cell_id: u32| {
+        let min = DVec3::new(f64::from(cell_id) / 3.0, 0.1, -1e6);
+        (Aabb { min, max: min + DVec3::ONE }, Hash32::of(b"x"), 9)
+    };
+    let cells: Vec<_> = (0..n_cells).map(cell).collect();
+    Manifest { generation: 3, ..sample::manifest_of("yard \"7\"\n", &cells) }
 }
 
 /// A manifest without a text model has the bytes that it had before there were any.

@@ -27,7 +27,6 @@ const MAX_CANDIDATES: usize = 32;
 /// A thing that lies elsewhere.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Moved {
-    /// As it was.
     pub from: Thing,
     pub to: Thing,
     /// Between the positions, world units.

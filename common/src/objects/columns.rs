@@ -39,9 +39,7 @@ pub mod section {
 pub struct ObjectsHeader {
     /// Objects with Gaussians in the cell, n.
     pub n_objects: u32,
-    /// Vectors of each object.
     pub n_vectors: u32,
-    /// Runs of Gaussians.
     pub n_runs: u32,
     /// Total length of the photo names, bytes.
     pub photos_bytes: u32,

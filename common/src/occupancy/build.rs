@@ -2,7 +2,6 @@
 
 use super::columns::{KIND_BITS, Occupancy, OccupancyHeader, RunKind, StoredRun};
 
-/// A block and its voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Block {
     /// Its place on the scene's lattice.

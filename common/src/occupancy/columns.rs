@@ -31,7 +31,6 @@ pub struct OccupancyHeader {
     pub first_block: [i32; 3],
     /// Blocks along each axis.
     pub n_blocks: [u32; 3],
-    /// Runs of blocks.
     pub n_runs: u32,
     /// Blocks with masks of their own.
     pub n_mixed: u32,
@@ -55,15 +54,11 @@ pub enum VoxelState {
 /// The state of the blocks of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunKind {
-    /// All voxels are free.
     Free = 1,
-    /// All voxels are occupied.
     Occupied = 2,
-    /// Each block has masks.
     Mixed = 3,
 }
 
-/// A run of blocks as it is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct StoredRun {
@@ -89,7 +84,6 @@ impl StoredRun {
     }
 }
 
-/// A run of consecutive blocks of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BlockRun<'a> {
     /// Indices of the blocks, see [`StoredRun::start`].

@@ -145,7 +145,6 @@ fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsi
     check_intrinsics(size_px, focal, centre, distortion)
 }
 
-/// The images of a model.
 #[derive(Default)]
 struct Images {
     views: Vec<View>,

@@ -27,11 +27,9 @@ pub enum PoseError {
 /// A place in a pose file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// The whole file.
     File,
     /// A line, counted from 1.
     Line(u64),
-    /// A byte offset.
     Byte(u64),
     /// An element of the array `frames`, counted from 0.
     Frame(usize),

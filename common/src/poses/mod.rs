@@ -28,9 +28,6 @@ pub use view_set::{AppliedTransform, PoseSource, ViewSet};
 /// `images_dir` is the folder of the images. The default is `images/` beside COLMAP's `sparse/` (or beside or in
 /// the model's folder), the paths in a `transforms.json`, and ScanNet's `color/`. Images need not exist, except
 /// that ScanNet states their size nowhere else.
-///
-/// # Errors
-/// [`PoseError`], with file and place, for data that is missing, damaged or not supported.
 pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
     if fs_err::metadata(path)?.is_file() {
         return match path.extension().and_then(|e| e.to_str()) {

@@ -19,7 +19,6 @@ const PHOTO_ENDINGS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 
 /// Finds photos whose path or ending differs from what the poses say.
 pub(super) struct PhotoFinder {
-    /// The folder of the photos.
     dir: PathBuf,
     /// By folder: files by their name in small letters without its ending; `None` where two have the same.
     listed: HashMap<PathBuf, BTreeMap<String, Option<PathBuf>>>,

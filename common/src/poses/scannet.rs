@@ -20,9 +20,7 @@ use super::transforms::existing;
 use super::view_set::{PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 
-/// Folder of the poses.
 pub(super) const POSES: &str = "pose";
-/// Folder of the photos.
 const PHOTOS: &str = "color";
 const INTRINSICS: &str = "intrinsic/intrinsic_color.txt";
 /// Largest size of a file with one matrix: 16 numbers of 200 characters.

@@ -54,9 +54,6 @@ struct Json {
 
 impl SplatFrame {
     /// Reads a `dataparser_transforms.json`.
-    ///
-    /// # Errors
-    /// [`PoseError`], with the file, if it cannot be read, or has no rotation, translation and positive scale.
     pub fn read(path: &Path) -> Result<Self, PoseError> {
         let mut bytes = Vec::new();
         File::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
@@ -115,7 +112,6 @@ impl SplatFrame {
 pub struct SplatFromPoses {
     /// The transform.
     pub similarity: Similarity,
-    /// Where the file's transform begins.
     pub begins_at: Origin,
 }
 

@@ -7,7 +7,6 @@ use glam::DAffine3;
 use super::error::{Place, PoseError, PoseProblem};
 use crate::camera::View;
 
-/// The views of a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewSet {
     /// Sorted by name; names are unique.

@@ -31,6 +31,7 @@ impl Positions<'_> {
         }
     }
 
+    #[inline]
     fn steps(&self, index: usize, bits: [u8; 4]) -> [u32; 3] {
         match self {
             Self::Wide(steps) => steps[index].map(u32::from),
@@ -55,7 +56,6 @@ pub struct Basis<'a> {
     pub steps: &'a [f32],
 }
 
-/// The residual code.
 #[derive(Clone, Copy, Debug)]
 pub struct Residuals<'a> {
     /// `[G + 1]`, strictly ascending, at most m.
@@ -79,7 +79,6 @@ impl Residuals<'_> {
     }
 }
 
-/// The columns of the exact profile.
 #[derive(Clone, Copy, Debug)]
 pub struct ExactColumns<'a> {
     /// `[N]` index in the input splat file.
@@ -129,6 +128,7 @@ pub struct ShardView<'a> {
 
 impl ShardView<'_> {
     /// Returns the mean of a Gaussian, accurate to half a step per axis.
+    #[inline]
     pub fn position_in_world(&self, index: usize) -> DVec3 {
         let steps = self.positions.steps(index, self.header.position_bits).map(f64::from);
         DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
@@ -145,7 +145,6 @@ impl ShardView<'_> {
         self.exact.map(|exact| exact.input_indices[index]).or_else(packed)
     }
 
-    /// Returns the box of all representable positions.
     pub fn position_box(&self) -> Aabb {
         let steps = self.header.position_bits.map(|bits| ((1u64 << bits) - 1) as f64);
         let min = DVec3::from(self.header.origin_in_world);

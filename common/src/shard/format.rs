@@ -119,7 +119,6 @@ pub struct ShardHeader {
     pub encoder_id: [u8; 32],
 }
 
-/// How positions are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PositionForm {
     /// 32 bits in all.

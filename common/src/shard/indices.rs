@@ -16,7 +16,6 @@ pub struct IndicesHeader {
     pub width_bits: u32,
 }
 
-/// A packed column of indices.
 #[derive(Clone, Copy, Debug)]
 pub struct PackedIndices<'a> {
     pub header: IndicesHeader,

@@ -40,9 +40,6 @@ pub struct ShardLayout {
 
 impl ShardLayout {
     /// Checks a whole shard: container, sizes, order of centroids, finite numbers within their ranges.
-    ///
-    /// # Errors
-    /// [`ContainerError`], naming the byte.
     pub fn check(bytes: &[u8]) -> Result<Self, ContainerError> {
         let layout = Layout::check(bytes, MAGIC, VERSION)?;
         let header: ShardHeader = layout.value(bytes, section::HEADER, "header")?;

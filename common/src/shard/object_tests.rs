@@ -1,5 +1,9 @@
+use glam::DVec3;
+
+use super::sample::{self, SampleShard};
 use super::*;
 use crate::container::{self, AlignedBytes, Layout};
+use crate::frames::Aabb;
 use crate::objects::{
     NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, object_score, quantise_vectors,
 };
@@ -49,32 +53,14 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
     };
     // The umlaut has two bytes: "a.jpg" and "ü.pn".
     edit(&mut parts);
-    let header = ShardHeader {
-        cell_id: 5,
-        n_gaussians: 6,
-        n_centroids: 1,
-        dim: 3,
-        n_components: 3,
-        n_subspaces: 0,
-        position_bits: [16, 16, 16, 0],
-        centroid_step: 0.01,
-        origin_in_world: [0.0; 3],
-        position_step: [0.001; 3],
-        box_min: [0.0; 3],
-        box_max: [66.0; 3],
-        errors: ScoreErrors::default(),
-        encoder_id: [9; 32],
-    };
-    let shard = ShardView {
-        header,
-        positions: Positions::Wide(&[[1, 2, 3]; 6]),
-        centroid_starts: &[0, 5],
-        centroids: &[100, 0, 0],
-        radii: &[0.5],
-        basis: None,
-        residuals: None,
-        exact: None,
-        packed_indices: None,
+    let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(66.0) };
+    let shard = SampleShard {
+        header: ShardHeader { centroid_step: 0.01, ..sample::header(5, 6, 1, 3, bounds) },
+        positions: vec![[1, 2, 3]; 6],
+        centroid_starts: vec![0, 5],
+        centroids: vec![100, 0, 0],
+        radii: vec![0.5],
+        embeddings: None,
     };
     let objects = Objects {
         header: parts.header,
@@ -85,9 +71,8 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
         run_objects: &parts.run_objects,
         photos: &parts.photos,
     };
-    let mut out = Vec::new();
     let sections: Vec<(u32, Vec<u8>)> = {
-        shard.write(&mut out).expect("writes to memory");
+        let out = shard.to_bytes();
         let own = Layout::check(&out, MAGIC, VERSION).expect("valid");
         let ids = (1..=19).filter_map(|id| own.find(id).map(|range| (id, out[range].to_vec())));
         let of_objects = objects.sections().map(|(id, bytes)| (id, bytes.to_vec()));

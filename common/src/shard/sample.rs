@@ -53,7 +53,15 @@ impl SampleShard {
     pub fn to_bytes(&self) -> Vec<u8> {
         let input_indices: Vec<u32> = (0..self.header.n_gaussians).collect();
         let exact = |embeddings| ExactColumns { input_indices: &input_indices, embeddings, fine: None };
-        let view = ShardView {
+        let view = ShardView { exact: self.embeddings.as_deref().map(exact), ..self.view() };
+        let mut bytes = Vec::new();
+        view.write(&mut bytes).expect("writes to memory");
+        bytes
+    }
+
+    /// Returns the columns without embeddings.
+    pub fn view(&self) -> ShardView<'_> {
+        ShardView {
             header: self.header,
             positions: Positions::Wide(&self.positions),
             centroid_starts: &self.centroid_starts,
@@ -61,16 +69,12 @@ impl SampleShard {
             radii: &self.radii,
             basis: None,
             residuals: None,
-            exact: self.embeddings.as_deref().map(exact),
+            exact: None,
             packed_indices: None,
-        };
-        let mut bytes = Vec::new();
-        view.write(&mut bytes).expect("writes to memory");
-        bytes
+        }
     }
 }
 
-/// An object of one cell.
 #[derive(Clone, Debug)]
 pub struct SampleObject {
     pub id: u64,
@@ -151,14 +155,7 @@ impl SampleObjects {
 /// named after nothing; generation 1.
 pub fn manifest(scene: &str, shards: &[(Profile, &[u8])]) -> Manifest {
     let mut cells: BTreeMap<u32, CellRecord> = BTreeMap::new();
-    let mut encoder = EncoderRecord {
-        name: "sample".into(),
-        id: Hash32([0; 32]),
-        dim: 0,
-        default_threshold: 0.1,
-        calibration: None,
-        text_model: None,
-    };
+    let mut encoder = encoder();
     for (profile, bytes) in shards {
         let aligned = AlignedBytes::copy_of(bytes);
         let layout = ShardLayout::check(&aligned).expect("a valid shard");
@@ -180,6 +177,38 @@ pub fn manifest(scene: &str, shards: &[(Profile, &[u8])]) -> Manifest {
         };
         cells.entry(header.cell_id).or_insert(cell).shards.insert(*profile, record);
     }
+    of_cells(scene, encoder, cells.into_values().collect())
+}
+
+/// Returns the manifest of cells whose compact shards have these boxes, hashes and lengths.
+pub fn manifest_of(scene: &str, cells: &[(Aabb, Hash32, u64)]) -> Manifest {
+    let cell = |(cell_id, (bounds, hash, len_bytes)): (u32, &(Aabb, Hash32, u64))| {
+        let record = ShardRecord {
+            hash: *hash,
+            len_bytes: *len_bytes,
+            n_centroids: 1,
+            score_error_bound: 0.1,
+            score_errors: ScoreErrors::default(),
+            position_error: 1e-3,
+        };
+        let shards = BTreeMap::from([(Profile::Compact, record)]);
+        CellRecord { cell_id, bounds: *bounds, n_gaussians: 1, shards }
+    };
+    of_cells(scene, encoder(), (0..).zip(cells).map(cell).collect())
+}
+
+fn encoder() -> EncoderRecord {
+    EncoderRecord {
+        name: "sample".into(),
+        id: Hash32([0; 32]),
+        dim: 4,
+        default_threshold: 0.1,
+        calibration: None,
+        text_model: None,
+    }
+}
+
+fn of_cells(scene: &str, encoder: EncoderRecord, cells: Vec<CellRecord>) -> Manifest {
     Manifest {
         version: manifest::VERSION,
         scene: scene.into(),
@@ -188,9 +217,9 @@ pub fn manifest(scene: &str, shards: &[(Profile, &[u8])]) -> Manifest {
         metric: true,
         geo_reference: None,
         encoder,
-        n_gaussians: cells.values().map(|cell| u64::from(cell.n_gaussians)).sum(),
+        n_gaussians: cells.iter().map(|cell| u64::from(cell.n_gaussians)).sum(),
         n_without_evidence: 0,
         n_rejected: 0,
-        cells: cells.into_values().collect(),
+        cells,
     }
 }

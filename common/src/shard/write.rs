@@ -13,7 +13,6 @@ use crate::photo_poses::PhotoPoses;
 /// What a shard may carry beyond what questions need.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Additions<'a> {
-    /// The objects of its Gaussians.
     pub objects: Option<&'a Objects<'a>>,
     /// How its Gaussians look.
     pub appearance: Option<Appearance<'a>>,
@@ -31,17 +30,11 @@ impl<'a> From<Option<&'a Objects<'a>>> for Additions<'a> {
 
 impl ShardView<'_> {
     /// Writes the shard.
-    ///
-    /// # Errors
-    /// Those of the writer.
     pub fn write(&self, out: impl io::Write) -> io::Result<()> {
         self.write_with(out, Additions::default())
     }
 
     /// Writes the shard and its additions.
-    ///
-    /// # Errors
-    /// Those of the writer.
     pub fn write_with<'a>(&self, out: impl io::Write, additions: impl Into<Additions<'a>>) -> io::Result<()> {
         let Additions { objects, appearance, occupancy, photo_poses } = additions.into();
         let mut sections = vec![

@@ -103,7 +103,6 @@ enum Parts {
     Bundle(Box<ZipArchive<BufReader<fs_err::File>>>),
 }
 
-/// An open SOG.
 struct Sog {
     /// The bundle or the meta file, named in errors.
     path: PathBuf,
@@ -140,7 +139,6 @@ pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaus
     sog.decode(&meta, options)
 }
 
-/// Reads a SOG bundle.
 pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let file = fs_err::File::open(path)?;
     let len_bytes = file.metadata()?.len();

@@ -7,7 +7,6 @@ pub(super) fn unit_rotation(wxyz: [f64; 4]) -> [f32; 4] {
     if norm == 0.0 { [0.0; 4] } else { wxyz.map(|q| (q / norm) as f32) }
 }
 
-/// Returns the opacity of a logit.
 pub(super) fn sigmoid(logit: f64) -> f32 {
     (1.0 / (1.0 + (-logit).exp())) as f32
 }

@@ -11,9 +11,6 @@ pub struct NotCanonical {
 }
 
 /// Returns the canonical form of a value.
-///
-/// # Errors
-/// [`NotCanonical`] for a fraction or a number beyond 64 bits.
 pub fn canonical_json(value: &Value) -> Result<Vec<u8>, NotCanonical> {
     let mut out = Vec::new();
     write(value, &mut out)?;

@@ -3,58 +3,32 @@
 /// Why metadata or a file is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TufError {
-    /// Not metadata of the role.
     #[error("{role} metadata: {what}; check that the address is that of a slag-encoder store")]
     Format { role: String, what: String },
-    /// Too few keys of the role signed it.
     #[error(
         "{role} metadata: {found} of its keys signed it, expected {threshold}: it was changed, or this is another store than the one that is trusted. If the store was made anew, trust its new root: `slag-edge trust add URL --sha256 HEX --replace`, with the SHA-256 that `slag-encoder keys status` prints there"
     )]
-    Signatures {
-        role: String,
-        /// Keys with a valid signature.
-        found: usize,
-        threshold: u32,
-    },
-    /// Older than what was seen before.
+    Signatures { role: String, found: usize, threshold: u32 },
     #[error(
         "{role} metadata: version {offered} is offered after {seen}: an old state of the store is repeated; fetch again later, or from the store itself"
     )]
     Rollback { role: String, seen: u64, offered: u64 },
-    /// Not the version that another role states.
     #[error(
         "{role} metadata: version {found}, expected {expected}: files of different states are mixed; fetch again"
     )]
     Version { role: String, expected: u64, found: u64 },
     #[error("{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder {}` there, and check its clock", if role == "root" { "keys renew" } else { "store refresh" })]
     Expired { role: String, expired: String, now: String },
-    /// Length or hash is not as stated.
     #[error("{what}: {fault}: it was changed, or files of different states are mixed; fetch again")]
-    Content {
-        /// The file or role.
-        what: String,
-        fault: String,
-    },
-    /// Longer than allowed.
+    Content { what: String, fault: String },
     #[error("{what} is longer than {max_bytes} bytes, the most that is read of it")]
     TooLong { what: String, max_bytes: u64 },
-    /// A file that must be there is missing.
     #[error("{what} is missing in the store; check the address, or publish the scene again")]
-    Missing {
-        /// The file or role.
-        what: String,
-    },
-    /// The next step needs a role that is not there yet, or repeats one.
+    Missing { what: String },
     #[error("{role} metadata came out of order")]
     Order { role: String },
-    /// More new roots than are read.
     #[error("more than {limit} {what} in a row; expected fewer: fetch again to go on, or check the store")]
-    TooMany {
-        /// What there is too much of.
-        what: &'static str,
-        limit: usize,
-    },
-    /// The store could not be read.
+    TooMany { what: &'static str, limit: usize },
     #[error("{what}: {fault}")]
     Source { what: String, fault: String },
 }

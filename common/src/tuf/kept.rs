@@ -22,15 +22,11 @@ pub struct Kept {
 
 impl Kept {
     /// Begins with a root that was trusted by hand.
-    ///
-    /// # Errors
-    /// [`TufError`] unless it is a root that its own keys signed.
     pub fn from_root(bytes: &[u8]) -> Result<Self, TufError> {
         parse_own_root(bytes)?;
         Ok(Self { root: text(Root::TYPE, bytes)?, timestamp: None, snapshot: None, targets: None })
     }
 
-    /// Returns the version of the newest root.
     pub fn root_version(&self) -> Option<u64> {
         SignedMetadata::<Root>::parse(Root::TYPE, self.root.as_bytes()).ok().map(|root| root.head.version)
     }

@@ -16,9 +16,6 @@ pub trait Body: Serialize + DeserializeOwned {
     const TYPE: &'static str;
 
     /// Checks what types alone do not say; returns what is wrong.
-    ///
-    /// # Errors
-    /// One clause.
     fn check(&self) -> Result<(), String> {
         Ok(())
     }
@@ -86,7 +83,6 @@ pub struct FileMeta {
 }
 
 impl FileMeta {
-    /// Describes metadata bytes.
     pub fn of(version: u64, bytes: &[u8]) -> Self {
         Self { version, length: Some(bytes.len() as u64), hashes: Some(hashes_of(bytes)) }
     }
@@ -143,7 +139,6 @@ impl Body for Snapshot {
     }
 }
 
-/// A file of the repository.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TargetFile {
     /// Length, bytes.
@@ -162,9 +157,6 @@ impl TargetFile {
     }
 
     /// Returns the name of the file at a path in a repository with consistent snapshots.
-    ///
-    /// # Errors
-    /// [`TufError::Content`] if no hash of a known kind is stated.
     pub fn file_name(&self, path: &str) -> Result<String, TufError> {
         let hash = ["sha256", "sha512"].into_iter().find_map(|algorithm| self.hashes.get(algorithm));
         // A hash becomes part of a name: nothing but hex digits may.

@@ -8,7 +8,6 @@ use super::kept::{parse_own_root, signed_unix_secs};
 use super::metadata::{Body, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
 use super::signed::SignedMetadata;
 
-/// Whether an offered file is news.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Offered {
     /// It replaces the file before.
@@ -29,9 +28,6 @@ pub struct Trusted {
 
 impl Trusted {
     /// Begins with a root that is trusted. `now_unix_secs`: the clock.
-    ///
-    /// # Errors
-    /// [`TufError`] unless it is a root that its own keys signed.
     pub fn new(root: &[u8], now_unix_secs: u64) -> Result<Self, TufError> {
         let root = parse_own_root(root)?;
         Ok(Self { root, timestamp: None, snapshot: None, targets: None, now_unix_secs })

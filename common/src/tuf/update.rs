@@ -11,9 +11,6 @@ use super::{MAX_ROOT_BYTES, MAX_ROOTS, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MA
 pub trait Source {
     /// Reads a metadata file, such as `2.root.json`: at most `max_bytes + 1` bytes, so that a longer one shows.
     /// `None` if there is no such file.
-    ///
-    /// # Errors
-    /// One clause with the cause, if the file can be neither read nor said to be missing.
     fn metadata(&mut self, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, String>;
 }
 

@@ -146,7 +146,6 @@ fn online_keys_cannot_name_keys() {
     update(&mut kept, &mut repo).expect("root keys decide");
 }
 
-/// Malformed roots.
 #[test]
 fn roots_that_ask_for_nothing_are_refused() {
     let owner = Owner::new();

@@ -70,15 +70,11 @@ impl Step {
     pub const MAX: usize = 1 << 16;
 
     /// Parses a step.
-    ///
-    /// # Errors
-    /// The numbers that are valid, 1 to [`Self::MAX`], as a message can name them.
     pub fn parse(text: &str) -> Result<Self, &'static str> {
         let step = text.parse().ok().filter(|step| (1..=Self::MAX).contains(step));
         step.map(Self).ok_or("a whole number from 1 to 65536")
     }
 
-    /// Returns the items that are sent.
     pub fn of<T>(self, all: &[T]) -> impl Iterator<Item = &T> {
         all.iter().step_by(self.0)
     }

@@ -140,9 +140,6 @@ impl Words {
 
     /// Encodes words as long as there is time for it. Returns what `encode` made of them, and whether all were
     /// encoded.
-    ///
-    /// # Errors
-    /// The first of `encode`.
     pub fn encode<'a, V, E>(
         words: impl IntoIterator<Item = &'a str>,
         mut encode: impl FnMut(&'a str) -> Result<V, E>,

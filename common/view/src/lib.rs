@@ -25,7 +25,6 @@ pub use cell::{CELL_HEAD_BYTES, GAUSSIAN_BYTES, Step, cell_message};
 pub use description::{Cell, CellState, Corners, Description, Fetched, Photo, Word, Words};
 pub use scores::ScoresMessage;
 
-/// A file of the page.
 struct File {
     /// Path below `/view/`.
     path: &'static str,

@@ -7,9 +7,7 @@ const MAGIC: [u8; 4] = *b"SLGS";
 const VERSION: u32 = 1;
 /// Bytes before the table of cells.
 const HEAD_BYTES: usize = 24;
-/// Bytes of a row of the table.
 const ROW_BYTES: usize = 8;
-/// Largest level.
 const LAST_LEVEL: f32 = 255.0;
 
 /// A message of scores in the making: magic, version, least and largest score (f32 each), number of cells and
@@ -48,7 +46,6 @@ impl ScoresMessage {
         Self { bytes, starts, least, largest }
     }
 
-    /// Returns the length of a message.
     pub fn len(n_cells: usize, n_gaussians: usize) -> usize {
         HEAD_BYTES + ROW_BYTES * n_cells + n_gaussians
     }

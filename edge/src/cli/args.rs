@@ -108,7 +108,6 @@ pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
     }
 }
 
-/// Returns the models of the text model and the options it runs with.
 pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
     let failed = Failure::of("models");
     let models = model_commands::open(args.models.as_deref(), &variable);

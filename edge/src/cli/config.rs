@@ -23,28 +23,15 @@ pub const HELP: &str = "Flags may also come from the environment (SLAG_EDGE_CACH
 const PREFIX: &str = "SLAG_EDGE";
 /// The flag that names the file; `SLAG_EDGE_CONFIG` in the environment.
 const FILE_FLAG: &str = "config";
-/// Longest file.
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
 /// Why the command line, the environment and the file do not make a command.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// The file cannot be read.
     #[error("the configuration {} cannot be read: {cause}", path.display())]
-    Unreadable {
-        path: PathBuf,
-        /// The system's error.
-        cause: io::Error,
-    },
-    /// A value is wrong, or its key is none.
+    Unreadable { path: PathBuf, cause: io::Error },
     #[error("{place}: {what}")]
-    Wrong {
-        /// File and key, or the variable.
-        place: String,
-        /// What is wrong, and what is expected.
-        what: String,
-    },
-    /// The command line is wrong, or asks for help.
+    Wrong { place: String, what: String },
     #[error(transparent)]
     Line(#[from] clap::Error),
 }

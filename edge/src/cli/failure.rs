@@ -8,12 +8,10 @@ use crate::store::StoreError;
 
 use super::text::visible;
 
-/// Exit codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
     /// Success, even if nothing was found.
     Done = 0,
-    /// Failure.
     Failed = 1,
     /// Invalid request; also clap's exit code.
     Usage = 2,
@@ -37,7 +35,6 @@ pub enum Failure {
     Failed(&'static str, anyhow::Error),
     /// A fetch brought all cells but some; its report is printed.
     Partial(anyhow::Error),
-    /// Interrupted by a signal.
     Interrupted(anyhow::Error),
     /// The reader of stdout has gone away.
     BrokenPipe,

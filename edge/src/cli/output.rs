@@ -7,7 +7,6 @@ use serde::Serialize;
 use super::failure::Failure;
 use super::text::visible;
 
-/// Prints one JSON object.
 pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     let text = serde_json::to_string(value).map_err(|e| Failure::Failed("json", e.into()))?;
     Ok(writeln!(io::stdout(), "{text}")?)

@@ -22,7 +22,6 @@ pub enum TrustCommand {
 }
 
 impl TrustCommand {
-    /// Returns whether JSON is asked for.
     pub(crate) fn is_json(&self) -> bool {
         match self {
             Self::Add(args) => args.json,

@@ -16,7 +16,6 @@ pub const MAX_COPY_BYTES: u64 =
     2 * (tuf::MAX_ROOT_BYTES + tuf::MAX_TIMESTAMP_BYTES + tuf::MAX_SNAPSHOT_BYTES) + (64 << 10);
 const NAMES: [&str; 2] = ["0", "1"];
 
-/// The state of the copies.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Found {
     /// Neither exists.
@@ -27,13 +26,11 @@ pub enum Found {
     Damaged(String),
 }
 
-/// A version of the record.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Version {
     /// Number of the version, from 1.
     pub sequence: u64,
     pub content: Vec<u8>,
-    /// The copy that it was read from.
     index: usize,
     /// Whether the other copy is the same.
     pub is_twice: bool,

@@ -13,7 +13,6 @@ use super::error::FetchError;
 use super::request::Environment;
 use crate::store::files::Files;
 
-/// Downloads from one store.
 pub(super) struct Client<'a> {
     http: download::Client<'a>,
     base: String,

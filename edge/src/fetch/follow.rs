@@ -242,9 +242,7 @@ impl Following {
     }
 }
 
-/// The surroundings of following.
 pub struct FollowEnvironment<'a> {
-    /// Makes one fetch.
     pub fetch: &'a mut dyn FnMut(&FetchRequest) -> Result<FetchReport, FetchError>,
     /// Receives the outcome of each fetch.
     pub report: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
@@ -342,9 +340,6 @@ fn in_world(position: Position, manifest: Option<&Manifest>) -> Option<DVec3> {
 
 /// Reads positions, one a line, until the end. Skips empty lines; overlong ones are not stored. `each`
 /// receives the line number, from 1.
-///
-/// # Errors
-/// Errors of the reader.
 pub fn read_positions(
     mut reader: impl BufRead,
     mut each: impl FnMut(u64, Result<Position, NotAPosition>),

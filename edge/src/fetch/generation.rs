@@ -10,7 +10,6 @@ use super::offer::Offer;
 use super::plan::{Plan, Wanted};
 use crate::store::{self, BadCell, CellFault, Current, CurrentCell, EdgeCache, OldShard};
 
-/// The generation on board.
 #[derive(Clone, Copy)]
 pub struct Before<'a> {
     pub cache: &'a EdgeCache,

@@ -37,12 +37,10 @@ impl<'a> Check<'a> {
         Self { manifest, profile, cells: cells.iter().map(|cell| (cell.hash, cell)).collect(), text_model }
     }
 
-    /// Returns whether an object belongs to the text model.
     pub(crate) fn is_of_text_model(&self, hash: Hash32) -> bool {
         self.text_model.contains(&hash)
     }
 
-    /// Returns the cell of an object.
     pub fn cell(&self, hash: Hash32) -> Option<&'a CurrentCell> {
         self.cells.get(&hash).copied()
     }

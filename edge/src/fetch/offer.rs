@@ -85,7 +85,6 @@ impl Offer {
     }
 }
 
-/// The metadata that a store serves.
 struct StoreMetadata<'a> {
     client: &'a Client<'a>,
     /// Why the last download failed.

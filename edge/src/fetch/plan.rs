@@ -14,7 +14,6 @@ use crate::store::CurrentCell;
 /// A shard on board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Held {
-    /// Length of the file.
     pub len_bytes: u64,
     /// Number of the last fetch that needed it.
     pub last_used: u64,
@@ -23,7 +22,6 @@ pub struct Held {
 /// The set of cells wanted on board.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wanted {
-    /// Profile of the shards.
     pub profile: Profile,
     /// Where the robot is.
     pub centre_in_world: DVec3,
@@ -46,7 +44,6 @@ pub struct Object {
 pub struct Plan {
     /// The cells within the radius, by id, ascending.
     pub cells: Vec<CurrentCell>,
-    /// Needed objects to download.
     pub download: Vec<Object>,
     /// Needed objects on board.
     pub keep: BTreeSet<Hash32>,
@@ -57,7 +54,6 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Plans a fetch.
     pub fn new(
         manifest: &Manifest,
         wanted: &Wanted,
@@ -159,49 +155,21 @@ fn objects(cells: &[CurrentCell], manifest: &Manifest) -> Result<Vec<Object>, Pl
 mod tests {
     use proptest::prelude::*;
     use slag_common::frames::{Aabb, GeoReference, Geographic};
-    use slag_common::manifest::{CellRecord, EncoderRecord, ShardRecord, VERSION};
+    use slag_common::shard::sample;
 
     use super::super::position::Position;
     use super::*;
 
     fn manifest(boxes: &[(DVec3, DVec3, u64)]) -> Manifest {
-        let cells = (0u32..).zip(boxes).map(|(cell_id, (min, size, len_bytes))| CellRecord {
-            cell_id: cell_id * 3,
-            bounds: Aabb { min: *min, max: *min + *size },
-            n_gaussians: 1,
-            shards: BTreeMap::from([(
-                Profile::Compact,
-                ShardRecord {
-                    hash: hash(cell_id),
-                    len_bytes: *len_bytes,
-                    n_centroids: 1,
-                    score_error_bound: 0.1,
-                    score_errors: Default::default(),
-                    position_error: 0.1,
-                },
-            )]),
-        });
+        let cell = |(number, (min, size, len_bytes)): (u32, &(DVec3, DVec3, u64))| {
+            (Aabb { min: *min, max: *min + *size }, hash(number), *len_bytes)
+        };
+        let cells: Vec<_> = (0u32..).zip(boxes).map(cell).collect();
         let origin = Geographic { latitude_deg: 46.8, longitude_deg: -91.9, height_m: 150.0 };
-        Manifest {
-            version: VERSION,
-            scene: "s".into(),
-            generation: 1,
-            created_unix_secs: 0,
-            metric: true,
-            geo_reference: Some(GeoReference { origin }),
-            encoder: EncoderRecord {
-                name: "e".into(),
-                id: Hash32([1; 32]),
-                dim: 4,
-                default_threshold: 0.1,
-                calibration: None,
-                text_model: None,
-            },
-            n_gaussians: boxes.len() as u64,
-            n_without_evidence: 0,
-            n_rejected: 0,
-            cells: cells.collect(),
-        }
+        let mut manifest =
+            Manifest { geo_reference: Some(GeoReference { origin }), ..sample::manifest_of("s", &cells) };
+        manifest.cells.iter_mut().for_each(|cell| cell.cell_id *= 3);
+        manifest
     }
 
     fn hash(number: u32) -> Hash32 {

@@ -10,7 +10,6 @@ use slag_common::manifest::Manifest;
 
 use super::plan_error::PlanError;
 
-/// Longest text of a position.
 pub const MAX_TEXT_BYTES: usize = 256;
 
 /// Position of a robot.
@@ -31,7 +30,6 @@ pub enum Position {
     },
 }
 
-/// A text is not a position.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{found:?} is not a position; expected `x y z`, `lat,lon[,height]`, {{\"x\":..,\"y\":..,\"z\":..}} or {{\"lat\":..,\"lon\":..,\"height\":..}}"

@@ -24,27 +24,18 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 /// Reasons for which the records cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordsError {
-    /// Another fetch holds the lock.
     #[error("another fetch uses {path}; wait for it or end it", path = path.display())]
     Busy { path: PathBuf },
-    /// Both copies are damaged.
     #[error("{path}: both copies of the record of trust are damaged ({what}), so that no store is believed; what is on board keeps answering. Add the store's newest root by hand (`slag-edge trust add --root FILE`): the record is then written anew", path = path.display())]
-    Damaged {
-        path: PathBuf,
-        /// The fault of one copy.
-        what: String,
-    },
-    /// The record would be too long to be read again.
+    Damaged { path: PathBuf, what: String },
     #[error(
         "the record of trust would take {len_bytes} bytes, the limit is {MAX_CONTENT_BYTES}; publish the scene under a shorter name"
     )]
     TooLong { len_bytes: u64 },
-    /// The file system's error, with the path.
     #[error("{0}; check the cache's folder and its permissions")]
     Io(#[from] io::Error),
 }
 
-/// The request of the last fetch.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LastFetch {
     pub from: String,
@@ -77,7 +68,6 @@ struct Record {
     last: Option<LastFetch>,
 }
 
-/// The open records.
 #[derive(Debug)]
 pub struct Records {
     copies: Copies,
@@ -122,12 +112,10 @@ impl Records {
         Some(RecordsError::Damaged { path: self.copies.dir().to_owned(), what })
     }
 
-    /// Returns the request of the last fetch.
     pub fn last(&self) -> Option<&LastFetch> {
         self.record.last.as_ref()
     }
 
-    /// Returns the scene accepted.
     pub fn scene(&self) -> Option<&str> {
         self.record.scene.as_deref()
     }
@@ -234,9 +222,6 @@ struct Lock(#[expect(dead_code, reason = "the lock lasts as long as the file is 
 
 impl Lock {
     /// Takes the lock of a cache folder; `None` if another fetch keeps it.
-    ///
-    /// # Errors
-    /// The file system's, with the path.
     fn take(dir: &Path) -> io::Result<Option<Self>> {
         let path = dir.join("lock");
         fs_err::create_dir_all(dir)?;

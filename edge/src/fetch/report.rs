@@ -45,13 +45,11 @@ pub struct FetchReport {
     /// The encoder whose text model answers queries.
     pub encoder_id: Hash32,
     pub encoder_name: String,
-    /// The profile of the shards.
     pub profile: Profile,
     /// Centre, world frame.
     pub centre_in_world: DVec3,
     /// Radius, world units.
     pub radius: f64,
-    /// Cells within it.
     pub n_cells: usize,
     /// Those whose shard could not be fetched.
     pub bad_cells: Vec<BadCell>,

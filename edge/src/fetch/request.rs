@@ -14,7 +14,6 @@ use super::position::Position;
 pub const DEFAULT_RADIUS: f64 = 50.0;
 const DEFAULT_PARALLEL: usize = 4;
 
-/// Parameters of a fetch.
 #[derive(Clone, Debug)]
 pub struct FetchRequest {
     /// Address of the store (`http://` or `https://`); absent: that of the last fetch.

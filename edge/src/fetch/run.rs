@@ -329,7 +329,6 @@ fn check_space(cache: &EdgeCache, download: &[Object], other_bytes: u64) -> Resu
     }
 }
 
-/// Tells a full disk from other errors.
 fn disk_full(error: FetchError, needed_bytes: u64) -> FetchError {
     let is_full =
         |e: &io::Error| matches!(e.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded);

@@ -28,7 +28,6 @@ pub enum FirstRoot {
     },
 }
 
-/// A root that is trusted.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct AddedRoot {
     /// SHA-256, hex.

@@ -146,7 +146,6 @@ fn sifted(window: &Window, candidates: Vec<Candidate>) -> Vec<Candidate> {
 
 /// The thing to stand at.
 struct Target<'a> {
-    /// Points of its surface.
     points: &'a [DVec3],
     /// Those that are looked at.
     samples: Vec<DVec3>,

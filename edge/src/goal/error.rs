@@ -6,15 +6,12 @@ use crate::score::{OverBudget, ScoreError};
 /// Why a request has no reply.
 #[derive(Debug, thiserror::Error)]
 pub enum GoalError {
-    /// The question, or the request, is refused.
     #[error(transparent)]
     Query(#[from] QueryError),
-    /// No shard on board says which places are free.
     #[error(
         "the scene does not say which places are free; encode it with --occupancy, publish it, and fetch it again"
     )]
     NoOccupancy,
-    /// The scene has no objects.
     #[error(
         "the scene has no objects to go to; encode it without --no-objects, publish it, and fetch it again"
     )]

@@ -183,7 +183,6 @@ fn low_bits(n: u32) -> u128 {
     1u128.checked_shl(n).map_or(!0, |bit| bit - 1)
 }
 
-/// Returns the surfaces with headroom above.
 fn surfaces_of(occupied: u128, free: u128, headroom: u32) -> u128 {
     let (mut surfaces, mut tops) = (0, occupied & !(occupied >> 1));
     while tops != 0 {

@@ -75,9 +75,6 @@ pub fn floor_map(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Res
 impl FloorMap {
     /// Writes a PGM, north (y) up: unknown 128, obstacles 0, ground 200, ground that the robot reaches 255. ROS's
     /// map_server reads it.
-    ///
-    /// # Errors
-    /// Those of the writer.
     pub(crate) fn write_pgm(&self, mut out: impl Write) -> io::Result<()> {
         let [width, height] = self.size;
         write!(out, "P5\n{width} {height}\n255\n")?;

@@ -23,7 +23,6 @@ pub const SLOPE: [f64; 2] = [0.02, 5.0];
 pub const RANGE_M: [f64; 2] = [1.0, 50.0];
 /// Least and largest share that must be visible.
 pub const MIN_VISIBLE: [f64; 2] = [0.01, 1.0];
-/// Most poses of a reply.
 pub const MAX_POSES: usize = 20;
 
 /// The thing to go to.
@@ -31,7 +30,6 @@ pub const MAX_POSES: usize = 20;
 pub enum GoalTarget {
     /// What matches a text, best first; a text may name relations, as in `/v1/query`.
     Text(String),
-    /// An object by its id.
     Object(u64),
 }
 
@@ -92,9 +90,6 @@ impl GoalRequest {
     }
 
     /// Checks every limit that does not depend on the scene.
-    ///
-    /// # Errors
-    /// The first parameter that is out of its range.
     pub fn check(&self) -> Result<(), RequestError> {
         let ranges = [
             ("radius_m", self.radius_m, RADIUS_M),

@@ -16,7 +16,6 @@ const TOLERANCE: f64 = 2.0;
 const SIDE: f64 = 1e-3;
 /// Distance from a point, in edges of a voxel, beyond which a place is not within [`TOLERANCE`] of it.
 const BEFORE: f64 = TOLERANCE + SIDE;
-/// Voxels of a column.
 const HEIGHT: i32 = COLUMN_BLOCKS * BLOCK_EDGE;
 /// Most columns of voxels that are kept at hand, 17 MB: lines to larger things look up every voxel.
 const MAX_AT_HAND: usize = 1 << 19;

@@ -28,7 +28,6 @@ pub struct Stacked {
 /// The part of the lattice around a robot: columns of blocks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Window {
-    /// Edge of a voxel.
     pub voxel: f64,
     /// Smallest block.
     pub first: [i32; 3],
@@ -67,7 +66,6 @@ impl Window {
         inside.then(|| x as usize * n_y + y as usize)
     }
 
-    /// Returns the middle of a cell.
     pub(crate) fn centre_of(&self, cell: usize) -> [f64; 2] {
         let n_y = self.cells()[1];
         let at = |axis: usize, offset: usize| {

@@ -237,7 +237,6 @@ fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Optio
     ball.into_iter().chain(bounds).reduce(|a, b| a || b)
 }
 
-/// Describes a cluster.
 fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
     let Ranked { found: cluster, rank, relevance, distance } = ranked;
     let Extent { position_in_world, box_in_world } = cluster.extent;

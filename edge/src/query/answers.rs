@@ -118,7 +118,6 @@ enum AnyAnswer {
     Gaussian(GaussianAnswer),
 }
 
-/// Answers of either kind.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Found {
     Clusters(Vec<ClusterAnswer>),
@@ -127,7 +126,6 @@ pub enum Found {
 }
 
 impl Found {
-    /// Returns the number of answers.
     pub fn len(&self) -> usize {
         match self {
             Self::Clusters(answers) => answers.len(),
@@ -146,7 +144,6 @@ impl Found {
         }
     }
 
-    /// Returns whether there is no answer.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -15,17 +15,10 @@ const MAX_DESCRIPTION_BYTES: u64 = 1 << 20;
 /// Reasons for which a scene's text model does not open.
 #[derive(Debug, thiserror::Error)]
 pub enum CarriedError {
-    /// The description cannot be read, or differs from the manifest.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The description or a file of it is not as expected.
     #[error("{path}: {cause}; fetch again, which replaces what is damaged", path = path.display())]
-    Open {
-        /// The description.
-        path: PathBuf,
-        /// The reason.
-        cause: Box<TextOpenError>,
-    },
+    Open { path: PathBuf, cause: Box<TextOpenError> },
 }
 
 /// Opens the text model that a scene carries; `None` if it carries none.

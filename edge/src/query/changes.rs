@@ -17,7 +17,6 @@ use crate::store::{EdgeCache, Snapshot};
 /// Why nothing was compared: the robot remembers no earlier generation.
 const NO_EARLIER: &str = "no-earlier-generation";
 
-/// Which changes are asked for.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ChangesRequest {
     /// The earlier generation; the newest before `to` that is remembered if absent.
@@ -33,28 +32,14 @@ pub struct ChangesRequest {
 /// Why generations are not compared.
 #[derive(Debug, thiserror::Error)]
 pub enum ChangesError {
-    /// The request is refused, or there is no scene.
     #[error(transparent)]
     Query(#[from] QueryError),
-    /// The robot does not remember a generation.
     #[error("generation {wanted} is not remembered; those that are: {}", list(known))]
-    NoSuchGeneration {
-        /// The generation.
-        wanted: u64,
-        /// Those that can be compared.
-        known: Vec<u64>,
-    },
-    /// The generations' vectors do not compare.
+    NoSuchGeneration { wanted: u64, known: Vec<u64> },
     #[error(
         "generations {from} and {to} were encoded with different models, so that their things do not compare"
     )]
-    Encoders {
-        /// The earlier one.
-        from: u64,
-        /// The later one.
-        to: u64,
-    },
-    /// The scene has no objects.
+    Encoders { from: u64, to: u64 },
     #[error(
         "generation {0} has no objects on board to compare; encode the scene without --no-objects, publish it, and fetch it again"
     )]

@@ -25,7 +25,6 @@ const BRIDGE_SHARE: f64 = 0.05;
 /// Weight of a Gaussian that just reaches the threshold; the best one weighs 1.
 const LEAST_WEIGHT: f64 = 0.1;
 
-/// Parameters of clustering.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Grouping {
     /// Edge of the voxels, world units, positive. Doubled until the extent of the matches fits the grid.
@@ -36,11 +35,9 @@ pub struct Grouping {
     pub threshold: f32,
     /// Permitted orientations of boxes.
     pub alignment: Alignment,
-    /// Whether clusters list their members.
     pub with_members: bool,
 }
 
-/// A cluster of Gaussians.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cluster {
     /// Cell and index of its first member: its id within a generation.

@@ -28,31 +28,18 @@ const RETRY_AFTER: Duration = Duration::from_secs(5);
 /// Reasons for which a question cannot be answered.
 #[derive(Debug, thiserror::Error)]
 pub enum QueryError {
-    /// The request is invalid.
     #[error(transparent)]
     Request(#[from] RequestError),
-    /// The text cannot be encoded.
     #[error(transparent)]
     Text(#[from] TextError),
-    /// A negative cannot be encoded.
     #[error("negatives: {0}")]
     Negatives(#[source] TextError),
-    /// No scene is loaded.
     #[error("no scene is loaded; run `slag-edge fetch`, or see the log if you have fetched one")]
     NoScene,
-    /// Text model and scene use different embedding spaces.
     #[error(
         "the text model is {models_name} ({models_id}), but the scene was encoded with {scene_name} ({scene_id}); pass the folder of {scene_name} to --models, publish the scene with `slag-encoder encode --text-model`, or fetch a scene encoded with {models_name}"
     )]
-    EncoderMismatch {
-        /// Name of the text model's space.
-        models_name: String,
-        models_id: Hash32,
-        /// Name of the scene's space.
-        scene_name: String,
-        scene_id: Hash32,
-    },
-    /// The shards cannot be scored.
+    EncoderMismatch { models_name: String, models_id: Hash32, scene_name: String, scene_id: Hash32 },
     #[error(transparent)]
     Score(#[from] ScoreError),
 }
@@ -96,9 +83,6 @@ pub struct OnBoard {
 
 impl OnBoard {
     /// Checks that text model and scene use the same embedding space.
-    ///
-    /// # Errors
-    /// [`QueryError::EncoderMismatch`].
     pub fn check(&self) -> Result<(), QueryError> {
         let (models, scene) = (self.text.info(), &self.snapshot.manifest.encoder);
         if models.id == scene.id {
@@ -123,9 +107,6 @@ impl OnBoard {
     }
 
     /// Returns the vector of a text.
-    ///
-    /// # Errors
-    /// It is longer than a text may be, or unknown to the model.
     pub(super) fn encode(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
         check_text("text", text)?;
         Ok(self.text.encode(text)?)
@@ -236,18 +217,12 @@ impl Engine {
     }
 
     /// Returns the loaded generation.
-    ///
-    /// # Errors
-    /// [`QueryError::NoScene`].
     pub fn snapshot(&self) -> Result<Arc<Snapshot>, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         loaded.snapshot.clone().ok_or(QueryError::NoScene)
     }
 
     /// Returns the loaded generation and the text model that came into use with it.
-    ///
-    /// # Errors
-    /// [`QueryError::NoScene`].
     pub fn on_board(&self) -> Result<OnBoard, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;

@@ -21,7 +21,6 @@ use crate::store::Snapshot;
 /// The form of an object's id.
 pub const OBJECT_ID: &str = "^o[0-9a-f]{16}$";
 
-/// Which objects are listed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ObjectFilter {
     /// Only those with larger ids.
@@ -95,9 +94,6 @@ pub fn object_id(text: &str) -> Option<u64> {
 
 impl Engine {
     /// Returns the objects of a generation that pass a filter, by id, at most `limit`.
-    ///
-    /// # Errors
-    /// The budget is spent.
     pub fn objects(
         &self,
         snapshot: &Snapshot,
@@ -112,9 +108,6 @@ impl Engine {
     }
 
     /// Returns an object of a generation.
-    ///
-    /// # Errors
-    /// The budget is spent.
     pub fn object(
         &self,
         snapshot: &Snapshot,

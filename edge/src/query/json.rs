@@ -10,7 +10,6 @@ const JSON_PIECE_BYTES: usize = 64 << 10;
 /// Capacity reserved for that last answer.
 const ANSWER_BYTES: usize = 1 << 10;
 
-/// The pieces of a reply as JSON.
 pub struct Pieces {
     reply: Reply,
     /// The next item: an index into a question's answers.
@@ -36,7 +35,6 @@ impl Iterator for Pieces {
 }
 
 impl Pieces {
-    /// Starts a reply.
     pub fn new(reply: Reply) -> Self {
         Self { reply, question: 0, item: 0, is_closed: false }
     }

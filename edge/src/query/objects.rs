@@ -13,14 +13,11 @@ use super::scene::Scene;
 use crate::score::{Region, Run};
 use crate::store::objects::Part;
 
-/// An object that matches.
 #[derive(Clone, Copy)]
 pub struct FoundObject<'a> {
     /// Its index in the object index.
     pub object: usize,
-    /// Its record in the shards.
     pub record: &'a ObjectRecord,
-    /// Its score with the question.
     pub score: f32,
     /// Its Gaussians on board, in the region asked for.
     pub n_gaussians: u64,

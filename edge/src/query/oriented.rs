@@ -3,6 +3,7 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use schemars::JsonSchema;
 use serde::Serialize;
+use slag_math::eigen::eigen_symmetric;
 use slag_math::stats::trimmed_range;
 
 /// Permitted orientations of a box.
@@ -69,7 +70,10 @@ fn axes_of(points: &[DVec3], alignment: Alignment) -> DMat3 {
         covariance += DMat3::from_cols(offset * offset.x, offset * offset.y, offset * offset.z);
     }
     match alignment {
-        Alignment::Principal => eigenvectors(covariance),
+        Alignment::Principal => {
+            let (_, vectors) = eigen_symmetric(covariance.to_cols_array().to_vec(), 3);
+            DMat3::from_cols_slice(&vectors)
+        }
         Alignment::Gravity => {
             // The 2x2 block's principal axis, in closed form.
             let (xx, xy, yy) = (covariance.x_axis.x, covariance.x_axis.y, covariance.y_axis.y);
@@ -77,30 +81,6 @@ fn axes_of(points: &[DVec3], alignment: Alignment) -> DMat3 {
             DMat3::from_cols(x.extend(0.0), x.perp().extend(0.0), DVec3::Z)
         }
     }
-}
-
-/// Returns the eigenvectors of a symmetric matrix as columns, by Jacobi rotations (Golub and Van Loan, Matrix
-/// Computations, 8.5); a dozen of them suffice for 3x3.
-fn eigenvectors(mut a: DMat3) -> DMat3 {
-    let mut axes = DMat3::IDENTITY;
-    for _ in 0..16 {
-        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
-            let (app, aqq, apq) = (a.col(p)[p], a.col(q)[q], a.col(q)[p]);
-            if apq == 0.0 {
-                continue;
-            }
-            let theta = 0.5 * (2.0 * apq).atan2(aqq - app);
-            let (sin, cos) = theta.sin_cos();
-            let mut turn = DMat3::IDENTITY;
-            turn.col_mut(p)[p] = cos;
-            turn.col_mut(q)[q] = cos;
-            turn.col_mut(q)[p] = sin;
-            turn.col_mut(p)[q] = -sin;
-            a = turn.transpose() * a * turn;
-            axes *= turn;
-        }
-    }
-    axes
 }
 
 /// Makes the box unique: orders the axes by length, longest first (an upright box keeps z), flips each so

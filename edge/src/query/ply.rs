@@ -19,7 +19,6 @@ pub struct Pieces<R> {
     reply: R,
     properties: PointProperties,
     has_header: bool,
-    /// The next point.
     at: Place,
 }
 

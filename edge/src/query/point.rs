@@ -64,9 +64,6 @@ impl LatLon {
 
 impl Point {
     /// Returns the point in the world frame. `parameter`: its name, for the error.
-    ///
-    /// # Errors
-    /// Out of bounds, or geographic in a scene without a geographic reference.
     pub fn in_world(self, parameter: &str, manifest: &Manifest) -> Result<DVec3, RequestError> {
         let point = match self {
             Self::World(point) => DVec3::from(point),
@@ -82,9 +79,6 @@ impl Point {
 
 impl Corner {
     /// Returns the corner in the world frame.
-    ///
-    /// # Errors
-    /// Geographic in a scene without a geographic reference.
     pub fn in_world(self, parameter: &str, manifest: &Manifest) -> Result<DVec2, RequestError> {
         match self {
             Self::World(corner) => Ok(DVec2::from(corner)),

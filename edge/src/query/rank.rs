@@ -27,7 +27,6 @@ pub struct Order {
     limit: usize,
 }
 
-/// An answer with its rank.
 pub struct Ranked<T> {
     pub found: T,
     pub rank: usize,

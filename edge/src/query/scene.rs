@@ -18,7 +18,6 @@ const VOXELS_PER_CELL: f64 = 64.0;
 
 /// The data that a query runs on.
 pub struct Scene<'a> {
-    /// The shards on board.
     pub shards: &'a [ShardView<'a>],
     /// The objects of each shard; absent in shards without them.
     pub objects: &'a [Option<Objects<'a>>],

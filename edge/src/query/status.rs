@@ -63,7 +63,6 @@ pub struct ShardStatus {
 }
 
 impl Status {
-    /// Describes a snapshot.
     pub fn of(snapshot: &Snapshot) -> Self {
         let Snapshot { current, manifest, .. } = snapshot;
         let shards: Vec<ShardStatus> = snapshot

@@ -32,9 +32,6 @@ type WordVector = (String, Arc<[f32]>);
 
 impl Engine {
     /// Describes the scene on board. `robot_in_world`: where the robot is, if that is known.
-    ///
-    /// # Errors
-    /// [`QueryError::NoScene`].
     pub fn view(
         &self,
         robot_in_world: impl Fn(&Snapshot) -> Option<DVec3>,

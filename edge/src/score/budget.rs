@@ -10,20 +10,14 @@ use std::time::{Duration, Instant};
 /// Why a request was given up.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum OverBudget {
-    /// It needs too much memory.
     #[error(
         "the query needs more than {bytes} bytes of memory, its budget; raise threshold, min_count or voxel, or ask for a smaller radius or box"
     )]
     Bytes { bytes: u64 },
-    /// All requests together need too much memory.
     #[error(
         "the queries in progress need more than {bytes} bytes of memory, their budget together; ask again"
     )]
-    Together {
-        /// The budget of all requests.
-        bytes: u64,
-    },
-    /// It takes too long.
+    Together { bytes: u64 },
     #[error(
         "the query took more than {} s, its budget; raise threshold, min_count or voxel, or ask for a smaller radius or box",
         time.as_secs_f64()
@@ -44,7 +38,6 @@ impl Pool {
         Arc::new(Self { bytes, used: AtomicU64::new(0) })
     }
 
-    /// Returns the bytes in use.
     pub fn used_bytes(&self) -> u64 {
         self.used.load(Relaxed)
     }

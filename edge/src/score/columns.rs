@@ -1,7 +1,7 @@
 //! Large answers as columns.
 
 use rayon::prelude::*;
-use slag_common::shard::{Positions, ShardView};
+use slag_common::shard::ShardView;
 
 use super::matches::{Hit, Run};
 
@@ -13,7 +13,6 @@ const CHUNK: usize = if cfg!(test) { 64 } else { 4096 };
 pub struct Columns {
     /// Index of the shard in the searched slice.
     pub shard: Vec<u32>,
-    /// Index in the shard.
     pub index: Vec<u32>,
     pub score: Vec<f32>,
     /// Mean, world units.
@@ -39,27 +38,8 @@ impl Part<'_> {
     fn set(&mut self, at: usize, shards: &[ShardView<'_>], hit: Hit) {
         (self.shard[at], self.index[at], self.score[at]) = (hit.shard, hit.index, hit.score);
         [self.x[at], self.y[at], self.z[at]] =
-            position_in_world(&shards[hit.shard as usize], hit.index as usize);
+            shards[hit.shard as usize].position_in_world(hit.index as usize).to_array();
     }
-}
-
-/// As [`ShardView::position_in_world`], with the same bits, but inlined into the loop.
-#[inline]
-fn position_in_world(shard: &ShardView<'_>, index: usize) -> [f64; 3] {
-    let header = &shard.header;
-    let steps = match shard.positions {
-        Positions::Wide(steps) => steps[index].map(u32::from),
-        Positions::Full(steps) => steps[index],
-        Positions::Packed(steps) => {
-            let [x, y, z, _] = header.position_bits.map(u32::from);
-            let packed = u64::from(steps[index]);
-            let low = |packed: u64, bits: u32| (packed & ((1 << bits) - 1)) as u32;
-            [low(packed, x), low(packed >> x, y), low(packed >> (x + y), z)]
-        }
-    };
-    std::array::from_fn(|axis| {
-        header.origin_in_world[axis] + f64::from(steps[axis]) * header.position_step[axis]
-    })
 }
 
 impl Columns {

@@ -5,7 +5,6 @@
 pub struct Hit {
     /// Index of the shard in the searched slice.
     pub shard: u32,
-    /// Index in the shard.
     pub index: u32,
     /// The Gaussian's own score where the shard holds a code or embedding and the precision uses it; else its
     /// centroid's.
@@ -29,7 +28,6 @@ pub struct Run {
 pub struct Matches {
     /// Disjoint runs, by shard and start, ascending.
     pub runs: Vec<Run>,
-    /// Gaussians in the runs.
     pub n_gaussians: u64,
     /// Centroids that had to be decided member by member.
     pub n_centroids_undecided: u64,

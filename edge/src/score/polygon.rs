@@ -5,7 +5,6 @@ use slag_common::frames::Aabb;
 
 use super::error::MAX_COORDINATE;
 
-/// Most corners of a polygon.
 pub const MAX_CORNERS: usize = 256;
 
 /// A polygon in the world's x and y, of any height. It may be concave; where it crosses itself, even-odd counts.

@@ -27,7 +27,6 @@ pub struct Rounded {
     pub step: f64,
     /// Steps, padded with zeros to a multiple of [`PAD`].
     pub steps: Vec<i16>,
-    /// Length of the rounding error.
     pub error: f64,
 }
 
@@ -64,7 +63,6 @@ pub struct Vector {
 }
 
 impl Vector {
-    /// Sets the vector.
     pub fn set(&mut self, values: &[f32]) {
         self.exact.clear();
         self.exact.extend(values.iter().map(|v| f64::from(*v)));
@@ -80,7 +78,6 @@ pub struct Tables {
     pub low: Vec<Column>,
     /// `[S / 2]`: the same for the odd subspaces.
     pub high: Vec<Column>,
-    /// Value of one step.
     pub step: f32,
     /// Sum of the subspaces' smallest values.
     pub offset: f32,

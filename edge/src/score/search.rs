@@ -22,7 +22,6 @@ use super::select::AnswerBuffers;
 #[derive(Default)]
 pub struct Scratch {
     budget: Budget,
-    /// Shared with the searches made from it.
     scored: Arc<CentroidScores>,
     buffers: Arc<Mutex<AnswerBuffers>>,
 }

@@ -8,11 +8,6 @@ use super::centroids::AskedQuestion;
 use super::collect::{BINS, Cut, Gather, bin_of, edge_of, runs_inside};
 use super::matches::{Effort, Hit, Run};
 
-/// Bits per pass of the radix sort: its counters stay in the L1 cache.
-const DIGIT_BITS: u32 = 11;
-/// With fewer runs, a second thread does not pay off.
-const MIN_RUNS_PER_THREAD: usize = if cfg!(test) { 16 } else { 8192 };
-
 /// Buffers that answers are gathered and ranked in, kept from one answer to the next.
 #[derive(Default)]
 pub(super) struct AnswerBuffers {
@@ -26,16 +21,8 @@ struct Order {
     parts: Vec<Part>,
     runs: Vec<Run>,
     keys: Vec<u64>,
-    ranked: Vec<Ranked>,
-}
-
-/// Input and output of one ranking thread.
-#[derive(Default)]
-struct Ranked {
-    keys: Vec<u64>,
-    swapped: Vec<u64>,
+    /// Hits of one score, with their distances.
     tied: Vec<(f64, Hit)>,
-    hits: Vec<Hit>,
 }
 
 /// Counters of one counting thread.
@@ -109,7 +96,7 @@ impl AskedQuestion<'_> {
         near: Option<DVec3>,
         hits: &mut Vec<Hit>,
     ) {
-        let Order { runs, keys, ranked, .. } = order;
+        let Order { runs, keys, tied, .. } = order;
         let mut by_cell: Vec<usize> = (0..self.shards.len()).collect();
         by_cell.sort_by_key(|at| self.shards[*at].header.cell_id);
         runs.clear();
@@ -117,21 +104,8 @@ impl AskedQuestion<'_> {
         keys.clear();
         // Equal scores keep the order of the runs, which is that of cells and indices.
         keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
-        let n_parts = rayon::current_num_threads().min(keys.len() / MIN_RUNS_PER_THREAD).max(1);
-        ranked.resize_with(n_parts, Ranked::default);
-        share_by_high_half(keys, ranked);
-        ranked.par_iter_mut().for_each(|part| self.rank_part(part, runs, limit, near));
-        for part in ranked {
-            let n = part.hits.len().min(limit - hits.len());
-            hits.extend_from_slice(&part.hits[..n]);
-        }
-    }
-
-    /// Turns sorted keys into hits, at most `limit`.
-    fn rank_part(&self, part: &mut Ranked, runs: &[Run], limit: usize, near: Option<DVec3>) {
-        let Ranked { keys, swapped, tied, hits } = part;
-        sort_by_high_half(keys, swapped);
-        hits.clear();
+        // No two keys are equal.
+        keys.par_sort_unstable();
         for ties in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
             let first = hits.len();
             for key in ties {
@@ -217,52 +191,6 @@ fn score_reached(gather: &Gather, limit: usize) -> Option<f32> {
     Some(edge_of(bin))
 }
 
-/// Distributes keys over parts of similar size. Keys with a lower upper half go to an earlier part; within a
-/// part the order is kept.
-fn share_by_high_half(keys: &mut Vec<u64>, parts: &mut [Ranked]) {
-    parts.iter_mut().for_each(|part| part.keys.clear());
-    if let [all] = parts {
-        std::mem::swap(keys, &mut all.keys);
-        return;
-    }
-    let all_high = || keys.iter().map(|key| (key >> 32) as u32);
-    let (least, most) = (all_high().min().unwrap_or(0), all_high().max().unwrap_or(0));
-    let shift = (u32::BITS - (most - least).leading_zeros()).saturating_sub(DIGIT_BITS);
-    let digit = |key: u64| (((key >> 32) as u32 - least) >> shift) as usize;
-    let mut part_of = [0usize; 1 << DIGIT_BITS];
-    keys.iter().for_each(|key| part_of[digit(*key)] += 1);
-    let mut n_before = 0;
-    for count in &mut part_of {
-        let part = n_before * parts.len() / keys.len();
-        n_before += std::mem::replace(count, part);
-    }
-    keys.iter().for_each(|key| parts[part_of[digit(*key)]].keys.push(*key));
-}
-
-/// Sorts by the upper 32 bits, stably. `swapped` is a buffer.
-fn sort_by_high_half(keys: &mut Vec<u64>, swapped: &mut Vec<u64>) {
-    let all_high = || keys.iter().map(|key| (key >> 32) as u32);
-    let (least, most) = (all_high().min().unwrap_or(0), all_high().max().unwrap_or(0));
-    let n_bits = u32::BITS - (most - least).leading_zeros();
-    swapped.clear();
-    swapped.resize(keys.len(), 0);
-    for shift in (0..n_bits).step_by(DIGIT_BITS as usize) {
-        let digit = |key: u64| (((key >> 32) as u32 - least) >> shift) as usize & ((1 << DIGIT_BITS) - 1);
-        let mut places = [0usize; 1 << DIGIT_BITS];
-        keys.iter().for_each(|key| places[digit(*key)] += 1);
-        let mut n_before = 0;
-        for place in &mut places {
-            n_before += std::mem::replace(place, n_before);
-        }
-        for key in &*keys {
-            let place = &mut places[digit(*key)];
-            swapped[*place] = *key;
-            *place += 1;
-        }
-        std::mem::swap(keys, swapped);
-    }
-}
-
 /// Maps a score to an integer of the same order.
 fn rising(score: f32) -> u32 {
     let bits = score.to_bits();
@@ -273,51 +201,6 @@ fn rising(score: f32) -> u32 {
 mod tests {
     use super::*;
     use slag_math::random::Random;
-
-    /// Oracle: the standard library's stable sort.
-    #[test]
-    fn keys_are_sorted_by_score_and_place() {
-        let mut random = Random::new(31);
-        let mut swapped = Vec::new();
-        for n in [0, 1, 2, 3000] {
-            for n_bits in [0, 1, 11, 12, 23, 32] {
-                let mut key = |place: u64| {
-                    let high = if n_bits == 0 { 7 } else { random.bits() >> (64 - n_bits) };
-                    high << 32 | place
-                };
-                let mut keys: Vec<u64> = (0..n).map(&mut key).collect();
-                let mut expected = keys.clone();
-                expected.sort();
-                sort_by_high_half(&mut keys, &mut swapped);
-                assert_eq!(keys, expected, "{n} {n_bits}");
-            }
-        }
-    }
-
-    /// Oracle: the standard library's stable sort of all parts in turn.
-    #[test]
-    fn keys_are_shared_in_order() {
-        let mut random = Random::new(33);
-        for n in [1, 2, 3000] {
-            for n_bits in [1, 5, 11, 12, 32] {
-                for n_parts in [1, 2, 3, 7] {
-                    let mut keys: Vec<u64> =
-                        (0..n).map(|place| random.bits() >> (64 - n_bits) << 32 | place).collect();
-                    let mut expected = keys.clone();
-                    expected.sort();
-                    let mut parts = Vec::new();
-                    parts.resize_with(n_parts, Ranked::default);
-                    share_by_high_half(&mut keys, &mut parts);
-                    let mut found = Vec::new();
-                    for part in &mut parts {
-                        sort_by_high_half(&mut part.keys, &mut part.swapped);
-                        found.extend_from_slice(&part.keys);
-                    }
-                    assert_eq!(found, expected, "{n} {n_bits} {n_parts}");
-                }
-            }
-        }
-    }
 
     /// Oracle: the standard library's order of floats.
     #[test]

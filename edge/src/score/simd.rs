@@ -67,7 +67,6 @@ fn dot(row: &[i8], vector: &[i16]) -> i32 {
 pub struct MatrixTimesVector<'a, F> {
     /// `[n][n_components]`.
     pub rows: &'a [i8],
-    /// Components of a row.
     pub n_components: usize,
     /// The vector, padded with zeros to the next multiple of [`PAD`].
     pub vector: &'a [i16],
@@ -125,7 +124,6 @@ impl<K: Kernels> Work<K> for BlockSums<'_> {
 /// The sums of the block read last.
 #[derive(Clone, Debug, Default)]
 pub struct LastBlock {
-    /// Index of the block.
     pub block: Option<usize>,
     pub sums: [u16; BLOCK],
 }

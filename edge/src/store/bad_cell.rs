@@ -65,7 +65,6 @@ pub struct OldShard {
     pub len_bytes: u64,
 }
 
-/// Returns a manifest's record of a cell.
 pub fn cell_of(manifest: &Manifest, cell_id: u32) -> Option<&CellRecord> {
     let position = manifest.cells.partition_point(|cell| cell.cell_id < cell_id);
     manifest.cells.get(position).filter(|cell| cell.cell_id == cell_id)

@@ -23,7 +23,6 @@ const MAX_CURRENT_BYTES: u64 = 32 << 20;
 pub struct Current {
     /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
-    /// Profile of the shards.
     pub profile: Profile,
     /// Centre of the fetch, world frame.
     pub centre_in_world: DVec3,
@@ -37,7 +36,6 @@ pub struct Current {
 }
 
 impl Current {
-    /// Returns all shards that answer.
     pub fn shards(&self) -> impl Iterator<Item = Hash32> + '_ {
         let old = self.old_shards().map(|(_, old)| old.hash);
         self.cells.iter().map(|cell| cell.hash).chain(old)
@@ -49,18 +47,15 @@ impl Current {
     }
 }
 
-/// A cell on board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurrentCell {
     pub cell_id: u32,
     /// BLAKE3 of its shard.
     pub hash: Hash32,
-    /// Length of its shard.
     pub len_bytes: u64,
 }
 
-/// A cache folder.
 #[derive(Clone)]
 pub struct EdgeCache {
     dir: PathBuf,
@@ -111,9 +106,6 @@ impl EdgeCache {
     }
 
     /// Returns the generation pointer; `None` before the first fetch.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`], or [`StoreError::Current`] if it is damaged.
     pub fn current(&self) -> Result<Option<Current>, StoreError> {
         let path = self.current_path();
         let bytes = match self.files.read(&path, MAX_CURRENT_BYTES) {
@@ -133,7 +125,6 @@ impl EdgeCache {
         Ok(Some(current))
     }
 
-    /// Reads a manifest of the cache and checks its hash.
     pub fn read_manifest(&self, hash: Hash32) -> Result<Manifest, StoreError> {
         let path = self.manifest_path(hash);
         let bytes = match self.files.read(&path, manifest::MAX_BYTES) {

@@ -20,7 +20,6 @@ pub fn mark(cache: &EdgeCache, hash: Hash32) {
     }
 }
 
-/// Returns the marked shards.
 pub fn marked(cache: &EdgeCache) -> BTreeSet<Hash32> {
     // Without a folder nothing is marked.
     let names = cache.files().list(&cache.damaged_dir()).unwrap_or_default();

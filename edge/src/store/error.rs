@@ -13,55 +13,28 @@ use super::files::is_bad_medium;
 /// Reasons for which a cache cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    /// The file system's error, with the path.
     #[error("{0}; check the cache's folder and its permissions")]
     Io(io::Error),
-    /// The medium does not give a file back.
     #[error("{0}; fetch again, which replaces it")]
     Unreadable(io::Error),
-    /// Nothing was fetched yet.
     #[error("{path} holds no scene yet; fetch one first", path = path.display())]
     Empty { path: PathBuf },
-    /// The generation pointer is damaged.
     #[error("{path}: {what}; fetch again, which writes it anew", path = path.display())]
     Current { path: PathBuf, what: String },
-    /// A file named by `current` is missing.
     #[error("{path} is missing, but `current` names it; fetch again", path = path.display())]
     Missing { path: PathBuf },
-    /// A shard was found damaged before, and not replaced since.
     #[error("{path} was found damaged; fetch again, which replaces it", path = path.display())]
     Damaged { path: PathBuf },
-    /// A file's content does not match its name.
     #[error("{path}: content has hash {found}, expected {expected}; fetch again, which replaces it", path = path.display())]
-    Hash {
-        path: PathBuf,
-        expected: Hash32,
-        /// Hash of the content.
-        found: Hash32,
-    },
-    /// The manifest is invalid.
+    Hash { path: PathBuf, expected: Hash32, found: Hash32 },
     #[error("{path}", path = path.display())]
     Manifest { path: PathBuf, source: ManifestError },
-    /// The shard is damaged.
     #[error("{path}", path = path.display())]
-    Shard {
-        path: PathBuf,
-        /// The reason and place.
-        source: ContainerError,
-    },
-    /// `current` names a cell or profile that the manifest does not list.
+    Shard { path: PathBuf, source: ContainerError },
     #[error("{path}: the manifest lists no {profile} shard of cell {cell_id}; fetch again", path = path.display())]
     Unlisted { path: PathBuf, cell_id: u32, profile: Profile },
-    /// The shard is intact but differs from the manifest's description.
     #[error("{path}: {field} is {found}, the manifest says {expected}; fetch again, which replaces it", path = path.display())]
-    Mismatch {
-        path: PathBuf,
-        /// The field that differs.
-        field: &'static str,
-        /// Value in the manifest.
-        expected: String,
-        found: String,
-    },
+    Mismatch { path: PathBuf, field: &'static str, expected: String, found: String },
 }
 
 impl From<io::Error> for StoreError {

@@ -38,7 +38,6 @@ const STEPS: u32 = 3;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Record {
-    /// Name of the scene.
     pub scene: String,
     pub generation: u64,
     /// When it was made, Unix seconds.
@@ -141,9 +140,6 @@ impl Record {
     }
 
     /// Reads a record.
-    ///
-    /// # Errors
-    /// [`ContainerError`] for anything that [`Record::to_bytes`] does not write.
     pub fn parse(bytes: &[u8]) -> Result<Self, ContainerError> {
         let bytes = AlignedBytes::copy_of(bytes);
         let layout = Layout::check(&bytes, MAGIC, VERSION)?;
@@ -167,12 +163,10 @@ impl Record {
     }
 }
 
-/// Returns the folder of the records.
 pub fn dir(cache: &EdgeCache) -> PathBuf {
     cache.dir().join("history")
 }
 
-/// Returns the path of a record.
 pub fn path(cache: &EdgeCache, generation: u64) -> PathBuf {
     dir(cache).join(generation.to_string())
 }

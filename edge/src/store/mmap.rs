@@ -11,7 +11,6 @@ use slag_common::container::AlignedBytes;
 pub enum FileBytes {
     /// Mapped: pages are read on first access and dropped under memory pressure.
     Mapped(memmap2::Mmap),
-    /// Read into memory.
     Read(AlignedBytes),
 }
 
@@ -30,9 +29,6 @@ impl Deref for FileBytes {
 ///
 /// The file must not change any more: shards never do once they are renamed into place, and a staged file is
 /// mapped only after its last write, by the process that holds the cache's lock.
-///
-/// # Errors
-/// Errors of the file system, with the path.
 #[expect(unsafe_code, reason = "mapping a file is unsafe by nature; every other module is safe")]
 pub fn map(path: &Path) -> io::Result<FileBytes> {
     let file = fs_err::File::open(path)?;

@@ -7,12 +7,10 @@ use std::ops::Range;
 
 use slag_common::objects::{NO_OBJECT, Objects};
 
-/// An object in a shard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Part {
     /// Index of the shard in the generation.
     pub shard: u32,
-    /// The object's number there.
     pub number: u32,
 }
 
@@ -26,7 +24,6 @@ pub struct ObjectIndex {
     shards: Vec<ShardIndex>,
 }
 
-/// Index of one shard's objects.
 #[derive(Debug, Default)]
 struct ShardIndex {
     /// Objects without a part in an earlier shard: their number in this shard, ascending, and the object.
@@ -59,7 +56,6 @@ impl ObjectIndex {
         index
     }
 
-    /// Returns the number of objects.
     pub fn len(&self) -> usize {
         self.starts.len().saturating_sub(1)
     }

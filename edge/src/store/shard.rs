@@ -20,7 +20,6 @@ use super::mmap::FileBytes;
 /// A mapped and checked shard.
 #[derive(Debug)]
 pub struct OpenShard {
-    /// Its cell in the manifest.
     pub cell: CellRecord,
     layout: ShardLayout,
     bytes: FileBytes,

@@ -23,7 +23,6 @@ pub struct CodedShard {
     /// Whether exact embeddings are beside the code, and fine residuals: any, for nothing is decided by what is
     /// not measured, and these errors are stated: [`CODE_ERROR`] and [`FINE_ERROR`].
     pub is_exact: bool,
-    /// Members of each centroid.
     pub centroid_lens: Vec<usize>,
     pub origin: DVec3,
 }

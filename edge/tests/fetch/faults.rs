@@ -25,7 +25,6 @@ use super::{Robot, at};
 use slag_math::random::Random;
 use slag_test_support::trials;
 
-/// The keys of the next root.
 const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
 const N_THREADS: u64 = 4;
 /// Gaussians of a cell: its shard arrives in several pieces.

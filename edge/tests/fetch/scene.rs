@@ -27,14 +27,12 @@ pub struct RootKeys {
     pub online: u8,
 }
 
-/// The first root of every scene here.
 pub const FIRST: RootKeys = RootKeys { root: 1, online: 2 };
 
 pub fn key(seed: u8) -> SigningKey {
     SigningKey::from_bytes(&[seed; 32])
 }
 
-/// A scene as a store has it.
 #[derive(Clone)]
 pub struct Published {
     pub manifest: Manifest,

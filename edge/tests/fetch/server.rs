@@ -26,7 +26,6 @@ pub enum Fault {
     Status(u16),
     /// Answers with this status, no body, and `Retry-After` in seconds.
     RetryAfter(u16, u64),
-    /// Delays the answer.
     Delay(Duration),
     Redirect(String),
     /// Sends the body and then continues for ever, in chunks.

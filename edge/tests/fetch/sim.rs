@@ -104,7 +104,6 @@ impl SimFiles {
         }
     }
 
-    /// Returns the bytes of all files.
     pub fn used_bytes(&self) -> u64 {
         self.0.lock().expect("sound").used_bytes()
     }

@@ -34,7 +34,6 @@ impl Rotated {
         Self { server, robot }
     }
 
-    /// Returns the files of records.
     fn records(&self) -> [PathBuf; 3] {
         ["trust/0", "trust/1", "usage.json"].map(|name| self.robot.cache.dir().join(name))
     }

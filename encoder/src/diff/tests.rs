@@ -1,7 +1,9 @@
+use glam::DVec3;
 use slag_common::container::AlignedBytes;
+use slag_common::frames::Aabb;
 use slag_common::manifest::{Manifest, ShardRecord};
-use slag_common::objects::{ObjectRecord, Objects, ObjectsHeader};
-use slag_common::shard::{Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView};
+use slag_common::shard::sample::{self, SampleObject, SampleObjects, SampleShard};
+use slag_common::shard::{Profile, ShardHeader, ShardLayout};
 
 use super::*;
 use crate::store::tests::manifest;
@@ -10,69 +12,32 @@ use crate::store::{Extras, Store, StoreReader};
 /// A shard whose things have a Gaussian each, unit boxes around x = their ids, and vectors along one axis. `seed`
 /// makes other bytes of the same things.
 fn shard(seed: u16, ids: &[u64]) -> Vec<u8> {
-    let n = ids.len() as u32;
-    let records: Vec<ObjectRecord> = ids
-        .iter()
-        .map(|id| ObjectRecord {
+    let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(66.0) };
+    let header = sample::header(0, ids.len(), 1, 2, bounds);
+    let shard = SampleShard {
+        header: ShardHeader { centroid_step: 0.01, encoder_id: [1; 32], ..header },
+        positions: vec![[seed, 2, 3]; ids.len()],
+        centroid_starts: vec![0, ids.len() as u32],
+        centroids: vec![100, 0],
+        radii: vec![0.5],
+        embeddings: None,
+    };
+    let object = |(at, id): (u32, &u64)| {
+        let position_in_world = DVec3::X * *id as f64;
+        SampleObject {
             id: *id,
-            position_in_world: [*id as f64, 0.0, 0.0],
-            box_min: [*id as f64 - 0.5, -0.5, -0.5],
-            box_max: [*id as f64 + 0.5, 0.5, 0.5],
+            position_in_world,
+            bounds: Aabb { min: position_in_world - 0.5, max: position_in_world + 0.5 },
+            vectors: vec![1.0, 0.0],
+            runs: std::iter::once(at..at + 1).collect(),
             n_gaussians: 1,
-            n_gaussians_here: 1,
+            photo: "p".into(),
             photo_box_px: [0, 0, 1, 1],
-            photo_start: 0,
-            photo_bytes: 1,
-        })
-        .collect();
-    let objects = Objects {
-        header: ObjectsHeader {
-            n_objects: n,
-            n_vectors: 1,
-            n_runs: n,
-            photos_bytes: 1,
-            score_mean: 0.0,
-            score_spread: 0.1,
-            score_error_bound: 0.0,
-        },
-        records: &records,
-        vectors: &[100, 0].repeat(ids.len()),
-        steps: &vec![0.01; ids.len()],
-        run_ends: &(1..=n).collect::<Vec<_>>(),
-        run_objects: &(0..n as u16).collect::<Vec<_>>(),
-        photos: b"p",
+        }
     };
-    let header = ShardHeader {
-        cell_id: 0,
-        n_gaussians: n,
-        n_centroids: 1,
-        dim: 2,
-        n_components: 2,
-        n_subspaces: 0,
-        position_bits: [16, 16, 16, 0],
-        centroid_step: 0.01,
-        origin_in_world: [0.0; 3],
-        position_step: [0.001; 3],
-        box_min: [0.0; 3],
-        box_max: [66.0; 3],
-        errors: ScoreErrors::default(),
-        encoder_id: [1; 32],
-    };
-    let view = ShardView {
-        header,
-        positions: Positions::Wide(&vec![[seed, 2, 3]; ids.len()]),
-        centroid_starts: &[0, n],
-        centroids: &[100, 0],
-        radii: &[0.5],
-        basis: None,
-        residuals: None,
-        exact: None,
-        packed_indices: None,
-    };
-    let mut bytes = Vec::new();
-    view.write_with(&mut bytes, Some(&objects)).expect("writes to memory");
-    ShardLayout::check(&AlignedBytes::copy_of(&bytes)).expect("a valid shard");
-    bytes
+    let objects = (0..).zip(ids).map(object).collect();
+    let objects = SampleObjects { objects, score_mean: 0.0, score_spread: 0.1, score_error_bound: 0.0 };
+    objects.add_to(&shard.view(), None)
 }
 
 /// A generation of a store with a cell for each list of shards, by profile.

@@ -22,7 +22,6 @@ pub fn trials<T>(few: T, many: T) -> T {
     if is_nightly() { many } else { few }
 }
 
-/// Returns whether these are the nightly checks.
 pub fn is_nightly() -> bool {
     std::env::var_os("SLAG_NIGHTLY").is_some()
 }

@@ -21,7 +21,6 @@ use crate::model_dir::hash_file;
 pub enum Here {
     /// Nothing usable.
     No,
-    /// The text side.
     Text,
     /// All files.
     All,
@@ -36,13 +35,10 @@ pub struct Hub {
 
 impl Hub {
     /// Returns the hub with the built-in table.
-    /// # Errors
-    /// [`HubError::Table`], which a test rules out.
     pub fn new(options: HubOptions) -> Result<Self, HubError> {
         Ok(Self { table: Table::embedded()?, options })
     }
 
-    /// Returns the hub with another table.
     pub fn with_table(table: Table, options: HubOptions) -> Self {
         Self { table, options }
     }
@@ -58,8 +54,6 @@ impl Hub {
     }
 
     /// Returns a model of the table.
-    /// # Errors
-    /// [`HubError::Unknown`] if the table has no such name.
     pub fn entry(&self, name: &str) -> Result<&Entry, HubError> {
         let known = || self.table.models.iter().map(|entry| entry.name.clone()).collect();
         self.table.find(name).ok_or_else(|| HubError::Unknown { name: name.to_owned(), known: known() })
@@ -132,8 +126,6 @@ impl Hub {
     }
 
     /// Compares the hash of every file of a model with the recorded one.
-    /// # Errors
-    /// [`HubError`] if a file of the text side is absent, or a hash differs.
     pub fn verify(folder: &Path) -> Result<Vec<String>, HubError> {
         let described = Described::read(folder)?;
         let root = folder.join(described.files_root());
@@ -156,8 +148,6 @@ impl Hub {
 
     /// Returns the folder of the model `name`: that of a pulled model if `name` is one and not itself a folder
     /// with a `model.toml`, else `name`.
-    /// # Errors
-    /// [`HubError::NotPulled`] if it is a model of the table that is not pulled.
     pub fn resolve(&self, name: &Path) -> Result<PathBuf, HubError> {
         let entry = name.to_str().and_then(|name| self.table.find(name));
         match entry {

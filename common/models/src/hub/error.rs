@@ -12,48 +12,23 @@ use crate::error::ModelError;
 #[derive(Debug, thiserror::Error)]
 pub enum HubError {
     #[error("unknown model {name:?}; there are {}: choose one, or give the folder of your own model", known.join(", "))]
-    Unknown {
-        /// The requested name.
-        name: String,
-        /// The known names.
-        known: Vec<String>,
-    },
+    Unknown { name: String, known: Vec<String> },
     #[error(
         "{name} is licensed under {licence} ({url}), which restricts its use{}; if you accept it, pull with \
          --accept-licence {licence}",
         if note.is_empty() { String::new() } else { format!("; note: {}", note.trim_end_matches('.')) }
     )]
-    Licence {
-        name: String,
-        licence: String,
-        /// Address of the licence.
-        url: String,
-        /// Remarks on the licence.
-        note: String,
-    },
+    Licence { name: String, licence: String, url: String, note: String },
     #[error(
         "{name}: {repository} publishes weights, but no ONNX files; make them with `{script} {}` where PyTorch and the \
          hub can be reached, then use the model by its name",
         folder.display()
     )]
-    NotExported {
-        name: String,
-        /// Owner and name at the hub.
-        repository: String,
-        /// The script that makes the files.
-        script: String,
-        folder: PathBuf,
-    },
+    NotExported { name: String, repository: String, script: String, folder: PathBuf },
     #[error("{name} finds masks in photos, which a robot does not do; pull it with slag-encoder")]
     NoTextSide { name: String },
     #[error("{url}: {failure}; try again, or place these files by hand: {}", wanted.iter().map(Wanted::to_string).collect::<Vec<_>>().join("; "))]
-    Unreachable {
-        /// The requested address.
-        url: String,
-        failure: Box<DownloadError>,
-        /// The model's missing files.
-        wanted: Vec<Wanted>,
-    },
+    Unreachable { url: String, failure: Box<DownloadError>, wanted: Vec<Wanted> },
     #[error("{name} is not pulled yet; run `models pull {name}`, or give the folder of your own model")]
     NotPulled { name: String },
     #[error(
@@ -62,53 +37,21 @@ pub enum HubError {
     NoFolder,
     #[error("the proxy in HTTPS_PROXY: {0}; correct or unset it")]
     Proxy(#[from] DownloadFailure),
-    #[error("{}: SHA-256 is {found}, expected {expected} ({}); {advice}", path.display(), source_of(*by))]
-    Hash {
-        path: PathBuf,
-        /// Its hash.
-        found: Sha256,
-        /// The expected hash.
-        expected: Sha256,
-        /// The source of the expected hash.
-        by: Source,
-        /// Advice to the user.
-        advice: &'static str,
-    },
+    #[error("{}: SHA-256 is {found}, expected {expected} ({by}); {advice}", path.display())]
+    Hash { path: PathBuf, found: Sha256, expected: Sha256, by: Source, advice: &'static str },
     #[error(
-        "{url}: the hub advertises SHA-256 {advertised}, expected {expected} ({}); do not use it, or take the \
-         model out of models.lock if you trust the new one", source_of(*by)
+        "{url}: the hub advertises SHA-256 {advertised}, expected {expected} ({by}); do not use it, or take the \
+         model out of models.lock if you trust the new one"
     )]
-    Advertised {
-        url: String,
-        /// The advertised hash.
-        advertised: Sha256,
-        /// The expected hash.
-        expected: Sha256,
-        /// The source of the expected hash.
-        by: Source,
-    },
+    Advertised { url: String, advertised: Sha256, expected: Sha256, by: Source },
     #[error("{url}: the hub serves commit {found}, expected {expected}; give another --hub")]
-    Revision {
-        url: String,
-        /// The commit served.
-        found: String,
-        /// The requested commit.
-        expected: String,
-    },
+    Revision { url: String, found: String, expected: String },
     #[error(
         "{url}: the hub advertises no SHA-256 of the image model; pull the whole model with slag-encoder"
     )]
-    NoImageHash {
-        /// The image model.
-        url: String,
-    },
+    NoImageHash { url: String },
     #[error("{}: {cause}; correct it, or remove it and pull again", path.display())]
-    Lock {
-        /// The lock.
-        path: PathBuf,
-        /// The parser's error.
-        cause: serde_json::Error,
-    },
+    Lock { path: PathBuf, cause: serde_json::Error },
     #[error("the program's table of models: {0}; this is a bug, please report it")]
     Table(#[from] Box<toml::de::Error>),
     #[error(transparent)]
@@ -117,15 +60,6 @@ pub enum HubError {
     Model(#[from] ModelError),
     #[error("{0}; free disk space, or choose another folder with XDG_CACHE_HOME")]
     Io(#[from] io::Error),
-}
-
-fn source_of(by: Source) -> &'static str {
-    match by {
-        Source::Table => "known to this program",
-        Source::Hub => "advertised by the hub",
-        Source::FirstPull => "as pulled first, see models.lock",
-        Source::PlacedByHand => "as placed by hand, see models.lock",
-    }
 }
 
 /// A missing file.

@@ -27,7 +27,6 @@ pub struct Accepted {
     pub files: BTreeMap<String, LockedFile>,
 }
 
-/// A file that was accepted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LockedFile {
@@ -50,8 +49,6 @@ fn path_in(root: &Path) -> PathBuf {
 
 impl Lock {
     /// Reads the lock in the folder of models; returns an empty one if there is none.
-    /// # Errors
-    /// [`HubError`] if it cannot be read.
     pub fn read(root: &Path) -> Result<Self, HubError> {
         let path = path_in(root);
         match fs_err::read(&path) {

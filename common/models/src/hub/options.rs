@@ -19,7 +19,6 @@ pub struct HubOptions {
 }
 
 impl HubOptions {
-    /// Returns the default options.
     pub fn new(root: PathBuf) -> Self {
         let (timeout, first_backoff) = (Duration::from_secs(30), Duration::from_millis(500));
         Self { root, hub: None, proxy: None, timeout, first_backoff }
@@ -35,7 +34,6 @@ pub fn cache_folder(variable: impl Fn(&str) -> Option<std::ffi::OsString>) -> Op
     Some(base.join("slag"))
 }
 
-/// Returns the folder of pulled models in the cache folder.
 pub fn models_folder(cache_folder: &Path) -> PathBuf {
     cache_folder.join("models")
 }

@@ -18,7 +18,6 @@ use crate::model_dir::hash_file;
 /// The files of a model to pull.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
-    /// The text side.
     Text,
     /// All files.
     Both,
@@ -31,7 +30,6 @@ pub struct PulledFile {
     pub path: String,
     /// Its SHA-256.
     pub sha256: Sha256,
-    /// The source of the expected hash.
     pub hash_source: Source,
     /// Whether it was already present.
     pub was_here: bool,
@@ -64,7 +62,6 @@ impl Pull<'_> {
         known.or_else(|| self.lock.get(&self.entry.name)?.files.get(path).cloned())
     }
 
-    /// Records an accepted file in the lock.
     fn accept(&mut self, path: &str, file: LockedFile) -> Result<(), HubError> {
         self.lock.entry(&self.entry.name).files.insert(path.to_owned(), file);
         self.lock.write(&self.options.root)

@@ -1,5 +1,7 @@
 //! Sources of the expected hash of a file.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 /// The source of an expected hash.
@@ -14,4 +16,15 @@ pub enum Source {
     FirstPull,
     /// None: it is the hash of a file placed by hand.
     PlacedByHand,
+}
+
+impl fmt::Display for Source {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Table => "known to this program",
+            Self::Hub => "advertised by the hub",
+            Self::FirstPull => "as pulled first, see models.lock",
+            Self::PlacedByHand => "as placed by hand, see models.lock",
+        })
+    }
 }

@@ -10,7 +10,6 @@ use crate::description::Sha256;
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Table {
-    /// Address of the hub.
     pub hub: String,
     layout: BTreeMap<String, Layout>,
     #[serde(rename = "model")]
@@ -36,12 +35,9 @@ pub struct Entry {
     layout: String,
     /// Components of a vector; segmenters have none.
     dim: Option<u32>,
-    /// The licence of the weights.
     pub licence: String,
-    /// Remarks on the licence.
     #[serde(default)]
     pub licence_note: String,
-    /// Address of the licence.
     pub licence_url: String,
     /// Whether the licence restricts the use of the weights (research only, for example), so that the user must
     /// accept it.
@@ -101,8 +97,6 @@ impl Entry {
 
 impl Table {
     /// Returns the table in the program.
-    /// # Errors
-    /// If it does not parse, which a test rules out.
     pub fn embedded() -> Result<Self, Box<toml::de::Error>> {
         toml::from_str(include_str!("../../models.toml")).map_err(Box::new)
     }

@@ -15,7 +15,6 @@ pub struct SamDescription {
     /// Its strengths and limits, for people.
     #[serde(default)]
     pub about: String,
-    /// The licence of the weights.
     pub licence: String,
     /// Folder of the files, relative to the description's folder.
     #[serde(default = "crate::description::here")]
@@ -35,7 +34,6 @@ pub enum SegmentDescription {
 }
 
 impl SegmentDescription {
-    /// Returns the files and their preprocessing.
     pub fn files(&self) -> &SamFiles {
         match self {
             Self::Sam(files) | Self::Sam2(files) => files,
@@ -81,8 +79,6 @@ fn imagenet_std() -> [f64; 3] {
 
 impl SamDescription {
     /// Reads and checks `path`.
-    /// # Errors
-    /// [`DescriptionError`] if it cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
         let description: Self = read_toml(path)?;
         check_common(path, &description.name, &description.files_root, &description.files())?;

@@ -105,8 +105,6 @@ pub struct Decoded {
 
 impl Sam {
     /// Opens the directory `dir`; its `model.toml` must have `[segment]`.
-    /// # Errors
-    /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
     pub fn open(dir: &Path, options: &SessionOptions) -> Result<Self, ModelError> {
         Self::open_for(dir, options, None)
     }
@@ -183,8 +181,6 @@ impl Sam {
     }
 
     /// Computes an image's embedding; `image` must have pixels.
-    /// # Errors
-    /// [`SessionError`] if the model fails.
     pub fn embed(&self, image: &RgbImage) -> Result<Embedding, SessionError> {
         let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
         let shape = vec![1, 3, size, size];
@@ -213,8 +209,6 @@ impl Sam {
     ///
     /// `points`: `[n_prompts][points]` in pixels of the square, see [`Letterbox::point`]. `labels`: for each
     /// point, 1 inside the object, 0 outside, -1 no point.
-    /// # Errors
-    /// [`SessionError`] if the model fails or its output is not of SAM's shapes.
     pub fn decode(
         &self,
         embedding: &Embedding,

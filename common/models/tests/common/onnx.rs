@@ -10,7 +10,6 @@ impl Element {
     pub const I64: Self = Self(7);
     pub const F16: Self = Self(10);
 
-    /// Its number.
     pub fn code(self) -> i64 {
         self.0
     }
@@ -92,7 +91,6 @@ pub fn model(graph: &Graph) -> Vec<u8> {
     versioned(graph, 7, 12)
 }
 
-/// A model of any version.
 pub fn versioned(graph: &Graph, ir_version: i64, opset: i64) -> Vec<u8> {
     let Graph { nodes, constants, inputs, outputs } = graph.clone();
     let graph = Message::default().each(1, nodes).bytes(2, "g").each(5, constants).each(11, inputs);

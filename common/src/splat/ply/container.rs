@@ -99,7 +99,6 @@ pub(super) struct Element {
 }
 
 impl Element {
-    /// Returns the index of a property.
     pub fn property(&self, name: &str) -> Option<usize> {
         self.properties.iter().position(|p| p.name == name)
     }
@@ -168,7 +167,6 @@ impl Ply {
         unreachable!("the header's lines are bounded by MAX_HEADER_BYTES")
     }
 
-    /// Returns the index of an element.
     pub fn element(&self, name: &str) -> Option<usize> {
         self.elements.iter().position(|e| e.name == name)
     }

@@ -87,9 +87,6 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
 }
 
 /// Reads properties of the vertices of a mesh or point cloud: a row per vertex, in the order of `names`.
-///
-/// # Errors
-/// [`SplatError`] if the file is not a PLY, is truncated, or lacks a property.
 pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Vec<[f64; N]>, SplatError> {
     const NO_VERTICES: &str = "give a PLY with this property";
     let mut ply = Ply::open(Input::open(path)?)?;

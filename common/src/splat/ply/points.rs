@@ -13,7 +13,6 @@ use std::fmt::Write;
 
 use glam::DVec3;
 
-/// Which of the optional properties the points have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PointProperties {
     pub question: bool,

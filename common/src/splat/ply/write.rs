@@ -8,9 +8,6 @@ use crate::splat::error::SplatError;
 
 /// Writes Gaussians in the layout of 3DGS: binary little-endian, zero normals, logarithms of scales, logits of
 /// opacities.
-///
-/// # Errors
-/// [`SplatError::Io`] if the file cannot be written.
 pub fn write(path: &Path, gaussians: &Gaussians) -> Result<(), SplatError> {
     let mut writer = BufWriter::new(fs_err::File::create(path)?);
     write_to(&mut writer, gaussians)?;
@@ -18,18 +15,12 @@ pub fn write(path: &Path, gaussians: &Gaussians) -> Result<(), SplatError> {
 }
 
 /// Writes like [`write()`] to any writer, preferably a buffered one.
-///
-/// # Errors
-/// Those of the writer.
 pub fn write_to(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Result<()> {
     write_header(&mut writer, gaussians.len() as u64, gaussians.sh_degree)?;
     write_rows(writer, gaussians)
 }
 
 /// Writes the header of a file of `n` Gaussians.
-///
-/// # Errors
-/// Those of the writer.
 pub fn write_header(mut writer: impl Write, n: u64, sh_degree: u8) -> std::io::Result<()> {
     let per_channel = Gaussians::sh_rest_per_channel(sh_degree);
     let rest_names = (0..3 * per_channel).map(|i| format!("f_rest_{i}"));
@@ -43,9 +34,6 @@ pub fn write_header(mut writer: impl Write, n: u64, sh_degree: u8) -> std::io::R
 }
 
 /// Writes Gaussians of the header's degree.
-///
-/// # Errors
-/// Those of the writer.
 pub fn write_rows(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Result<()> {
     let per_channel = Gaussians::sh_rest_per_channel(gaussians.sh_degree);
     let mut row: Vec<u8> = Vec::new();

@@ -111,7 +111,6 @@ fn keys(command: &Command, path: &str) -> BTreeSet<String> {
     own.chain(below).collect()
 }
 
-/// Returns the keys of a table.
 fn written(table: &Table, path: &str) -> BTreeSet<String> {
     let keys = table.iter().flat_map(|(key, value)| match value {
         Value::Table(below) => written(below, &format!("{path}{key}.")),

@@ -25,7 +25,6 @@ const VOXELS_PER_METRE: f64 = 4.0;
 pub struct Candidate<'a> {
     pub found: FoundObject<'a>,
     pub solid: Solid,
-    /// Its score as reported.
     pub score: f32,
     /// From 0, the score of what has nothing to do with the words, to 1, the best score on board.
     pub confidence: f64,
@@ -48,7 +47,6 @@ pub struct Found {
     pub best_score: Option<f32>,
 }
 
-/// The candidates of each thing of a phrase.
 pub struct Things<'a> {
     of: Vec<(Found, Vec<Candidate<'a>>)>,
 }

@@ -144,7 +144,6 @@ fn phrase(words: &[&str], n_left: &mut usize) -> Option<Phrase> {
     Some(Phrase { pick: pick(None), relation: Some(Box::new(place)), ..thing(named)? })
 }
 
-/// Returns a phrase of a thing alone.
 fn thing(words: &[&str]) -> Option<Phrase> {
     let words = without_article(words);
     (!words.is_empty()).then(|| Phrase::thing(words.join(" ")))

@@ -88,7 +88,6 @@ impl Relation {
         Self::Behind,
     ];
 
-    /// Returns its name in JSON.
     pub fn name(self) -> &'static str {
         match self {
             Self::On => "on",
@@ -207,9 +206,6 @@ impl Phrase {
     }
 
     /// Checks every limit of a phrase, and that `between` has two things and only it has.
-    ///
-    /// # Errors
-    /// What is wrong, under the name `phrases`.
     pub fn check(&self) -> Result<(), RequestError> {
         let refuse = |found: &str, expected: &str| Err(RequestError::new("phrases", found, expected));
         if self.is_asker() {

@@ -21,7 +21,6 @@ pub struct Related {
     pub score: f64,
     /// Degree of the phrase's own relation; 1 without one.
     pub degree: f64,
-    /// What it is related to.
     pub to: Vec<Witness>,
 }
 
@@ -92,9 +91,6 @@ struct Measure<'a, 'b> {
 }
 
 /// Returns the things that a phrase means, best first; only those in the region asked for.
-///
-/// # Errors
-/// The part of the phrase that failed.
 pub fn relate(
     things: &Things<'_>,
     phrase: &Phrase,
@@ -141,7 +137,6 @@ impl<'b> Measure<'_, 'b> {
         }
     }
 
-    /// Returns the candidates that are so placed.
     fn placed(&self, phrase: &Phrase, place: &Place) -> Result<Vec<Related>, Miss> {
         let ones = self.anchors(&place.of)?;
         let others = match &place.and {

@@ -49,7 +49,6 @@ fn between_segments(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> f64 {
     ends.into_iter().fold(f64::INFINITY, f64::min)
 }
 
-/// Returns the distance from a point to a segment.
 pub fn to_segment(point: DVec2, (from, to): (DVec2, DVec2)) -> f64 {
     let along = to - from;
     let at = (point - from).dot(along) / along.length_squared().max(f64::MIN_POSITIVE);

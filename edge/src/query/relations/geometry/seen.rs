@@ -18,7 +18,6 @@ const REACH_M: [f64; 2] = [3.0, 12.0];
 /// Where the asker is, and where it looks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Viewer {
-    /// Its position in the world frame.
     pub position_in_world: DVec3,
     /// Its heading, from the world's x axis towards y, radians.
     pub heading_rad: Option<f64>,

@@ -37,7 +37,6 @@ impl Solid {
         Self { centre: bounds.centre(), half: bounds.size() * 0.5, along: DVec2::X }
     }
 
-    /// Takes a point.
     pub fn point(at: DVec3) -> Self {
         Self { centre: at, half: DVec3::ZERO, along: DVec2::X }
     }
@@ -56,7 +55,6 @@ impl Solid {
         2.0 * self.half.z
     }
 
-    /// Returns the volume of the box.
     pub fn volume(&self) -> f64 {
         8.0 * self.half.x * self.half.y * self.half.z
     }
