@@ -58,7 +58,6 @@ impl PositionError {
 /// Limits of a cell's size.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CellLimits {
-    /// Most Gaussians of a cell.
     pub max_gaussians: usize,
     /// Longest edge of the box around a cell's means, world units; `None` where units are not metres.
     pub max_width: Option<f64>,
@@ -165,7 +164,7 @@ impl CellSplit {
 
     /// Reserves the partition: each Gaussian's cell, its index there, and its place in the cell's list.
     pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
-        memory.reserve_held(
+        memory.reserve(
             Phase::Always,
             "the cell of each Gaussian",
             (n_gaussians * 3 * size_of::<u32>()) as u64,

@@ -24,7 +24,7 @@ td.n{text-align:right;white-space:nowrap}thead th{position:sticky;top:0;backgrou
 figure{margin:12px 0;display:inline-block;vertical-align:top}figcaption{font-size:13px}\
 img,svg{max-width:100%;height:auto}svg{background:#fff;color:#111}";
 
-pub struct Page {
+pub(crate) struct Page {
     title: String,
     body: String,
 }
@@ -45,7 +45,7 @@ pub fn escaped(text: &str) -> String {
 }
 
 impl Page {
-    pub fn new(title: &str) -> Self {
+    pub(crate) fn new(title: &str) -> Self {
         Self { title: escaped(title), body: String::new() }
     }
 
@@ -54,7 +54,7 @@ impl Page {
         self.body.write_fmt(what).unwrap_or_default();
     }
 
-    pub fn heading(&mut self, text: &str) {
+    pub(crate) fn heading(&mut self, text: &str) {
         self.add(format_args!("<h2>{}</h2>\n", escaped(text)));
     }
 
@@ -62,17 +62,12 @@ impl Page {
         self.add(format_args!("<p>{}</p>\n", escaped(text)));
     }
 
-    /// Adds text as it is laid out.
-    pub fn plain(&mut self, text: &str) {
-        self.add(format_args!("<pre>{}</pre>\n", escaped(text)));
-    }
-
     /// Adds a drawing: SVG of this program, which is not escaped.
-    pub fn drawing(&mut self, svg: &str, caption: &str) {
+    pub(crate) fn drawing(&mut self, svg: &str, caption: &str) {
         self.add(format_args!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escaped(caption)));
     }
 
-    pub fn picture(&mut self, jpeg: &[u8], caption: &str) {
+    pub(crate) fn picture(&mut self, jpeg: &[u8], caption: &str) {
         let (data, caption) = (STANDARD.encode(jpeg), escaped(caption));
         self.add(format_args!(
             "<figure><img alt=\"{caption}\" src=\"data:image/jpeg;base64,{data}\"><figcaption>{caption}</figcaption></figure>\n"
@@ -80,7 +75,7 @@ impl Page {
     }
 
     /// Adds a table; a row of fewer cells than columns ends early. Cells that read as numbers stand right.
-    pub fn table(&mut self, columns: &[&str], rows: &[Vec<String>]) {
+    pub(crate) fn table(&mut self, columns: &[&str], rows: &[Vec<String>]) {
         self.body.push_str("<div class=\"wide\" tabindex=\"0\"><table><thead><tr>");
         for column in columns {
             self.add(format_args!("<th scope=\"col\">{}</th>", escaped(column)));
@@ -102,8 +97,8 @@ impl Page {
 
     /// Adds a result as its JSON has it: what is single as one table, then a table for each list of records and
     /// each record of columns, under its name.
-    pub fn value(&mut self, value: &Value) {
-        let Some(members) = value.as_object() else { return self.plain(&shown(value)) };
+    pub(crate) fn value(&mut self, value: &Value) {
+        let Some(members) = value.as_object() else { return };
         let is_single = |value: &&Value| !is_list_of_records(value) && !is_of_columns(value);
         let single: Vec<Vec<String>> = (members.iter())
             .filter(|(_, value)| is_single(value))
@@ -119,7 +114,7 @@ impl Page {
     }
 
     /// Adds the table of a list of records, or of a record of columns, of a result's JSON.
-    pub fn records(&mut self, value: &Value) {
+    pub(crate) fn records(&mut self, value: &Value) {
         if let Some(columns) = value.as_object().filter(|_| is_of_columns(value)) {
             let names: Vec<&str> = columns.keys().map(String::as_str).collect();
             let n = columns.values().filter_map(|column| column.as_array()).map(Vec::len).max().unwrap_or(0);
@@ -140,7 +135,7 @@ impl Page {
         self.table(&names.clone(), &rows);
     }
 
-    pub fn finish(self) -> String {
+    pub(crate) fn finish(self) -> String {
         let Self { title, body } = self;
         format!(
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\

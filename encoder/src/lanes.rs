@@ -17,7 +17,6 @@ pub struct GpuLoad {
     pub gpu: u32,
     /// Lanes: models that may be at work at once.
     pub n_lanes: usize,
-    /// Seconds in which any of them was.
     pub busy_secs: f64,
 }
 
@@ -69,7 +68,6 @@ impl<T> Lanes<T> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the number of lanes.
     pub fn len(&self) -> usize {
         self.state().gpus.iter().map(|gpu| gpu.n_lanes).sum()
     }

@@ -19,7 +19,6 @@ pub trait Progress: Sync {
     /// receivers that show the picture call it.
     fn segmented(&self, _view: &str, _n_masks: usize, _draw: &dyn Fn() -> RgbImage) {}
     fn left_out(&self, _view: &str, _reason: &str) {}
-    /// Tells the things that were found.
     fn objects(&self, _objects: &mut dyn Iterator<Item = FoundObject>) {}
 }
 
@@ -30,7 +29,6 @@ pub struct FoundObject {
     pub id: String,
     /// Where it is, world.
     pub position_m: DVec3,
-    /// Its box.
     pub bounds: Aabb,
     pub n_gaussians: u32,
     /// Masks that show it.

@@ -1,7 +1,6 @@
 //! Full-precision scores of a published field, for evaluation and trust.
 
 mod hits;
-mod picture;
 
 use std::collections::BTreeMap;
 
@@ -14,7 +13,6 @@ use crate::lift::published::{ReadFieldError, read_field, read_regions};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader};
 pub use hits::{Hit, SceneMismatch, check_scene, located, points_ply};
-pub use picture::{draw_lit, luma};
 use slag_math::dot;
 
 /// Cosines of every Gaussian of the input with a query.

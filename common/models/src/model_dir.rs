@@ -202,15 +202,6 @@ impl ModelDir {
         Ok(Box::new(encoder))
     }
 
-    /// Returns the bytes of the image model's files; `None` if it needs none. Files that are absent count as
-    /// empty.
-    pub fn image_bytes(&self) -> Option<u64> {
-        let Source::Files { files, description, .. } = &self.source else { return None };
-        let Files::Folder(root) = files else { return Some(embedded::IMAGE.len() as u64) };
-        let len = |part: &FileRef| std::fs::metadata(root.join(&part.path)).map_or(0, |found| found.len());
-        Some(description.image.file.parts().map(len).sum())
-    }
-
     /// Opens the text encoder; loads ONNX Runtime only if the text side is ONNX.
     pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
         let Source::Files { files, description, .. } = &self.source else {

@@ -24,7 +24,6 @@ pub struct Alignment {
     pub residual: f64,
 }
 
-/// Reason why two sets of poses cannot be aligned.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AlignError {
     #[error(

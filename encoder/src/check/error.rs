@@ -3,7 +3,6 @@
 use crate::ingest::IngestError;
 use crate::raster::RasterError;
 
-/// Reason why a check fails.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckError {
     #[error("no views to check; give at least one photo with its pose")]

@@ -85,7 +85,6 @@ impl Mistake {
         }
     }
 
-    /// Returns the view with the mistake corrected.
     pub(crate) fn corrected(self, view: &RasterView) -> RasterView {
         let mut corrected = *view;
         let (pose, camera) = (&mut corrected.camera_from_world, &mut corrected.intrinsics);

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use super::mistake::FrameCandidate;
 use super::suspicion::Suspicion;
 
-/// Settings of a check.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CheckOptions {
     /// Width at which views are compared, pixels. Photos are never enlarged.

@@ -9,7 +9,6 @@ use super::diagnosis::Diagnosis;
 /// Comparison of one view with its photo.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ViewCheck {
-    /// Name of the view.
     pub name: String,
     /// Peak signal-to-noise ratio of the drawing against the photo, dB.
     pub psnr_db: f64,
@@ -17,7 +16,6 @@ pub struct ViewCheck {
     pub flat_psnr_db: f64,
     /// Share of the image that the scene covers (alpha above 0.5).
     pub covered_share: f64,
-    /// Gaussians in view.
     pub visible_gaussians: usize,
 }
 

@@ -11,7 +11,6 @@ use crate::raster::{Drawing, LoadedScene, RasterView};
 /// A photo with its camera.
 #[derive(Clone, Debug)]
 pub struct CheckView {
-    /// Name of the view.
     pub name: String,
     /// The undistorted photo.
     pub image: RgbImage,

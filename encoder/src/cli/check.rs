@@ -21,7 +21,6 @@ const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder check --scene splat.ply --views sparse/0 --images photos/ --samples 30\n\
     \x20 slag-encoder check --scene splat.ply --views transforms.json --write-frame frame.json\n";
 
-/// `check`.
 #[derive(Debug, Args)]
 #[command(before_help = EXAMPLES)]
 pub struct CheckArgs {

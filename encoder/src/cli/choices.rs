@@ -2,11 +2,8 @@
 
 use clap::Args;
 
-use crate::codebook::basis::MAX_COMPONENTS;
 use crate::encode::{EncodeSettings, Masks, Preset, RasterWidth, Regions, ViewOrder, ViewsLimit};
 use crate::raster::WeightKind;
-
-use super::common::parse_error;
 
 /// The choices, each the preset's where its flag is absent.
 #[derive(Clone, Debug, Default, Args)]
@@ -37,7 +34,7 @@ pub struct ChoiceArgs {
     )]
     view_order: Option<ViewOrder>,
     /// Number of scales at which the built-in segmenter looks, coarsest first [default: the preset's].
-    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=4), help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "N", help_heading = "Speed and accuracy", hide_short_help = true)]
     mask_levels: Option<usize>,
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX", help_heading = "Speed and accuracy", hide_short_help = true)]
@@ -46,42 +43,42 @@ pub struct ChoiceArgs {
     /// neighbours.
     #[arg(long, help_heading = "Speed and accuracy", hide_short_help = true)]
     keep_slivers: bool,
-    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024,
-    /// or `twice` for twice that width [default: the preset's].
-    #[arg(long, value_name = "photo|twice|PX", value_parser = parse_raster_width, help_heading = "Speed and accuracy", hide_short_help = true)]
+    /// Width at which weights are rasterised: a number of pixels, or `photo` for the photo's own width, at most 1024
+    /// [default: the preset's].
+    #[arg(long, value_name = "photo|PX", value_parser = parse_raster_width, help_heading = "Speed and accuracy", hide_short_help = true)]
     raster_width: Option<RasterWidth>,
     /// Skips the search for objects: masks of different views that show the same Gaussians.
     #[arg(long, help_heading = "Speed and accuracy", hide_short_help = true)]
     no_objects: bool,
     /// Drops views in which a Gaussian has less than this share of its weight in its best view
-    #[arg(long, value_name = "SHARE", value_parser = share, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "SHARE", help_heading = "Speed and accuracy", hide_short_help = true)]
     min_view_share: Option<f32>,
     /// Each mask counts (1 - truncation)^POWER; truncation is the share of its outline that the photo's edge cuts
     /// off
-    #[arg(long, value_name = "POWER", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "POWER", help_heading = "Speed and accuracy", hide_short_help = true)]
     truncation_power: Option<f32>,
     /// Weight of the superpoint's mean, relative to the Gaussian's own
-    #[arg(long, value_name = "TIMES", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "TIMES", help_heading = "Speed and accuracy", hide_short_help = true)]
     superpoint: Option<f32>,
     /// Weight of the larger superpoint's mean, relative to the result so far
-    #[arg(long, value_name = "TIMES", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "TIMES", help_heading = "Speed and accuracy", hide_short_help = true)]
     coarse: Option<f32>,
     /// Weight of the mean of the Gaussian's object, relative to the result so far
-    #[arg(long, value_name = "TIMES", value_parser = amount, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "TIMES", help_heading = "Speed and accuracy", hide_short_help = true)]
     object: Option<f32>,
     /// Whether Gaussians without evidence take their superpoint's mean
     #[arg(long, value_name = "BOOL", help_heading = "Speed and accuracy", hide_short_help = true)]
     fill: Option<bool>,
     /// Mean error of scores that the compact profile may have, relative to the spread of scores [default: the
     /// preset's].
-    #[arg(long, value_name = "E", value_parser = parse_error, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "E", help_heading = "Speed and accuracy", hide_short_help = true)]
     compact_error: Option<f32>,
     /// The same for the balanced profile.
-    #[arg(long, value_name = "E", value_parser = parse_error, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "E", help_heading = "Speed and accuracy", hide_short_help = true)]
     balanced_error: Option<f32>,
     /// Most components of a vector in compact and balanced shards, even [default: as many as the errors need, at
     /// most 128].
-    #[arg(long, value_name = "N", value_parser = parse_components, help_heading = "Speed and accuracy", hide_short_help = true)]
+    #[arg(long, value_name = "N", help_heading = "Speed and accuracy", hide_short_help = true)]
     max_components: Option<usize>,
 }
 
@@ -120,31 +117,10 @@ impl ChoiceArgs {
     }
 }
 
-fn share(text: &str) -> Result<f32, String> {
-    amount(text).and_then(|x| if x <= 1.0 { Ok(x) } else { Err(format!("{x} is not in 0..=1")) })
-}
-
-fn amount(text: &str) -> Result<f32, String> {
-    let value: f32 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
-    if (0.0..=1000.0).contains(&value) { Ok(value) } else { Err(format!("{value} is not in 0..=1000")) }
-}
-
-fn parse_components(text: &str) -> Result<usize, String> {
-    let is_valid = |n: &usize| (2..=MAX_COMPONENTS).contains(n) && n.is_multiple_of(2);
-    let components = text.parse().ok().filter(is_valid);
-    components.ok_or_else(|| format!("expected an even number from 2 to {MAX_COMPONENTS}"))
-}
-
 fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
     match text {
         "photo" => Ok(RasterWidth::Photo),
-        "twice" => Ok(RasterWidth::Twice),
-        _ => {
-            let width_px = text.parse().ok().filter(|px| (16..=8192).contains(px));
-            width_px
-                .map(RasterWidth::Px)
-                .ok_or_else(|| format!("{text:?} is none of: photo, twice, 16 to 8192 pixels"))
-        }
+        _ => text.parse().map(RasterWidth::Px).map_err(|_| "expected photo, or a number of pixels".into()),
     }
 }
 
@@ -170,7 +146,7 @@ mod tests {
         assert_eq!(parse_views_limit("12.5%"), Ok(ViewsLimit::Share(0.125)));
         assert_eq!(parse_raster_width("photo"), Ok(RasterWidth::Photo));
         assert_eq!(parse_raster_width("16"), Ok(RasterWidth::Px(16)));
-        assert!(parse_raster_width("8193").is_err() && parse_views_limit("-1").is_err());
+        assert!(parse_raster_width("twice").is_err() && parse_views_limit("-1").is_err());
     }
 
     #[test]

@@ -93,7 +93,6 @@ pub struct ModelArgs {
     /// with].
     #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR", help_heading = "Models")]
     pub models: Option<PathBuf>,
-    /// How models run.
     #[command(flatten)]
     pub how: RunArgs,
 }
@@ -257,12 +256,4 @@ pub fn runtime() -> Result<tokio::runtime::Runtime> {
 /// Returns the parser of profiles, whose names the help text lists.
 pub fn profile_parser() -> impl TypedValueParser<Value = Profile> {
     PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
-}
-
-/// Reads an error of scores.
-pub fn parse_error(text: &str) -> Result<f32, String> {
-    match text.parse::<f32>() {
-        Ok(error) if error >= 0.0 && error.is_finite() => Ok(error),
-        _ => Err("expected a share of the spread of scores, for example 0.1".into()),
-    }
 }

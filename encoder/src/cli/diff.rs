@@ -12,7 +12,6 @@ use super::common::{Exit, print};
 use crate::diff::{self, Diff, Generation};
 use crate::store::{Published, StoreReader};
 
-/// `diff`.
 #[derive(Debug, Args)]
 pub struct DiffArgs {
     /// The earlier generation: STORE for its current one, STORE@N for generation N, which is the current one or

@@ -19,6 +19,8 @@ use super::sam::SamArgs;
 use super::summary::lines;
 use super::target::TargetArgs;
 use crate::cells::PositionError;
+#[cfg(not(feature = "fleet"))]
+use crate::encode;
 use crate::encode::front::Expectation;
 use crate::encode::{DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, MAX_CELL_GAUSSIANS, Masks};
 use crate::occupancy::OccupancySettings;
@@ -32,14 +34,12 @@ const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder encode --scene splat.ply --views sparse/0 --store STORE --models clip-vit-base-patch32-int8 --text-model\n\
     \x20 slag-encoder encode --scene splat.ply --views transforms.json --store STORE --preset fast --time-budget 60\n";
 
-/// `encode`.
 #[derive(Clone, Debug, Args)]
 #[command(before_help = EXAMPLES)]
 pub struct EncodeArgs {
     /// Scene, poses, photos.
     #[command(flatten)]
     input: InputArgs,
-    /// Models.
     #[command(flatten)]
     models: ModelArgs,
     /// Store to publish into; made if absent.
@@ -139,7 +139,7 @@ pub struct EncodeArgs {
     /// Publishes a generation in which no Gaussian has an embedding, too: nothing is found in it.
     #[arg(long, help_heading = "Output", hide_short_help = true)]
     allow_empty: bool,
-    /// Views by other machines.
+    #[cfg(feature = "fleet")]
     #[command(flatten)]
     fleet: super::fleet::CoordinatorArgs,
     /// Writes a report of the encode, one HTML file: views, masks, objects, cells, errors by profile, what was
@@ -231,7 +231,10 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let cancel = cancel_flag()?;
     let recorder = args.report.as_ref().map(|_| Recorder::new(progress));
     let progress = recorder.as_ref().map_or(progress, |recorder| recorder as &dyn Progress);
+    #[cfg(feature = "fleet")]
     let summary = args.fleet.encode(&settings, &engines, progress, cancel.as_ref())?;
+    #[cfg(not(feature = "fleet"))]
+    let summary = encode::encode(&settings, &engines, progress, cancel.as_ref())?;
     let lines = lines(&settings, &summary, expected.as_ref());
     let next = if json { String::new() } else { next::of_store(&settings.output.store)? };
     print(json, &summary, lines + &next)?;

@@ -70,7 +70,6 @@ pub struct CoordinatorArgs {
     /// with credentials in the usual variables. Start `slag-encoder worker` with the same bucket.
     #[arg(long, value_name = "URL", conflicts_with = "time_budget", hide_short_help = true)]
     blobs: Option<String>,
-    /// The queue.
     #[command(flatten)]
     queue: QueueArgs,
 }
@@ -99,7 +98,6 @@ impl CoordinatorArgs {
     }
 }
 
-/// `worker`.
 #[derive(Debug, Args)]
 pub struct WorkerArgs {
     /// Bucket of the fleet, as `encode --blobs` has it.
@@ -114,7 +112,6 @@ pub struct WorkerArgs {
     /// Seconds without work after which a worker does what others have left of their shares.
     #[arg(long, value_name = "SECS", default_value = "120", value_parser = parse_secs)]
     help_after: Duration,
-    /// The queue.
     #[command(flatten)]
     queue: QueueArgs,
     /// Models, as the coordinator has them.

@@ -6,7 +6,7 @@ pub mod common;
 pub mod devices;
 mod diff;
 mod encode;
-#[cfg_attr(not(feature = "fleet"), path = "no_fleet.rs")]
+#[cfg(feature = "fleet")]
 mod fleet;
 mod keys;
 pub mod memory;

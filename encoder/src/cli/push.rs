@@ -19,7 +19,6 @@ pub enum PushCommand {
     Qdrant(QdrantArgs),
 }
 
-/// `push qdrant`.
 #[derive(Debug, Args)]
 pub struct QdrantArgs {
     /// Store.
@@ -86,18 +85,8 @@ fn lines(args: &QdrantArgs, report: &qdrant::PushReport) -> String {
         report.n_points, report.n_sent, report.n_without_evidence, report.n_retries
     );
     let mut line = |text: std::fmt::Arguments<'_>| writeln!(lines, "{text}").expect("a string takes text");
-    for change in &report.changed_settings {
-        let (setting, before, after) = (change.setting, &change.before, &change.after);
-        line(format_args!("collection {}: {setting} changed from {before} to {after}", change.collection));
-    }
     for name in &report.deleted_collections {
         line(format_args!("collection {name} deleted: the scene no longer has this cell"));
-    }
-    for name in &report.left_collections {
-        line(format_args!(
-            "collection {name} left alone: the scene has no such cell, but it holds points of other scenes, or is \
-             empty and was not made from this store; delete it yourself if nothing needs it"
-        ));
     }
     for snapshot in &report.snapshots {
         let sha256 = snapshot.sha256.as_deref().unwrap_or("not stated");

@@ -7,21 +7,17 @@ use clap::Args;
 use serde_json::json;
 use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
-use slag_common::{Gaussians, npy, poses};
+use slag_common::{Gaussians, npy};
 
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
-use crate::query::{self, Hit, Scores};
-use crate::raster::RasterView;
+use crate::query::{self, Hit};
 use crate::store::StoreReader;
-
-const MAX_PICTURE_WIDTH_PX: u32 = 1600;
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder query --store STORE \"fire extinguisher\"\n\
     \x20 slag-encoder query --store STORE chair --json\n\
     \x20 slag-encoder query --store STORE chair --ply found.ply\n";
 
-/// `query`.
 #[derive(Debug, Args)]
 #[command(before_help = EXAMPLES)]
 pub struct QueryArgs {
@@ -52,15 +48,6 @@ pub struct QueryArgs {
     /// The splat that the store was encoded from.
     #[arg(long, value_name = "FILE")]
     pub scene: Option<PathBuf>,
-    /// Draws a view in which the Gaussians that match keep their colours and all others are grey.
-    #[arg(long, value_name = "FILE", requires_all = ["scene", "views", "view"])]
-    pub png: Option<PathBuf>,
-    /// Poses of the views: the folder of a COLMAP model, or a nerfstudio transforms.json.
-    #[arg(long, value_name = "PATH")]
-    pub views: Option<PathBuf>,
-    /// Name of the photo whose view --png draws.
-    #[arg(long, value_name = "PHOTO")]
-    pub view: Option<String>,
 }
 
 pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
@@ -85,9 +72,6 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     if let Some(path) = &args.ply {
         let located = query::located(&reader, &scores, &matching)?;
         write_ply(path, scene.as_ref(), &matching, &located, &args.text)?;
-    }
-    if let (Some(path), Some(scene), Some(views), Some(view)) = (&args.png, &scene, &args.views, &args.view) {
-        draw(path, scene, &scores, threshold, &view_of(views, view)?)?;
     }
     let n_matching = matching.len();
     let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
@@ -130,28 +114,4 @@ fn write_ply(
         ));
     }
     Ok(fs_err::write(path, query::points_ply(located, &[format!("text {text}")]))?)
-}
-
-/// Returns the camera of a photo, without its lens's distortion.
-fn view_of(views: &Path, name: &str) -> Result<RasterView> {
-    let all = poses::read(views, None)?.views;
-    let Some(view) = all.iter().find(|view| view.name == name) else {
-        let first = all.first().map_or("none", |view| &view.name);
-        return Err(anyhow!(
-            "{}: no view is named {name:?}; it has {} views, the first is {first:?}",
-            views.display(),
-            all.len()
-        ));
-    };
-    let intrinsics = view.intrinsics.without_distortion();
-    let width_px = intrinsics.width_px.min(MAX_PICTURE_WIDTH_PX);
-    Ok(RasterView {
-        camera_from_world: view.camera_from_world,
-        intrinsics: intrinsics.scaled_to_width(width_px),
-    })
-}
-
-fn draw(path: &Path, scene: &Gaussians, scores: &Scores, threshold: f32, view: &RasterView) -> Result<()> {
-    let picture = query::draw_lit(scene, &scores.cosines, threshold, view)?;
-    picture.save_with_format(path, image::ImageFormat::Png).with_context(|| path.display().to_string())
 }

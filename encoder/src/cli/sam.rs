@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use slag_models::commands;
 
 use super::common::available_threads;
 use crate::encode::Masks;
-use crate::segment::{SamLevels, SamSettings, ScoreFilter};
+use crate::segment::{SamLevels, SamSettings};
 
 /// Masks from Segment Anything; the other flags need `--segmenter`.
 #[derive(Clone, Debug, Args)]
@@ -49,43 +49,15 @@ pub struct SamArgs {
     /// IoU of boxes from which masks of two crops are the same.
     #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
     sam_crop_nms: f64,
-    /// Overlap of neighbouring crops, relative to the image's shorter edge.
-    #[arg(long, value_name = "RATIO", default_value_t = SamSettings::default().crop_overlap, value_parser = parse_ratio, hide_short_help = true)]
-    sam_crop_overlap: f64,
-    /// Divisor of the points along a side from one layer of crops to the next.
-    #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_points_divisor,
-        value_parser = clap::value_parser!(u32).range(1..=16), hide_short_help = true)]
-    sam_crop_points_divisor: u32,
     /// Fills holes and drops islands of masks with fewer pixels [default: the preset's].
     #[arg(long, value_name = "PX", hide_short_help = true)]
     sam_min_region_px: Option<u32>,
     /// Which of the three masks of each prompt are used [default: the preset's].
     #[arg(long, value_enum, hide_short_help = true)]
     sam_levels: Option<SamLevels>,
-    /// Filter of each level's masks at the end [default: the preset's].
-    #[arg(long, value_enum, hide_short_help = true)]
-    sam_score_filter: Option<ScoreFilterArg>,
     /// Threads within the model; masks may depend on their number in the last bits [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
     sam_threads: Option<u32>,
-}
-
-/// `--sam-score-filter`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum ScoreFilterArg {
-    /// None.
-    None,
-    /// LangSplat's: by predicted IoU times stability, without masks that larger ones contain.
-    Langsplat,
-}
-
-impl From<ScoreFilterArg> for Option<ScoreFilter> {
-    fn from(arg: ScoreFilterArg) -> Self {
-        match arg {
-            ScoreFilterArg::None => None,
-            ScoreFilterArg::Langsplat => Some(ScoreFilter::LANGSPLAT),
-        }
-    }
 }
 
 impl SamArgs {
@@ -105,11 +77,9 @@ impl SamArgs {
             mask_nms_iou: self.sam_mask_nms,
             crop_layers: self.sam_crop_layers.unwrap_or(preset.crop_layers),
             crop_nms_iou: self.sam_crop_nms,
-            crop_overlap: self.sam_crop_overlap,
-            crop_points_divisor: self.sam_crop_points_divisor,
             min_region_px: self.sam_min_region_px.unwrap_or(preset.min_region_px),
             levels: self.sam_levels.unwrap_or(preset.levels),
-            score_filter: self.sam_score_filter.map_or(preset.score_filter, Into::into),
+            ..*preset
         };
         let n_model_threads = self.sam_threads.map_or_else(available_threads, |n| n as usize);
         Ok(Some(Masks::Sam { dir, settings, n_model_threads }))

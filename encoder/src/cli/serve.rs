@@ -22,7 +22,6 @@ const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder serve --store STORE --listen 0.0.0.0:7733\n\
     \x20 slag-encoder serve --store STORE --listen 0.0.0.0:7733 --tls-cert cert.pem --tls-key key.pem\n";
 
-/// `serve`.
 #[derive(Debug, Args)]
 #[command(before_help = EXAMPLES)]
 pub struct ServeArgs {

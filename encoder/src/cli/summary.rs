@@ -4,7 +4,7 @@ use slag_common::ByteSize;
 
 use crate::encode::coverage::CoverageReport;
 use crate::encode::front::Expectation;
-use crate::encode::{CellReport, EncodeSettings, EncodeSummary, GpuReport, StageReport, ViewsReport};
+use crate::encode::{EncodeSettings, EncodeSummary, GpuReport, StageReport};
 
 /// Returns the lines. `expected`: what a front expected of the target that was asked for.
 pub(super) fn lines(
@@ -57,7 +57,6 @@ pub(super) fn lines(
     let encoder = summary.encoder_before.as_ref().map_or(String::new(), |before| {
         format!("encoder    {} in place of {before}: robots need its text model\n", summary.encoder)
     });
-    let most = most_spent(summary);
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let of_target = expected.map_or(String::new(), |e| {
         let profile = e.setting.profile.name();
@@ -77,7 +76,7 @@ pub(super) fn lines(
          views      {} of {} ({} resumed, {} without masks)\n{lost}{coverage}{skipped}{encoder}{images_on}\
          masks      {} in {} regions, {} contributions\n\
          cells      {} with {} centroids\n\
-         {objects}{occupancy}shards     {sizes}\n{most}\
+         {objects}{occupancy}shards     {sizes}\n\
          seconds    {:.1}; by stage, all threads: {busy}\n\
          views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
         summary.generation,
@@ -96,21 +95,5 @@ pub(super) fn lines(
         summary.n_centroids,
         summary.wall_secs,
         summary.views_secs,
-    )
-}
-
-/// Returns the line that names the most expensive view and cell.
-fn most_spent(summary: &EncodeSummary) -> String {
-    let (views, cells) = (&summary.views, &summary.cells);
-    let most = (0..views.view.len()).max_by(|a, b| views.secs[*a].total_cmp(&views.secs[*b]));
-    let (Some(at), Some(cell)) = (most, cells.iter().max_by_key(|cell| cell.n_centroids)) else {
-        return String::new();
-    };
-    let ViewsReport { view, raster_width_px, n_masks, n_regions, n_entries, secs } = views;
-    let CellReport { cell_id, n_gaussians, n_centroids, .. } = cell;
-    format!(
-        "most on    view {}, {:.1} s ({} masks, {} regions, {} contributions, {} px wide); cell {cell_id}, {n_centroids} centroids \
-         ({n_gaussians} Gaussians)\n",
-        view[at], secs[at], n_masks[at], n_regions[at], n_entries[at], raster_width_px[at]
     )
 }

@@ -48,7 +48,7 @@ impl TargetArgs {
         let bytes = ByteSize(chosen.bytes as u64);
         tracing::info!(
             "setting {:?} ({}): {:.1} s and {bytes} of {} shards are expected for {n_photos} photos and {n_gaussians} \
-             Gaussians, measured on {} scenes on {} with {}; mIoU there {:.3} (standard deviation {:.3})",
+             Gaussians, measured on {} scenes on {} with {}; mIoU there {:.3}",
             chosen.setting.name,
             chosen.setting.flags,
             chosen.seconds,
@@ -57,7 +57,6 @@ impl TargetArgs {
             front.machine,
             front.measured_with,
             chosen.setting.miou,
-            chosen.setting.miou_spread,
         );
         Ok(Some((parse_choices(&chosen.setting.flags)?, chosen)))
     }

@@ -21,7 +21,6 @@ const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder view --store STORE --scene splat.ply --views sparse/0\n\
     \x20 slag-encoder view --scene splat.ply\n";
 
-/// `view`.
 #[derive(Debug, Args)]
 #[command(before_help = EXAMPLES)]
 pub struct ViewArgs {
@@ -105,7 +104,6 @@ fn check_page() -> Result<()> {
     }
 }
 
-/// Reads what is shown.
 fn shown(args: &ViewArgs) -> Result<Viewed> {
     let set = args.views.as_deref().map(|path| poses::read(path, args.images.as_deref())).transpose()?;
     let splat = match &args.scene {

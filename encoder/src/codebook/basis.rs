@@ -26,7 +26,6 @@ const LARGE_BANK: usize = 19 * HELD_OUT_STEP;
 /// Texts like the expected queries: `[n][dim]`, unit vectors in the space of the embeddings.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TextBank {
-    /// Components.
     pub dim: usize,
     /// `[n][dim]`.
     pub vectors: Vec<f32>,
@@ -59,7 +58,6 @@ impl TextBank {
         Self { dim, vectors }
     }
 
-    /// Returns the number of texts.
     pub fn len(&self) -> usize {
         self.vectors.len().checked_div(self.dim).unwrap_or(0)
     }

@@ -27,7 +27,6 @@ pub struct Sample<'a> {
 /// Sums over pairs of a text and a Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ScoreMoments {
-    /// Mean of the scores.
     pub mean: f64,
     pub mean_square: f64,
 }

@@ -24,7 +24,6 @@ impl Members {
         Self { order, starts }
     }
 
-    /// Returns the places of a centroid's members.
     pub(super) fn places(&self, centroid: usize) -> Range<usize> {
         self.starts[centroid] as usize..self.starts[centroid + 1] as usize
     }

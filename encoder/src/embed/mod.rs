@@ -13,39 +13,17 @@ use crate::masks::{BoxPx, Mask};
 pub use shared::{Failure, OpenEncoder, SharedEncoders};
 pub use surroundings::Surroundings;
 
-/// Reason why masks cannot be embedded.
 #[derive(Debug, thiserror::Error)]
 pub enum EmbedError {
     #[error(
         "mask {index}: box {box_px:?} with {n_inside} pixels inside does not fit an image of {width_px}x{height_px}; \
          segment this image again"
     )]
-    Mask {
-        /// Index of the mask.
-        index: usize,
-        /// Bounding box of the mask.
-        box_px: BoxPx,
-        /// Number of pixels in the mask.
-        n_inside: usize,
-        /// Width of the image.
-        width_px: u32,
-        /// Height of the image.
-        height_px: u32,
-    },
+    Mask { index: usize, box_px: BoxPx, n_inside: usize, width_px: u32, height_px: u32 },
     #[error("patches of the photo: {cause}")]
-    Patches {
-        /// The encoder's error.
-        cause: Box<InferenceError>,
-    },
+    Patches { cause: Box<InferenceError> },
     #[error("masks {first} to {last}: {cause}")]
-    Encode {
-        /// Index of the first mask in the batch.
-        first: usize,
-        /// Index of the last mask in the batch.
-        last: usize,
-        /// The encoder's error.
-        cause: Box<InferenceError>,
-    },
+    Encode { first: usize, last: usize, cause: Box<InferenceError> },
 }
 
 impl EmbedError {

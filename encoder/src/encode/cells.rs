@@ -9,10 +9,10 @@ use slag_common::manifest::{Calibration, CellRecord};
 use slag_common::{Hash32, View};
 
 use super::cell::{CellMaker, CellsBudget, FinishedCell};
-use super::context::{Phase, RunContext};
+use super::context::RunContext;
 use super::error::EncodeError;
 use super::plan::Plan;
-use super::report::ViewsReport;
+use super::report::{Phase, ViewsReport};
 use super::sink::ViewRecord;
 use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
@@ -20,7 +20,7 @@ use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::{PendingRefinement, Refinement};
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable, SceneContributions};
-use crate::memory::{self, MemoryPlan, PlannedPeak};
+use crate::memory;
 use crate::objects::{self, Object, ObjectsReport};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
@@ -40,8 +40,6 @@ pub(super) struct BuiltCells {
     pub(super) objects: Option<ObjectsReport>,
     pub(super) occupancy: Option<OccupancyReport>,
     pub(super) counts: Counts,
-    /// The most memory that these steps were expected to take.
-    pub(super) planned_peak: Option<PlannedPeak>,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
     score_sums: [f64; 3],
 }
@@ -97,7 +95,7 @@ fn build(
 ) -> Result<BuiltCells, EncodeError> {
     let Plan { inputs, store, settings, .. } = *plan;
     let opened = context.install(|| Opened::of(plan, views, occupancy.as_ref(), context))?;
-    let Opened { index, table, score_context, photos, pass_bytes, cells: budget, planned_peak } = opened;
+    let Opened { index, table, score_context, photos, pass_bytes, cells: budget } = opened;
     let scene = SceneContributions {
         index: &index,
         gaussians: &inputs.scene,
@@ -162,7 +160,6 @@ fn build(
         objects: maker.objects.map(|objects| objects.report),
         occupancy: maker.occupancy.map(|occupancy| occupancy.report),
         counts,
-        planned_peak,
         score_sums: [0.0; 3],
     };
     finished.into_iter().for_each(|cell| built.add(cell));
@@ -217,7 +214,6 @@ struct Opened {
     /// Bytes for the contributions that a pass of the refinement or of objects holds.
     pass_bytes: u64,
     cells: CellsBudget,
-    planned_peak: Option<PlannedPeak>,
 }
 
 impl Opened {
@@ -266,31 +262,8 @@ impl Opened {
             ScoreMetricContext { metric, bank, spread }
         });
         let n_at_once = 1 + n_more as usize;
-        let planned_peak = planned_peak(&memory, plan, &index, (pass_bytes, n_at_once));
         let cells = CellsBudget { group_bytes, n_at_once };
         tracing::debug!("{} cells at once, {cell_bytes} bytes each", cells.n_at_once);
-        Ok(Self { index, table, score_context, photos, pass_bytes, cells, planned_peak })
+        Ok(Self { index, table, score_context, photos, pass_bytes, cells })
     }
-}
-
-/// Returns the peak that is expected of the steps from here on; `None` where the system does not tell what the
-/// process holds.
-fn planned_peak(
-    memory: &MemoryPlan,
-    plan: &Plan<'_>,
-    index: &ContributionIndex,
-    (pass_bytes, n_at_once): (u64, usize),
-) -> Option<PlannedPeak> {
-    let mut memory = memory.clone();
-    let (kept_bytes, group_bytes) = index.expected_bytes(pass_bytes, plan.settings.run.threads as u64);
-    for phase in
-        [memory::Phase::Superpoints, memory::Phase::Objects, memory::Phase::Refine, memory::Phase::Cells]
-    {
-        memory.reserve_expecting(phase, "contributions of all views", 0, kept_bytes + group_bytes);
-    }
-    let cells_bytes = shard::largest_cells_bytes(&plan.inputs.split, plan.engines.models.dim(), n_at_once);
-    let len_bytes = shard::expected_bytes(cells_bytes);
-    memory.reserve_expecting(memory::Phase::Cells, "cells at once", 0, len_bytes);
-    memory::give_back();
-    Some(memory.planned_peak(memory::held_bytes()?))
 }

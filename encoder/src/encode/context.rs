@@ -8,7 +8,7 @@ use std::time::Instant;
 use rayon::ThreadPool;
 
 use super::error::EncodeError;
-use super::report::PhaseReport;
+use super::report::{Phase, PhaseReport};
 use super::workers::Workers;
 use crate::memory;
 use crate::progress::Progress;
@@ -16,45 +16,6 @@ use crate::progress::Progress;
 /// The time spent in each stage, added over all threads.
 #[derive(Default)]
 struct StageTimes(Mutex<BTreeMap<&'static str, f64>>);
-
-/// A part of a run, one after the other.
-#[derive(Clone, Copy)]
-pub(super) enum Phase {
-    /// Scene and poses are read and split into cells.
-    Read,
-    /// What is to do is decided, and what is done is found.
-    Plan,
-    /// Views are segmented, embedded and rasterised.
-    Views,
-    /// Free and occupied places are found.
-    Occupancy,
-    /// The views' contributions are opened.
-    Merge,
-    /// Masks are weighed and superpoints found.
-    Superpoints,
-    Objects,
-    Refine,
-    /// Cells become codebooks and shards.
-    Cells,
-    Publish,
-}
-
-impl Phase {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Read => "read",
-            Self::Plan => "plan",
-            Self::Views => "views",
-            Self::Occupancy => "occupancy",
-            Self::Merge => "merge",
-            Self::Superpoints => "superpoints",
-            Self::Objects => "objects",
-            Self::Refine => "refine",
-            Self::Cells => "cells",
-            Self::Publish => "publish",
-        }
-    }
-}
 
 /// The beginning of a phase.
 struct Began {
@@ -102,7 +63,7 @@ impl<'a> RunContext<'a> {
         let began = phases.iter().skip(1).map(|Began { at, peak_before, .. }| (*at, *peak_before));
         let ends = began.chain([(end, memory::peak_bytes())]);
         let report = |(Began { phase, at, .. }, (ended, peak_bytes)): (&Began, _)| PhaseReport {
-            phase: phase.name().to_owned(),
+            phase: *phase,
             secs: Instant::duration_since(&ended, *at).as_secs_f64(),
             peak_bytes,
         };
@@ -144,7 +105,6 @@ impl<'a> RunContext<'a> {
         self.workers.run(false, work)
     }
 
-    /// Runs work and adds its time to a stage.
     pub(crate) fn time<T>(&self, stage: &'static str, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let result = work();

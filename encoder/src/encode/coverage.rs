@@ -45,7 +45,6 @@ const GAIN_STEPS: f64 = (1 << 24) as f64;
 /// How well each view shows each Gaussian.
 #[derive(Clone, Debug)]
 pub struct Coverage {
-    /// Gaussians that count.
     n_gaussians: usize,
     /// For each view the Gaussians that it shows, and their qualities in steps.
     views: Vec<(Vec<u32>, Vec<u8>)>,

@@ -18,12 +18,7 @@ use crate::store::StoreError;
 #[derive(Debug, thiserror::Error)]
 pub enum EncodeError {
     #[error("{setting}: {problem}")]
-    Setting {
-        /// The setting's name.
-        setting: &'static str,
-        /// What is wrong with it, and what is expected.
-        problem: String,
-    },
+    Setting { setting: &'static str, problem: String },
     #[error(
         "{model} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out"
     )]
@@ -31,11 +26,7 @@ pub enum EncodeError {
     #[error("--text-model: {0}")]
     TextModel(#[from] TextSideError),
     #[error("cannot start {n_threads} threads: {source}; use fewer with --threads")]
-    Threads {
-        /// Threads asked for.
-        n_threads: usize,
-        source: rayon::ThreadPoolBuildError,
-    },
+    Threads { n_threads: usize, source: rayon::ThreadPoolBuildError },
     #[error(transparent)]
     Splat(#[from] SplatError),
     #[error(transparent)]
@@ -61,60 +52,22 @@ pub enum EncodeError {
     #[error(transparent)]
     Io(#[from] std::io::Error),
     #[error("{}: job records: {source}; start over with --restart", path.display())]
-    Records {
-        /// The store.
-        path: PathBuf,
-        /// The database's error.
-        source: sled::Error,
-    },
+    Records { path: PathBuf, source: sled::Error },
     #[error(
         "{}: holds an unfinished encode of another splat or with other settings ({n_done} views done); finish it with its own \
          splat and settings, or drop it with --restart", path.display()
     )]
-    OtherJob {
-        /// The store.
-        path: PathBuf,
-        /// Views that it finished.
-        n_done: usize,
-    },
+    OtherJob { path: PathBuf, n_done: usize },
     #[error("{n_missing} of {n_views} photos are missing, the first is {}; give their folder with --images", first.display())]
-    MissingImages {
-        /// Photos missing.
-        n_missing: usize,
-        /// Views in the poses file.
-        n_views: usize,
-        /// The first missing photo.
-        first: PathBuf,
-    },
+    MissingImages { n_missing: usize, n_views: usize, first: PathBuf },
     #[error("{}: view {view} has a pose already in {}; give the photos other names, or leave one of the files out", path.display(), first.display())]
-    AddedTwice {
-        view: String,
-        /// The poses file that was given first.
-        first: PathBuf,
-        /// The one that was added.
-        path: PathBuf,
-    },
+    AddedTwice { view: String, first: PathBuf, path: PathBuf },
     #[error("{}: applied_transform or applied_scale differ from those of {}; bring both poses into one frame", path.display(), first.display())]
-    AddedFrame {
-        /// The poses file that was given first.
-        first: PathBuf,
-        /// The one that was added.
-        path: PathBuf,
-    },
+    AddedFrame { first: PathBuf, path: PathBuf },
     #[error("--drop {view}: no poses file has this view; its first view is {first:?}")]
-    NoViewToDrop {
-        /// The name as given.
-        view: String,
-        /// A view that there is.
-        first: String,
-    },
+    NoViewToDrop { view: String, first: String },
     #[error("none of {n_views} views can be used; the first: {reason}")]
-    NoViews {
-        /// Views in the poses file.
-        n_views: usize,
-        /// Why the first one cannot be used.
-        reason: String,
-    },
+    NoViews { n_views: usize, reason: String },
     #[error(
         "no Gaussian has an embedding, so nothing is published: {n_views} views ({n_views_without_masks} without masks) have \
          {n_masks} masks and {n_entries} contributions; see whether masks, poses and splat fit with `slag-encoder check`, or \
@@ -122,28 +75,16 @@ pub enum EncodeError {
     )]
     NoEvidence { n_views: usize, n_views_without_masks: usize, n_masks: usize, n_entries: u64 },
     #[error("{}: hardly any of {n_gaussians} Gaussians can be seen (finite, positive scales, a rotation, not transparent); export the splat again", path.display())]
-    NoGaussians {
-        /// The splat file.
-        path: PathBuf,
-        n_gaussians: usize,
-    },
+    NoGaussians { path: PathBuf, n_gaussians: usize },
     /// A view has no pose, and `strict` is set.
     #[error("view {view} has no pose: {reason}; remove it from the poses, or leave out --strict")]
-    NoPose {
-        view: String,
-        /// What its pose is.
-        reason: String,
-    },
+    NoPose { view: String, reason: String },
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
     Fleet(Box<dyn std::error::Error + Send + Sync>),
     #[error("interrupted after {n_done} of {n_views} views; run the same command again to resume")]
-    Interrupted {
-        /// Views finished.
-        n_done: usize,
-        n_views: usize,
-    },
+    Interrupted { n_done: usize, n_views: usize },
 }
 
 impl EncodeError {

@@ -31,13 +31,10 @@ pub struct FrontSetting {
     pub profile: Profile,
     /// Seconds per photo of the scene, used or not.
     pub seconds_per_view: f64,
-    /// All other seconds, per million Gaussians.
     pub seconds_per_million_gaussians: f64,
     pub bytes_per_gaussian: f64,
     /// Multi-class mIoU.
     pub miou: f64,
-    /// Its standard deviation over scenes.
-    pub miou_spread: f64,
 }
 
 /// What a user accepts; at least one of the two.
@@ -59,7 +56,6 @@ pub struct Expectation {
     pub bytes: f64,
 }
 
-/// Reason why a front cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum FrontError {
     #[error(transparent)]
@@ -69,14 +65,7 @@ pub enum FrontError {
     #[error(
         "no measured setting meets the target: the quickest, {quickest}, is expected to take {seconds:.1} s, the smallest, {smallest}, {bytes:.0} bytes; raise the target"
     )]
-    OutOfReach {
-        /// The quickest setting.
-        quickest: String,
-        seconds: f64,
-        /// The smallest setting.
-        smallest: String,
-        bytes: f64,
-    },
+    OutOfReach { quickest: String, seconds: f64, smallest: String, bytes: f64 },
 }
 
 impl Front {
@@ -150,7 +139,6 @@ mod tests {
             seconds_per_million_gaussians: 10.0,
             bytes_per_gaussian: bytes,
             miou,
-            miou_spread: 0.1,
         }
     }
 

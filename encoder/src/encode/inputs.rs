@@ -84,7 +84,7 @@ impl Inputs {
 
 /// Reserves the scene's columns.
 pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
-    memory.reserve_held(Phase::Always, "the scene", scene.len_bytes());
+    memory.reserve(Phase::Always, "the scene", scene.len_bytes());
 }
 
 /// Reserves the largest photos: those that threads work on, and those that wait for a device or in a queue.

@@ -159,7 +159,6 @@ impl<'a> Job<'a> {
         self.flush()
     }
 
-    /// Records the step that begins.
     pub(super) fn begin(&self, step: &str) -> Result<(), EncodeError> {
         self.records.insert(STEP_KEY, step).map_err(|source| records_error(self.store, source))?;
         self.flush()

@@ -41,7 +41,7 @@ use std::sync::atomic::AtomicBool;
 
 use crate::progress::Progress;
 use crate::store::Store;
-use context::{Phase, RunContext};
+use context::RunContext;
 use executor::Executor;
 
 pub use crate::memory::{MemoryError, Reservation};
@@ -51,7 +51,7 @@ pub use inputs::count_inputs;
 pub use job::{JobStatus, job_status};
 pub use preset::Preset;
 pub use report::{
-    CellReport, EncodeSummary, GpuReport, LostViews, MemoryReport, PhaseReport, SkippedView, StageReport,
+    CellReport, EncodeSummary, GpuReport, LostViews, Phase, PhaseReport, SkippedView, StageReport,
     ViewsReport,
 };
 pub use settings::{

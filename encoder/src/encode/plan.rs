@@ -3,8 +3,6 @@
 use std::path::Path;
 use std::time::Instant;
 
-use glam::DVec3;
-use rayon::prelude::*;
 use slag_common::{Hash32, View};
 use slag_models::SessionOptions;
 
@@ -21,7 +19,7 @@ use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::embed::SharedEncoders;
 use crate::lift::refine::Refinement;
-use crate::memory::{self, MemoryPlan, Phase, PlannedPeak};
+use crate::memory::MemoryPlan;
 use crate::objects;
 use crate::raster::PreparedScene;
 use crate::raster::{LoadedScene, RasterView};
@@ -31,21 +29,6 @@ use crate::segment::{
 use crate::shard;
 use crate::store::{Store, StoreReader};
 
-/// Gaussians that are looked at for all views, to tell how far they see.
-const MAX_TESTS: usize = 1 << 24;
-// Measured with the embedded models, 1 to 16 threads and 0.1 to 2.1 million Gaussians.
-/// ONNX Runtime's code, as far as models use it, its environment, and what they leave behind.
-const RUNTIME_BYTES: u64 = 56 << 20;
-/// What a session takes beside its weights, and what the allocator keeps for each thread.
-const SESSION_BYTES: u64 = 4 << 20;
-/// What a GPU's driver keeps in the process, and what each view takes that is with it: copies of all that goes
-/// there and back.
-const DEVICE_BYTES: u64 = 140 << 20;
-const DEVICE_BYTES_PER_VIEW: u64 = 10 << 20;
-/// What the processor's rasteriser takes for each Gaussian in a view's frustum, most of them hidden: 110 projected
-/// and in tiles, and 200 blended for each of a fifth.
-const RASTER_BYTES_PER_VISIBLE: u64 = 150;
-
 /// What was decided.
 pub(crate) struct Plan<'a> {
     pub(crate) settings: &'a EncodeSettings,
@@ -53,8 +36,6 @@ pub(crate) struct Plan<'a> {
     pub(crate) inputs: &'a Inputs,
     pub(crate) store: &'a Store,
     pub(super) memory: MemoryPlan,
-    /// The most memory that the run is expected to take; `None` where the system does not tell what it has now.
-    pub(super) planned_peak: Option<PlannedPeak>,
     pub(crate) segmenter: Box<dyn Segmenter>,
     pub(crate) job: Job<'a>,
     /// Kept views that are done anew.
@@ -122,7 +103,6 @@ pub(super) fn plan<'a>(
         inputs,
         store,
         memory,
-        planned_peak: None,
         segmenter,
         job,
         lost_views,
@@ -132,32 +112,16 @@ pub(super) fn plan<'a>(
         coverage,
         coverage_secs,
     };
-    plan.reserve_views(context)?;
+    plan.reserve_views()?;
     Ok(plan)
 }
 
 impl Plan<'_> {
-    /// Reserves what depends on segmenter, devices and chosen views, and plans the peak of the process.
-    fn reserve_views(&mut self, context: &RunContext<'_>) -> Result<(), EncodeError> {
+    /// Reserves what depends on segmenter and views.
+    fn reserve_views(&mut self) -> Result<(), EncodeError> {
         let mut memory = self.memory.clone();
         self.view_tools().reserve_photos(&mut memory, &self.inputs.views);
         memory.rest(0)?;
-        expect_runtime(&mut memory, self.settings, self.engines, self.scene.as_ref());
-        if self.scene.gpus().is_none() {
-            let views: Vec<&View> = self.order.iter().map(|i| &self.inputs.views[*i]).collect();
-            let (means, n_threads) = (&self.inputs.scene.means_in_world, self.settings.run.threads);
-            let n_visible = context.install(|| n_visible_at_once(&views, means, n_threads));
-            let len_bytes = n_visible * RASTER_BYTES_PER_VISIBLE;
-            memory.reserve_expecting(Phase::Views, "views that are rasterised", 0, len_bytes);
-        }
-        memory::give_back();
-        self.planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
-        if let Some(PlannedPeak { len_bytes, phase }) = self.planned_peak {
-            let len_mb = len_bytes / 1_000_000;
-            tracing::info!(
-                "about {len_mb} MB of memory in {phase:?}, and then what the views' contributions take"
-            );
-        }
         self.memory = memory;
         Ok(())
     }
@@ -186,48 +150,6 @@ fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<St
         before.name
     );
     Some(before.name.clone())
-}
-
-/// Adds what models and devices are expected to take; nothing bounds it.
-fn expect_runtime(
-    memory: &mut MemoryPlan,
-    settings: &EncodeSettings,
-    engines: &Engines<'_>,
-    scene: &dyn LoadedScene,
-) {
-    let n_threads = settings.run.threads as u64;
-    let mut expect = |phase, purpose, len_bytes| memory.reserve_expecting(phase, purpose, 0, len_bytes);
-    if let Some(model_bytes) = engines.models.image_bytes() {
-        expect(Phase::Always, "ONNX Runtime", RUNTIME_BYTES);
-        expect(Phase::Views, "a model of each thread", n_threads * model_bytes);
-    }
-    expect(Phase::Always, "sessions and allocations of each thread", n_threads * SESSION_BYTES);
-    if let Some(gpus) = scene.gpus() {
-        expect(Phase::Always, "drivers of GPUs", gpus.n_gpus as u64 * DEVICE_BYTES);
-        expect(Phase::Views, "views on GPUs", gpus.n_views() as u64 * DEVICE_BYTES_PER_VIEW);
-    }
-}
-
-/// Returns how many Gaussians are in the frusta of views that are worked on at the same time, at most: of
-/// `n_at_once` that follow one another. Few views see far, but these hold the most, and they lie together.
-fn n_visible_at_once(views: &[&View], means_in_world: &[DVec3], n_at_once: usize) -> u64 {
-    let step = (means_in_world.len() * views.len() / MAX_TESTS).max(1);
-    let n_visible: Vec<u64> = views.par_iter().map(|view| n_before(means_in_world, step, view)).collect();
-    let n = n_at_once.clamp(1, n_visible.len().max(1));
-    let most = n_visible.windows(n).map(|views| views.iter().sum::<u64>()).max().unwrap_or(0);
-    most * step as u64
-}
-
-/// Returns how many of every `step`-th mean lie before a view.
-fn n_before(means_in_world: &[DVec3], step: usize, view: &View) -> u64 {
-    let is_before = |mean: &&DVec3| {
-        let at = view.camera_from_world.transform_point3(**mean);
-        let [x_px, y_px] = view.intrinsics.pixel_from_distorted([at.x / at.z, at.y / at.z]);
-        at.z > 0.0
-            && (0.0..f64::from(view.intrinsics.width_px)).contains(&x_px)
-            && (0.0..f64::from(view.intrinsics.height_px)).contains(&y_px)
-    };
-    means_in_world.iter().step_by(step).filter(is_before).count() as u64
 }
 
 /// Returns which kept views cannot be taken over, and says so; an encode that is unfinished is refused later, not

@@ -16,9 +16,8 @@ use super::context::RunContext;
 use super::error::EncodeError;
 use super::executor::Executor;
 use super::plan::Plan;
-use super::report::{CellReport, EncodeSummary, MemoryReport};
+use super::report::{CellReport, EncodeSummary};
 use super::views::DoneViews;
-use crate::memory;
 use crate::store::{ModelsRecord, Store};
 
 /// Publishes the built cells, ends the job and returns the summary.
@@ -48,7 +47,6 @@ pub(super) fn publish(
     let manifest = manifest(&plan, &built, generation, text_model);
     executor.begin_publication()?;
     plan.store.publish(&manifest, &built.extras)?;
-    let planned_peak = plan.planned_peak.max(built.planned_peak);
     let mut summary = summary(&plan, &views, built, &manifest);
     // With views left to do the contributions stay: the next encode goes on from them.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
@@ -64,11 +62,6 @@ pub(super) fn publish(
     let end = Instant::now();
     summary.wall_secs = end.duration_since(context.start()).as_secs_f64();
     summary.phases = context.phases(end);
-    summary.memory = planned_peak.zip(memory::peak_bytes()).map(|(planned, peak_bytes)| MemoryReport {
-        planned_bytes: planned.len_bytes,
-        planned_phase: planned.phase,
-        peak_bytes,
-    });
     Ok(summary)
 }
 
@@ -167,7 +160,6 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         views: views_report,
         busy_secs: BTreeMap::new(),
         view_stages: views.stages.clone(),
-        memory: None,
         phases: Vec::new(),
         views_secs: views.secs,
         wall_secs: 0.0,

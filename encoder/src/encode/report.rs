@@ -7,7 +7,6 @@ use serde::Serialize;
 use super::coverage::CoverageReport;
 use super::settings::ViewOrder;
 use crate::lanes::GpuLoad;
-use crate::memory::Phase;
 use crate::objects::ObjectsReport;
 use crate::occupancy::OccupancyReport;
 
@@ -104,7 +103,6 @@ pub struct GpuReport {
     pub gpu: u32,
     /// Lanes: models that may be at work at once.
     pub n_lanes: usize,
-    /// Seconds in which any of them was.
     pub busy_secs: f64,
     /// Their share of the time, 0 to 1.
     pub busy_share: f64,
@@ -123,28 +121,38 @@ impl StageReport {
     }
 }
 
+/// A part of a run, one after the other.
+#[derive(Clone, Copy, Debug, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Phase {
+    /// Scene and poses are read and split into cells.
+    Read,
+    /// What is to do is decided, and what is done is found.
+    Plan,
+    /// Views are segmented, embedded and rasterised.
+    Views,
+    /// Free and occupied places are found.
+    Occupancy,
+    /// The views' contributions are opened.
+    Merge,
+    /// Masks are weighed and superpoints found.
+    Superpoints,
+    Objects,
+    Refine,
+    /// Cells become codebooks and shards.
+    Cells,
+    Publish,
+}
+
 /// A part of the run. The parts follow each other and add up to the run's time.
 #[derive(Clone, Debug, Serialize)]
 pub struct PhaseReport {
-    /// The part: read, plan, views, occupancy, merge, superpoints, objects, refine, cells, publish.
-    pub phase: String,
+    pub phase: Phase,
     pub secs: f64,
     /// The most memory of the process until its end, bytes; absent where the system does not tell.
     pub peak_bytes: Option<u64>,
 }
 
-/// The memory of the run.
-#[derive(Clone, Debug, Serialize)]
-pub struct MemoryReport {
-    /// The most that the process was expected to hold, as planned before the first view, bytes.
-    pub planned_bytes: u64,
-    /// The step that was expected to need it.
-    pub planned_phase: Phase,
-    /// The most that it held, bytes.
-    pub peak_bytes: u64,
-}
-
-/// The result of an encode.
 #[derive(Clone, Debug, Serialize)]
 pub struct EncodeSummary {
     /// The generation that was published.
@@ -197,8 +205,6 @@ pub struct EncodeSummary {
     pub busy_secs: BTreeMap<String, f64>,
     /// The load of the views' stages, in their order.
     pub view_stages: Vec<StageReport>,
-    /// Memory, planned and used; absent where the system does not tell.
-    pub memory: Option<MemoryReport>,
     /// The parts of the run, in their order.
     pub phases: Vec<PhaseReport>,
     /// Seconds from the first view to the last.

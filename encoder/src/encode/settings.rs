@@ -30,7 +30,6 @@ pub const MAX_CELL_GAUSSIANS: usize = 65_536;
 /// Largest width of a cell of a metric scene.
 pub const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 
-/// What to encode and how.
 #[derive(Clone, Debug)]
 pub struct EncodeSettings {
     /// What is read.
@@ -50,7 +49,6 @@ pub struct EncodeSettings {
 /// The files that an encode reads.
 #[derive(Clone, Debug)]
 pub struct InputSettings {
-    /// The splat file.
     pub scene: PathBuf,
     /// The poses: a COLMAP model, a transforms.json or a ScanNet scene folder.
     pub views: PathBuf,
@@ -152,25 +150,16 @@ pub enum Masks {
 pub enum RasterWidth {
     /// The photo's own width, at most `MAX_RASTER_WIDTH_PX`.
     Photo,
-    /// Twice the width of [`Self::Photo`] in every view.
-    Twice,
-    /// This many pixels.
     Px(u32),
 }
 
 impl RasterWidth {
-    /// Returns the width in which weights are counted, for a photo of this width.
-    pub(crate) fn base_px(self, photo_px: u32) -> u32 {
-        match self {
-            Self::Px(width_px) => width_px,
-            Self::Photo | Self::Twice => photo_px.min(MAX_RASTER_WIDTH_PX),
-        }
-    }
-
     /// Returns the width of the raster of a photo of this width.
     pub(crate) fn px(self, photo_px: u32) -> u32 {
-        // Twice the width keeps pixels in step with those of the photo, so that masks keep their outlines.
-        self.base_px(photo_px) * if self == Self::Twice { 2 } else { 1 }
+        match self {
+            Self::Px(width_px) => width_px,
+            Self::Photo => photo_px.min(MAX_RASTER_WIDTH_PX),
+        }
     }
 }
 
@@ -233,7 +222,6 @@ pub struct RunSettings {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ViewsLimit {
     All,
-    /// This many.
     Count(usize),
     /// This share of them, 0 to 1.
     Share(f64),

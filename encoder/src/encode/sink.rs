@@ -7,7 +7,6 @@ use super::error::EncodeError;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
 
-/// The record of a finished view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ViewRecord {
     /// Width at which its weights were rasterised.

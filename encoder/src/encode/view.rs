@@ -128,8 +128,6 @@ struct Partition {
     regions: RegionMap,
     masks_of_region: Vec<Vec<u32>>,
     outlines: Vec<MaskOutline>,
-    /// Pixels of the base width in one of the raster, so that a finer view does not count more.
-    weight_scale: f32,
 }
 
 struct Embedded {
@@ -290,7 +288,7 @@ impl<'a> ViewStages<'a> {
     fn add_depth(&self, view: &View, photo: Photo) -> Result<Photo, EncodeError> {
         let loaded = photo.loaded;
         let width = self.tools.settings.raster_width;
-        let raster_view = raster_view(&loaded, width.base_px(loaded.view.intrinsics.width_px));
+        let raster_view = raster_view(&loaded, width.px(loaded.view.intrinsics.width_px));
         // A GPU waits for colours that these threads compute, rather than they for it.
         let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
         let drawing = self
@@ -363,8 +361,8 @@ impl<'a> ViewStages<'a> {
 
     /// Makes the regions of a view's masks.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
-        let (width, photo_px) = (self.tools.settings.raster_width, loaded.view.intrinsics.width_px);
-        let raster_view = raster_view(loaded, width.px(photo_px));
+        let width = self.tools.settings.raster_width;
+        let raster_view = raster_view(loaded, width.px(loaded.view.intrinsics.width_px));
         let raster_px = [raster_view.intrinsics.width_px, raster_view.intrinsics.height_px];
         let (image, valid) = (&loaded.image, loaded.valid.as_deref());
         let (width_px, height_px) = image.dimensions();
@@ -373,9 +371,8 @@ impl<'a> ViewStages<'a> {
         if self.tools.settings.merges_slivers {
             absorb_slivers(&mut regions, &mut masks_of_region);
         }
-        let weight_scale = (f64::from(width.base_px(photo_px)) / f64::from(raster_px[0])).powi(2) as f32;
         let outlines = masks.iter().map(|mask| MaskOutline::of(mask, width_px, height_px, valid)).collect();
-        Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
+        Partition { raster_view, regions, masks_of_region, outlines }
     }
 
     /// Makes a vector per mask, or per patch that is a region.
@@ -427,14 +424,13 @@ impl<'a> ViewStages<'a> {
 
     /// Rasterises what each Gaussian contributes to each region.
     fn lift(&self, view: &View, Embedded { vectors, partition }: Embedded) -> Result<Lifted, EncodeError> {
-        let Partition { raster_view, regions, masks_of_region, outlines, weight_scale } = partition;
+        let Partition { raster_view, regions, masks_of_region, outlines } = partition;
         let ViewTools { engines, settings, scene, split, .. } = self.tools;
-        let mut weights = scene
+        let weights = scene
             .weights(&raster_view, &regions, settings.weights)
             .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
         let n_unrepresentable = weights.counters.unusable.saturating_sub(split.n_rejected);
         self.n_unrepresentable.fetch_max(n_unrepresentable, Ordering::Relaxed);
-        weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
         let dim = engines.models.dim();
         let contributions = ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, split);
         Ok(Lifted { contributions, outlines, raster_width_px: raster_view.intrinsics.width_px })

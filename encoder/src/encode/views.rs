@@ -5,13 +5,13 @@ use std::time::Instant;
 
 use slag_common::View;
 
-use super::context::{Phase, RunContext};
+use super::context::RunContext;
 use super::coverage::CoverageReport;
 use super::error::EncodeError;
 use super::executor::{Executor, ViewsRun};
 use super::inputs::Inputs;
 use super::plan::Plan;
-use super::report::{SkippedView, StageReport};
+use super::report::{Phase, SkippedView, StageReport};
 use super::sink::ViewRecord;
 use crate::occupancy::{self, SceneOccupancy};
 

@@ -77,7 +77,6 @@ pub(super) fn upload(
     })
 }
 
-/// Returns models and segmenter in words.
 pub(super) fn engines_text(models: impl ToString, segmenter: &str) -> String {
     let segmenter: String = segmenter.chars().take(120).collect();
     format!("{} and {segmenter}", models.to_string())

@@ -9,7 +9,6 @@ use serde::de::Error;
 use serde_json::Value;
 use slag_common::frames::{GeoReference, Geographic};
 
-/// Reason why a geo-reference cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum GeoError {
     #[error("{0}; check that the file exists and may be read")]

@@ -68,7 +68,6 @@ impl RotatedPhotos {
     }
 }
 
-/// Reason why a photo cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum IngestError {
     #[error("{0}; check that the file exists and may be read")]

@@ -116,11 +116,7 @@ pub enum ContributionError {
     #[error(transparent)]
     Io(#[from] std::io::Error),
     #[error("{}: {source}", path.display())]
-    Damaged {
-        path: PathBuf,
-        /// The damage.
-        source: ContainerError,
-    },
+    Damaged { path: PathBuf, source: ContainerError },
     #[error("interrupted")]
     Cancelled,
     #[error(
@@ -128,11 +124,7 @@ pub enum ContributionError {
     )]
     TooManyInAll { what: &'static str },
     #[error("{}: {found} regions, the limit is {MAX_REGIONS}; give fewer masks or a lower --raster-width", path.display())]
-    TooManyRegions {
-        path: PathBuf,
-        /// Regions of the view.
-        found: usize,
-    },
+    TooManyRegions { path: PathBuf, found: usize },
 }
 
 /// Returns the CRC-32 of some entries: at a gigabyte per scene a cryptographic hash would be the slowest step of
@@ -307,7 +299,6 @@ impl ContributionFile {
         self.n_entries
     }
 
-    /// Returns the range of a run's entries.
     pub fn entries_of_run(&self, run: usize) -> Range<u64> {
         self.runs[run].start..self.runs.get(run + 1).map_or(self.n_entries, |next| next.start)
     }

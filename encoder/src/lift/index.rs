@@ -177,18 +177,6 @@ impl ContributionIndex {
         self.parts.iter().map(of_part).sum()
     }
 
-    /// Returns the bytes that a pass is expected to take of a budget: those that are kept for the next one, and
-    /// those of the parts that all threads work on at a time.
-    pub(crate) fn expected_bytes(&self, budget_bytes: u64, n_threads: u64) -> (u64, u64) {
-        let all_bytes = self.kept_bytes();
-        let n_at_once = self.n_entries().min(n_threads * GROUP_ENTRIES);
-        let group_bytes = (all_bytes as f64 * n_at_once as f64 / self.n_entries().max(1) as f64) as u64;
-        match 2 * all_bytes <= budget_bytes {
-            true => (all_bytes, group_bytes),
-            false => (0, group_bytes.min(budget_bytes)),
-        }
-    }
-
     /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part. `n_largest`: how
     /// many of the largest parts a group may hold where the budget allows more.
     pub fn groups(&self, budget_bytes: u64, n_largest: u64) -> Vec<Range<usize>> {

@@ -58,15 +58,7 @@ pub enum ReadFieldError {
     #[error(transparent)]
     Store(#[from] StoreError),
     #[error("the store has no {name}: another version published it; encode again")]
-    Absent {
-        /// The part.
-        name: String,
-    },
+    Absent { name: String },
     #[error("{name}: {source}")]
-    Damaged {
-        /// The part.
-        name: String,
-        /// The damage.
-        source: ContainerError,
-    },
+    Damaged { name: String, source: ContainerError },
 }

@@ -60,7 +60,6 @@ impl RegionTable {
         self.dim
     }
 
-    /// Returns the number of regions.
     pub fn len(&self) -> usize {
         self.starts.len() - 1
     }

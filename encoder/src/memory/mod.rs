@@ -4,18 +4,16 @@
 //! names the purpose and states the bytes. The encoder calls them before the first view, and again once the views
 //! are done for what depends on masks and contributions.
 //!
-//! A reservation is a bound. Beside it stands what is expected, from which the peak of the whole process is
-//! planned.
+//! A reservation is a bound.
 
 mod process;
 
 use std::fmt;
 
-pub use process::{give_back, held_bytes, peak_bytes};
+pub use process::{give_back, peak_bytes};
 
 /// The steps that hold memory one after the other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Phase {
     /// From the first view to the end.
     Always,
@@ -39,17 +37,6 @@ pub struct Reservation {
     pub purpose: &'static str,
     pub len_bytes: u64,
     phase: Phase,
-    /// Bytes that are expected beyond what the process holds when its peak is planned.
-    expected_bytes: u64,
-}
-
-/// The most memory that a run is expected to take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct PlannedPeak {
-    /// Bytes of the whole process.
-    pub len_bytes: u64,
-    /// The step that needs them.
-    pub phase: Phase,
 }
 
 /// The budget is too small.
@@ -100,39 +87,12 @@ pub struct MemoryPlan {
 }
 
 impl MemoryPlan {
-    /// Makes an empty plan.
     pub fn new(available_bytes: u64) -> Self {
         Self { available_bytes, is_before_views: true, reservations: Vec::new() }
     }
 
-    /// Sets memory aside, all of which is expected to be needed.
     pub fn reserve(&mut self, phase: Phase, purpose: &'static str, len_bytes: u64) {
-        self.reserve_expecting(phase, purpose, len_bytes, len_bytes);
-    }
-
-    /// Sets memory aside that the process holds already when its peak is planned.
-    pub(crate) fn reserve_held(&mut self, phase: Phase, purpose: &'static str, len_bytes: u64) {
-        self.reserve_expecting(phase, purpose, len_bytes, 0);
-    }
-
-    /// Sets memory aside, of which a part is expected to be needed; more where nothing bounds it.
-    pub(crate) fn reserve_expecting(
-        &mut self,
-        phase: Phase,
-        purpose: &'static str,
-        len_bytes: u64,
-        expected_bytes: u64,
-    ) {
-        self.reservations.push(Reservation { purpose, len_bytes, phase, expected_bytes });
-    }
-
-    /// Returns the peak of a process that holds `held_bytes` now.
-    pub(crate) fn planned_peak(&self, held_bytes: u64) -> PlannedPeak {
-        let of_phase = |phase: Phase| {
-            self.of_phase(phase).fold(held_bytes, |sum, r| sum.saturating_add(r.expected_bytes))
-        };
-        let phase = PHASES.into_iter().max_by_key(|phase| of_phase(*phase)).unwrap_or(Phase::Always);
-        PlannedPeak { len_bytes: of_phase(phase), phase }
+        self.reservations.push(Reservation { purpose, len_bytes, phase });
     }
 
     /// Marks the views as done: later reservations depend on their results.
@@ -171,7 +131,6 @@ impl MemoryPlan {
             purpose: "contributions of a part of a cell",
             len_bytes: contributions_bytes,
             phase: Phase::Always,
-            expected_bytes: 0,
         };
         let mut parts: Vec<Reservation> =
             self.of_phase(most).chain([contributions]).filter(|r| r.len_bytes > 0).collect();
@@ -205,18 +164,6 @@ mod tests {
             [40, 50, 30]
         );
         assert_eq!(plan(69).rest_of(Phase::Cells), 0);
-    }
-
-    /// By hand: what is held counts once, a bound with what is expected of it, and the largest phase decides.
-    #[test]
-    fn the_peak_is_planned_from_what_is_expected() {
-        let mut plan = plan(100);
-        assert_eq!(plan.planned_peak(1000), PlannedPeak { len_bytes: 1070, phase: Phase::Cells });
-        plan.reserve_held(Phase::Always, "the scene", 30);
-        plan.reserve_expecting(Phase::Views, "rasters", 0, 15);
-        plan.reserve_expecting(Phase::Cells, "a bound", 40, 1);
-        assert_eq!(plan.planned_peak(1000), PlannedPeak { len_bytes: 1075, phase: Phase::Views });
-        assert_eq!(plan.rest(0).expect_err("bounds count, too").needed_bytes, 20 + 50 + 30 + 40);
     }
 
     /// Photos are gone once the views are done; until then fewer threads hold fewer of them.

@@ -1,10 +1,5 @@
 //! The memory that this process really has, as Linux counts it.
 
-/// Returns the bytes that the process holds now; `None` on other systems than Linux.
-pub fn held_bytes() -> Option<u64> {
-    status_bytes("VmRSS:")
-}
-
 /// Returns the most bytes that the process has held so far; `None` on other systems than Linux.
 pub fn peak_bytes() -> Option<u64> {
     status_bytes("VmHWM:")
@@ -49,9 +44,9 @@ mod tests {
             })
             .join()
             .expect("no panic");
-            let before = held_bytes().expect("Linux");
+            let before = status_bytes("VmRSS:").expect("Linux");
             give_back();
-            let after = held_bytes().expect("Linux");
+            let after = status_bytes("VmRSS:").expect("Linux");
             for (i, piece) in kept.iter().enumerate() {
                 assert!(piece.iter().all(|x| *x == (64 * i % 251) as u8), "piece {i}");
             }

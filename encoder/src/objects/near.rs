@@ -11,8 +11,6 @@ use crate::memory::{MemoryPlan, Phase};
 const MAX_SAMPLES: usize = 4;
 /// Gaussians for each sample, where superpoints are so small that there would be more samples.
 const GAUSSIANS_PER_SAMPLE: usize = 8;
-/// The same in labelled scenes.
-const EXPECTED_PER_SAMPLE: usize = 25;
 /// Samples that are near a sample: with those of its own superpoint, those of a dozen.
 const N_NEIGHBOURS: usize = 48;
 
@@ -22,9 +20,8 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
         + size_of::<[f64; 3]>()
         + nearest::working_bytes_per_point(N_NEIGHBOURS)
         + N_NEIGHBOURS / 2 * size_of::<(u32, u32)>();
-    let bytes = |of_sample: usize| (n_gaussians / of_sample * per_sample) as u64;
-    let (len_bytes, expected_bytes) = (bytes(GAUSSIANS_PER_SAMPLE), bytes(EXPECTED_PER_SAMPLE));
-    memory.reserve_expecting(Phase::Objects, "superpoints near each other", len_bytes, expected_bytes);
+    let len_bytes = (n_gaussians / GAUSSIANS_PER_SAMPLE * per_sample) as u64;
+    memory.reserve(Phase::Objects, "superpoints near each other", len_bytes);
 }
 
 /// Returns the pairs of superpoints that lie near each other: a sampled Gaussian of one is among the nearest

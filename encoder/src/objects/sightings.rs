@@ -11,10 +11,9 @@ use crate::memory::{MemoryPlan, Phase};
 const MIN_WEIGHT_SHARE: f32 = 0.1;
 /// Gaussians that a thread goes through at once.
 const GAUSSIANS_PER_TASK: usize = 1 << 12;
-/// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, and of labelled
-/// scenes a fifteenth.
+/// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, 15 in labelled
+/// scenes.
 const ENTRIES_PER_REGION: u64 = 8;
-const EXPECTED_ENTRIES_PER_REGION: u64 = 15;
 
 /// What a view shows of a superpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -57,14 +56,8 @@ struct Entry {
 
 /// Reserves what views show of superpoints, among `n_entries` contributions.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_entries: u64) {
-    let bytes =
-        |per_region: u64| n_entries / per_region * (size_of::<Entry>() + size_of::<MaskSighting>()) as u64;
-    memory.reserve_expecting(
-        Phase::Objects,
-        "masks of superpoints",
-        bytes(ENTRIES_PER_REGION),
-        bytes(EXPECTED_ENTRIES_PER_REGION),
-    );
+    let bytes_per_region = (size_of::<Entry>() + size_of::<MaskSighting>()) as u64;
+    memory.reserve(Phase::Objects, "masks of superpoints", n_entries / ENTRIES_PER_REGION * bytes_per_region);
 }
 
 impl Sightings {

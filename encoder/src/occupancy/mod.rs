@@ -34,7 +34,6 @@ pub struct OccupancySettings {
 
 pub struct SceneOccupancy {
     pub cells: Vec<BuiltOccupancy>,
-    /// What was found.
     pub report: OccupancyReport,
 }
 

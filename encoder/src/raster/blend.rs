@@ -28,7 +28,6 @@ pub const EXP_OF_MINUS_C: [f32; 8] = [
     0.000_095_198_29,
 ];
 
-/// One value for each pixel of a tile.
 pub type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
 
 /// Position of a tile, and its pixels inside the image.

@@ -1,7 +1,5 @@
 //! The reference backend, on the CPU.
 
-use std::time::Instant;
-
 use slag_common::Gaussians;
 use slag_math::simd::InstructionSet;
 
@@ -14,7 +12,7 @@ use super::rasterizer::{LoadedScene, Rasterizer};
 use super::sh;
 use super::validate::{check_regions, check_scene, check_view};
 use super::view::RasterView;
-use super::weights::{StageTime, ViewCounters, ViewWeights, WeightKind};
+use super::weights::{ViewCounters, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
 /// The reference backend. It runs on the current rayon pool, with the widest instruction set available.
@@ -27,22 +25,8 @@ impl Rasterizer for CpuRasterizer {
     }
 
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
-        CpuWith(InstructionSet::widest()).load(scene)
-    }
-}
-
-/// The reference backend with a chosen instruction set; results have the same bits for all of them.
-#[derive(Clone, Copy, Debug)]
-pub struct CpuWith(pub InstructionSet);
-
-impl Rasterizer for CpuWith {
-    fn identity(&self) -> String {
-        CpuRasterizer.identity()
-    }
-
-    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         check_scene(scene)?;
-        Ok(Box::new(CpuScene { prepared: Prepared::new(scene), instructions: self.0 }))
+        Ok(Box::new(CpuScene { prepared: Prepared::new(scene), instructions: InstructionSet::widest() }))
     }
 }
 
@@ -53,24 +37,20 @@ struct CpuScene<'s> {
 }
 
 impl LoadedScene for CpuScene<'_> {
-    fn weights_and_times(
+    fn weights(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-        _: bool,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
+    ) -> Result<ViewWeights, RasterError> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
-        let mut times = Vec::new();
-        let projection = timed("project", &mut times, || self.prepared.project(view));
+        let projection = self.prepared.project(view);
         let visible = &projection.visible;
-        let tiles = timed("bin", &mut times, || bin(visible, &view.intrinsics));
-        let by_tile = timed("blend", &mut times, || {
-            tile_contributions(visible, &tiles, regions, kind, self.instructions)
-        });
-        let entries = timed("merge", &mut times, || merge(visible, &by_tile));
-        Ok((ViewWeights { entries, counters: counters(&projection, &tiles) }, times))
+        let tiles = bin(visible, &view.intrinsics);
+        let by_tile = tile_contributions(visible, &tiles, regions, kind, self.instructions);
+        let entries = merge(visible, &by_tile);
+        Ok(ViewWeights { entries, counters: counters(&projection, &tiles) })
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
@@ -83,14 +63,6 @@ impl LoadedScene for CpuScene<'_> {
         drawing.counters = counters(&projection, &tiles);
         Ok(drawing)
     }
-}
-
-/// Runs a stage and records its duration.
-fn timed<T>(stage: &'static str, times: &mut Vec<StageTime>, work: impl FnOnce() -> T) -> T {
-    let start = Instant::now();
-    let result = work();
-    times.push(StageTime { stage, ms: start.elapsed().as_secs_f64() * 1e3 });
-    result
 }
 
 fn counters(projection: &Projection, tiles: &Tiles) -> ViewCounters {

@@ -13,7 +13,7 @@ use super::error::RasterError;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
 use super::rasterizer::{GpuSlots, LoadedScene, Rasterizer};
 use super::view::RasterView;
-use super::weights::{StageTime, ViewWeights, WeightKind};
+use super::weights::{ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
 /// The choice of the user.
@@ -66,7 +66,6 @@ impl fmt::Display for DeviceChoice {
     }
 }
 
-/// Reason why no device can be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
     #[error(
@@ -75,11 +74,7 @@ pub enum DeviceError {
     )]
     NoAdapter,
     #[error("adapter {number} does not exist; `slag-encoder devices` lists the {n_adapters} adapters")]
-    NoSuchAdapter {
-        /// The chosen number.
-        number: usize,
-        n_adapters: usize,
-    },
+    NoSuchAdapter { number: usize, n_adapters: usize },
     #[error(transparent)]
     Unfit(#[from] RasterError),
 }
@@ -161,7 +156,6 @@ impl Devices {
         &self.gpus
     }
 
-    /// Returns the names of the devices.
     pub fn names(&self) -> Vec<String> {
         match self.gpus.is_empty() {
             true => vec!["CPU".into()],
@@ -287,14 +281,13 @@ impl Drop for Slot<'_, '_> {
 }
 
 impl LoadedScene for SharedScene<'_> {
-    fn weights_and_times(
+    fn weights(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-        is_timed: bool,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
-        self.run(|scene| scene.weights_and_times(view, regions, kind, is_timed))
+    ) -> Result<ViewWeights, RasterError> {
+        self.run(|scene| scene.weights(view, regions, kind))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

@@ -35,10 +35,10 @@ mod validate;
 mod view;
 mod weights;
 
-pub use cpu::{CpuRasterizer, CpuWith};
+pub use cpu::CpuRasterizer;
 pub use draw::Drawing;
 pub use error::RasterError;
 pub(crate) use project::Prepared as PreparedScene;
 pub use rasterizer::{GpuSlots, LoadedScene, Rasterizer};
 pub use view::RasterView;
-pub use weights::{RegionWeight, StageTime, ViewCounters, ViewWeights, WeightKind};
+pub use weights::{RegionWeight, ViewCounters, ViewWeights, WeightKind};

@@ -99,11 +99,7 @@ struct Size {
 impl<'s> Prepared<'s> {
     /// Reserves the sizes of a scene's Gaussians.
     pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
-        memory.reserve_held(
-            Phase::Views,
-            "the size of each Gaussian",
-            (n_gaussians * size_of::<Size>()) as u64,
-        );
+        memory.reserve(Phase::Views, "the size of each Gaussian", (n_gaussians * size_of::<Size>()) as u64);
     }
 
     /// Prepares a scene with columns of matching lengths.

@@ -5,7 +5,7 @@ use slag_common::Gaussians;
 use super::draw::Drawing;
 use super::error::RasterError;
 use super::view::RasterView;
-use super::weights::{StageTime, ViewWeights, WeightKind};
+use super::weights::{ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
 /// The GPUs that rasterise a scene.
@@ -70,29 +70,7 @@ pub trait LoadedScene: Send + Sync {
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
-        Ok(self.weights_and_times(view, regions, kind, false)?.0)
-    }
-
-    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure
-    /// them. Measuring may slow the view down.
-    fn weights_timed(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
-        self.weights_and_times(view, regions, kind, true)
-    }
-
-    /// Returns what [`Self::weights_timed`] returns; where no times are wanted, there may be none.
-    fn weights_and_times(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-        is_timed: bool,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError>;
+    ) -> Result<ViewWeights, RasterError>;
 
     /// Draws the scene over a background colour, in the colour space of its training.
     ///

@@ -41,12 +41,3 @@ pub struct ViewWeights {
     /// Statistics of the view.
     pub counters: ViewCounters,
 }
-
-/// Duration of one stage of a view.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct StageTime {
-    /// Name of the stage.
-    pub stage: &'static str,
-    /// Wall time, milliseconds.
-    pub ms: f64,
-}

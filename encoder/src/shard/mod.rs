@@ -79,25 +79,13 @@ pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
 
 /// Returns the bytes that building the shards of a scene's largest cell takes.
 pub fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
-    largest_cells_bytes(split, dim, 1)
-}
-
-/// Returns the bytes that building the shards of a scene's `n` largest cells takes at the same time.
-pub fn largest_cells_bytes(split: &CellSplit, dim: usize, n: usize) -> u64 {
-    let mut sizes: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
-    sizes.sort_unstable_by_key(|n_gaussians| std::cmp::Reverse(*n_gaussians));
-    sizes.iter().take(n).map(|n_gaussians| working_bytes(*n_gaussians, dim)).sum()
+    let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max();
+    largest.map_or(0, |n_gaussians| working_bytes(n_gaussians, dim))
 }
 
 /// Reserves the bytes of the largest cell.
 pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
-    memory.reserve_expecting(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim), 0);
-}
-
-/// Returns the bytes that cells of at most `len_bytes` are expected to take, as measured: the precision of the
-/// default needs half of the coordinates, and without the exact profile there are no embeddings in f16.
-pub fn expected_bytes(len_bytes: u64) -> u64 {
-    len_bytes / 20 * 9
+    memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
 
 /// What a cell's shards carry besides Gaussians and their embeddings.

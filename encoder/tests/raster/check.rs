@@ -11,8 +11,7 @@ use slag_encoder::check::{
 use slag_encoder::ingest::IngestError;
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::{
-    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, StageTime, ViewWeights,
-    WeightKind,
+    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, WeightKind,
 };
 
 use super::fixtures::{needs_shared, shared};
@@ -321,14 +320,13 @@ struct Counting {
 struct CountingScene<'s>(Box<dyn LoadedScene + 's>, &'s AtomicUsize);
 
 impl LoadedScene for CountingScene<'_> {
-    fn weights_and_times(
+    fn weights(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-        is_timed: bool,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
-        self.0.weights_and_times(view, regions, kind, is_timed)
+    ) -> Result<ViewWeights, RasterError> {
+        self.0.weights(view, regions, kind)
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

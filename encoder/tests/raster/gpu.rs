@@ -107,9 +107,9 @@ fn the_same_bits_each_time_from_every_thread() {
     });
 }
 
-/// Buffers that earlier views left behind, with fewer and with more regions, and timestamps change no bit.
+/// Buffers that earlier views left behind, with fewer and with more regions, change no bit.
 #[test]
-fn neither_earlier_views_nor_timing_change_a_bit() {
+fn earlier_views_change_no_bit() {
     let Some(gpu) = open(GpuOptions { views_in_flight: 1, ..GpuOptions::default() }) else { return };
     let random = &mut Random::new(24);
     let view = random_view(random, 61, 53);
@@ -118,11 +118,7 @@ fn neither_earlier_views_nor_timing_change_a_bit() {
     for n_regions in [3, 1, 600, 40] {
         let regions = random_regions(random, &view, n_regions);
         let expected = gpu.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
-        let (timed, stages) = loaded.weights_timed(&view, &regions, WeightKind::Blend).unwrap();
-        assert!(timed == expected, "{n_regions} regions");
         assert!(weights(loaded.as_ref(), &view, &regions) == expected, "{n_regions} regions");
-        let ends = stages.first().zip(stages.last()).map(|(first, last)| (first.stage, last.stage));
-        assert_eq!(ends, Some(("submit", "read")));
     }
     // More regions than a device can number.
     let mut many = random_regions(random, &view, 3);

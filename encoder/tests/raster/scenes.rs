@@ -6,7 +6,6 @@ use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::RasterView;
 use slag_math::random::Random;
 
-/// Random numbers for scenes.
 pub trait SceneRandom {
     /// Returns a number whose logarithm is evenly spread.
     fn log_between(&mut self, low: f64, high: f64) -> f64;

@@ -29,7 +29,6 @@ const LIKENESS: f64 = 0.3;
 /// Gaussians that a dump decodes at a time.
 const CHUNK: usize = 4096;
 
-/// `bench query`.
 #[derive(Debug, Args)]
 pub(crate) struct QueryArgs {
     /// The robot's cache.
@@ -73,7 +72,6 @@ pub(crate) struct QueryReport {
     searches: Vec<Timing>,
 }
 
-/// Times for one number of results.
 #[derive(Debug, Serialize)]
 struct Timing {
     limit: usize,
@@ -259,7 +257,6 @@ fn dump_ids(
     Ok(())
 }
 
-/// `bench text`.
 #[derive(Debug, Args)]
 pub(crate) struct TextArgs {
     #[command(flatten)]

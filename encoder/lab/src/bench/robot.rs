@@ -26,7 +26,6 @@ use crate::harness::{Machine, load_1min};
 use crate::programs::{fetch_all, json_of, remove, sibling};
 use crate::table::Table;
 
-/// `bench robot`.
 #[derive(Debug, Args)]
 pub(crate) struct RobotArgs {
     /// Folder for robot.json, robot.md and the figures; what was measured there before is not measured again.

@@ -1,32 +1,20 @@
 //! `eval` and `bench`.
 
-use std::fmt::Display;
-use std::path::{Path, PathBuf};
-
 use anyhow::Result;
-use clap::{Args, Subcommand};
+use clap::Subcommand;
 use serde::Serialize;
 use slag_encoder::cli::Exit;
 use slag_encoder::cli::common::{print, text_encoder_of};
-use slag_encoder::html::Page;
 use slag_encoder::progress::Progress;
 use slag_encoder::store::StoreReader;
+use std::fmt::Display;
 
 use crate::bench::{load, query, raster, robot, tradeoff};
 use crate::eval::{defaults, encoder, goal, judge, lerf, masks, relations, run, scannet};
 
 /// `eval`.
-#[derive(Debug, Args)]
-pub(crate) struct EvalArgs {
-    /// Writes the result as one HTML file, too.
-    #[arg(long, global = true, value_name = "FILE")]
-    html: Option<PathBuf>,
-    #[command(subcommand)]
-    command: EvalCommand,
-}
-
 #[derive(Debug, Subcommand)]
-enum EvalCommand {
+pub(crate) enum EvalCommand {
     /// Evaluates a store of a scene with a label for every Gaussian, such as those of `generate scene`.
     Labelled(judge::LabelledArgs),
     /// Compares the plain average with the default on labelled scenes, with true and automatic masks.
@@ -47,50 +35,34 @@ enum EvalCommand {
     Relations(relations::RelationsArgs),
 }
 
-pub(super) fn eval(args: &EvalArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let output = Output { json, html: args.html.as_deref() };
-    match &args.command {
+pub(super) fn eval(command: &EvalCommand, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    match command {
         EvalCommand::Labelled(args) => {
             let reader = StoreReader::open(&args.store)?;
             let mut encoder = text_encoder_of(&reader, &args.models)?;
             let truth = run::truth_of(&reader, &args.truth)?;
-            output.print(&judge::judge(&reader, &truth, &mut *encoder, &args.judge)?)
+            show(json, &judge::judge(&reader, &truth, &mut *encoder, &args.judge)?, true)
         }
-        EvalCommand::Defaults(args) => output.print(&defaults::run(args, progress)?),
-        EvalCommand::Masks(args) => output.print(&masks::run(args, progress)?),
+        EvalCommand::Defaults(args) => show(json, &defaults::run(args, progress)?, true),
+        EvalCommand::Masks(args) => show(json, &masks::run(args, progress)?, true),
         EvalCommand::Lerf(args) => {
             let report = lerf::run(args)?;
-            output.print(&report)?;
-            Ok(if report.is_complete() { Exit::Done } else { Exit::Partly })
+            show(json, &report, report.is_complete())
         }
         EvalCommand::Scannet(args) => {
             let report = scannet::run(args)?;
-            output.print(&report)?;
-            Ok(if report.is_complete() { Exit::Done } else { Exit::Partly })
+            show(json, &report, report.is_complete())
         }
-        EvalCommand::Encoder(args) => output.print(&encoder::run(args, progress)?),
-        EvalCommand::Goal(args) => output.print(&goal::run(args, progress)?),
-        EvalCommand::Relations(args) => output.print(&relations::run(args, progress)?),
+        EvalCommand::Encoder(args) => show(json, &encoder::run(args, progress)?, true),
+        EvalCommand::Goal(args) => show(json, &goal::run(args, progress)?, true),
+        EvalCommand::Relations(args) => show(json, &relations::run(args, progress)?, true),
     }
 }
 
-/// Where a result goes: the terminal, and a page.
-struct Output<'a> {
-    json: bool,
-    html: Option<&'a Path>,
-}
-
-impl Output<'_> {
-    fn print(&self, result: &(impl Serialize + Display)) -> Result<Exit> {
-        if let Some(path) = self.html {
-            let mut page = Page::new("Evaluation");
-            page.plain(&result.to_string());
-            page.value(&serde_json::to_value(result)?);
-            fs_err::write(path, page.finish())?;
-        }
-        print(self.json, result, result)?;
-        Ok(Exit::Done)
-    }
+/// Prints a result; returns whether anything was left out of it.
+fn show(json: bool, result: &(impl Serialize + Display), is_complete: bool) -> Result<Exit> {
+    print(json, result, result)?;
+    Ok(if is_complete { Exit::Done } else { Exit::Partly })
 }
 
 /// `bench`.
@@ -106,30 +78,23 @@ pub(crate) enum BenchCommand {
     Robot(robot::RobotArgs),
     /// Times the weights of a view: each device on generated scenes, or on one of yours.
     Raster(raster::RasterArgs),
-    /// Measures cost and accuracy of settings of `encode` on labelled scenes: table, Pareto front and plots.
+    /// Measures cost and accuracy of settings of `encode` on labelled scenes: table, Pareto front and its plots.
     Tradeoff(tradeoff::TradeoffArgs),
 }
 
 pub(super) fn bench(command: &BenchCommand, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let done_unless = |is_partly| if is_partly { Exit::Partly } else { Exit::Done };
     match command {
         BenchCommand::Query(args) => print_json(&query::run(args)?),
         BenchCommand::Text(args) => print_json(&query::time_texts(args)?),
         BenchCommand::Load(args) => print_json(&load::run(args)?),
         BenchCommand::Robot(args) => {
             let report = robot::run(args, progress)?;
-            print(json, &report, &report)?;
-            Ok(done_unless(!report.not_run.is_empty()))
+            show(json, &report, report.not_run.is_empty())
         }
-        BenchCommand::Raster(args) => {
-            let report = raster::run(args, progress)?;
-            print(json, &report, &report)?;
-            Ok(Exit::Done)
-        }
+        BenchCommand::Raster(args) => show(json, &raster::run(args, progress)?, true),
         BenchCommand::Tradeoff(args) => {
             let report = tradeoff::run(args, progress)?;
-            print(json, &report, &report)?;
-            Ok(done_unless(!report.left_out.is_empty()))
+            show(json, &report, report.left_out.is_empty())
         }
     }
 }

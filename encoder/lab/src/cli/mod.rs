@@ -24,7 +24,8 @@ pub struct Cli {
 enum Command {
     /// Evaluates stores and encoders against labels.
     #[cfg(feature = "measure")]
-    Eval(measure::EvalArgs),
+    #[command(subcommand)]
+    Eval(measure::EvalCommand),
     /// Generates scenes, crops and photos with known contents.
     #[command(subcommand)]
     Generate(generate::GenerateCommand),

@@ -55,7 +55,6 @@ pub struct DemoOptions {
     pub created_unix_secs: u64,
 }
 
-/// A finished demo.
 pub struct Demo {
     pub report: DemoReport,
     edge: PathBuf,

@@ -51,7 +51,6 @@ fn same_noun(a: &TrueObject, b: &TrueObject) -> bool {
     a.category == b.category
 }
 
-/// Returns what a thing is used for.
 fn use_of(object: &TrueObject) -> Option<&String> {
     object.kinds.iter().find(|kind| kind.starts_with("something to"))
 }

@@ -2,14 +2,12 @@
 //! 2023).
 //!
 //! ```text
-//! LABELS/frame_00041.json   labelme-like: info {name, width, height}, objects [{category, bbox, segmentation}]
+//! LABELS/frame_00041.json   labelme-like: info {name, width, height}, objects [{category, segmentation}]
 //! ```
 //!
-//! `bbox` holds the corners `x1 y1 x2 y2` and `segmentation` a polygon of pixels, as in LangSplat's
-//! `eval/evaluate_iou_loc.py`; the frames' poses are those of the scene. Gaussians are selected in 3D and rendered
-//! alone, as OpenGaussian (Wu et al. 2024) does: a pixel is selected where their alpha exceeds `MIN_COVERAGE`. A
-//! thing is localised if the rendered scores, averaged over a square of `SMOOTHING_PX`, have their maximum inside
-//! one of its boxes.
+//! `segmentation` is a polygon of pixels, as in LangSplat's `eval/evaluate_iou_loc.py`; the frames' poses are those
+//! of the scene. Gaussians are selected in 3D and rendered alone, as OpenGaussian (Wu et al. 2024) does: a pixel is
+//! selected where their alpha exceeds `MIN_COVERAGE`.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -18,8 +16,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use slag_common::gaussians::SH_C0;
-use slag_common::shard::Profile;
 use slag_common::{Gaussians, View, poses, splat};
 use slag_encoder::cli::common::{ModelArgs, parse_frame, text_encoder_of};
 use slag_encoder::ingest::{self, FrameChoice};
@@ -35,15 +31,12 @@ use crate::table::{Table, figure};
 
 /// Alpha above which a rendered pixel is selected, as in OpenGaussian's `render_lerf_by_text.py`.
 const MIN_COVERAGE: f32 = 0.7;
-/// Side of the square for averaging scores before the maximum is taken, as in LangSplat.
-const SMOOTHING_PX: usize = 30;
 /// Largest relative difference between the aspect ratios of a label and its view.
 const MAX_ASPECT_ERROR: f64 = 0.01;
 
 /// The threshold of the paper's figures.
 const PAPERS_THRESHOLD: f32 = 0.28;
 
-/// `eval lerf`.
 #[derive(Debug, Args)]
 pub(crate) struct LerfArgs {
     /// Store.
@@ -69,9 +62,6 @@ pub(crate) struct LerfArgs {
     /// comparison.
     #[arg(long, value_name = "COSINE,...", value_delimiter = ',', default_values_t = [PAPERS_THRESHOLD])]
     threshold: Vec<f32>,
-    /// Scores this profile's shards, as a robot does [default: the field in full precision].
-    #[arg(long, value_name = "NAME")]
-    profile: Option<Profile>,
 }
 
 pub(crate) fn run(args: &LerfArgs) -> Result<LerfReport> {
@@ -85,7 +75,7 @@ pub(crate) fn run(args: &LerfArgs) -> Result<LerfReport> {
         frame.to_poses(&mut scene);
     }
     let labels = LerfLabels::read(&args.labels, &views.views)?;
-    judge(&reader, &labels, &scene, &mut *encoder, &args.threshold, args.profile)
+    judge(&reader, &labels, &scene, &mut *encoder, &args.threshold)
 }
 
 /// A thing on a frame.
@@ -94,8 +84,6 @@ pub(super) struct LabelledThing {
     pub(super) category: String,
     /// Its pixels, row-major.
     pub(super) mask: Vec<bool>,
-    /// Boxes of its parts: smallest and largest x and y, pixels.
-    pub(super) boxes: Vec<[f64; 4]>,
 }
 
 #[derive(Clone, Debug)]
@@ -131,15 +119,7 @@ struct Info {
 #[derive(Deserialize)]
 struct Object {
     category: String,
-    bbox: Corners,
     segmentation: Polygons,
-}
-
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum Corners {
-    Flat([f64; 4]),
-    Pairs([[f64; 2]; 2]),
 }
 
 #[derive(Deserialize)]
@@ -168,7 +148,7 @@ impl LerfLabels {
         for path in &paths {
             let expected = || {
                 format!(
-                    "{}: expected info {{name, width, height}} and objects [{{category, bbox, segmentation}}]",
+                    "{}: expected info {{name, width, height}} and objects [{{category, segmentation}}]",
                     path.display()
                 )
             };
@@ -208,10 +188,6 @@ impl LabelledFrame {
         let size = [width as usize, height as usize];
         let mut things: BTreeMap<String, LabelledThing> = BTreeMap::new();
         for object in label.objects {
-            let [x1, y1, x2, y2] = match object.bbox {
-                Corners::Flat(corners) => corners,
-                Corners::Pairs([[x1, y1], [x2, y2]]) => [x1, y1, x2, y2],
-            };
             let polygons = match object.segmentation {
                 Polygons::One(polygon) => vec![polygon],
                 Polygons::Many(polygons) => polygons,
@@ -219,9 +195,7 @@ impl LabelledFrame {
             let thing = things.entry(object.category.clone()).or_insert_with(|| LabelledThing {
                 category: object.category,
                 mask: vec![false; size[0] * size[1]],
-                boxes: Vec::new(),
             });
-            thing.boxes.push([x1.min(x2), y1.min(y2), x1.max(x2), y1.max(y2)]);
             polygons.iter().for_each(|polygon| fill(polygon, size, &mut thing.mask));
         }
         let camera_from_world = view.camera_from_world;
@@ -270,8 +244,6 @@ pub(super) struct ThingReport {
     pub(super) category: String,
     /// Intersection over union of the rendered selection and its mask, for each threshold.
     pub(super) ious: Vec<f64>,
-    /// Whether the maximum score lies in one of its boxes.
-    pub(super) localised: bool,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -292,7 +264,6 @@ pub(super) fn judge(
     scene: &Gaussians,
     encoder: &mut dyn TextEncoder,
     thresholds: &[f32],
-    profile: Option<Profile>,
 ) -> Result<LerfReport> {
     check_scene(reader, scene.len())?;
     let mut on_frames: BTreeMap<&str, Vec<(&LabelledFrame, &LabelledThing)>> = BTreeMap::new();
@@ -301,31 +272,25 @@ pub(super) fn judge(
     }
     let (mut things, mut unknown_words) = (Vec::new(), BTreeMap::new());
     for (word, on_frames) in &on_frames {
-        let cosines = match (encoder.encode(word), profile) {
-            (Ok(vector), Some(profile)) => query::scores_of_shards(reader, &vector, profile)?.cosines,
-            (Ok(vector), None) => query::scores(reader, &vector)?.cosines,
-            (Err(error), _) => {
+        let cosines = match encoder.encode(word) {
+            Ok(vector) => query::scores(reader, &vector)?.cosines,
+            Err(error) => {
                 unknown_words.insert((*word).to_owned(), error.to_string());
                 things.extend(on_frames.iter().map(|(frame, _)| ThingReport {
                     frame: frame.name.clone(),
                     category: (*word).to_owned(),
                     ious: vec![0.0; thresholds.len()],
-                    localised: false,
                 }));
                 continue;
             }
         };
-        let scored = scored(scene, &cosines);
-        let scored = CpuRasterizer.load(&scored)?;
         let selected: Vec<Gaussians> = thresholds.iter().map(|t| selected(scene, &cosines, *t)).collect();
         let selected =
             selected.iter().map(|scene| CpuRasterizer.load(scene)).collect::<Result<Vec<_>, _>>()?;
         for (frame, thing) in on_frames {
             let ious =
                 selected.iter().map(|s| selection_iou(s.as_ref(), frame, thing)).collect::<Result<_>>()?;
-            let localised = is_localised(scored.as_ref(), frame, thing)?;
-            let (frame, category) = (frame.name.clone(), thing.category.clone());
-            things.push(ThingReport { frame, category, ious, localised });
+            things.push(ThingReport { frame: frame.name.clone(), category: thing.category.clone(), ious });
         }
     }
     if unknown_words.len() == on_frames.len() {
@@ -365,69 +330,25 @@ fn selected(scene: &Gaussians, scores: &[f32], threshold: f32) -> Gaussians {
     selected
 }
 
-/// Returns the scene with scores as colours.
-fn scored(scene: &Gaussians, scores: &[f32]) -> Gaussians {
-    let mut scored = scene.clone();
-    (scored.sh_degree, scored.sh_rest) = (0, Vec::new());
-    // A Gaussian without a score counts as the opposite of the query. Scores become colours of 0 to 1, so none is
-    // clamped.
-    let colour = |score: f32| (if score.is_nan() { -1.0 } else { score } + 1.0) / 2.0;
-    scored.sh_dc.iter_mut().zip(scores).for_each(|(sh, score)| *sh = [(colour(*score) - 0.5) / SH_C0; 3]);
-    scored
-}
-
 fn selection_iou(selected: &dyn LoadedScene, frame: &LabelledFrame, thing: &LabelledThing) -> Result<f64> {
     let drawing = selected.draw(&frame.view, [0.0; 3])?;
     let found = drawing.coverage.iter().map(|coverage| *coverage > MIN_COVERAGE);
     Ok(iou_of_sets(found.zip(thing.mask.iter().copied())).unwrap_or(0.0))
 }
 
-/// Returns whether the best score, smoothed, lies in one of the thing's boxes.
-fn is_localised(scored: &dyn LoadedScene, frame: &LabelledFrame, thing: &LabelledThing) -> Result<bool> {
-    let drawing = scored.draw(&frame.view, [0.0; 3])?;
-    let (width, height) = (drawing.width_px as usize, drawing.height_px as usize);
-    let values: Vec<f32> = drawing.rgb.chunks_exact(3).map(|rgb| rgb[0]).collect();
-    let smooth = box_mean(&values, width, height, SMOOTHING_PX);
-    let best = (0..smooth.len()).max_by(|a, b| smooth[*a].total_cmp(&smooth[*b]).then(b.cmp(a)));
-    let [x, y] = best.map_or([0.0; 2], |best| [(best % width) as f64, (best / width) as f64]);
-    let is_in = |[x1, y1, x2, y2]: &[f64; 4]| (*x1..=*x2).contains(&x) && (*y1..=*y2).contains(&y);
-    Ok(thing.boxes.iter().any(is_in))
-}
-
-/// Returns the mean over a square around each pixel, clipped to the image, by a summed-area table (Crow 1984).
-fn box_mean(values: &[f32], width: usize, height: usize, side: usize) -> Vec<f64> {
-    let mut sums = vec![0.0f64; (width + 1) * (height + 1)];
-    for y in 0..height {
-        let mut row = 0.0;
-        for x in 0..width {
-            row += f64::from(values[y * width + x]);
-            sums[(y + 1) * (width + 1) + x + 1] = sums[y * (width + 1) + x + 1] + row;
-        }
-    }
-    let range = |at: usize, size: usize| (at.saturating_sub(side / 2), (at + side.div_ceil(2)).min(size));
-    let mean = |x: usize, y: usize| {
-        let ((x1, x2), (y1, y2)) = (range(x, width), range(y, height));
-        let at = |x: usize, y: usize| sums[y * (width + 1) + x];
-        (at(x2, y2) - at(x1, y2) - at(x2, y1) + at(x1, y1)) / ((x2 - x1) * (y2 - y1)) as f64
-    };
-    (0..width * height).map(|pixel| mean(pixel % width, pixel / width)).collect()
-}
-
 impl fmt::Display for LerfReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let names = ["frame", "thing", "localised"].map(str::to_owned);
+        let names = ["frame", "thing"].map(str::to_owned);
         let thresholds = self.thresholds.iter().map(|threshold| format!("IoU at {threshold}"));
         let mut table = Table::new(names.into_iter().chain(thresholds));
         for t in &self.things {
-            let localised = if t.localised { "yes" } else { "no" }.to_owned();
             let ious = t.ious.iter().map(|iou| figure(Some(*iou)));
-            table.row([t.frame.clone(), t.category.clone(), localised].into_iter().chain(ious));
+            table.row([t.frame.clone(), t.category.clone()].into_iter().chain(ious));
         }
         writeln!(f, "{table}")?;
-        let mut table = Table::new(["threshold", "things", "mIoU", "above 0.25", "above 0.5", "localised"]);
-        let localised = mean(self.things.iter().map(|t| Some(f64::from(u8::from(t.localised)))));
+        let mut table = Table::new(["threshold", "things", "mIoU", "above 0.25", "above 0.5"]);
         for (at, threshold) in self.thresholds.iter().enumerate() {
-            let means = self.means(at).into_iter().chain([localised]).map(figure);
+            let means = self.means(at).map(figure);
             table.row([threshold.to_string(), self.things.len().to_string()].into_iter().chain(means));
         }
         write!(f, "{table}")?;
@@ -475,18 +396,5 @@ mod tests {
             }
         }
         fill(&[], size, &mut [false; 24 * 18]);
-    }
-
-    #[test]
-    fn means_are_those_of_the_square() {
-        let (width, height) = (7, 5);
-        let values: Vec<f32> = (0..35).map(|i| (i * i % 11) as f32).collect();
-        let found = box_mean(&values, width, height, 3);
-        for (pixel, found) in found.iter().enumerate() {
-            let (x, y) = ((pixel % width) as i64, (pixel / width) as i64);
-            let near = (0..35i64).filter(|p| (p % 7 - x).abs() <= 1 && (p / 7 - y).abs() <= 1);
-            let near: Vec<f64> = near.map(|p| f64::from(values[p as usize])).collect();
-            assert!((found - near.iter().sum::<f64>() / near.len() as f64).abs() < 1e-9);
-        }
     }
 }

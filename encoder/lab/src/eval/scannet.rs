@@ -14,7 +14,6 @@ use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::poses::PoseSource;
-use slag_common::shard::Profile;
 use slag_common::{Gaussians, splat};
 use slag_encoder::cli::common::{ModelArgs, parse_frame, text_encoder_of};
 use slag_encoder::ingest::{self, FrameChoice};
@@ -78,7 +77,6 @@ const PAPER: [(&str, [[f64; 2]; 3]); 3] = [
     ("SLAG PF (paper)", [[0.3754, 0.4999], [0.3771, 0.5070], [0.4546, 0.6008]]),
 ];
 
-/// `eval scannet`.
 #[derive(Debug, Args)]
 pub(crate) struct ScannetArgs {
     /// Store; once per scan.
@@ -90,9 +88,6 @@ pub(crate) struct ScannetArgs {
     /// Scan: scans/sceneXXXX_YY; may be repeated.
     #[arg(long, value_name = "DIR", required = true)]
     scan: Vec<PathBuf>,
-    /// scannetv2-labels.combined.tsv, for scans without a labelled mesh.
-    #[arg(long, value_name = "FILE")]
-    categories: Option<PathBuf>,
     /// Says how the splat's frame follows from that of the scan, see `slag-encoder encode --help`: auto, none or a
     /// file.
     #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
@@ -114,9 +109,6 @@ pub(super) struct ScannetSettings {
     /// take its most frequent class.
     #[arg(long)]
     pub(super) segments: bool,
-    /// Scores this profile's shards, as a robot does [default: the field in full precision].
-    #[arg(long, value_name = "NAME")]
-    pub(super) profile: Option<Profile>,
 }
 
 /// Figures of a scene.
@@ -132,8 +124,6 @@ pub(crate) struct ScanReport {
     /// Labelled vertices without an answer, because no Gaussian is near or it has no evidence; they count as
     /// wrong.
     pub(super) n_without_answer: usize,
-    /// Labels that the table of categories lacks, with their vertices, which are not counted.
-    unknown_labels: BTreeMap<String, usize>,
     /// Classes with words that the encoder does not know, and why; they count as never found.
     pub(super) unknown_words: BTreeMap<String, String>,
 }
@@ -166,7 +156,7 @@ pub(crate) fn run(args: &ScannetArgs) -> Result<ScannetReport> {
             tracing::info!("{frame}; the splat is brought into the world of the scan");
             frame.to_poses(&mut scene);
         }
-        let scan = Scan::read(scan, args.categories.as_deref())?;
+        let scan = Scan::read(scan)?;
         scenes.push(judge(&reader, &scan, &scene, &mut *encoder, args.judge)?);
     }
     Ok(ScannetReport::new(scenes))
@@ -194,10 +184,9 @@ pub(super) fn judge(
     let answerers = if settings.by_index { by_index(scan, scene)? } else { by_distance(scan, scene) };
     let (mut unknown_words, mut scores) = (BTreeMap::new(), Vec::new());
     for (_, word) in CLASSES {
-        scores.push(match (encoder.encode(word), settings.profile) {
-            (Ok(vector), Some(profile)) => query::scores_of_shards(reader, &vector, profile)?.cosines,
-            (Ok(vector), None) => query::scores(reader, &vector)?.cosines,
-            (Err(error), _) => {
+        scores.push(match encoder.encode(word) {
+            Ok(vector) => query::scores(reader, &vector)?.cosines,
+            Err(error) => {
                 unknown_words.insert(word.to_owned(), error.to_string());
                 Vec::new()
             }
@@ -224,7 +213,6 @@ pub(super) fn judge(
         filtered: segments.as_deref().map(|segments| subsets(Some(segments))),
         n_labelled: judged.len(),
         n_without_answer: judged.iter().filter(|answerer| answers.best(answerer, &all).is_none()).count(),
-        unknown_labels: scan.unknown_labels.clone(),
         unknown_words,
     })
 }
@@ -350,9 +338,9 @@ impl ScannetReport {
         Self { scenes, means, filtered_means, missing_scenes }
     }
 
-    /// Returns whether every word and label of every scene is known.
+    /// Returns whether every word is known for every scene.
     pub(crate) fn is_complete(&self) -> bool {
-        self.scenes.iter().all(|s| s.unknown_words.is_empty() && s.unknown_labels.is_empty())
+        self.scenes.iter().all(|s| s.unknown_words.is_empty())
     }
 }
 
@@ -380,9 +368,6 @@ impl fmt::Display for ScannetReport {
             if scene.n_without_answer > 0 {
                 let (n, of) = (scene.n_without_answer, scene.n_labelled);
                 writeln!(f, "{name}: {n} of {of} labelled vertices have no answer and count as wrong")?;
-            }
-            for (label, n) in &scene.unknown_labels {
-                writeln!(f, "{name}: {n} vertices left out: the table of categories lacks {label:?}")?;
             }
             for (word, reason) in &scene.unknown_words {
                 writeln!(f, "{name}: unknown to the encoder and counted as never found: {word} ({reason})")?;

@@ -12,7 +12,6 @@ use slag_math::random::Xorshift;
 use super::solid::{Part, Shape};
 use slag_encoder::raster::RasterView;
 
-/// Size of the photos.
 pub(super) const PHOTO_PX: [u32; 2] = [640, 480];
 /// Horizontal field of view, 75 degrees: a phone's wide camera.
 pub(super) const FIELD_OF_VIEW_RAD: f64 = 75.0 * std::f64::consts::PI / 180.0;
@@ -32,7 +31,6 @@ const SHELL_M: f64 = 0.04;
 /// A thing in its scene.
 #[derive(Clone, Debug)]
 pub struct Placed {
-    /// Index of its noun.
     pub noun: usize,
     /// Its parts, colours and paint.
     pub object: Object,
@@ -66,7 +64,6 @@ struct Area {
 /// Things, light and areas to walk.
 #[derive(Clone, Debug)]
 pub struct Layout {
-    /// The things.
     pub placed: Vec<Placed>,
     areas: Vec<Area>,
     light: Light,

@@ -26,7 +26,6 @@ pub struct CopiesSettings {
 
 #[derive(Clone, Debug)]
 pub struct WrittenCopies {
-    /// The splat.
     pub scene: PathBuf,
     /// The poses.
     pub views: PathBuf,

@@ -50,7 +50,6 @@ pub enum Split {
 /// Label of a crop.
 #[derive(Clone, Debug, Serialize)]
 pub struct Label {
-    /// Index of its noun.
     pub noun: usize,
     /// Main colour.
     pub colour: Colour,

@@ -37,7 +37,6 @@ use super::solid::{Part, Shape};
 
 static OBJECTS: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/src/generate/objects");
 
-/// Error in the object files.
 #[derive(Debug, thiserror::Error)]
 pub enum GrammarError {
     /// A file or folder cannot be read.
@@ -45,13 +44,7 @@ pub enum GrammarError {
     Io(#[from] std::io::Error),
     /// A line is malformed.
     #[error("{}:{line}: {reason}", path.display())]
-    Line {
-        path: PathBuf,
-        /// The line, from 1.
-        line: usize,
-        /// What was found and what was expected.
-        reason: String,
-    },
+    Line { path: PathBuf, line: usize, reason: String },
 }
 
 /// Kind of a scene.

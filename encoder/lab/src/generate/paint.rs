@@ -15,7 +15,6 @@ macro_rules! named {
         }
 
         impl $name {
-            /// All values.
             pub const ALL: &[Self] = &[$(Self::$variant),+];
 
             pub fn word(self) -> &'static str {
@@ -96,7 +95,6 @@ pub struct Paint {
 }
 
 impl Colour {
-    /// Returns a random shade of this colour.
     pub fn shade(self, random: &mut Xorshift) -> [f64; 3] {
         // Ranges of hue in degrees, saturation and value that clearly belong to the name.
         let [hue, saturation, value] = match self {

@@ -62,10 +62,8 @@ pub struct Solids {
     tint: [f64; 3],
 }
 
-/// A photo and the things on it.
 #[derive(Clone, Debug)]
 pub struct Photo {
-    /// The picture.
     pub image: RgbImage,
     /// Index of the thing at each pixel, row-major; [`NOTHING`] for the sky.
     pub thing_of_pixel: Vec<u16>,

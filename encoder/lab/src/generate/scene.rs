@@ -35,7 +35,6 @@ const FIRST_ID: u16 = 10;
 pub struct Scene {
     /// The Gaussians; metres, z up.
     pub gaussians: Gaussians,
-    /// Id of each Gaussian's thing.
     pub id_of_gaussian: Vec<u16>,
     /// The objects, including floor and walls.
     pub objects: Vec<TrueObject>,
@@ -74,7 +73,6 @@ pub struct TrueObject {
 
 /// Paths of a written scene.
 pub struct WrittenScene {
-    /// The splat.
     pub scene: PathBuf,
     /// The poses.
     pub views: PathBuf,

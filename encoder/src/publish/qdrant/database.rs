@@ -2,7 +2,6 @@
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use qdrant_client::qdrant::{
@@ -25,8 +24,6 @@ pub(super) struct Database<'a> {
     patient_client: Qdrant,
     options: &'a PushOptions,
     n_retries: AtomicU64,
-    /// The last error that was told of: one that repeats is told once.
-    told: Mutex<String>,
 }
 
 impl<'a> Database<'a> {
@@ -46,7 +43,6 @@ impl<'a> Database<'a> {
             patient_client: client(options.snapshot_timeout)?,
             options,
             n_retries: AtomicU64::new(0),
-            told: Mutex::default(),
         })
     }
 
@@ -81,14 +77,7 @@ impl<'a> Database<'a> {
                 }
                 _ => Duration::ZERO,
             };
-            let text = format!("{action}: {}", words(&error));
-            let before = std::mem::replace(
-                &mut *self.told.lock().unwrap_or_else(PoisonError::into_inner),
-                text.clone(),
-            );
-            if before != text {
-                tracing::warn!("{text}; trying again");
-            }
+            tracing::warn!("{action}: {}; trying again", words(&error));
             tokio::time::sleep(pause.max(asked).min(MAX_RETRY_DELAY)).await;
         }
     }

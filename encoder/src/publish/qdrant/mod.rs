@@ -27,7 +27,7 @@ use slag_common::shard::Profile;
 use crate::store::StoreError;
 
 pub(crate) use push::push;
-pub use settings::{IndexSettings, Quantisation, SettingChange};
+pub use settings::{IndexSettings, Quantisation};
 
 /// Which collections a scene is pushed to.
 ///
@@ -110,13 +110,8 @@ pub(crate) struct PushReport {
     pub(crate) n_collections: usize,
     /// How many of them this run created.
     pub(crate) n_created_collections: usize,
-    /// Settings of existing collections that this run changed.
-    pub(crate) changed_settings: Vec<SettingChange>,
     /// Collections of cells that this generation no longer has, deleted.
     pub(crate) deleted_collections: Vec<String>,
-    /// Collections named like those of cells that this generation does not have, left alone: they hold points of
-    /// other scenes, or none at all and no push from this store is known.
-    pub(crate) left_collections: Vec<String>,
     /// Snapshots of the collections, where asked for.
     pub(crate) snapshots: Vec<Snapshot>,
 }

@@ -185,7 +185,12 @@ impl<'a> Push<'a> {
     async fn prepare(&mut self, target: &Target<'a>) -> Result<Record, PushError> {
         let (collection, name) = (&target.collection, &target.collection.name);
         let info = match &target.existing {
-            Some(info) => info.clone(),
+            Some(info) => {
+                if let Some(request) = self.options.index.update(name) {
+                    collection.update(request).await?;
+                }
+                info.clone()
+            }
             None => {
                 // First, so that a push cut off here does not take the new collection for the old one.
                 self.records.remove(name).await?;
@@ -197,17 +202,12 @@ impl<'a> Push<'a> {
         let manifest = Some(self.reader.current().hash);
         let known = self.records.read(name)?.filter(|record| record.manifest == manifest);
         let record = known.unwrap_or_else(|| Record { manifest, ..Record::default() });
-        let config = info.config.unwrap_or_default();
-        if let Some((request, changes)) = self.options.index.update(name, config) {
-            collection.update(request).await?;
-            self.report.changed_settings.extend(changes);
-        }
         collection.ensure_indexes(&info.payload_schema).await?;
         Ok(record)
     }
 
     /// Deletes the collections of cells that the scene no longer has. Those with points of other scenes stay,
-    /// and empty ones that no push from this store made.
+    /// and those that no push from this store made.
     async fn remove_obsolete(&mut self, targets: &[Target<'a>]) -> Result<(), PushError> {
         let mut names = self.database.collection_names().await?;
         names.sort_unstable();
@@ -215,14 +215,10 @@ impl<'a> Push<'a> {
         names.retain(|name| targets.iter().all(|target| target.collection.name != *name));
         for name in names {
             let collection = self.collection(name.clone());
-            let is_ours = collection.count_others().await? == 0
-                && (self.records.read(&name)?.is_some() || collection.count(Filter::default()).await? > 0);
-            if is_ours {
+            if self.records.read(&name)?.is_some() && collection.count_others().await? == 0 {
                 collection.delete().await?;
                 self.records.remove(&name).await?;
                 self.report.deleted_collections.push(name);
-            } else {
-                self.report.left_collections.push(name);
             }
         }
         Ok(())

@@ -3,14 +3,12 @@
 
 use clap::{Args, ValueEnum};
 use qdrant_client::qdrant::{
-    BinaryQuantization, CollectionConfig, CollectionParamsDiff, CompressionRatio, CreateCollection,
-    CreateCollectionBuilder, Disabled, Distance, HnswConfigDiff, ProductQuantization, QuantizationConfig,
-    QuantizationConfigDiff, QuantizationType, ScalarQuantization, UpdateCollection, VectorParams,
-    VectorParamsBuilder, VectorParamsDiff, VectorsConfig, VectorsConfigDiff,
-    quantization_config::Quantization as Stored, quantization_config_diff::Quantization as Diff,
-    vectors_config, vectors_config_diff,
+    BinaryQuantization, CollectionParamsDiff, CompressionRatio, CreateCollection, CreateCollectionBuilder,
+    Disabled, Distance, HnswConfigDiff, ProductQuantization, QuantizationConfig, QuantizationConfigDiff,
+    QuantizationType, ScalarQuantization, UpdateCollection, VectorParams, VectorParamsBuilder,
+    VectorParamsDiff, VectorsConfig, VectorsConfigDiff, quantization_config::Quantization as Stored,
+    quantization_config_diff::Quantization as Diff, vectors_config, vectors_config_diff,
 };
-use serde::Serialize;
 
 /// Settings of collections: new ones are created with them, existing ones are changed to them. What is not given
 /// is not sent: a new collection has the database's defaults, an existing one keeps its own.
@@ -45,15 +43,6 @@ pub enum Quantisation {
     Product,
 }
 
-/// A setting of an existing collection that differed from the one asked for.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct SettingChange {
-    pub(crate) collection: String,
-    pub(crate) setting: &'static str,
-    pub(crate) before: String,
-    pub(crate) after: String,
-}
-
 impl IndexSettings {
     /// Returns the request that creates a collection for vectors of `dim` components.
     pub(super) fn create(&self, name: &str, dim: u64) -> CreateCollection {
@@ -69,58 +58,21 @@ impl IndexSettings {
         request
     }
 
-    /// Returns the request that gives a collection these settings, and what it changes; `None` if it has them.
-    pub(super) fn update(
-        &self,
-        name: &str,
-        config: CollectionConfig,
-    ) -> Option<(UpdateCollection, Vec<SettingChange>)> {
-        let changes = self.changes(name, config);
+    /// Returns the request that gives an existing collection these settings; `None` where none is given.
+    pub(super) fn update(&self, name: &str) -> Option<UpdateCollection> {
         let vectors = VectorParamsDiff { on_disk: Some(true), ..Default::default() };
         let vectors = VectorsConfigDiff { config: Some(vectors_config_diff::Config::Params(vectors)) };
         let params = CollectionParamsDiff { on_disk_payload: Some(true), ..Default::default() };
         let quantisation =
             |wanted: Quantisation| QuantizationConfigDiff { quantization: Some(wanted.diff()) };
-        let request = UpdateCollection {
+        (*self != Self::default()).then(|| UpdateCollection {
             collection_name: name.to_owned(),
             params: self.on_disk.then_some(params),
             hnsw_config: self.hnsw(),
             vectors_config: self.on_disk.then_some(vectors),
             quantization_config: self.quantisation.map(quantisation),
             ..Default::default()
-        };
-        (!changes.is_empty()).then_some((request, changes))
-    }
-
-    fn changes(&self, name: &str, config: CollectionConfig) -> Vec<SettingChange> {
-        let params = config.params.unwrap_or_default();
-        let vectors = vectors_of(params.vectors_config).unwrap_or_default();
-        let graph = config.hnsw_config.unwrap_or_default();
-        let number = |n: Option<u64>| n.map_or_else(|| "the default".to_owned(), |n| n.to_string());
-        let place = |is_on_disk: bool| if is_on_disk { "on disk" } else { "in memory" }.to_owned();
-        let on_disk = || self.on_disk.then(|| place(true));
-        let quantisation = config.quantization_config.and_then(|config| config.quantization);
-        let settings = [
-            ("hnsw-m", self.hnsw_m.map(|m| number(Some(m))), number(graph.m)),
-            (
-                "hnsw-ef-construct",
-                self.hnsw_ef_construct.map(|ef| number(Some(ef))),
-                number(graph.ef_construct),
-            ),
-            (
-                "quantisation",
-                self.quantisation.map(|wanted| describe(wanted.stored())),
-                describe(quantisation),
-            ),
-            ("vectors", on_disk(), place(vectors.on_disk == Some(true))),
-            ("graph", on_disk(), place(graph.on_disk == Some(true))),
-            ("payload", on_disk(), place(params.on_disk_payload)),
-        ];
-        let differing = settings.into_iter().filter_map(|(setting, wanted, before)| {
-            let after = wanted.filter(|wanted| *wanted != before)?;
-            Some(SettingChange { collection: name.to_owned(), setting, before, after })
-        });
-        differing.collect()
+        })
     }
 
     fn hnsw(&self) -> Option<HnswConfigDiff> {
@@ -169,18 +121,4 @@ pub(super) fn vectors_of(config: Option<VectorsConfig>) -> Option<VectorParams> 
         vectors_config::Config::Params(vectors) => Some(vectors),
         vectors_config::Config::ParamsMap(_) => None,
     }
-}
-
-fn describe(quantisation: Option<Stored>) -> String {
-    let (kind, always_ram) = match quantisation {
-        None => return "none".to_owned(),
-        Some(Stored::Scalar(q)) => ("int8", q.always_ram),
-        Some(Stored::Binary(q)) => ("binary", q.always_ram),
-        Some(Stored::Product(q)) if q.compression == i32::from(CompressionRatio::X16) => {
-            ("product", q.always_ram)
-        }
-        Some(Stored::Product(q)) => ("product of another ratio", q.always_ram),
-        Some(Stored::Turboquant(q)) => ("turbo", q.always_ram),
-    };
-    if always_ram == Some(true) { kind.to_owned() } else { format!("{kind}, not kept in memory") }
 }

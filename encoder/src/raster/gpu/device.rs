@@ -81,12 +81,8 @@ impl Adapter {
                 return Err(failed(format!("has {found} {name}, expected at least {needed}")));
             }
         }
-        let has_timestamps = self.adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
         let mut features = wgpu::Features::empty();
-        features.set(wgpu::Features::TIMESTAMP_QUERY, has_timestamps);
-        if precision == Precision::F64 {
-            features |= wgpu::Features::SHADER_F64;
-        }
+        features.set(wgpu::Features::SHADER_F64, precision == Precision::F64);
         let (device, queue) = block_on(self.adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("slag"),
             required_features: features,

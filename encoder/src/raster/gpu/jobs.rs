@@ -57,7 +57,6 @@ pub fn depth_keys() -> (u32, u32) {
     (least, bits_of(most - least + 1))
 }
 
-/// Number of scan records.
 pub const SCAN_JOBS: u64 = 6;
 
 impl Scan {

@@ -16,7 +16,6 @@ mod jobs;
 mod layout;
 mod shader;
 mod stages;
-mod timestamps;
 mod workspace;
 
 use std::ops::Range;
@@ -36,7 +35,7 @@ use super::rasterizer::{LoadedScene, Rasterizer};
 use super::sh;
 use super::validate::{check_regions, check_scene, check_view};
 use super::view::RasterView;
-use super::weights::{RegionWeight, StageTime, ViewCounters, ViewWeights, WeightKind};
+use super::weights::{RegionWeight, ViewCounters, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 use band::{Band, band_size};
 use buffers::{REGION_BYTES, Size};
@@ -411,13 +410,12 @@ const MAX_SIZE_OF_F32_PX: u32 = 1 << 23;
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
 impl LoadedScene for GpuScene<'_> {
-    fn weights_and_times(
+    fn weights(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-        is_timed: bool,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
+    ) -> Result<ViewWeights, RasterError> {
         check_view(view)?;
         self.check_size(view)?;
         check_regions(regions, &view.intrinsics)?;
@@ -428,7 +426,6 @@ impl LoadedScene for GpuScene<'_> {
         if self.chunks.is_empty() {
             return Ok(Default::default());
         }
-        let mut times = is_timed.then(Vec::new);
         let mut entries: Vec<RegionWeight> = Vec::new();
         let mut sums: Vec<RegionSum> = Vec::new();
         let counters = self.each_band(view, REGION_BYTES, |workspace, band, rows| {
@@ -437,14 +434,14 @@ impl LoadedScene for GpuScene<'_> {
                 false => sums.extend(found),
             };
             let regions_and_kind = (&regions.region_of_pixel[rows.px], regions.n_regions, kind);
-            workspace.contributions(band, regions_and_kind, times.as_mut(), &mut take)
+            workspace.contributions(band, regions_and_kind, &mut take)
         })?;
         sums.sort_unstable_by_key(|sum| (sum.gaussian, sum.region));
         entries.extend(
             sums.chunk_by(|a, b| (a.gaussian, a.region) == (b.gaussian, b.region))
                 .map(|same| same[0].weight(same.iter().map(RegionSum::fixed).sum())),
         );
-        Ok((ViewWeights { entries, counters }, times.unwrap_or_default()))
+        Ok(ViewWeights { entries, counters })
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

@@ -12,14 +12,12 @@ use crate::raster::weights::WeightKind;
 
 /// Records the stages of one view in flight.
 pub struct Stages {
-    /// The buffers of all stages.
     pub buffers: Buffers,
     /// Bind groups by kernel and variant.
     groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
 }
 
 impl Stages {
-    /// Creates the stages on buffers.
     pub fn new(buffers: Buffers) -> Self {
         Self { buffers, groups: HashMap::new() }
     }

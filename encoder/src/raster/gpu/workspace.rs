@@ -1,7 +1,5 @@
 //! One view in flight: submits the stages and reads the results back.
 
-use std::time::Instant;
-
 use bytemuck::Zeroable;
 use wgpu::BufferUsages as Usage;
 
@@ -14,15 +12,11 @@ use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
 use super::layout::{Background, Capacities, RegionSum};
 use super::shader::Counter;
 use super::stages::Stages;
-use super::timestamps::{GpuTimestamps, TIMESTAMPS_BYTES};
 use crate::raster::error::RasterError;
-use crate::raster::weights::{StageTime, WeightKind};
+use crate::raster::weights::WeightKind;
 
 /// The values of all counters after a band.
 pub type Counts = [u32; Counter::ALL.len()];
-
-/// Size of the data before the contributions in the staging buffer: counters and timestamps.
-const HEAD_BYTES: u64 = (COUNTERS_BYTES + TIMESTAMPS_BYTES).next_multiple_of(256);
 
 /// Size of a drawn pixel, bytes.
 pub const PIXEL_BYTES: u64 = 20;
@@ -39,7 +33,6 @@ pub struct Workspace {
     staging: wgpu::Buffer,
     /// Contributions that are copied back together with the counters.
     n_copied: u32,
-    timestamps: GpuTimestamps,
     /// Bits of a region in the records of the entries' sort.
     region_bits: u32,
 }
@@ -58,13 +51,12 @@ impl Workspace {
             uploads: device.buffer("uploads", uploads_bytes, Usage::MAP_WRITE | Usage::COPY_SRC)?,
             staging: Self::staging(device, n_copied)?,
             n_copied,
-            timestamps: GpuTimestamps::new(device)?,
             region_bits: u32::MAX,
         })
     }
 
     fn staging(device: &Device, n_copied: u32) -> Option<wgpu::Buffer> {
-        let bytes = HEAD_BYTES + u64::from(n_copied) * size_of::<RegionSum>() as u64;
+        let bytes = COUNTERS_BYTES + u64::from(n_copied) * size_of::<RegionSum>() as u64;
         device.buffer("staging", bytes, Usage::MAP_READ | Usage::COPY_DST)
     }
 
@@ -79,31 +71,24 @@ impl Workspace {
         &mut self,
         band: &Band<'_>,
         (regions, n_regions, kind): (&[u32], u32, WeightKind),
-        mut times: Option<&mut Vec<StageTime>>,
         take: &mut dyn FnMut(&[RegionSum]),
     ) -> Result<Counts, RasterError> {
-        let start = Instant::now();
         let device = band.device;
-        self.timestamps.is_asked = times.is_some();
         self.set_region_bits(device, bits_of(n_regions));
         let mut encoder = self.bin(band, regions)?;
         let [columns, rows] = band.tiles();
-        let mut pass = self.timestamps.pass(&mut encoder, 3, (true, true));
+        let mut pass = encoder.begin_compute_pass(&Default::default());
         self.stages.blend(device, &mut pass, (columns, rows), kind);
         drop(pass);
-        let mut pass = self.timestamps.pass(&mut encoder, 4, (true, true));
+        let mut pass = encoder.begin_compute_pass(&Default::default());
         let bits = bits_of(self.capacities.visible) + self.region_bits;
         let entry_order = self.stages.sort(device, &mut pass, (SortKey::MemberRegion, bits));
         self.stages.compact(device, &mut pass, entry_order);
         drop(pass);
-        self.timestamps.resolve(&mut encoder, &self.staging, COUNTERS_BYTES);
         self.copy_back(&mut encoder);
         let submission = device.queue.submit([encoder.finish()]);
         self.uploads.map_async(wgpu::MapMode::Write, .., |_| {});
-        if let Some(times) = &mut times {
-            times.push(StageTime { stage: "submit", ms: start.elapsed().as_secs_f64() * 1e3 });
-        }
-        let counts = self.read_back(device, submission, times, take)?;
+        let counts = self.read_back(device, submission, take)?;
         let n_contributions = counts[Counter::RegionSums as usize];
         if !self.fits(&counts) || n_contributions <= self.n_copied {
             return Ok(counts);
@@ -115,7 +100,7 @@ impl Workspace {
         let mut encoder = device.device.create_command_encoder(&Default::default());
         self.copy_back(&mut encoder);
         let submission = device.queue.submit([encoder.finish()]);
-        self.read_back(device, submission, None, take)
+        self.read_back(device, submission, take)
     }
 
     /// Writes the records of the entries' sort, unless those there are for as many bits.
@@ -135,7 +120,6 @@ impl Workspace {
         colours: &wgpu::Buffer,
     ) -> Result<(Counts, Vec<f32>), RasterError> {
         let device = band.device;
-        self.timestamps.is_asked = false;
         let mut encoder = self.bin(band, &[])?;
         let [columns, rows] = band.tiles();
         let n_bytes = u64::from(self.n_px) * PIXEL_BYTES;
@@ -208,12 +192,11 @@ impl Workspace {
         encoder.clear_buffer(&self.stages.buffers.counters, 0, None);
         encoder.clear_buffer(&self.stages.buffers.ranges, 0, None);
         for (index, chunk) in chunks.iter().enumerate() {
-            let ends = (index == 0, index + 1 == chunks.len());
             match &chunk.gaussians {
-                Some(gaussians) => self.project(device, &mut encoder, (chunk, gaussians), ends),
+                Some(gaussians) => self.project(device, &mut encoder, chunk, gaussians),
                 None => {
                     let gaussians = upload(index)?;
-                    self.project(device, &mut encoder, (chunk, &gaussians), ends);
+                    self.project(device, &mut encoder, chunk, &gaussians);
                     // Waits before the next upload, so that at most one such chunk is on the device.
                     let next = device.device.create_command_encoder(&Default::default());
                     let full = std::mem::replace(&mut encoder, next);
@@ -223,10 +206,10 @@ impl Workspace {
             }
         }
         let [columns, rows] = band.tiles();
-        let mut pass = self.timestamps.pass(&mut encoder, 1, (true, true));
+        let mut pass = encoder.begin_compute_pass(&Default::default());
         let depth_order = self.stages.sort(device, &mut pass, (SortKey::Depth, depth_keys().1));
         drop(pass);
-        let mut pass = self.timestamps.pass(&mut encoder, 2, (true, true));
+        let mut pass = encoder.begin_compute_pass(&Default::default());
         self.stages.pair(device, &mut pass, depth_order);
         let pair_order = self.stages.sort(device, &mut pass, (SortKey::Tile, bits_of(columns * rows)));
         self.stages.find_ranges(device, &mut pass, pair_order);
@@ -248,7 +231,7 @@ impl Workspace {
             &self.stages.buffers.region_sums,
             0,
             &self.staging,
-            HEAD_BYTES,
+            COUNTERS_BYTES,
             contribution_bytes,
         );
     }
@@ -257,29 +240,17 @@ impl Workspace {
         &self,
         device: &Device,
         submission: wgpu::SubmissionIndex,
-        times: Option<&mut Vec<StageTime>>,
         take: &mut dyn FnMut(&[RegionSum]),
     ) -> Result<Counts, RasterError> {
-        let start = Instant::now();
         self.staging.map_async(wgpu::MapMode::Read, .., |_| {});
         device.wait(submission)?;
-        let waited_ms = start.elapsed().as_secs_f64() * 1e3;
         let bytes = self.staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
         let mut counts: Counts = Zeroable::zeroed();
-        counts.copy_from_slice(
-            &bytemuck::cast_slice::<u8, u32>(&bytes[..COUNTERS_BYTES as usize])[..Counter::ALL.len()],
-        );
+        let (head, rest) = bytes.split_at(COUNTERS_BYTES as usize);
+        counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
         let n_contributions = counts[Counter::RegionSums as usize];
         if self.fits(&counts) && n_contributions <= self.n_copied {
-            let start = Instant::now();
-            take(&bytemuck::cast_slice(&bytes[HEAD_BYTES as usize..])[..n_contributions as usize]);
-            if let Some(times) = times {
-                let stages = self.timestamps.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]);
-                let on_device_ms: f64 = stages.iter().map(|stage| stage.ms).sum();
-                times.extend(stages);
-                times.push(StageTime { stage: "copy", ms: (waited_ms - on_device_ms).max(0.0) });
-                times.push(StageTime { stage: "read", ms: start.elapsed().as_secs_f64() * 1e3 });
-            }
+            take(&bytemuck::cast_slice(rest)[..n_contributions as usize]);
         }
         drop(bytes);
         self.staging.unmap();
@@ -290,10 +261,10 @@ impl Workspace {
         &self,
         device: &Device,
         encoder: &mut wgpu::CommandEncoder,
-        (chunk, gaussians): (&SceneChunk, &wgpu::Buffer),
-        ends: (bool, bool),
+        chunk: &SceneChunk,
+        gaussians: &wgpu::Buffer,
     ) {
-        let mut pass = self.timestamps.pass(encoder, 0, ends);
+        let mut pass = encoder.begin_compute_pass(&Default::default());
         self.stages.project(device, &mut pass, chunk, gaussians);
     }
 }

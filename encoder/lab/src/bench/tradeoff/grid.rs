@@ -9,16 +9,14 @@
 //! }]}
 //! ```
 //!
-//! `axis` names the curve of the plots that a point belongs to. `views` are the flags of `encode` that change the
+//! `axis` names the varied setting. `views` are the flags of `encode` that change the
 //! views' contributions; `lift` are its other flags; `eval` are flags of `eval labelled`. The shards of `profile`
-//! are evaluated, measured and queried. All profiles are made, because the exact shards tell which Gaussian is
+//! are evaluated and measured. All profiles are made, because the exact shards tell which Gaussian is
 //! which.
 //!
 //! `{masks}` stands for the scene's folder of true masks, `{sam}` for the model directory of Segment Anything;
 //! without these a point is not run. Points of a scene with the same `views` share one store, and their
 //! contributions are computed once.
-//!
-//! `ordered` names the axes whose points ascend: plots connect their points, in the grid's order.
 
 use std::path::{Path, PathBuf};
 
@@ -32,9 +30,6 @@ use crate::scenes::SceneFiles;
 #[serde(deny_unknown_fields)]
 pub(super) struct Grid {
     pub(super) points: Vec<Point>,
-    /// Axes whose points ascend.
-    #[serde(default)]
-    pub(super) ordered: Vec<String>,
 }
 
 /// One way of encoding a scene.
@@ -43,7 +38,6 @@ pub(super) struct Grid {
 pub(super) struct Point {
     /// The varied setting.
     pub(super) axis: String,
-    /// Its value.
     pub(super) name: String,
     #[serde(default)]
     pub(super) views: String,
@@ -73,18 +67,14 @@ impl Grid {
 
     pub(super) fn parse(text: &str) -> Result<Self> {
         let grid: Self = serde_json::from_str(text).context(
-            "expected {\"points\": [..]}, each with axis and name, and optionally views, lift, eval, profile; \
-             and \"ordered\": [axis, ..]",
+            "expected {\"points\": [..]}, each with axis and name, and optionally views, lift, eval, profile",
         )?;
         for (number, point) in grid.points.iter().enumerate() {
             if grid.points[..number].iter().any(|p| p.axis == point.axis && p.name == point.name) {
                 bail!("{} / {} occurs twice", point.axis, point.name);
             }
         }
-        match grid.ordered.iter().find(|axis| !grid.points.iter().any(|p| p.axis == **axis)) {
-            Some(axis) => bail!("{axis} is ordered, and no point has this axis"),
-            None => Ok(grid),
-        }
+        Ok(grid)
     }
 }
 

@@ -11,7 +11,7 @@ use slag_encoder::progress::Progress;
 use super::grid::{Grid, Point, expand};
 use super::report::{Figures, TradeoffReport};
 use crate::harness::Machine;
-use crate::programs::{fetch_all, json_of, remove};
+use crate::programs::{json_of, remove};
 use crate::scenes::SceneFiles;
 
 /// Paths of the programs and their common flags.
@@ -19,7 +19,6 @@ use crate::scenes::SceneFiles;
 pub(super) struct Programs {
     pub(super) encoder: PathBuf,
     pub(super) lab: PathBuf,
-    pub(super) times_queries: bool,
     /// Flags that select the models and their runtime.
     pub(super) models: Vec<String>,
     pub(super) segmenter: Option<PathBuf>,
@@ -59,8 +58,7 @@ pub(super) fn measure(
         }
     }
     progress.end();
-    let (machine, ordered) = (Machine::here(), grid.ordered.clone());
-    let report = TradeoffReport { machine, ordered, figures: measured, left_out };
+    let report = TradeoffReport { machine: Machine::here(), figures: measured, left_out };
     report.write(out)?;
     Ok(report)
 }
@@ -90,7 +88,7 @@ fn measure_group<'p>(
         } else {
             let run = Run { programs, scene, point, store: &store };
             let of_point = || format!("{} / {} on {}", point.axis, point.name, scene.name);
-            let figures = run.measure(&mut views_seconds, out).with_context(of_point)?;
+            let figures = run.measure(&mut views_seconds).with_context(of_point)?;
             if let Ok(figures) = &figures {
                 // Renamed into place: a point is measured completely or not at all.
                 slag_common::durable::write(&path, &serde_json::to_vec_pretty(figures)?)?;
@@ -108,7 +106,7 @@ fn measure_group<'p>(
 fn file_name(scene: &SceneFiles, point: &Point, programs: &Programs) -> String {
     let dir = scene.dir.canonicalize().unwrap_or_else(|_| scene.dir.clone());
     // The first word is the version of the figures: files of another one are not read.
-    let key = format!("3 {dir:?} {point:?} {}", programs.made_by);
+    let key = format!("4 {dir:?} {point:?} {}", programs.made_by);
     format!("{}-{}.json", scene.name, &blake3::hash(key.as_bytes()).to_hex()[..16])
 }
 
@@ -121,7 +119,7 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    fn measure(&self, views_seconds: &mut Option<f64>, out: &Path) -> Result<Result<Figures, &'static str>> {
+    fn measure(&self, views_seconds: &mut Option<f64>) -> Result<Result<Figures, &'static str>> {
         let (point, programs) = (self.point, self.programs);
         let expand = |flags: &str| expand(flags, self.scene, programs.segmenter.as_ref());
         let (views, lift, eval) = match [expand(&point.views)?, expand(&point.lift)?, expand(&point.eval)?] {
@@ -161,7 +159,6 @@ impl Run<'_> {
             views_seconds: of_views,
             coverage_seconds: figure(&encoded, "coverage_secs")?,
             bytes_per_gaussian: figure(&encoded["shard_bytes"], point.profile.name())? / n_gaussians,
-            query_ms: self.query_ms(out)?,
         }))
     }
 
@@ -183,30 +180,6 @@ impl Run<'_> {
         command.arg("--store").arg(self.store);
         command.args(["--profile", self.point.profile.name()]);
         json_of(command.args(&self.programs.models).args(eval))
-    }
-
-    /// Fetches the shards as a robot does, and times queries on them.
-    fn query_ms(&self, out: &Path) -> Result<Option<f64>> {
-        if !self.programs.times_queries {
-            return Ok(None);
-        }
-        let cache = out.join("cache");
-        fetch_all(self.store, &cache, self.point.profile.name())?;
-        let mut bench = Command::new(&self.programs.lab);
-        bench.args([
-            "--json",
-            "bench",
-            "query",
-            "--limits",
-            "1000",
-            "--runs",
-            "40",
-            "--precision",
-            "measured",
-        ]);
-        let timed = json_of(bench.arg("--cache").arg(&cache))?;
-        remove(&cache)?;
-        Ok(timed["searches"][0]["best"]["median_ms"].as_f64())
     }
 }
 

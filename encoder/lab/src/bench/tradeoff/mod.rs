@@ -1,6 +1,6 @@
 //! `bench tradeoff`: cost and accuracy of each choice of settings, on labelled scenes.
 //!
-//! For each point of a [`grid`], the programs encode, evaluate and query the scene as a user runs them, each in
+//! For each point of a [`grid`], the programs encode and evaluate the scene as a user runs them, each in
 //! its own process, so that threads and memory are those of the flags. A point leaves one JSON file; points with a
 //! file are not measured again. Points with the same contributions share a store: the seconds of the views are
 //! those of the first point, all other seconds are each point's own.
@@ -24,7 +24,6 @@ use grid::Grid;
 use measure::{Programs, measure};
 pub(crate) use report::TradeoffReport;
 
-/// `bench tradeoff`.
 #[derive(Debug, Args)]
 pub(crate) struct TradeoffArgs {
     /// Labelled scene: a folder that `generate scene` wrote; may be repeated.
@@ -64,14 +63,9 @@ pub(crate) fn run(args: &TradeoffArgs, progress: &dyn Progress) -> Result<Tradeo
         flag("--model-threads", n.to_string());
     }
     let lab = std::env::current_exe().context("cannot find the path of this program")?;
-    let edge = sibling("slag-edge");
-    if let Err(error) = &edge {
-        tracing::warn!("queries are not timed: {error}");
-    }
     let programs = Programs {
         encoder: sibling("slag-encoder")?,
         lab,
-        times_queries: edge.is_ok(),
         models: flags,
         segmenter: args.segmenter.clone(),
         made_by: format!("{} {}, {:?}", env!("CARGO_PKG_VERSION"), models.encoder_id(), session.providers),
