@@ -70,6 +70,32 @@ fn masks_take_a_share_of_windows() {
     assert!(!cosines.is_empty() && cosines.iter().all(|cosine| (least - 1e-3..0.9999).contains(cosine)));
 }
 
+/// Beside the coffee table, whose top is 0.36 m high and has room above it, and from elsewhere: places to stand are
+/// on the floor.
+#[needs_shared]
+#[nightly("encodes the house with its free places")]
+#[test]
+fn places_by_the_sofa_are_on_the_floor() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (store, cache) = (dir.path().join("house"), dir.path().join("cache"));
+    let models = root().join("tests/models/conse");
+    let flags = "--min-mask-px 200 --raster-width 320 --occupancy 0.05 --profiles compact";
+    run(encode_house("sparse/0", &store, flags).args(["--models", text(&models)]));
+    let served = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
+    let fetch = ["fetch", "--cache", text(&cache), "--from", &served.url, "--at", "0,0,0", "--trust-first"];
+    run(&mut edge(&fetch));
+    for near in ["2,-1.5,0", "2,-0.9,0", "1.4,-1.5,0"] {
+        let asked = ["goal", "sofa", "--near", near, "--cache", text(&cache), "--models", text(&models)];
+        let found = run_json(&mut edge(&asked));
+        let goals = found["goals"].as_array().expect("a list");
+        assert!(!goals.is_empty(), "{near}: {found:#}");
+        for goal in goals {
+            let z = goal["position_in_world"][2].as_f64().expect("a number");
+            assert!(z.abs() < 0.1, "{near}: {goal}");
+        }
+    }
+}
+
 /// The GPU's field equals the CPU's within the bound of docs/numerics.md: contributions differ only at pixels
 /// across a cut, together by less than a 50,000th. A machine without a GPU uses a software adapter.
 #[needs_shared]

@@ -244,6 +244,9 @@ fn photos_and_models_are_found_and_choices_are_said() {
     for name in ["3.jpg", "4.png", "5.JPG"] {
         write(&format!("images/{name}"), "");
     }
+    // A folder, and a link to itself, are no photos with other names.
+    fs_err::create_dir(dir.path().join("images/6.JPG")).unwrap();
+    fs_err::os::unix::fs::symlink("7.JPG", dir.path().join("images/7.JPG")).unwrap();
     for path in ["", "sparse", "sparse/1"] {
         let set = poses::read(&dir.path().join(path), None).unwrap();
         assert_eq!(set.views.len(), 6, "{path}");

@@ -4,7 +4,7 @@
 use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
-use slag_common::shard::{Profile, ShardLayout};
+use slag_common::shard::{Profile, ShardLayout, ShardView};
 use slag_common::{Gaussians, Hash32};
 use slag_encoder::cells::{self, Cell, CellLimits, PositionError};
 use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
@@ -394,6 +394,79 @@ fn positions_keep_their_error_with_strays() {
     }
 }
 
+/// What the radii of a shard's centroids are worth, in float64.
+struct Bounds {
+    /// A radius over the distance of its centroid's farthest member: the least and the largest.
+    nearest: f64,
+    farthest: f64,
+    /// The largest error of a score, in radii.
+    score: f64,
+}
+
+impl Bounds {
+    /// `vectors`: by input index. Where all members are the centroid, its radius must not be negative.
+    fn of(shard: &ShardView<'_>, vectors: &[Vec<f32>], queries: &[Vec<f64>]) -> Self {
+        let (mut nearest, mut farthest, mut score) = (f64::INFINITY, 0.0_f64, 0.0_f64);
+        for centroid in 0..shard.radii.len() {
+            let mut stored = vec![0.0; DIM];
+            shard.decode_centroid(centroid, &mut stored);
+            let radius = f64::from(shard.radii[centroid]);
+            let mut largest = 0.0_f64;
+            for member in shard.members(centroid) {
+                let input = shard.exact.expect("exact").input_indices[member] as usize;
+                let difference: Vec<f64> =
+                    vectors[input].iter().zip(&stored).map(|(v, s)| f64::from(*v) - s).collect();
+                largest = largest.max(length(&difference));
+                for query in queries {
+                    let off: f64 = difference.iter().zip(query).map(|(d, q)| d * q).sum();
+                    score = score.max(if off == 0.0 { 0.0 } else { off.abs() / radius });
+                }
+            }
+            let ratio = if largest == 0.0 { 1.0 + radius } else { radius / largest };
+            (nearest, farthest) = (nearest.min(ratio), farthest.max(ratio));
+        }
+        Self { nearest, farthest, score }
+    }
+}
+
+/// The bound of scores at the extremes: all vectors alike, two that cancel, every axis, components that a byte
+/// cannot hold beside large ones, and one that is unlike thousands. The worst question is the error's own
+/// direction.
+#[test]
+fn scores_keep_their_bound_at_the_extremes() {
+    let random = &mut Random::new(12);
+    let n = 1200;
+    let axis =
+        |k: usize, sign: f64| -> Vec<f64> { (0..DIM).map(|c| if c == k { sign } else { 0.0 }).collect() };
+    let common = direction(random);
+    let needle = |random: &mut Random, size: f64| {
+        let noise = direction(random);
+        unit(&axis(0, 1.0).iter().zip(&noise).map(|(a, n)| a + size * n).collect::<Vec<_>>())
+    };
+    let scenes: Vec<(&str, Vec<Vec<f64>>)> = vec![
+        ("alike", vec![common.clone(); n]),
+        ("opposite", (0..n).map(|i| axis(3, if i % 2 == 0 { 1.0 } else { -1.0 })).collect()),
+        ("every axis", (0..n).map(|i| axis(i % DIM, 1.0)).collect()),
+        ("small beside large", (0..n).map(|i| needle(random, 10f64.powi(-((i % 13) as i32)))).collect()),
+        ("one unlike all", (0..n).map(|i| if i == 77 { axis(9, -1.0) } else { common.clone() }).collect()),
+        ("noise", (0..n).map(|_| direction(random)).collect()),
+    ];
+    for (name, vectors) in scenes {
+        let vectors: Vec<Vec<f32>> = vectors.iter().map(|vector| to_f32(vector)).collect();
+        let means = (0..n).map(|k| DVec3::splat(k as f64 * 0.01)).collect();
+        let bytes = one_shard(&vectors, means);
+        let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+        let queries: Vec<Vec<f64>> =
+            (0..4).map(|_| direction(random)).chain([common.clone(), axis(0, 1.0)]).collect();
+        let Bounds { nearest, score, .. } = Bounds::of(&shard, &vectors, &queries);
+        println!(
+            "| {name} | {} centroids, radius over distance {nearest:.6}, score {score:.3} radii |",
+            shard.radii.len()
+        );
+        assert!(nearest >= 1.0 && score <= 1.0, "{name}: {nearest} {score}");
+    }
+}
+
 /// Centroids are within the stated radius of their members, positions within half a step.
 #[test]
 fn shards_keep_their_bounds() {
@@ -417,24 +490,8 @@ fn shards_keep_their_bounds() {
         (0..n).map(|i| ((shard.position_in_world(i) - means[input(i)]) / half_step).abs().max_element());
     let position = offsets.fold(0.0, f64::max);
 
-    let (mut nearest, mut farthest, mut score) = (f64::INFINITY, 0.0_f64, 0.0_f64);
     let queries: Vec<Vec<f64>> = centres.iter().cloned().chain((0..20).map(|_| direction(random))).collect();
-    for centroid in 0..shard.radii.len() {
-        let mut stored = vec![0.0; DIM];
-        shard.decode_centroid(centroid, &mut stored);
-        let radius = f64::from(shard.radii[centroid]);
-        let mut largest = 0.0_f64;
-        for member in shard.members(centroid) {
-            let difference: Vec<f64> =
-                vectors[input(member)].iter().zip(&stored).map(|(v, s)| f64::from(*v) - s).collect();
-            largest = largest.max(length(&difference));
-            for query in &queries {
-                let off: f64 = difference.iter().zip(query).map(|(d, q)| d * q).sum();
-                score = score.max(off.abs() / radius);
-            }
-        }
-        (nearest, farthest) = (nearest.min(radius / largest), farthest.max(radius / largest));
-    }
+    let Bounds { nearest, farthest, score } = Bounds::of(&shard, &vectors, &queries);
     println!(
         "| shards | 25 m cell 1e6 m away, {} centroids | position {position:.6} half steps, radius over distance {nearest:.6} \
          to {farthest:.6}, score {score:.3} radii |",

@@ -50,7 +50,7 @@ impl PhotoFinder {
         let files = self.listed.entry(folder.to_owned()).or_insert_with(|| {
             let mut files = BTreeMap::new();
             let entries = fs_err::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
-            for file in entries.map(|entry| entry.path()) {
+            for file in entries.map(|entry| entry.path()).filter(|path| path.is_file()) {
                 let ending = file.extension().and_then(|ending| ending.to_str()).map(str::to_lowercase);
                 if let (Some(stem), true) =
                     (stem_of(&file), ending.is_some_and(|ending| PHOTO_ENDINGS.contains(&&*ending)))

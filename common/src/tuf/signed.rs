@@ -63,7 +63,7 @@ impl<T: Body> SignedMetadata<T> {
     pub fn parse(role: &str, bytes: &[u8]) -> Result<Self, TufError> {
         let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
         let Envelope { signatures, signed } =
-            serde_json::from_slice(bytes).map_err(|e| refuse(e.to_string()))?;
+            serde_json::from_slice(bytes).map_err(|e| refuse(in_place_of_json(bytes, &e)))?;
         let canonical = canonical_json(&signed).map_err(|e| refuse(e.to_string()))?;
         let head = Head::deserialize(&signed).map_err(|e| refuse(e.to_string()))?;
         if head.kind != T::TYPE {
@@ -151,6 +151,15 @@ pub fn sign<T: Body>(version: u64, expires_unix_secs: u64, body: &T, keys: &[&Si
     signatures.sort_by(|a, b| a.keyid.cmp(&b.keyid));
     signatures.dedup();
     serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON")
+}
+
+/// Says what came in the place of JSON, where its first bytes tell.
+fn in_place_of_json(bytes: &[u8], error: &serde_json::Error) -> String {
+    match bytes.trim_ascii_start() {
+        [b'<', ..] => "a web page came in its place, such as a network's log-in".into(),
+        [0x1f, 0x8b, ..] => "it came packed with gzip, as a proxy on the way may do".into(),
+        _ => error.to_string(),
+    }
 }
 
 /// Adds the signatures of keys that have not signed metadata yet.

@@ -270,3 +270,16 @@ fn every_flipped_bit_is_refused() {
         }
     }
 }
+
+/// What networks send in the place of a store's files is named.
+#[test]
+fn pages_and_packed_files_are_named() {
+    for (bytes, word) in [
+        (&b"\n<html><body>Please log in.</body></html>"[..], "web page"),
+        (b"\x1f\x8b\x08\x00", "gzip"),
+        (b"Please log in.", "expected value"),
+    ] {
+        let error = Kept::from_root(bytes).expect_err("no metadata");
+        assert!(matches!(&error, TufError::Format { what, .. } if what.contains(word)), "{error}");
+    }
+}

@@ -15,7 +15,7 @@ import time
 import urllib.request
 
 from ros_messages import (
-    Detection3DArray, Duration, FeedbackMessage, FindRequest, FindResponse, GetResultRequest, Header, HumbleResult,
+    CancelGoalRequest, Detection3DArray, Duration, FeedbackMessage, FindRequest, FindResponse, GetResultRequest, Header, HumbleResult,
     JazzyResult, MarkerArray, NavigateFeedback, NavSatFix, NavSatStatus, Odometry, Point,
     OccupancyGrid, PointCloud2, Pose, PoseStamped, PoseWithCovariance, Quaternion, SendGoalRequest, SendGoalResponse,
     StandRequest, StandResponse, String,
@@ -228,9 +228,9 @@ def check_places(ros, robot):
     return n_free, word
 
 
-def check_action(ros, word, distribution):
+def check_action(ros, node, word, distribution):
     """Stands in for Nav2's server: takes a goal, tells how far it is, and ends it; then one that it gives up;
-    then rejects."""
+    then rejects. A goal on its way is cancelled where a later wish fails, and where the node ends."""
     action = "navigate_to_pose/_action"
     goals = ros.reader("rt/slag/goal", PoseStamped)
     states = ros.reader("rt/slag/navigation", String)
@@ -267,7 +267,33 @@ def check_action(ros, word, distribution):
             results.write(kind(result.client, result.number, status, *own))
         [state] = until("the end", states.take)
         assert state.data == said, state
-    return len(ends)
+
+    cancels = ros.reader(f"rq/{action}/cancel_goalRequest", CancelGoalRequest)
+    until("writer", cancels.get_matched_publications)
+
+    def drive():
+        going.write(String(word))
+        [request] = until("a goal for the action", asked.take)
+        taken.write(SendGoalResponse(request.client, request.number, True, Time(1, 2)))
+        until("a call for the result", waiting.take)
+        return list(request.goal_id.uuid)
+
+    def cancelled(goal):
+        [cancel] = until("a call to cancel", cancels.take)
+        # A time of zero: this goal alone.
+        assert (list(cancel.goal_id.uuid), cancel.stamp.sec, cancel.stamp.nanosec) == (goal, 0, 0), cancel
+
+    goal = drive()
+    assert not cancels.take()
+    going.write(String("?"))
+    cancelled(goal)
+    said = set()
+    until("both ends", lambda: said.update(state.data for state in states.take()) or len(said) == 2)
+    assert f"{word}: cancelled" in said and any(text.startswith("?: failed: ") for text in said), said
+    goal = drive()
+    node.process.terminate()
+    cancelled(goal)
+    return len(ends) + 2
 
 
 def stamped(parent, child, translation, rotation):
@@ -347,10 +373,10 @@ def main(program, robot, word, domain, distribution):
         check_service(ros, word)
         check_transforms(ros, robot)
         n_free, place = check_places(ros, robot)
-    with Node(program, robot, domain + 3, *body, "--reach", str(BODY["reach_m"]), "--send-goals", "action"):
+    with Node(program, robot, domain + 3, *body, "--reach", str(BODY["reach_m"]), "--send-goals", "action") as node:
         ros = Ros(domain + 3)
         check_transforms(ros, robot)
-        n_goals = check_action(ros, place, distribution)
+        n_goals = check_action(ros, node, place, distribution)
     with Node(program, robot, domain + 1, "--position", "odom"):
         check_odometry(Ros(domain + 1), robot)
     with Node(program, robot, domain + 2, "--position", "fix"):

@@ -313,6 +313,14 @@ class SendGoalResponse(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToP
 
 
 @dataclass
+class CancelGoalRequest(IdlStruct, typename="action_msgs::srv::dds_::CancelGoal_Request_"):
+    client: uint64
+    number: int64
+    goal_id: UUID
+    stamp: Time
+
+
+@dataclass
 class GetResultRequest(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_GetResult_Request_"):
     client: uint64
     number: int64

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use crate::fetch::follow::Following;
 use crate::http::{self, App, Settings};
-use crate::store::StoreError;
+use crate::store::{EdgeCache, StoreError};
 use anyhow::anyhow;
 use clap::Args;
 use slag_service::access::{Access, AccessSettings};
@@ -91,6 +91,13 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     let tls = args.listen.tls(files.map(|(cert, key)| TlsFiles { cert, key }));
     let tls = tls.map_err(|e| Failure::Usage(e.into()))?;
     let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
+    if let Some(path) = open_to_everybody(&cache) {
+        tracing::warn!(
+            "everybody on this machine may write to {path}, and so decide what this robot answers until its next \
+             fetch; run `chmod o-w {path}`",
+            path = path.display()
+        );
+    }
     let engine = engine(cache.clone(), &args.models)?;
     match engine.reload() {
         Ok(()) => {}
@@ -148,6 +155,25 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     served
 }
 
+/// Returns a folder of the cache that every user of the machine may write to: what is on board is opened by its
+/// hashes, and signatures are checked by fetches alone.
+fn open_to_everybody(cache: &EdgeCache) -> Option<PathBuf> {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        let folders = ["", "manifests", "shards", "trust"].map(|name| cache.dir().join(name));
+        let is_open = |path: &PathBuf| {
+            fs_err::metadata(path).is_ok_and(|metadata| metadata.permissions().mode() & 0o002 != 0)
+        };
+        folders.into_iter().find(is_open)
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = cache;
+        None
+    }
+}
+
 fn parse_query_bytes(text: &str) -> Result<u64, String> {
     match parse_bytes(text).map_err(|e| e.to_string())? {
         bytes if bytes < 1 << 20 => Err("expected 1MiB or more".into()),
@@ -183,4 +209,28 @@ fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
         )));
     }
     Ok(access)
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn a_cache_that_others_may_write_is_warned_of() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let cache = EdgeCache::open(dir.path());
+        let shards = dir.path().join("shards");
+        fs_err::create_dir(&shards).expect("made");
+        let with_mode = |path: &PathBuf, mode: u32| {
+            fs_err::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
+            open_to_everybody(&cache)
+        };
+        assert_eq!(with_mode(&shards, 0o775), None);
+        assert_eq!(with_mode(&shards, 0o777), Some(shards.clone()));
+        assert_eq!(with_mode(&shards, 0o755), None);
+        let root = dir.path().to_owned();
+        assert_eq!(with_mode(&root, 0o1777), Some(root.join("")));
+    }
 }

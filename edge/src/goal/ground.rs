@@ -79,9 +79,10 @@ impl Ground {
     }
 
     /// Continues a surface from a cell: whatever a robot that climbs `step` voxels gets to over neighbours is
-    /// ground at that height, even if the column has a lower surface, such as the furniture of the storey below.
-    /// Returns which cells.
-    pub(crate) fn continue_from(&mut self, cell: usize, z: u8, step: u8) -> Vec<bool> {
+    /// ground at that height, even if the column has a lower surface, such as the furniture of the storey below. A
+    /// column with such a lower surface and one at the height of the robot is in its way, and no drop. Returns
+    /// which cells are ground.
+    pub(crate) fn continue_from(&mut self, cell: usize, z: u8, step: u8, headroom: u32) -> Vec<bool> {
         let (n_y, n) = (self.n_y, self.floors.len());
         let mut is_met = vec![false; n];
         (self.floors[cell], is_met[cell]) = (Floor::At(z), true);
@@ -95,10 +96,17 @@ impl Ground {
                 Some(cell + 1).filter(|_| y + 1 < n_y),
             ];
             for to in beside.into_iter().flatten() {
+                if is_met[to] {
+                    continue;
+                }
                 // If this neighbour is too high or too low for it, another may be near enough.
-                if let Some(z) = self.nearest_surface(to, z, step).filter(|_| !is_met[to]) {
+                if let Some(z) = self.nearest_surface(to, z, step) {
                     (self.floors[to], is_met[to]) = (Floor::At(z), true);
                     border.push_back((to, z));
+                } else if matches!(self.floors[to], Floor::At(low) if low < z)
+                    && (self.surfaces[to] & low_bits(u32::from(z) + headroom + 1)) >> z != 0
+                {
+                    self.floors[to] = Floor::Blocked;
                 }
             }
         }
@@ -273,8 +281,21 @@ mod tests {
         };
         assert_eq!([3, 5, 200].map(|z| ground.surface_below(2, z)), [Some(1), Some(5), Some(5)]);
         assert_eq!(ground.surface_below(2, -1), None);
-        ground.continue_from(0, 5, 1);
+        ground.continue_from(0, 5, 1, 10);
         assert_eq!(ground.floors, [5, 5, 5, 6, 9].map(Floor::At));
+        // Above a table of the storey below: a box that is in the way, a hole, and what hangs over the robot.
+        for (surfaces, expected) in [
+            (1 << 1 | 1 << 12, Floor::Blocked),
+            (1 << 1, Floor::At(1)),
+            (1 << 1 | 1 << 16, Floor::At(1)),
+            (1 << 12, Floor::At(12)),
+        ] {
+            let lowest = Floor::At(surfaces.trailing_zeros() as u8);
+            let mut ground =
+                Ground { floors: vec![Floor::At(5), lowest], n_y: 2, surfaces: vec![1 << 5, surfaces] };
+            ground.continue_from(0, 5, 1, 10);
+            assert_eq!(ground.floors[1], expected, "{surfaces:b}");
+        }
     }
 
     /// By hand: rows that rise by a voxel each cell, each second, each third; a wall beside a floor is no slope.

@@ -151,7 +151,7 @@ impl<'a> Surroundings<'a> {
         let headroom = (request.height() / voxel).ceil().clamp(1.0, 128.0) as u32;
         let mut ground = Ground::find(&space, headroom, u32::from(step));
         let is_continued = match own_surface(&space.window, &ground, request, near) {
-            Some((cell, z)) => ground.continue_from(cell, z, step),
+            Some((cell, z)) => ground.continue_from(cell, z, step, headroom),
             None => vec![false; ground.floors.len()],
         };
         ground.block_slopes(request.slope, step, voxel);

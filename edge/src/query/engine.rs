@@ -254,3 +254,45 @@ impl Engine {
         done
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::*;
+    use crate::testing::{Axes, Member, TestShard, write_cache};
+
+    /// A scene and the text model of its encoder.
+    fn loaded(encoder: u8) -> Loaded {
+        let (dir, id) = (tempfile::tempdir().expect("a folder"), Hash32([encoder; 32]));
+        let shard = TestShard::new(vec![vec![Member { steps: [0; 3], embedding: vec![1.0, 0.0] }]]);
+        write_cache(dir.path(), &[TestShard { encoder_id: id, ..shard }.build(false)], 1);
+        let snapshot = Snapshot::open(&EdgeCache::open(dir.path())).expect("opens");
+        let info = EncoderInfo { id, ..Axes::info(2) };
+        let text = TextService::start(info, Box::new(Axes::new(2))).expect("a thread");
+        Loaded { text: Arc::new(text), snapshot: Some(Arc::new(snapshot)), tried: None, failed_at: None }
+    }
+
+    /// While generations of two encoders replace each other, no question takes the text model of one to the scene
+    /// of the other.
+    #[test]
+    fn a_scene_is_asked_with_its_own_text_model() {
+        let (mut other, first) = (loaded(8), loaded(7));
+        let text = TextService::start(Axes::info(2), Box::new(Axes::new(2))).expect("a thread");
+        let engine = Engine::new(EdgeCache::open("unused"), text);
+        *engine.loaded.write().expect("no panic") = first;
+        let is_over = AtomicBool::new(false);
+        let mixed = std::thread::scope(|threads| {
+            threads.spawn(|| {
+                while !is_over.load(Ordering::Relaxed) {
+                    std::mem::swap(&mut *engine.loaded.write().expect("no panic"), &mut other);
+                }
+            });
+            let on_board = |_| engine.on_board().expect("a scene").check().err();
+            let mixed = (0..20_000).find_map(on_board);
+            is_over.store(true, Ordering::Relaxed);
+            mixed
+        });
+        assert!(mixed.is_none(), "{mixed:?}");
+    }
+}

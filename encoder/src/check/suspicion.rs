@@ -31,6 +31,8 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
     let mut say = |mistake: Option<Mistake>, text: String| found.push(Suspicion { text, mistake });
     if usable.is_empty() {
         say(None, "the splat has no Gaussians that can be drawn".into());
+    } else if usable.iter().all(|i| scene.scales[*i] == [0.0; 3]) {
+        say(None, "all Gaussians are points without a size; export the splat again".into());
     } else if usable.iter().all(|i| scene.scales[*i][2] == 0.0) {
         say(None, "the Gaussians are flat, as those of 2DGS: their third axis is taken as 0".into());
     }

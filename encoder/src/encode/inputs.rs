@@ -12,7 +12,7 @@ use super::context::RunContext;
 use super::error::EncodeError;
 use super::report::SkippedView;
 use super::settings::{EncodeSettings, InputSettings};
-use crate::cells::{self, CellSplit};
+use crate::cells::{self, CellSplit, PositionError};
 use crate::memory::{MemoryPlan, Phase};
 use crate::{check, ingest};
 
@@ -71,10 +71,13 @@ impl Inputs {
         }
         if split.n_for_precision > cells::MAX_CELLS_FOR_PRECISION {
             let (n, most) = (split.n_for_precision, cells::MAX_CELLS_FOR_PRECISION);
+            let asked = match limits.position_error {
+                PositionError::Within(error) => format!("{error} world units"),
+                PositionError::OfSize => "a quarter of the size of small Gaussians".into(),
+            };
             let problem = format!(
-                "{:?} would take {n} more cells, expected at most {most}; give a larger --position-error, or remove Gaussians far from \
-                 the scene",
-                limits.position_error
+                "{asked} would take {n} more cells, expected at most {most}; give a larger --position-error, or remove Gaussians far \
+                 from the scene"
             );
             return Err(EncodeError::Setting { setting: "position_error", problem });
         }

@@ -93,6 +93,41 @@ fn the_largest_gaussians_are_background() {
     }
 }
 
+/// A place is the same wherever it lies on the lattice: voxels of a power of two make the offset exact, up to the
+/// last block of the lattice. Beyond that nothing is stored, and everything is counted.
+#[test]
+fn places_at_the_ends_of_the_lattice_are_the_same() {
+    let mut random = Random::new(8);
+    let lattice = Lattice { voxel: 0.0625 };
+    let mut scene = Gaussians::default();
+    for _ in 0..60 {
+        // On a grid of 2^-12, which doubles hold at the ends of the lattice, too.
+        scene.means_in_world.push(DVec3::from([0; 3].map(|_| random.below(1 << 14) as f64 / 4096.0 - 2.0)));
+        scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        scene.scales.push([0.2, 0.1, 0.01]);
+        scene.opacities.push(0.9);
+        scene.sh_dc.push([0.0; 3]);
+    }
+    let usable: Vec<u32> = (0..scene.len() as u32).collect();
+    let near = occupied(&scene, &usable, lattice);
+    assert!(near.blocks.len() > 20 && near.n_background == 0);
+    let moved = |shift: [i32; 3]| {
+        let offset = DVec3::from(shift.map(f64::from)) * lattice.block();
+        let mut scene = scene.clone();
+        scene.means_in_world.iter_mut().for_each(|mean| *mean += offset);
+        occupied(&scene, &usable, lattice)
+    };
+    const LAST: i32 = (1 << 26) - 100;
+    for shift in [[1 << 20, -(1 << 20), 0], [LAST, -LAST, LAST]] {
+        let place = |(at, voxels): &(BlockAt, u64)| ([0, 1, 2].map(|axis| at[axis] + shift[axis]), *voxels);
+        let expected: Vec<_> = near.blocks.iter().map(place).collect();
+        let found = moved(shift);
+        assert_eq!((found.n_background, found.blocks), (0, expected), "{shift:?}");
+    }
+    let beyond = moved([1 << 27, 0, 0]);
+    assert_eq!((beyond.n_background, beyond.blocks.len()), (scene.len(), 0));
+}
+
 /// A plane of opaque Gaussians, 2 mm thick, in any direction: every voxel that it cuts is occupied, and none whose
 /// centre is farther than one and a half edges.
 #[test]
