@@ -44,6 +44,9 @@ impl PhraseEncoder {
             }
             index_of_key.entry(key).or_insert(index);
         }
+        for (index, phrase) in lines.iter().enumerate() {
+            index_of_key.entry(without_hyphens(&key(phrase))).or_insert(index);
+        }
         let mut vectors = tensors::read(vectors, tensor, Some(lines.len()), dim)?;
         for (index, vector) in vectors.chunks_exact_mut(dim).enumerate() {
             if !centred(vector, centre.as_deref()) {
@@ -99,7 +102,9 @@ impl TextEncoder for PhraseEncoder {
         if key.is_empty() {
             return Err(InferenceError::EmptyText);
         }
-        match self.index_of_key.get(&key) {
+        let spaced = without_hyphens(&key);
+        let mut keys = [key.clone(), spaced.clone()].into_iter().chain(singulars(&spaced));
+        match keys.find_map(|key| self.index_of_key.get(&key)) {
             Some(index) => Ok(self.vectors[index * self.dim..][..self.dim].to_vec()),
             None => Err(InferenceError::UnknownPhrase {
                 n_known: self.phrases.len(),
@@ -112,6 +117,18 @@ impl TextEncoder for PhraseEncoder {
     fn vocabulary(&self) -> Option<&[String]> {
         Some(&self.phrases)
     }
+}
+
+/// Endings of plurals, and what takes their place.
+const PLURALS: [(&str, &str); 5] = [("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")];
+
+/// Returns what a key may be the plural of, the longest ending first.
+fn singulars(key: &str) -> impl Iterator<Item = String> {
+    PLURALS.iter().filter_map(move |(plural, end)| Some(key.strip_suffix(plural)?.to_owned() + end))
+}
+
+fn without_hyphens(key: &str) -> String {
+    key.replace('-', " ")
 }
 
 /// Returns the lookup key of a phrase: lower case, single spaces, no leading article.

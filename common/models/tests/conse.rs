@@ -82,8 +82,13 @@ fn phrase_vectors_equal_the_file_centred_in_f64() {
         let cosine: f32 = found_of[a].iter().zip(&found_of[b]).map(|(a, b)| a * b).sum();
         assert!((cosine - expected).abs() < 1e-3, "{a}, {b}: {cosine}");
     }
-    for same in [" Chair", "the chair", "A  CHAIR\t", "an chair"] {
+    for same in [" Chair", "the chair", "A  CHAIR\t", "an chair", "chairs"] {
         assert_eq!(encoder.encode(same).expect("it is known"), found_of["chair"], "{same:?}");
+    }
+    let others = [("knives", "knife"), ("boxes", "box"), ("butterflies", "butterfly")];
+    let spelt = [("lamb chop", "lamb-chop"), ("traffic-lights", "traffic light")];
+    for (asked, known) in others.into_iter().chain(spelt) {
+        assert_eq!(encoder.encode(asked).expect("it is known"), found_of[known], "{asked:?}");
     }
 }
 
