@@ -28,6 +28,8 @@ pub(super) enum Phase {
     Views,
     /// Free and occupied places are found.
     Occupancy,
+    /// Photos are searched for landmarks.
+    Landmarks,
     /// The views' contributions are opened.
     Merge,
     /// Masks are weighed and superpoints found.
@@ -46,6 +48,7 @@ impl Phase {
             Self::Plan => "plan",
             Self::Views => "views",
             Self::Occupancy => "occupancy",
+            Self::Landmarks => "landmarks",
             Self::Merge => "merge",
             Self::Superpoints => "superpoints",
             Self::Objects => "objects",

@@ -126,7 +126,7 @@ impl StageReport {
 /// A part of the run. The parts follow each other and add up to the run's time.
 #[derive(Clone, Debug, Serialize)]
 pub struct PhaseReport {
-    /// The part: read, plan, views, occupancy, merge, superpoints, objects, refine, cells, publish.
+    /// The part: read, plan, views, occupancy, landmarks, merge, superpoints, objects, refine, cells, publish.
     pub phase: String,
     pub secs: f64,
     /// The most memory of the process until its end, bytes; absent where the system does not tell.

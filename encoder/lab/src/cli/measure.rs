@@ -13,7 +13,7 @@ use slag_encoder::progress::Progress;
 use slag_encoder::store::StoreReader;
 
 use crate::bench::{load, query, raster, robot, tradeoff};
-use crate::eval::{defaults, encoder, goal, judge, lerf, masks, relations, run, scannet};
+use crate::eval::{defaults, encoder, goal, judge, lerf, locate, masks, relations, run, scannet};
 
 /// `eval`.
 #[derive(Debug, Args)]
@@ -42,6 +42,8 @@ enum EvalCommand {
     /// Asks the robot's program for places to stand near the things of generated scenes, and compares with their
     /// true surfaces.
     Goal(goal::GoalArgs),
+    /// Finds the cameras of photos that a map of landmarks has not seen; photos of the other scenes must be lost.
+    Locate(locate::LocateArgs),
     /// Asks the robot's program for things by their relations in generated scenes, beside the plain phrase and the
     /// noun.
     Relations(relations::RelationsArgs),
@@ -70,6 +72,7 @@ pub(super) fn eval(args: &EvalArgs, progress: &dyn Progress, json: bool) -> Resu
         }
         EvalCommand::Encoder(args) => output.print(&encoder::run(args, progress)?),
         EvalCommand::Goal(args) => output.print(&goal::run(args, progress)?),
+        EvalCommand::Locate(args) => output.print(&locate::run(args, progress)?),
         EvalCommand::Relations(args) => output.print(&relations::run(args, progress)?),
     }
 }
