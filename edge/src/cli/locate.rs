@@ -13,7 +13,12 @@ use super::args::CacheArgs;
 use super::failure::{Failure, store_failure};
 use super::output::{print_json, print_pairs};
 
+const EXAMPLES: &str = "Examples:\n\
+    \x20 slag-edge locate photo.jpg --focal-px 554.3\n\
+    \x20 slag-edge locate photo.jpg --focal-px 554.3 --gravity 0,1,0 --json\n";
+
 #[derive(Debug, Args)]
+#[command(before_help = EXAMPLES)]
 pub struct LocateArgs {
     /// Photo: JPEG, PNG or WebP, without lens distortion.
     pub photo: PathBuf,

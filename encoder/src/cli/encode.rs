@@ -134,7 +134,7 @@ pub struct EncodeArgs {
     photo_poses: bool,
     /// Shards have landmarks, by which robots find the cameras of their photos: at most 2 bytes a Gaussian in every
     /// profile. Every photo is looked at once more.
-    #[arg(long)]
+    #[arg(long, help_heading = "Output", hide_short_help = true)]
     locate: bool,
     /// The store carries the text side of --models, signed as all else: robots fetch it with the scene and need no
     /// --models. Refused unless the licence in model.toml permits passing the weights on.
