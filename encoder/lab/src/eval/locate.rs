@@ -17,7 +17,7 @@ use slag_encoder::ingest;
 use slag_encoder::landmarks::{self, SceneRenderer};
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
-use slag_locate::{Grey, Map, MappingView, Outcome, Photo, Renderer, locate};
+use slag_locate::{Grey, Map, MappingView, Outcome, Photo, Reason, Renderer, locate};
 
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure};
@@ -79,13 +79,13 @@ struct Located {
 
 /// A query's result: errors in metres and degrees, where it was found.
 struct Try {
-    found: Option<[f64; 2]>,
+    found: Result<[f64; 2], Reason>,
     secs: f64,
 }
 
 impl Try {
     fn is_within(&self, metres: f64, degrees: f64) -> bool {
-        self.found.is_some_and(|[m, deg]| m <= metres && deg <= degrees)
+        self.found.is_ok_and(|[m, deg]| m <= metres && deg <= degrees)
     }
 }
 
@@ -139,7 +139,11 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         for view in &scene.queries {
             let one = attempt(view)?;
             if args.list && !one.is_within(0.25, 5.0) {
-                tracing::warn!("{} {}: {:?}", scene.name, view.name, one.found);
+                let told = one.found.map_or_else(
+                    |reason| reason.to_string(),
+                    |[m, deg]| format!("off by {m:.2} m, {deg:.1} degrees"),
+                );
+                tracing::warn!("{} {}: {told}", scene.name, view.name);
             }
             tries.push(one);
         }
@@ -211,9 +215,9 @@ fn attempt(
             let metres = truth.inverse().translation.distance(pose.inverse().translation);
             let between = glam::DQuat::from_mat3(&(pose.matrix3 * truth.matrix3.transpose()));
             let degrees = between.to_axis_angle().1.to_degrees();
-            Some([metres, degrees.min(360.0 - degrees)])
+            Ok([metres, degrees.min(360.0 - degrees)])
         }
-        Outcome::Lost(_) => None,
+        Outcome::Lost(reason) => Err(reason),
     };
     Ok(Try { found, secs })
 }
@@ -271,10 +275,10 @@ impl Figures {
             n_foreign: foreign.len(),
             within_25cm_5deg: of_tries(&|one| one.is_within(0.25, 5.0)),
             within_1m_10deg: of_tries(&|one| one.is_within(1.0, 10.0)),
-            lost: of_tries(&|one| one.found.is_none()),
-            wrong: of_tries(&|one| one.found.is_some() && !one.is_within(1.0, 10.0)),
-            foreign_accepted: share(foreign.iter().filter(|one| one.found.is_some()).count(), foreign.len()),
-            median_m: median(tries.iter().filter_map(|one| Some(one.found?[0])).collect()),
+            lost: of_tries(&|one| one.found.is_err()),
+            wrong: of_tries(&|one| one.found.is_ok() && !one.is_within(1.0, 10.0)),
+            foreign_accepted: share(foreign.iter().filter(|one| one.found.is_ok()).count(), foreign.len()),
+            median_m: median(tries.iter().filter_map(|one| Some(one.found.ok()?[0])).collect()),
             median_secs: median(tries.iter().map(|one| one.secs).collect()),
             bytes_per_million: (n_gaussians > 0).then(|| len_bytes as f64 * 1e6 / n_gaussians as f64),
             map_secs: scenes.iter().map(|scene| scene.map_secs).sum(),
