@@ -8,6 +8,7 @@ mod failure;
 mod fetch;
 mod follow;
 mod goal;
+mod locate;
 mod models;
 mod network;
 mod output;
@@ -31,6 +32,7 @@ pub use failure::Exit;
 use failure::Failure;
 use fetch::FetchArgs;
 use goal::GoalArgs;
+use locate::LocateArgs;
 use models::ModelsArgs;
 use query::QueryArgs;
 use serve::ServeArgs;
@@ -65,6 +67,8 @@ enum Command {
     Query(QueryArgs),
     /// Find places to stand near a thing: reached, clear, and in sight of it.
     Goal(GoalArgs),
+    /// Find the camera of a photo by the landmarks on board.
+    Locate(LocateArgs),
     /// Show what changed between two generations that this robot has had.
     Changes(ChangesArgs),
     /// Show what is on board.
@@ -113,6 +117,7 @@ impl Cli {
             Command::Serve(args) => (false, serve::run(args)),
             Command::Query(args) => (args.json, query::run(args)),
             Command::Goal(args) => (args.json, goal::run(args)),
+            Command::Locate(args) => (args.json, locate::run(args)),
             Command::Changes(args) => (args.json, changes::run(args)),
             Command::Status(args) => (args.json, status::run(args)),
             Command::Doctor(args) => (args.json, doctor::run(args)),
@@ -216,6 +221,7 @@ mod tests {
             panic!("goal")
         };
         assert_eq!((goal.radius_m, goal.reach_m, goal.limit), (0.25, 1.0, 3));
+        assert!(parse("slag-edge locate a.jpg --focal-px 554.3 --gravity 0,1,0 --cache c --json").is_ok());
         assert!(parse("slag-edge changes chair mug --from 3 --to 5 --json").is_ok());
         assert!(parse("slag-edge status --json --cache d").is_ok());
         assert!(parse("slag-edge models pull clip --accept-licence apple-amlr --json").is_ok());
@@ -238,6 +244,8 @@ mod tests {
             "slag-edge query chair --box 1,2,3",
             "slag-edge query chair --negatives ,",
             "slag-edge goal",
+            "slag-edge locate a.jpg",
+            "slag-edge locate a.jpg --focal-px 0",
             "slag-edge changes --from first",
             "slag-edge goal chair --near 1,2",
             "slag-edge fetch --at 1,2,3 --at-geo 1,2",

@@ -5,6 +5,7 @@ mod clock;
 pub mod fetch;
 pub mod goal;
 pub mod http;
+pub mod locate;
 pub mod query;
 pub mod score;
 pub mod store;

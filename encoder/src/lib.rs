@@ -39,6 +39,7 @@ pub mod encode;
 pub(crate) mod fleet;
 pub mod html;
 pub mod ingest;
+pub mod landmarks;
 mod lanes;
 pub mod lift;
 pub mod masks;

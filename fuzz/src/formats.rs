@@ -97,6 +97,9 @@ pub fn shard(data: &[u8]) -> bool {
     for (pose, name) in layout.photo_poses(&bytes).iter().flat_map(|photos| photos.iter()) {
         assert!(pose.offset.iter().all(|c| c.is_finite()) && pose.focal_px > 0.0 && name.len() <= 1024);
     }
+    for landmark in layout.landmarks(&bytes).iter().flat_map(|landmarks| landmarks.iter()) {
+        assert!(landmark.position_in_world.is_finite());
+    }
     if let Some(occupancy) = layout.occupancy(&bytes) {
         let n_blocks: u32 = occupancy.header.n_blocks.iter().product();
         let mut end = 0;

@@ -6,6 +6,7 @@ use glam::{DAffine3, DVec3};
 use half::f16;
 use slag_common::appearance::Appearance;
 use slag_common::frames::Aabb;
+use slag_common::landmarks::{BuiltLandmarks, Landmark};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::occupancy::{Block, BuiltOccupancy};
 use slag_common::photo_poses::BuiltPhotoPoses;
@@ -224,11 +225,14 @@ fn shard(is_exact: bool) -> Vec<u8> {
     for name in ["a.jpg", "b.jpg"] {
         photos.push(DVec3::ONE, &photo(name));
     }
+    let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 5, view: 1 };
+    let landmarks = BuiltLandmarks::pack(1, &[landmark(0.0), landmark(2.0)]);
     let additions = Additions {
         objects: is_exact.then_some(&objects),
         appearance: is_exact.then_some(appearance),
         occupancy: is_exact.then_some(&occupancy),
         photo_poses: photos.view().filter(|_| is_exact),
+        landmarks: landmarks.view().filter(|_| is_exact),
     };
     view.write_with(&mut out, additions).expect("writes to memory");
     out

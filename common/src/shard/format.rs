@@ -58,7 +58,8 @@ pub mod section {
     /// `[centroid_starts[K]][m]` i8.
     pub const FINE: u32 = 19;
     /// [`crate::shard::IndicesHeader`]; 20 to 26 are those of [`crate::objects`], 50 to 52 those of
-    /// [`crate::occupancy`], 60 and 61 those of [`crate::photo_poses`].
+    /// [`crate::occupancy`], 60 and 61 those of [`crate::photo_poses`], 70 and 71
+    /// those of [`crate::landmarks`].
     pub const PACKED_INDICES_HEADER: u32 = 27;
     /// `[ceil(N * width_bits / 32)]` u32.
     pub const PACKED_INDICES: u32 = 28;

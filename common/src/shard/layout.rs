@@ -12,6 +12,7 @@ use super::format::{
 use super::indices::{self, IndicesHeader, PackedIndices};
 use crate::appearance::Appearance;
 use crate::container::{ContainerError, Layout};
+use crate::landmarks::{Landmarks, LandmarksLayout};
 use crate::objects::{Objects, ObjectsLayout};
 use crate::occupancy::{Occupancy, OccupancyLayout};
 use crate::photo_poses::{PhotoPoses, PhotoPosesLayout};
@@ -36,6 +37,7 @@ pub struct ShardLayout {
     appearance: Option<[Range<usize>; 3]>,
     occupancy: Option<OccupancyLayout>,
     photo_poses: Option<PhotoPosesLayout>,
+    landmarks: Option<LandmarksLayout>,
 }
 
 impl ShardLayout {
@@ -68,6 +70,7 @@ impl ShardLayout {
             appearance: check.appearance()?,
             occupancy: OccupancyLayout::check(bytes, &layout)?,
             photo_poses: PhotoPosesLayout::check(bytes, &layout)?,
+            landmarks: LandmarksLayout::check(bytes, &layout)?,
         })
     }
 
@@ -106,6 +109,14 @@ impl ShardLayout {
     /// As [`ShardLayout::objects`].
     pub fn photo_poses<'a>(&self, bytes: &'a [u8]) -> Option<PhotoPoses<'a>> {
         self.photo_poses.as_ref().map(|photos| photos.view(bytes))
+    }
+
+    /// Returns what robots recognise the place of the checked bytes' cell by, if the shard has it.
+    ///
+    /// # Panics
+    /// As [`ShardLayout::objects`].
+    pub fn landmarks<'a>(&self, bytes: &'a [u8]) -> Option<Landmarks<'a>> {
+        self.landmarks.as_ref().map(|landmarks| landmarks.view(bytes))
     }
 
     /// Returns the columns in the checked bytes.

@@ -6,6 +6,7 @@ use super::columns::ShardView;
 use super::format::{MAGIC, VERSION, section};
 use crate::appearance::Appearance;
 use crate::container;
+use crate::landmarks::Landmarks;
 use crate::objects::Objects;
 use crate::occupancy::Occupancy;
 use crate::photo_poses::PhotoPoses;
@@ -20,6 +21,8 @@ pub struct Additions<'a> {
     pub occupancy: Option<&'a Occupancy<'a>>,
     /// Where the photos of its cell were taken.
     pub photo_poses: Option<PhotoPoses<'a>>,
+    /// What robots recognise their place by.
+    pub landmarks: Option<Landmarks<'a>>,
 }
 
 impl<'a> From<Option<&'a Objects<'a>>> for Additions<'a> {
@@ -36,7 +39,7 @@ impl ShardView<'_> {
 
     /// Writes the shard and its additions.
     pub fn write_with<'a>(&self, out: impl io::Write, additions: impl Into<Additions<'a>>) -> io::Result<()> {
-        let Additions { objects, appearance, occupancy, photo_poses } = additions.into();
+        let Additions { objects, appearance, occupancy, photo_poses, landmarks } = additions.into();
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),
@@ -78,6 +81,7 @@ impl ShardView<'_> {
         }
         sections.extend(occupancy.iter().flat_map(|occupancy| occupancy.sections()));
         sections.extend(photo_poses.iter().flat_map(|photos| photos.sections()));
+        sections.extend(landmarks.iter().flat_map(|landmarks| landmarks.sections()));
         container::write(out, MAGIC, VERSION, &sections)
     }
 }

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use slag_common::Hash32;
 use slag_common::appearance::Appearance;
+use slag_common::landmarks::Landmarks;
 use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::objects::Objects;
 use slag_common::occupancy::Occupancy;
@@ -52,6 +53,11 @@ impl OpenShard {
     /// Returns where the photos of its cell were taken, if the shard says so.
     pub fn photo_poses(&self) -> Option<PhotoPoses<'_>> {
         self.layout.photo_poses(&self.bytes)
+    }
+
+    /// Returns what its cell is recognised by, if the shard has it.
+    pub fn landmarks(&self) -> Option<Landmarks<'_>> {
+        self.layout.landmarks(&self.bytes)
     }
 
     /// Returns the hash of its bytes, by the manifest.

@@ -132,6 +132,10 @@ pub struct EncodeArgs {
     /// and the name a photo in every profile. Pictures are not published.
     #[arg(long, help_heading = "Output", hide_short_help = true)]
     photo_poses: bool,
+    /// Shards have landmarks, by which robots find the cameras of their photos: at most 2 bytes a Gaussian in every
+    /// profile. Every photo is looked at once more.
+    #[arg(long, help_heading = "Output", hide_short_help = true)]
+    locate: bool,
     /// The store carries the text side of --models, signed as all else: robots fetch it with the scene and need no
     /// --models. Refused unless the licence in model.toml permits passing the weights on.
     #[arg(long, help_heading = "Output")]
@@ -198,6 +202,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     cells.shards.appearance = args.appearance;
     cells.occupancy = args.occupancy.map(|voxel_m| OccupancySettings { voxel_m });
     cells.photo_poses = args.photo_poses;
+    cells.landmarks = args.locate;
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     output.scene_name = args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into());
     output.created_unix_secs = now_unix_secs();

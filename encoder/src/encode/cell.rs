@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
+use slag_common::landmarks::BuiltLandmarks;
 use slag_common::manifest::{CellRecord, ShardRecord};
 use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::Profile;
@@ -35,6 +36,8 @@ pub(super) struct CellMaker<'a> {
     pub(super) score_context: ScoreMetricContext,
     /// Where the photos of each cell were taken, if its shards say so.
     pub(super) photo_poses: Option<Vec<BuiltPhotoPoses>>,
+    /// The landmarks of each cell, if its shards have them.
+    pub(super) landmarks: Option<Vec<BuiltLandmarks>>,
     pub(super) store: &'a Store,
     pub(super) context: &'a RunContext<'a>,
 }
@@ -160,7 +163,8 @@ impl CellMaker<'_> {
         let none = BuiltPhotoPoses::default();
         let photo_poses = self.photo_poses.as_ref().map_or(&none, |of_cells| &of_cells[cell_id as usize]);
         let objects = self.objects.as_ref();
-        let extras = CellExtras { objects, occupancy, photo_poses: photo_poses.view() };
+        let landmarks = self.landmarks.as_ref().and_then(|of_cells| of_cells[cell_id as usize].view());
+        let extras = CellExtras { objects, occupancy, photo_poses: photo_poses.view(), landmarks };
         let embeddings = &in_work.embeddings;
         let made = self.context.time("codebook", || {
             ShardBuilder { scene, encoder_id: *encoder_id, score_context, settings }

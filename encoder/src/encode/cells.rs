@@ -5,6 +5,7 @@
 
 use std::path::PathBuf;
 
+use slag_common::landmarks::BuiltLandmarks;
 use slag_common::manifest::{Calibration, CellRecord};
 use slag_common::{Hash32, View};
 
@@ -76,10 +77,11 @@ pub(super) fn build_cells(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
     occupancy: Option<SceneOccupancy>,
+    landmarks: Option<Vec<BuiltLandmarks>>,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
     let n_views = views.used.len();
-    build(plan, views, occupancy, context).map_err(|error| match error {
+    build(plan, views, occupancy, landmarks, context).map_err(|error| match error {
         EncodeError::Contributions(ContributionError::Cancelled) => {
             EncodeError::Interrupted { n_done: n_views, n_views }
         }
@@ -91,6 +93,7 @@ fn build(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
     occupancy: Option<SceneOccupancy>,
+    landmarks: Option<Vec<BuiltLandmarks>>,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
     let Plan { inputs, store, settings, .. } = *plan;
@@ -143,6 +146,7 @@ fn build(
         objects,
         occupancy,
         score_context,
+        landmarks,
         photo_poses: has_poses.then(|| shard::photo_poses(&inputs.split, &views.used)),
         store,
         context,

@@ -8,6 +8,7 @@ use slag_models::{ModelError, TextSideError};
 
 use crate::embed::EmbedError;
 use crate::ingest::{GeoError, IngestError};
+use crate::landmarks::LandmarkError;
 use crate::lift::ContributionError;
 use crate::memory::MemoryError;
 use crate::raster::RasterError;
@@ -41,6 +42,8 @@ pub enum EncodeError {
     Scene(#[from] RasterError),
     #[error("view {view}: {source}")]
     Raster { view: String, source: RasterError },
+    #[error("view {view}: {source}")]
+    Landmarks { view: String, source: LandmarkError },
     #[error(transparent)]
     Model(#[from] ModelError),
     #[error("view {view}: {source}")]

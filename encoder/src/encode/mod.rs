@@ -105,9 +105,10 @@ pub(crate) fn encode_by(
     plan.job.begin("views")?;
     let views = views::run_views(&plan, executor, &context)?;
     let occupancy = views::look_around(&plan, &views, &context)?;
+    let landmarks = views::find_landmarks(&plan, &views, &context)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
-    let built = cells::build_cells(&plan, &views, occupancy, &context)?;
+    let built = cells::build_cells(&plan, &views, occupancy, landmarks, &context)?;
     context.begin_phase(Phase::Publish);
     plan.job.begin("publish")?;
     publish::publish(plan, views, built, executor, &context)

@@ -133,6 +133,8 @@ pub enum Phase {
     Views,
     /// Free and occupied places are found.
     Occupancy,
+    /// Photos are searched for landmarks.
+    Landmarks,
     /// The views' contributions are opened.
     Merge,
     /// Masks are weighed and superpoints found.

@@ -176,6 +176,8 @@ pub struct CellSettings {
     pub occupancy: Option<OccupancySettings>,
     /// Whether shards say where the photos of their cells were taken.
     pub photo_poses: bool,
+    /// Whether shards have landmarks, by which robots find the cameras of their photos.
+    pub landmarks: bool,
 }
 
 /// What is published, and where.
@@ -291,6 +293,7 @@ impl EncodeSettings {
                 objects: true,
                 occupancy: None,
                 photo_poses: false,
+                landmarks: false,
             },
             output: OutputSettings {
                 store,

@@ -1,9 +1,11 @@
 //! The second step: every view becomes a file of contributions.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use slag_common::View;
+use slag_common::landmarks::BuiltLandmarks;
 
 use super::context::RunContext;
 use super::coverage::CoverageReport;
@@ -13,7 +15,9 @@ use super::inputs::Inputs;
 use super::plan::Plan;
 use super::report::{Phase, SkippedView, StageReport};
 use super::sink::ViewRecord;
+use crate::landmarks;
 use crate::occupancy::{self, SceneOccupancy};
+use crate::shard;
 
 /// The views of a run, done or left out.
 pub(super) struct DoneViews<'a> {
@@ -85,4 +89,33 @@ pub(super) fn look_around(
         .map_err(|(at, source)| EncodeError::Raster { view: views.used[at].name.clone(), source })?
         .ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })?;
     Ok(Some(found))
+}
+
+/// Finds the landmarks of each cell in the photos of the used views; `None` if the settings do not ask for them.
+pub(super) fn find_landmarks(
+    plan: &Plan<'_>,
+    views: &DoneViews<'_>,
+    context: &RunContext<'_>,
+) -> Result<Option<Vec<BuiltLandmarks>>, EncodeError> {
+    if !plan.settings.cells.landmarks {
+        return Ok(None);
+    }
+    context.begin_phase(Phase::Landmarks);
+    let n_views = views.used.len();
+    context.progress().begin("landmarks", "view", n_views as u64, 0);
+    let mut mapping = Vec::with_capacity(n_views);
+    for (number, view) in views.used.iter().enumerate() {
+        if context.cancel().load(Ordering::Relaxed) {
+            return Err(EncodeError::Interrupted { n_done: n_views, n_views });
+        }
+        let observe = || landmarks::observe(plan.scene.as_ref(), number as u16, view);
+        let observed = context.time("landmarks", || context.install(observe));
+        let failed = |source| EncodeError::Landmarks { view: view.name.clone(), source };
+        mapping.push(observed.map_err(failed)?);
+        context.progress().advance(1);
+    }
+    context.progress().end();
+    let Inputs { scene, split, .. } = plan.inputs;
+    let found = context.time("landmarks", || landmarks::landmarks(&mapping, scene.len()));
+    Ok(Some(shard::landmarks(split, slag_locate::CODE_VERSION, &found)))
 }

@@ -6,6 +6,7 @@ use half::f16;
 use rayon::prelude::*;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::hash::Hash32;
+use slag_common::landmarks::{BuiltLandmarks, Landmark, Landmarks};
 use slag_common::occupancy::Occupancy;
 use slag_common::photo_poses::{BuiltPhotoPoses, PhotoPoses};
 use slag_common::shard::{
@@ -96,6 +97,8 @@ pub struct CellExtras<'a> {
     pub occupancy: Option<Occupancy<'a>>,
     /// Where the photos of the cell were taken, if that was asked for.
     pub photo_poses: Option<PhotoPoses<'a>>,
+    /// What robots recognise the cell by, if that was asked for.
+    pub landmarks: Option<Landmarks<'a>>,
 }
 
 /// What is common to the shards of a scene.
@@ -170,6 +173,7 @@ impl ShardBuilder<'_> {
             appearance: appearance.as_ref().map(AppearanceColumns::view),
             occupancy: extras.occupancy.as_ref(),
             photo_poses: extras.photo_poses,
+            landmarks: extras.landmarks,
         };
         let chosen = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
         let shards = chosen.map(|profile| match profile {
@@ -284,4 +288,18 @@ pub fn photo_poses(split: &CellSplit, views: &[&View]) -> Vec<BuiltPhotoPoses> {
         }
     }
     of_cells
+}
+
+/// Returns the landmarks of each cell: a landmark belongs to the cell whose Gaussians' means are nearest to it, the
+/// first of such cells.
+pub fn landmarks(split: &CellSplit, code_version: u32, all: &[Landmark]) -> Vec<BuiltLandmarks> {
+    let mut of_cells = vec![Vec::new(); split.cells.len()];
+    for landmark in all {
+        let of_cell = |cell: &Cell| cell.mean_bounds.distance_to(landmark.position_in_world);
+        let distances = split.cells.iter().map(of_cell).enumerate();
+        if let Some((cell, _)) = distances.min_by(|a, b| a.1.total_cmp(&b.1)) {
+            of_cells[cell].push(*landmark);
+        }
+    }
+    of_cells.iter().map(|landmarks| BuiltLandmarks::pack(code_version, landmarks)).collect()
 }

@@ -10,7 +10,7 @@ use slag_encoder::store::StoreReader;
 use std::fmt::Display;
 
 use crate::bench::{load, query, raster, robot, tradeoff};
-use crate::eval::{defaults, encoder, goal, judge, lerf, masks, relations, run, scannet};
+use crate::eval::{defaults, encoder, goal, judge, lerf, locate, masks, relations, run, scannet};
 
 /// `eval`.
 #[derive(Debug, Subcommand)]
@@ -30,6 +30,8 @@ pub(crate) enum EvalCommand {
     /// Asks the robot's program for places to stand near the things of generated scenes, and compares with their
     /// true surfaces.
     Goal(goal::GoalArgs),
+    /// Finds the cameras of photos that a map of landmarks has not seen; photos of the other scenes must be lost.
+    Locate(locate::LocateArgs),
     /// Asks the robot's program for things by their relations in generated scenes, beside the plain phrase and the
     /// noun.
     Relations(relations::RelationsArgs),
@@ -55,6 +57,7 @@ pub(super) fn eval(command: &EvalCommand, progress: &dyn Progress, json: bool) -
         }
         EvalCommand::Encoder(args) => show(json, &encoder::run(args, progress)?, true),
         EvalCommand::Goal(args) => show(json, &goal::run(args, progress)?, true),
+        EvalCommand::Locate(args) => show(json, &locate::run(args, progress)?, true),
         EvalCommand::Relations(args) => show(json, &relations::run(args, progress)?, true),
     }
 }

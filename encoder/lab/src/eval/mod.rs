@@ -11,6 +11,7 @@ pub(crate) mod goal;
 mod instances;
 pub(crate) mod judge;
 pub(crate) mod lerf;
+pub(crate) mod locate;
 pub(crate) mod masks;
 mod metrics;
 #[cfg(test)]

@@ -94,6 +94,7 @@ impl Wall {
             objects: false,
             occupancy: None,
             photo_poses: false,
+            landmarks: false,
         };
         settings.run.threads = 1;
         settings.run.memory_bytes = 1 << 28;

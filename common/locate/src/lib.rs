@@ -1,0 +1,30 @@
+//! Finds the camera of a photo in a map of landmarks, without a GPU, a network or a model.
+//!
+//! [`features`] (SIFT) become codes of 128 bits ([`code`]). Those of mapping photos, whose depth the splat gives,
+//! make the map ([`build()`]); those of a photo are matched with it, and the pose on which most matches agree is
+//! the answer ([`locate`]). A rendering of the scene at that pose verifies and improves it ([`Renderer`]).
+#![forbid(unsafe_code)]
+
+mod build;
+mod code;
+mod describe;
+mod features;
+mod find;
+mod grey;
+mod map;
+mod matching;
+mod p3p;
+mod pose;
+mod ransac;
+mod render;
+
+pub use build::{MappingView, Observation, build};
+pub use code::{CODE_VERSION, Code, code};
+pub use describe::{DIM, Descriptor};
+pub use features::{Feature, features};
+pub use find::{Located, MAX_FEATURES, Outcome, Photo, Reason, locate};
+pub use grey::Grey;
+pub use map::Map;
+pub use p3p::p3p;
+pub use render::{Renderer, Rendering, point_in_world};
+pub use slag_common::landmarks::Landmark;

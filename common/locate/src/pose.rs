@@ -1,0 +1,162 @@
+//! Refinement of a pose by the errors of its points on the image, and its covariance.
+
+use glam::{DAffine3, DQuat, DVec2, DVec3};
+use slag_common::Intrinsics;
+
+/// A point of the map and where the photo shows it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Match {
+    /// Its feature, in the order of the features.
+    pub feature: usize,
+    /// Its landmark, in the order of the map.
+    pub landmark: usize,
+    /// Pixels of an ideal pinhole.
+    pub at: DVec2,
+    pub point_in_world: DVec3,
+}
+
+/// Rounds of refinement; it converges in four or five.
+const MAX_ROUNDS: usize = 12;
+/// Least standard deviation of a feature's place, pixels: SIFT's own, and the map's.
+const MIN_SIGMA_PX: f64 = 0.5;
+/// Median of the length of a normal vector of two components, in standard deviations: sqrt(2 ln 2).
+const MEDIAN_RADIUS: f64 = 1.1774;
+
+/// The focal lengths and the principal point of a pinhole camera.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pinhole {
+    focal: DVec2,
+    centre: DVec2,
+}
+
+impl Pinhole {
+    pub(crate) fn new(of: &Intrinsics) -> Self {
+        let (focal, centre) =
+            (DVec2::new(of.focal_x_px, of.focal_y_px), DVec2::new(of.centre_x_px, of.centre_y_px));
+        Self { focal, centre }
+    }
+
+    /// Returns where a point of the camera's frame appears; `None` behind the camera.
+    pub(crate) fn pixel(&self, in_camera: DVec3) -> Option<DVec2> {
+        (in_camera.z > 1e-9).then(|| in_camera.truncate() / in_camera.z * self.focal + self.centre)
+    }
+
+    /// Returns the direction of a pixel.
+    pub(crate) fn ray(&self, pixel: DVec2) -> DVec3 {
+        ((pixel - self.centre) / self.focal).extend(1.0).normalize()
+    }
+
+    /// Returns the error of a match on the image, pixels; infinite behind the camera.
+    pub(crate) fn error(&self, camera_from_world: &DAffine3, one: &Match) -> f64 {
+        let in_camera = camera_from_world.transform_point3(one.point_in_world);
+        self.pixel(in_camera).map_or(f64::INFINITY, |pixel| pixel.distance(one.at))
+    }
+}
+
+/// The normal equations of a pose's six parameters: a small rotation and a small translation of the camera's frame.
+struct Normal {
+    matrix: [[f64; 6]; 6],
+    vector: [f64; 6],
+}
+
+fn normal_equations(
+    camera: &Pinhole,
+    pose: &DAffine3,
+    matches: &[Match],
+    weight: impl Fn(f64) -> f64,
+) -> Normal {
+    let mut of = Normal { matrix: [[0.0; 6]; 6], vector: [0.0; 6] };
+    for one in matches {
+        let p = pose.transform_point3(one.point_in_world);
+        let Some(pixel) = camera.pixel(p) else { continue };
+        let error = one.at - pixel;
+        let weight = weight(error.length());
+        let (fx, fy) = (camera.focal.x / p.z, camera.focal.y / p.z);
+        // d pixel / d p, then d p = rotation x p + translation.
+        let rows = [DVec3::new(fx, 0.0, -fx * p.x / p.z), DVec3::new(0.0, fy, -fy * p.y / p.z)];
+        for (row, error) in rows.into_iter().zip([error.x, error.y]) {
+            let turned = p.cross(row);
+            let j = [turned.x, turned.y, turned.z, row.x, row.y, row.z];
+            for a in 0..6 {
+                of.vector[a] += weight * j[a] * error;
+                for b in 0..6 {
+                    of.matrix[a][b] += weight * j[a] * j[b];
+                }
+            }
+        }
+    }
+    of
+}
+
+/// Returns the inverse of a positive definite matrix (Gauss and Jordan, largest pivot); `None` where it is singular.
+fn inverse(mut m: [[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
+    let mut out: [[f64; 6]; 6] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
+    for column in 0..6 {
+        let pivot = (column..6).max_by(|a, b| m[*a][column].abs().total_cmp(&m[*b][column].abs()))?;
+        m.swap(column, pivot);
+        out.swap(column, pivot);
+        let scale = m[column][column];
+        if scale.is_nan() || scale.abs() < 1e-12 {
+            return None;
+        }
+        m[column].iter_mut().chain(&mut out[column]).for_each(|v| *v /= scale);
+        let (row, out_row) = (m[column], out[column]);
+        for other in (0..6).filter(|other| *other != column) {
+            let factor = m[other][column];
+            for k in 0..6 {
+                m[other][k] -= factor * row[k];
+                out[other][k] -= factor * out_row[k];
+            }
+        }
+    }
+    Some(out)
+}
+
+/// Refines a pose so that the errors of its matches become least; errors above `soft_px` count less (Cauchy).
+pub(crate) fn refine(camera: &Pinhole, pose: &DAffine3, matches: &[Match], soft_px: f64) -> Option<DAffine3> {
+    let mut pose = *pose;
+    for _ in 0..MAX_ROUNDS {
+        let of = normal_equations(camera, &pose, matches, |e| (1.0 + (e / soft_px).powi(2)).recip());
+        let inverse = inverse(of.matrix)?;
+        let step: [f64; 6] = std::array::from_fn(|a| (0..6).map(|b| inverse[a][b] * of.vector[b]).sum());
+        let turn = DQuat::from_scaled_axis(DVec3::new(step[0], step[1], step[2]));
+        let shift = DVec3::new(step[3], step[4], step[5]);
+        pose = DAffine3::from_rotation_translation(turn, shift) * pose;
+        if !pose.is_finite() {
+            return None;
+        }
+        if step.iter().all(|s| s.abs() < 1e-10) {
+            break;
+        }
+    }
+    // Products of rotations drift from length 1.
+    let rotation = DQuat::from_mat3(&pose.matrix3).normalize();
+    Some(DAffine3::from_rotation_translation(rotation, pose.translation))
+}
+
+/// Returns the covariance of the camera's position and rotation in the world: x, y, z, then a small rotation about
+/// the world's axes. The errors' standard deviation comes from their median; 36 numbers, row by row.
+pub(crate) fn covariance(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -> Option<[f64; 36]> {
+    let mut errors: Vec<f64> = matches.iter().map(|one| camera.error(pose, one)).collect();
+    errors.sort_by(f64::total_cmp);
+    let sigma = (errors.get(errors.len() / 2)? / MEDIAN_RADIUS).max(MIN_SIGMA_PX);
+    let of_camera = inverse(normal_equations(camera, pose, matches, |_| 1.0).matrix)?;
+    // position = -R' t: d position = R' (rotation x t - d t) with t turned along, so rotation x t cancels t's part.
+    let back = pose.matrix3.transpose();
+    let mut jacobian = [[0.0; 6]; 6];
+    for column in 0..3 {
+        let axis = DVec3::AXES[column];
+        let (moved, turned) = (-(back * axis), -(back * axis));
+        for row in 0..3 {
+            jacobian[row][column + 3] = moved[row];
+            jacobian[row + 3][column] = turned[row];
+        }
+    }
+    let mut out = [0.0; 36];
+    for (i, out) in out.iter_mut().enumerate() {
+        let (a, b) = (i / 6, i % 6);
+        let product = |p: usize, q: usize| jacobian[a][p] * of_camera[p][q] * jacobian[b][q];
+        *out = sigma * sigma * (0..36).map(|pq| product(pq / 6, pq % 6)).sum::<f64>();
+    }
+    Some(out)
+}

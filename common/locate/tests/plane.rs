@@ -1,0 +1,142 @@
+//! A photo of a painted floor is located in a map of other photos of it. Truth: the cameras that the photos were
+//! drawn with, by intersection of rays and floor.
+
+use glam::{DAffine3, DMat3, DVec2, DVec3};
+use slag_common::{Distortion, Intrinsics};
+use slag_locate::{
+    Grey, Map, MappingView, Observation, Outcome, Photo, Reason, Renderer, Rendering, build, code, features,
+    locate,
+};
+use slag_math::random::mix64;
+
+const INTRINSICS: Intrinsics = Intrinsics {
+    width_px: 320,
+    height_px: 240,
+    focal_x_px: 280.0,
+    focal_y_px: 280.0,
+    centre_x_px: 160.0,
+    centre_y_px: 120.0,
+    distortion: Distortion::None,
+};
+
+/// Returns the paint at a place of a floor: patches of random grey in four sizes.
+fn paint(floor: u64, at: DVec2) -> f32 {
+    let of_size = |size: f64| {
+        let (x, y) = ((at.x / size).floor() as i64 as u64, (at.y / size).floor() as i64 as u64);
+        (mix64(floor ^ mix64(x ^ mix64(y ^ size.to_bits()))) >> 40) as f32 / (1u64 << 24) as f32
+    };
+    0.25 * [0.05, 0.11, 0.23, 0.47].map(of_size).iter().sum::<f32>()
+}
+
+/// Returns a camera above the floor that looks at a place of it.
+fn looking(from: DVec3, at: DVec3) -> DAffine3 {
+    let z = (at - from).normalize();
+    let x = z.cross(DVec3::Z).normalize();
+    let world_from_camera = DAffine3 { matrix3: DMat3::from_cols(x, z.cross(x), z), translation: from };
+    world_from_camera.inverse()
+}
+
+/// Draws the floor z = 0, 3 x 3 rays a pixel.
+fn draw(floor: u64, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Rendering {
+    let (width, height) = (intrinsics.width_px as usize, intrinsics.height_px as usize);
+    let world_from_camera = camera_from_world.inverse();
+    let hit = |x: f64, y: f64| {
+        let [u, v] = intrinsics.distorted_from_pixel([x, y]);
+        let ray = world_from_camera.transform_vector3(DVec3::new(u, v, 1.0));
+        let depth = -world_from_camera.translation.z / ray.z;
+        (depth, world_from_camera.translation + depth * ray)
+    };
+    let mut drawn = Rendering {
+        grey: Grey { width, height, values: Vec::new() },
+        depth: Vec::with_capacity(width * height),
+    };
+    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y as f64, x as f64))) {
+        let rays =
+            (0..9).map(|i| hit(x + f64::from(i % 3 * 2 + 1) / 6.0, y + f64::from(i / 3 * 2 + 1) / 6.0));
+        drawn.grey.values.push(rays.map(|(_, at)| paint(floor, at.truncate())).sum::<f32>() / 9.0);
+        drawn.depth.push(hit(x + 0.5, y + 0.5).0 as f32);
+    }
+    drawn
+}
+
+struct Floor(u64);
+
+impl Renderer for Floor {
+    fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering> {
+        Some(draw(self.0, camera_from_world, intrinsics))
+    }
+}
+
+fn map_of(floor: u64) -> Map {
+    let view = |view: u16| {
+        let at = DVec3::new(f64::from(view % 3) - 1.0, f64::from(view / 3) - 1.0, 0.0);
+        let camera_from_world = looking(at + DVec3::new(0.3, -1.5, 2.0), at);
+        let drawn = draw(floor, &camera_from_world, &INTRINSICS);
+        let observation = |feature: slag_locate::Feature| {
+            let at = DVec2::from(feature.at);
+            let depth = drawn.depth_at(at)?;
+            let point_in_world = slag_locate::point_in_world(&camera_from_world, &INTRINSICS, at, depth);
+            Some(Observation { at, point_in_world, code: code(&feature.descriptor) })
+        };
+        let observations = features(&drawn.grey, 600).into_iter().filter_map(observation).collect();
+        MappingView { view, intrinsics: INTRINSICS, camera_from_world, observations }
+    };
+    Map::new(build(&(0..9).map(view).collect::<Vec<_>>(), 3000))
+}
+
+#[test]
+fn a_photo_is_located_and_another_floor_is_lost() {
+    let map = map_of(1);
+    let truth = looking(DVec3::new(0.6, -1.1, 1.7), DVec3::new(0.2, 0.3, 0.0));
+    let grey = draw(1, &truth, &INTRINSICS).grey;
+    let photo = Photo { grey: &grey, intrinsics: &INTRINSICS, gravity_in_camera: None };
+    for renderer in [None, Some(&Floor(1) as &dyn Renderer)] {
+        let Outcome::Found(found) = locate(&map, &photo, renderer) else { panic!("lost") };
+        let moved = (found.camera_from_world.inverse().translation - truth.inverse().translation).length();
+        let turned = (found.camera_from_world.matrix3 * truth.matrix3.transpose()).to_cols_array();
+        let cosine = (turned[0] + turned[4] + turned[8] - 1.0) / 2.0;
+        assert!(moved < 0.02 && cosine > 0.9999, "{moved} m, {cosine}, {} inliers", found.n_inliers);
+        assert_eq!(found.is_verified, renderer.is_some());
+        // Three standard deviations hold the error; they are no larger than the accuracy asked for.
+        let sigma = [0, 7, 14].map(|at| found.covariance[at]).iter().sum::<f64>().sqrt();
+        assert!(moved < 3.0 * sigma && sigma < 0.05, "{moved} {sigma}");
+        assert_eq!(locate(&map, &photo, renderer), Outcome::Found(found), "the same again");
+    }
+    let gravity = |in_world: DVec3| {
+        let gravity_in_camera = Some(truth.transform_vector3(in_world));
+        locate(&map, &Photo { gravity_in_camera, ..photo }, None)
+    };
+    assert!(matches!(gravity(DVec3::NEG_Z), Outcome::Found(_)));
+    assert_eq!(gravity(DVec3::new(0.3, 0.0, -1.0)), Outcome::Lost(Reason::Gravity));
+    // Another floor; and the right pose, but the splat shows another floor.
+    let other = draw(2, &truth, &INTRINSICS).grey;
+    assert!(matches!(locate(&map, &Photo { grey: &other, ..photo }, None), Outcome::Lost(_)));
+    assert!(matches!(locate(&map, &photo, Some(&Floor(2))), Outcome::Lost(Reason::NoPose { .. })));
+}
+
+#[test]
+fn hostile_photos_are_lost() {
+    let map = map_of(1);
+    let noise = |width: usize, height: usize| {
+        let values = (0..(width * height) as u64).map(|at| (mix64(at) >> 40) as f32 / (1u64 << 24) as f32);
+        Grey { width, height, values: values.collect() }
+    };
+    let plain = |value: f32| Grey { width: 640, height: 480, values: vec![value; 640 * 480] };
+    for grey in [
+        noise(640, 480),
+        noise(1, 1),
+        noise(5000, 3),
+        noise(15, 2000),
+        plain(0.0),
+        plain(f32::NAN),
+        plain(1e30),
+    ] {
+        let intrinsics =
+            Intrinsics { width_px: grey.width as u32, height_px: grey.height as u32, ..INTRINSICS };
+        let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: Some(DVec3::NAN) };
+        assert!(matches!(locate(&map, &photo, None), Outcome::Lost(_)), "{} x {}", grey.width, grey.height);
+    }
+    let grey = noise(64, 64);
+    let photo = Photo { grey: &grey, intrinsics: &INTRINSICS, gravity_in_camera: None };
+    assert_eq!(locate(&Map::new(Vec::new()), &photo, None), Outcome::Lost(Reason::EmptyMap));
+}

@@ -1,0 +1,161 @@
+//! Landmarks: points of a scene that photos show as features, with which a robot finds the camera of a photo. The
+//! byte table is in `docs/formats.md`.
+
+use std::ops::Range;
+
+use bytemuck::{Pod, Zeroable};
+use glam::DVec3;
+
+use crate::container::{ContainerError, Layout};
+
+/// Ids of the sections.
+pub mod section {
+    /// One [`super::LandmarksHeader`].
+    pub const HEADER: u32 = 70;
+    /// `[n]` records of 24 bytes.
+    pub const LANDMARKS: u32 = 71;
+}
+
+/// Steps of a position along each axis.
+const STEPS: f64 = u16::MAX as f64;
+
+/// A point of the scene that photos show as a feature.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Landmark {
+    pub position_in_world: DVec3,
+    /// The code of its descriptor.
+    pub code: u128,
+    /// Number of a mapping photo that shows it, in the order of names; those beyond 65,535 share numbers.
+    pub view: u16,
+}
+
+/// What the landmarks of a shard have in common.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct LandmarksHeader {
+    /// Smallest corner of the landmarks, world frame.
+    pub origin_in_world: [f64; 3],
+    /// World units per step of a position, per axis.
+    pub step: [f64; 3],
+    /// Version of the codes. Those of other versions cannot be matched.
+    pub code_version: u32,
+    pub reserved: u32,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+struct Record {
+    position: [u16; 3],
+    view: u16,
+    /// Little-endian, the lowest first.
+    code: [u32; 4],
+}
+
+/// The landmarks of a shard.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Landmarks<'a> {
+    pub header: &'a LandmarksHeader,
+    records: &'a [Record],
+}
+
+impl<'a> Landmarks<'a> {
+    /// Returns each landmark.
+    pub fn iter(&self) -> impl Iterator<Item = Landmark> + use<'a> {
+        let (origin, step) = (DVec3::from(self.header.origin_in_world), DVec3::from(self.header.step));
+        self.records.iter().map(move |record| Landmark {
+            position_in_world: origin + step * DVec3::from(record.position.map(f64::from)),
+            code: record.code.iter().rev().fold(0, |code, word| code << 32 | u128::from(*word)),
+            view: record.view,
+        })
+    }
+
+    /// Returns the sections to write.
+    pub(crate) fn sections(&self) -> [(u32, &'a [u8]); 2] {
+        let records = bytemuck::cast_slice(self.records);
+        [(section::HEADER, bytemuck::bytes_of(self.header)), (section::LANDMARKS, records)]
+    }
+}
+
+/// The landmarks of a shard, to be written.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct BuiltLandmarks {
+    header: LandmarksHeader,
+    records: Vec<Record>,
+}
+
+impl BuiltLandmarks {
+    /// Packs the landmarks of a cell; those whose positions are not finite are left out.
+    pub fn pack(code_version: u32, landmarks: &[Landmark]) -> Self {
+        let finite = || landmarks.iter().filter(|landmark| landmark.position_in_world.is_finite());
+        let positions = || finite().map(|landmark| landmark.position_in_world);
+        let Some(min) = positions().reduce(DVec3::min) else { return Self::default() };
+        let max = positions().fold(min, DVec3::max);
+        // Halves, because the size of the largest scene overflows.
+        let step = (max / STEPS - min / STEPS).max(DVec3::splat(f64::MIN_POSITIVE));
+        let record = |landmark: &Landmark| Record {
+            position: ((landmark.position_in_world - min) / step)
+                .to_array()
+                .map(|steps| steps.round() as u16),
+            view: landmark.view,
+            code: [0, 1, 2, 3].map(|word| (landmark.code >> (32 * word)) as u32),
+        };
+        let header = LandmarksHeader {
+            origin_in_world: min.to_array(),
+            step: step.to_array(),
+            code_version,
+            reserved: 0,
+        };
+        Self { header, records: finite().map(record).collect() }
+    }
+
+    /// Returns the columns; `None` without landmarks, whose shard has no sections of them.
+    pub fn view(&self) -> Option<Landmarks<'_>> {
+        (!self.records.is_empty()).then_some(Landmarks { header: &self.header, records: &self.records })
+    }
+
+    /// Returns the bytes of its sections.
+    pub fn len_bytes(&self) -> u64 {
+        (size_of::<LandmarksHeader>() + size_of_val(&self.records[..])) as u64
+    }
+}
+
+/// Where the columns of a shard's checked landmarks lie.
+#[derive(Clone, Debug)]
+pub(crate) struct LandmarksLayout {
+    header: Range<usize>,
+    records: Range<usize>,
+}
+
+impl LandmarksLayout {
+    /// Checks the landmarks; returns `None` if the shard has none.
+    pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<Option<Self>, ContainerError> {
+        let Some(at) = layout.find(section::HEADER) else { return Ok(None) };
+        let header: LandmarksHeader = layout.value(bytes, section::HEADER, "header of the landmarks")?;
+        let is_sound = |axis: usize| {
+            let (origin, step) = (header.origin_in_world[axis], header.step[axis]);
+            step > 0.0 && origin.is_finite() && (origin + step * STEPS).is_finite()
+        };
+        if ![0, 1, 2].into_iter().all(is_sound) {
+            let what = format!(
+                "landmarks from {:?} in steps of {:?}, expected finite positions and steps above 0",
+                header.origin_in_world, header.step
+            );
+            return Err(ContainerError::Damaged { offset_bytes: at.start as u64, what });
+        }
+        let n_bytes = layout.find(section::LANDMARKS).map_or(0, |records| records.len());
+        let records =
+            layout.column::<Record>(section::LANDMARKS, "landmarks", n_bytes / size_of::<Record>())?;
+        Ok(Some(Self { header: at, records }))
+    }
+
+    /// Returns the columns of the bytes that were checked.
+    pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Landmarks<'a> {
+        Landmarks {
+            header: bytemuck::from_bytes(&bytes[self.header.clone()]),
+            records: bytemuck::cast_slice(&bytes[self.records.clone()]),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

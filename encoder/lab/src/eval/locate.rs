@@ -1,0 +1,319 @@
+//! `eval locate`: photos that the map has not seen, located in it; photos of the other scenes must not be.
+//!
+//! The map is made of three quarters of a scene's photos. The rest, and the photos of `test/`, are the queries.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+use clap::{Args, ValueEnum};
+use rayon::prelude::*;
+use serde::Serialize;
+use slag_common::landmarks::BuiltLandmarks;
+use slag_common::splat::{self, ReadOptions};
+use slag_common::{Gaussians, View, poses};
+use slag_encoder::ingest;
+use slag_encoder::landmarks::{self, SceneRenderer};
+use slag_encoder::progress::Progress;
+use slag_encoder::raster::{CpuRasterizer, Rasterizer};
+use slag_locate::{Grey, Map, MappingView, Outcome, Photo, Reason, Renderer, locate};
+
+use crate::scenes::SceneFiles;
+use crate::table::{Table, figure};
+
+/// Of so many photos one is a query.
+const HELD_OUT: usize = 4;
+/// Error of the focal length of [`Change::Focal`].
+const FOCAL_FACTOR: f64 = 1.03;
+/// Light of [`Change::Dark`].
+const DARK_FACTOR: f32 = 0.4;
+/// Width of the square of [`Change::Covered`], as a share of each side: 20 % of the area.
+const COVERED_SIDE: f64 = 0.447;
+
+/// `eval locate`.
+#[derive(Debug, Args)]
+pub(crate) struct LocateArgs {
+    /// Folders of scenes: a splat, poses, photos, and optionally test/transforms.json.
+    #[arg(long = "scene", value_name = "DIR", num_args = 1.., required = true)]
+    scenes: Vec<PathBuf>,
+    /// Decides by landmarks alone, as a robot does: no rendering verifies a pose.
+    #[arg(long)]
+    unverified: bool,
+    /// Changes each query.
+    #[arg(long, value_enum, default_value = "none")]
+    change: Change,
+    /// The map has only photos of these places in the order of names, from A to before B; the others are queries
+    /// [default: all].
+    #[arg(long, value_name = "A,B", value_delimiter = ',', num_args = 2)]
+    map_views: Option<Vec<usize>>,
+    /// Tells each query that was not found where it is.
+    #[arg(long)]
+    list: bool,
+}
+
+/// How queries differ from their photos.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+enum Change {
+    None,
+    /// 40 % of the light.
+    Dark,
+    /// Half the resolution, and back.
+    Blurred,
+    /// The focal length is stated 3 % too large.
+    Focal,
+    /// A grey square hides 20 % of the photo.
+    Covered,
+}
+
+/// A scene, its map and its queries.
+struct Located {
+    name: String,
+    gaussians: Gaussians,
+    map: Map,
+    len_bytes: u64,
+    map_secs: f64,
+    queries: Vec<View>,
+}
+
+/// A query's result: errors in metres and degrees, where it was found.
+struct Try {
+    found: Result<[f64; 2], Reason>,
+    secs: f64,
+}
+
+impl Try {
+    fn is_within(&self, metres: f64, degrees: f64) -> bool {
+        self.found.is_ok_and(|[m, deg]| m <= metres && deg <= degrees)
+    }
+}
+
+#[derive(Debug, Serialize)]
+pub(crate) struct LocateReport {
+    change: Change,
+    is_verified: bool,
+    /// Of all scenes.
+    #[serde(flatten)]
+    all: Figures,
+    scenes: Vec<Figures>,
+}
+
+/// Shares of queries, of a scene or of all.
+#[derive(Debug, Serialize)]
+struct Figures {
+    name: String,
+    n: usize,
+    n_foreign: usize,
+    within_25cm_5deg: Option<f64>,
+    within_1m_10deg: Option<f64>,
+    lost: Option<f64>,
+    /// Found, but further away than 1 m or 10 degrees.
+    wrong: Option<f64>,
+    foreign_accepted: Option<f64>,
+    /// Median error of those that were found.
+    median_m: Option<f64>,
+    median_secs: Option<f64>,
+    bytes_per_million: Option<f64>,
+    /// Time for making the map.
+    map_secs: f64,
+}
+
+pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateReport> {
+    let files = SceneFiles::find_all(&args.scenes)?;
+    progress.begin("locate", "scene", files.len() as u64, 0);
+    let scenes = files.iter().map(|files| prepare(files, args)).collect::<Result<Vec<_>>>()?;
+    let mut report = LocateReport {
+        change: args.change,
+        is_verified: !args.unverified,
+        all: Figures::default(),
+        scenes: Vec::new(),
+    };
+    let (mut all_tries, mut all_foreign) = (Vec::new(), Vec::new());
+    for (at, scene) in scenes.iter().enumerate() {
+        let loaded = CpuRasterizer.load(&scene.gaussians)?;
+        let renderer = SceneRenderer(loaded.as_ref());
+        let renderer = (!args.unverified).then_some(&renderer as &(dyn Renderer + Sync));
+        let attempt = |view: &View| attempt(scene, view, args.change, renderer);
+        let mut tries = Vec::new();
+        for view in &scene.queries {
+            let one = attempt(view)?;
+            if args.list && !one.is_within(0.25, 5.0) {
+                let told = one.found.map_or_else(
+                    |reason| reason.to_string(),
+                    |[m, deg]| format!("off by {m:.2} m, {deg:.1} degrees"),
+                );
+                tracing::warn!("{} {}: {told}", scene.name, view.name);
+            }
+            tries.push(one);
+        }
+        let others = scenes.iter().enumerate().filter(|(other, _)| *other != at);
+        let others: Vec<&View> = others.flat_map(|(_, other)| &other.queries).collect();
+        let foreign = others.par_iter().map(|view| attempt(view)).collect::<Result<Vec<_>>>()?;
+        report.scenes.push(Figures::of(&scene.name, &[scene], &tries, &foreign));
+        all_tries.extend(tries);
+        all_foreign.extend(foreign);
+        progress.advance(1);
+    }
+    progress.end();
+    report.all = Figures::of("all", &scenes.iter().collect::<Vec<_>>(), &all_tries, &all_foreign);
+    Ok(report)
+}
+
+/// Makes the map of a scene.
+fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
+    let gaussians = splat::read(&files.splat, &ReadOptions { with_sh_rest: true })?;
+    let views = poses::read(&files.poses, files.images.as_deref())?.views;
+    let range = args.map_views.as_ref().map_or(0..views.len(), |range| range[0]..range[1].min(views.len()));
+    let is_query = |at: usize| at % HELD_OUT == HELD_OUT - 1 || !range.contains(&at);
+    let start = Instant::now();
+    let loaded = CpuRasterizer.load(&gaussians)?;
+    let mapping = views.iter().enumerate().filter(|(at, _)| !is_query(*at));
+    let mapping: Vec<MappingView> = mapping
+        .map(|(at, view)| {
+            landmarks::observe(loaded.as_ref(), at as u16, view).with_context(|| view.name.clone())
+        })
+        .collect::<Result<_>>()?;
+    drop(loaded);
+    let found = landmarks::landmarks(&mapping, gaussians.len());
+    let built = BuiltLandmarks::pack(slag_locate::CODE_VERSION, &found);
+    let mut queries: Vec<View> =
+        views.iter().enumerate().filter(|(at, _)| is_query(*at)).map(|(_, view)| view.clone()).collect();
+    let test = files.dir.join("test/transforms.json");
+    if test.is_file() {
+        queries.extend(poses::read(&test, None)?.views);
+    }
+    Ok(Located {
+        name: files.name.clone(),
+        map: Map::new(built.view().map(|view| view.iter().collect()).unwrap_or_default()),
+        len_bytes: built.len_bytes(),
+        map_secs: start.elapsed().as_secs_f64(),
+        gaussians,
+        queries,
+    })
+}
+
+/// Locates a photo in a scene's map.
+fn attempt(
+    scene: &Located,
+    view: &View,
+    change: Change,
+    renderer: Option<&(dyn Renderer + Sync)>,
+) -> Result<Try> {
+    let loaded = ingest::load_image(view).with_context(|| view.name.clone())?;
+    let (width, height) = loaded.image.dimensions();
+    let mut grey = Grey::from_rgb8(width as usize, height as usize, loaded.image.as_raw());
+    let mut intrinsics = loaded.view.intrinsics;
+    changed(change, &mut grey, &mut intrinsics);
+    let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: None };
+    let start = Instant::now();
+    let outcome = locate(&scene.map, &photo, renderer.map(|renderer| renderer as &dyn Renderer));
+    let secs = start.elapsed().as_secs_f64();
+    let found = match outcome {
+        Outcome::Found(found) => {
+            let (truth, pose) = (view.camera_from_world, found.camera_from_world);
+            let metres = truth.inverse().translation.distance(pose.inverse().translation);
+            let between = glam::DQuat::from_mat3(&(pose.matrix3 * truth.matrix3.transpose()));
+            let degrees = between.to_axis_angle().1.to_degrees();
+            Ok([metres, degrees.min(360.0 - degrees)])
+        }
+        Outcome::Lost(reason) => Err(reason),
+    };
+    Ok(Try { found, secs })
+}
+
+fn changed(change: Change, grey: &mut Grey, intrinsics: &mut slag_common::Intrinsics) {
+    let (width, height) = (grey.width, grey.height);
+    match change {
+        Change::None => {}
+        Change::Dark => grey.values.iter_mut().for_each(|v| *v = (*v * DARK_FACTOR * 255.0).round() / 255.0),
+        Change::Blurred => {
+            let sharp = grey.values.clone();
+            for y in 0..height {
+                for x in 0..width {
+                    let (x0, y0) = (x / 2 * 2, y / 2 * 2);
+                    let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
+                    let corners = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)];
+                    grey.values[y * width + x] =
+                        0.25 * corners.map(|(x, y)| sharp[y * width + x]).iter().sum::<f32>();
+                }
+            }
+        }
+        Change::Focal => {
+            intrinsics.focal_x_px *= FOCAL_FACTOR;
+            intrinsics.focal_y_px *= FOCAL_FACTOR;
+        }
+        Change::Covered => {
+            let side = |n: usize| (n as f64 * COVERED_SIDE) as usize;
+            for y in height / 4..height / 4 + side(height) {
+                grey.values[y * width + width / 4..][..side(width)].fill(0.5);
+            }
+        }
+    }
+}
+
+impl Default for Figures {
+    fn default() -> Self {
+        Self::of("", &[], &[], &[])
+    }
+}
+
+impl Figures {
+    fn of(name: &str, scenes: &[&Located], tries: &[Try], foreign: &[Try]) -> Self {
+        let share = |n: usize, of: usize| (of > 0).then(|| n as f64 / of as f64);
+        let of_tries =
+            |is: &dyn Fn(&Try) -> bool| share(tries.iter().filter(|one| is(one)).count(), tries.len());
+        let median = |mut values: Vec<f64>| {
+            values.sort_by(f64::total_cmp);
+            values.get(values.len() / 2).copied()
+        };
+        let n_gaussians: usize = scenes.iter().map(|scene| scene.gaussians.len()).sum();
+        let len_bytes: u64 = scenes.iter().map(|scene| scene.len_bytes).sum();
+        Self {
+            name: name.to_owned(),
+            n: tries.len(),
+            n_foreign: foreign.len(),
+            within_25cm_5deg: of_tries(&|one| one.is_within(0.25, 5.0)),
+            within_1m_10deg: of_tries(&|one| one.is_within(1.0, 10.0)),
+            lost: of_tries(&|one| one.found.is_err()),
+            wrong: of_tries(&|one| one.found.is_ok() && !one.is_within(1.0, 10.0)),
+            foreign_accepted: share(foreign.iter().filter(|one| one.found.is_ok()).count(), foreign.len()),
+            median_m: median(tries.iter().filter_map(|one| Some(one.found.ok()?[0])).collect()),
+            median_secs: median(tries.iter().map(|one| one.secs).collect()),
+            bytes_per_million: (n_gaussians > 0).then(|| len_bytes as f64 * 1e6 / n_gaussians as f64),
+            map_secs: scenes.iter().map(|scene| scene.map_secs).sum(),
+        }
+    }
+}
+
+impl fmt::Display for LocateReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut table = Table::new([
+            "scene",
+            "n",
+            "0.25 m, 5 deg",
+            "1 m, 10 deg",
+            "lost",
+            "wrong",
+            "median m",
+            "median s",
+            "foreign",
+            "accepted",
+            "bytes a million",
+            "map s",
+        ]);
+        for of in self.scenes.iter().chain([&self.all]) {
+            let shares =
+                [of.within_25cm_5deg, of.within_1m_10deg, of.lost, of.wrong, of.median_m, of.median_secs];
+            let mut row = vec![of.name.clone(), of.n.to_string()];
+            row.extend(shares.map(figure));
+            row.extend([of.n_foreign.to_string(), figure(of.foreign_accepted)]);
+            row.extend([
+                of.bytes_per_million.map_or("-".into(), |b| format!("{b:.0}")),
+                format!("{:.1}", of.map_secs),
+            ]);
+            table.row(row);
+        }
+        write!(f, "{table}")
+    }
+}

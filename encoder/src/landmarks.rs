@@ -1,0 +1,77 @@
+//! The map with which a robot finds its own place: features of the photos, with the depth that the splat has at
+//! their pixels.
+
+use glam::{DAffine3, DVec2};
+use slag_common::{Intrinsics, View};
+use slag_locate::{
+    Grey, Landmark, MAX_FEATURES, MappingView, Observation, Renderer, Rendering, build, code, features,
+};
+
+use crate::ingest::{self, IngestError, LoadedImage};
+use crate::raster::{LoadedScene, RasterError, RasterView};
+
+/// Gaussians for which there is a landmark: at 24 bytes, 2 bytes a Gaussian.
+const GAUSSIANS_A_LANDMARK: usize = 12;
+/// Opacity of a pixel from which its depth is a surface's.
+const MIN_COVERAGE: f32 = 0.5;
+/// Widest rendering, pixels.
+const MAX_RENDERING_WIDTH_PX: u32 = 1600;
+
+/// Why a photo has no features.
+#[derive(Debug, thiserror::Error)]
+pub enum LandmarkError {
+    #[error(transparent)]
+    Photo(#[from] IngestError),
+    #[error(transparent)]
+    Raster(#[from] RasterError),
+}
+
+/// A scene that can be drawn.
+pub struct SceneRenderer<'a>(pub &'a dyn LoadedScene);
+
+impl SceneRenderer<'_> {
+    fn draw(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Result<Rendering, RasterError> {
+        let view = RasterView { camera_from_world: *camera_from_world, intrinsics: *intrinsics };
+        let drawing = self.0.draw(&view, [0.5; 3])?;
+        let surface = drawing.depth.iter().zip(&drawing.coverage);
+        let depth =
+            surface.map(|(depth, coverage)| if *coverage >= MIN_COVERAGE { *depth } else { 0.0 }).collect();
+        let bytes: Vec<u8> = drawing.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
+        let grey = Grey::from_rgb8(drawing.width_px as usize, drawing.height_px as usize, &bytes);
+        Ok(Rendering { grey, depth })
+    }
+}
+
+impl Renderer for SceneRenderer<'_> {
+    fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering> {
+        self.draw(camera_from_world, intrinsics).ok()
+    }
+}
+
+/// Returns the features of a photo that have a place in the scene.
+///
+/// # Errors
+/// The photo cannot be loaded, or the scene not be drawn.
+pub fn observe(scene: &dyn LoadedScene, number: u16, view: &View) -> Result<MappingView, LandmarkError> {
+    let LoadedImage { view, image, .. } = ingest::load_image(view)?;
+    let grey = Grey::from_rgb8(image.width() as usize, image.height() as usize, image.as_raw());
+    let width_px = view.intrinsics.width_px.min(MAX_RENDERING_WIDTH_PX);
+    let (intrinsics, pose) = (view.intrinsics.scaled_to_width(width_px), view.camera_from_world);
+    let (found, drawn) =
+        rayon::join(|| features(&grey, MAX_FEATURES), || SceneRenderer(scene).draw(&pose, &intrinsics));
+    let drawn = drawn?;
+    let scale = f64::from(width_px) / f64::from(view.intrinsics.width_px);
+    let observation = |feature: slag_locate::Feature| {
+        let at = DVec2::from(feature.at);
+        let depth = drawn.depth_at(at * scale)?;
+        let point_in_world = slag_locate::point_in_world(&pose, &view.intrinsics, at, depth);
+        Some(Observation { at, point_in_world, code: code(&feature.descriptor) })
+    };
+    let observations = found.into_iter().filter_map(observation).collect();
+    Ok(MappingView { view: number, intrinsics: view.intrinsics, camera_from_world: pose, observations })
+}
+
+/// Returns the landmarks of a scene of `n_gaussians`.
+pub fn landmarks(views: &[MappingView], n_gaussians: usize) -> Vec<Landmark> {
+    build(views, n_gaussians / GAUSSIANS_A_LANDMARK)
+}
