@@ -35,6 +35,9 @@ pub struct MappingView {
     pub observations: Vec<Observation>,
 }
 
+/// An observation of a view, and the observations of other views that show the same point: view, observation.
+type Ranked = (usize, Vec<(usize, usize)>);
+
 /// Returns at most `limit` landmarks: of each view, its share of the points that most of its neighbours show, too.
 /// A point that several views show is taken once.
 pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
@@ -43,7 +46,7 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
     let mut chosen: Vec<Vec<bool>> = views.iter().map(|view| vec![false; view.observations.len()]).collect();
     let mut hidden = chosen.clone();
     // By view: observations with the others that show the same point, those with most first.
-    let ranked: Vec<Vec<(usize, Vec<(usize, usize)>)>> = (0..views.len())
+    let ranked: Vec<Vec<Ranked>> = (0..views.len())
         .map(|at| {
             let mut others: Vec<usize> = (0..views.len()).filter(|other| *other != at).collect();
             let apart = |other: &usize| middles[at].distance_squared(middles[*other]);

@@ -50,6 +50,9 @@ pub(crate) struct Keypoint {
     pub(crate) contrast: f32,
 }
 
+/// A keypoint, the photo's pixels that one of its octave has, and its descriptors with their angles.
+type Described = (Keypoint, f32, Vec<(f32, Descriptor)>);
+
 /// Returns the strongest `limit` features of a photo, strongest first; ties by position.
 pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
     let (photo, factor) = photo.limited(MAX_PX);
@@ -60,12 +63,12 @@ pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
     let first = (SIGMA * SIGMA - 4.0 * CAMERA_SIGMA * CAMERA_SIGMA).sqrt();
     let mut base = photo.doubled().blurred(first);
     let mut pixel = 0.5 * factor as f32;
-    let mut found: Vec<(Keypoint, f32, Vec<(f32, Descriptor)>)> = Vec::new();
+    let mut found: Vec<Described> = Vec::new();
     while base.width >= MIN_SIDE && base.height >= MIN_SIDE {
         let layers = blurred_layers(base);
         let mut keypoints = extrema(&layers);
         // No more of one octave than of all: bounds the work on noise.
-        keypoints.sort_by(|a, b| stronger(a, b));
+        keypoints.sort_by(stronger);
         keypoints.truncate(limit);
         for keypoint in keypoints {
             let layer = &layers[keypoint.layer];
@@ -77,7 +80,7 @@ pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
         pixel *= 2.0;
     }
     found.sort_by(|(a, p, _), (b, q, _)| stronger(a, b).then(p.total_cmp(q)));
-    let of_keypoint = |(keypoint, pixel, described): (Keypoint, f32, Vec<(f32, Descriptor)>)| {
+    let of_keypoint = |(keypoint, pixel, described): Described| {
         described.into_iter().map(move |(angle, descriptor)| Feature {
             // Pixel 0 of the doubled picture is the middle of the photo's first pixel.
             at: [keypoint.x, keypoint.y].map(|c| f64::from(c * pixel) + 0.5 * f64::from(factor)),

@@ -285,7 +285,7 @@ mod tests {
         assert_eq!(ground.floors, [5, 5, 5, 6, 9].map(Floor::At));
         // Above a table of the storey below: a box that is in the way, a hole, and what hangs over the robot.
         for (surfaces, expected) in [
-            (1 << 1 | 1 << 12, Floor::Blocked),
+            (1_u128 << 1 | 1 << 12, Floor::Blocked),
             (1 << 1, Floor::At(1)),
             (1 << 1 | 1 << 16, Floor::At(1)),
             (1 << 12, Floor::At(12)),

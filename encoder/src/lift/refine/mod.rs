@@ -71,7 +71,7 @@ const FILLER_WEIGHT: f32 = 0.1;
 /// Returns the weight of each mask of some photos: (1 - truncation)^power, less for fillers.
 fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
     let weight = |outline: &MaskOutline| {
-        let of_kind = if outline.level == Mask::FILLER.into() { FILLER_WEIGHT } else { 1.0 };
+        let of_kind = if outline.level == u32::from(Mask::FILLER) { FILLER_WEIGHT } else { 1.0 };
         of_kind * outline.uncut_share().max(LEAST_MASK_WEIGHT).powf(power)
     };
     photos.iter().flat_map(|photo| &photo.outlines).map(weight).collect()

@@ -195,7 +195,7 @@ fn objects_are_those_of_the_definition() {
             let (mut world, superpoints) = world_of(&views);
             // Outlines of boxes of 10 x 10 pixels, half of them cut off somewhere.
             let outlines = world.photos.iter_mut().flat_map(|photo| &mut photo.outlines);
-            outlines.for_each(|outline| outline.cut_px = random.below(9).saturating_sub(4) as u32 * 3);
+            outlines.for_each(|outline| outline.cut_px = random.below(9_u32).saturating_sub(4) * 3);
             let uncut = |view: usize, mask: u32| {
                 1.0 - f64::from(world.photos[view].outlines[mask as usize].cut_px) / 40.0
             };
