@@ -23,7 +23,6 @@ const STEPS: f64 = u16::MAX as f64;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Landmark {
     pub position_in_world: DVec3,
-    /// The code of its descriptor.
     pub code: u128,
     /// Number of a mapping photo that shows it, in the order of names; those beyond 65,535 share numbers.
     pub view: u16,
@@ -51,7 +50,6 @@ struct Record {
     code: [u32; 4],
 }
 
-/// The landmarks of a shard.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Landmarks<'a> {
     pub header: &'a LandmarksHeader,
@@ -59,7 +57,6 @@ pub struct Landmarks<'a> {
 }
 
 impl<'a> Landmarks<'a> {
-    /// Returns each landmark.
     pub fn iter(&self) -> impl Iterator<Item = Landmark> + use<'a> {
         let (origin, step) = (DVec3::from(self.header.origin_in_world), DVec3::from(self.header.step));
         self.records.iter().map(move |record| Landmark {
@@ -69,7 +66,6 @@ impl<'a> Landmarks<'a> {
         })
     }
 
-    /// Returns the sections to write.
     pub(crate) fn sections(&self) -> [(u32, &'a [u8]); 2] {
         let records = bytemuck::cast_slice(self.records);
         [(section::HEADER, bytemuck::bytes_of(self.header)), (section::LANDMARKS, records)]
@@ -113,7 +109,6 @@ impl BuiltLandmarks {
         (!self.records.is_empty()).then_some(Landmarks { header: &self.header, records: &self.records })
     }
 
-    /// Returns the bytes of its sections.
     pub fn len_bytes(&self) -> u64 {
         (size_of::<LandmarksHeader>() + size_of_val(&self.records[..])) as u64
     }

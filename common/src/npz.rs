@@ -12,7 +12,6 @@ use zip::result::ZipError;
 pub struct Npz(ZipArchive<BufReader<File>>);
 
 impl Npz {
-    /// Opens an archive.
     pub fn open(path: &Path) -> io::Result<Self> {
         Ok(Self(ZipArchive::new(BufReader::new(File::open(path)?))?))
     }

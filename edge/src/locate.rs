@@ -32,7 +32,6 @@ pub enum LocateError {
     Version { cell_id: u32, found: u32 },
 }
 
-/// The camera of a photo.
 #[derive(Clone, Copy, Debug)]
 pub struct Camera {
     pub focal_px: f64,
@@ -42,7 +41,6 @@ pub struct Camera {
     pub gravity: Option<DVec3>,
 }
 
-/// The answer to a photo.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "state", rename_all = "lowercase")]
 pub enum Answer {
@@ -65,9 +63,6 @@ pub enum Answer {
 }
 
 /// Returns the landmarks on board.
-///
-/// # Errors
-/// [`LocateError::Version`].
 pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
     let mut all = Vec::new();
     for shard in &snapshot.shards {
@@ -122,7 +117,6 @@ fn found_answer(snapshot: &Snapshot, found: &Located) -> Answer {
     }
 }
 
-/// Reads a photo in grey.
 fn read(path: &Path) -> Result<Grey, LocateError> {
     let mut reader =
         ImageReader::new(std::io::BufReader::new(fs_err::File::open(path)?)).with_guessed_format()?;

@@ -49,9 +49,6 @@ impl Renderer for SceneRenderer<'_> {
 }
 
 /// Returns the features of a photo that have a place in the scene.
-///
-/// # Errors
-/// The photo cannot be loaded, or the scene not be drawn.
 pub fn observe(scene: &dyn LoadedScene, number: u16, view: &View) -> Result<MappingView, LandmarkError> {
     let LoadedImage { view, image, .. } = ingest::load_image(view)?;
     let grey = Grey::from_rgb8(image.width() as usize, image.height() as usize, image.as_raw());

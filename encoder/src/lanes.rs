@@ -10,7 +10,6 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-/// The load of a GPU by one stage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GpuLoad {
     /// The GPU, as CUDA numbers it.
@@ -91,7 +90,6 @@ impl<T> Lanes<T> {
         Some(Lane { lanes: self, gpu, held: Some(held) })
     }
 
-    /// Returns the load of each GPU so far.
     pub fn loads(&self) -> Vec<GpuLoad> {
         let load = |gpu: &Gpu<T>| GpuLoad {
             gpu: gpu.number,

@@ -11,7 +11,6 @@ pub trait Progress: Sync {
     fn begin(&self, stage: &str, unit: &str, total: u64, done: u64);
     /// Counts `n` more steps as done.
     fn advance(&self, n: u64);
-    /// Ends the stage.
     fn end(&self);
     /// Tells what an encode is going to do: its views, and its cells.
     fn plan(&self, _views: &[&View], _cells: &[Aabb]) {}
@@ -31,7 +30,6 @@ pub struct FoundObject {
     pub position_m: DVec3,
     pub bounds: Aabb,
     pub n_gaussians: u32,
-    /// Masks that show it.
     pub n_masks: u32,
     /// Name of the view that shows it best.
     pub photo: String,

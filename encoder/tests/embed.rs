@@ -10,7 +10,6 @@ use slag_encoder::{
 use slag_models::{Crop, ImageEncoder, InferenceError, ModelDir, SessionOptions};
 use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
 
-/// A labelled view.
 struct Labelled {
     photo: RgbImage,
     /// Instance of each pixel.

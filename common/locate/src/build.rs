@@ -25,7 +25,6 @@ pub struct Observation {
     pub code: Code,
 }
 
-/// A mapping photo.
 #[derive(Clone, Debug)]
 pub struct MappingView {
     /// Its number, see [`Landmark::view`].

@@ -3,7 +3,6 @@
 
 use crate::describe::{DIM, Descriptor};
 
-/// The code of a descriptor.
 pub type Code = u128;
 
 /// Version of the codes: maps of other versions cannot be matched.
@@ -12,10 +11,8 @@ pub const CODE_VERSION: u32 = 1;
 /// `[DIM]` the mean of descriptors, u8 in 1/1000, then `[128][DIM]` the directions, i8, of any length. Learned from
 /// the features of two scenes (`train_codes.py`).
 static LEARNED: &[u8; DIM + 128 * DIM] = include_bytes!("codes-1.bin");
-/// Unit of the mean.
 const MEAN_STEP: f32 = 1e-3;
 
-/// Returns the code of a descriptor.
 pub fn code(descriptor: &Descriptor) -> Code {
     let (mean, directions) = LEARNED.split_at(DIM);
     let mut centred = *descriptor;

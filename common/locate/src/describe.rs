@@ -12,7 +12,6 @@ pub type Descriptor = [f32; DIM];
 
 const PLACES: usize = 4;
 const DIRECTIONS: usize = 8;
-/// Bins of the histogram of orientations.
 const ORIENTATION_BINS: usize = 36;
 /// Other peaks of the histogram from which a keypoint has another orientation.
 const OTHER_PEAK: f32 = 0.8;

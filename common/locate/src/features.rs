@@ -17,14 +17,12 @@ const MIN_CONTRAST: f32 = 0.015;
 const MAX_CURVATURE_RATIO: f32 = 10.0;
 /// Pixels at the border of each octave without keypoints.
 const BORDER: usize = 5;
-/// Steps of the interpolation.
 const MAX_STEPS: usize = 5;
 /// Pixels up to which a photo keeps its size: the pictures of its largest octave take 96 bytes a pixel.
 const MAX_PX: usize = 1_500_000;
 /// Shortest side of an octave, pixels.
 const MIN_SIDE: usize = 16;
 
-/// A feature of a photo.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Feature {
     /// Where, pixels; the centre of the first pixel is 0.5.

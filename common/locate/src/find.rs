@@ -57,12 +57,15 @@ pub enum Outcome {
 /// Why a photo has no place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
-    /// The map has no landmark.
     EmptyMap,
     /// The photo is dark, blurred or plain.
-    FewFeatures { found: usize },
+    FewFeatures {
+        found: usize,
+    },
     /// No pose agrees with enough landmarks.
-    NoPose { inliers: usize },
+    NoPose {
+        inliers: usize,
+    },
     /// The landmarks that agree lie in one corner of the photo.
     NoSpread,
     /// The pose contradicts the direction of gravity.

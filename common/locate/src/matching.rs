@@ -18,7 +18,6 @@ const MAX_RATIO_OF_VIEWS: f32 = 0.9;
 const MAX_GUIDED_DISTANCE: u32 = 44;
 /// Pixels around a feature in which its landmark lies, given the pose.
 const GUIDED_PX: f64 = 12.0;
-/// Views that the matches vote for.
 const N_VIEWS: usize = 8;
 
 /// The features to match: places on an ideal pinhole's image, pixels, and codes.

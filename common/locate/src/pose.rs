@@ -41,7 +41,6 @@ impl Pinhole {
         (in_camera.z > 1e-9).then(|| in_camera.truncate() / in_camera.z * self.focal + self.centre)
     }
 
-    /// Returns the direction of a pixel.
     pub(crate) fn ray(&self, pixel: DVec2) -> DVec3 {
         ((pixel - self.centre) / self.focal).extend(1.0).normalize()
     }

@@ -189,7 +189,6 @@ impl ModelDir {
         }
     }
 
-    /// Opens the image encoder.
     pub fn image_encoder(&self, options: &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError> {
         let Source::Files { files, description, batch } = &self.source else {
             return Ok(Box::new(colours::ColourShape));

@@ -20,7 +20,6 @@ use crate::problem::Problem;
 
 /// Least characters of a token: 128 bits as hex digits take 32, as base64 22.
 const MIN_TOKEN_CHARS: usize = 16;
-/// Most bytes of a token file.
 const MAX_TOKEN_BYTES: u64 = 4096;
 const ALLOWED_METHODS: HeaderValue = HeaderValue::from_static("GET, HEAD, POST");
 const ALLOWED_HEADERS: HeaderValue = HeaderValue::from_static("authorization, content-type, x-request-id");
@@ -40,14 +39,8 @@ pub struct AccessSettings {
 /// The setting that is wrong.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
-    /// The token's file cannot be read.
     #[error("the token file {} cannot be read: {cause}; write a token of at least {MIN_TOKEN_CHARS} characters into it", path.display())]
-    Unreadable {
-        path: PathBuf,
-        /// The system's error.
-        cause: io::Error,
-    },
-    /// The token is too short or has characters that a header cannot carry.
+    Unreadable { path: PathBuf, cause: io::Error },
     #[error(
         "the token file {} holds {found}, expected one line of at least {MIN_TOKEN_CHARS} visible ASCII characters; `openssl rand -hex 32` makes one",
         path.display()
@@ -57,14 +50,10 @@ pub enum AccessError {
         /// What it holds; not the token.
         found: String,
     },
-    /// An origin is none.
     #[error(
         "the origin {found:?} is none, expected SCHEME://HOST or SCHEME://HOST:PORT, such as https://map.example"
     )]
-    Origin {
-        /// The text.
-        found: String,
-    },
+    Origin { found: String },
 }
 
 /// Whose writes are accepted.
@@ -74,7 +63,6 @@ enum Writes {
     All,
     /// Nobody's.
     None,
-    /// Those with this token.
     Token(String),
 }
 

@@ -113,9 +113,6 @@ fn too_slow(error: &axum::Error) -> Option<TooSlow> {
 
 /// Checks that a body is said to be JSON. Forms and plain text, which a page of any origin can post without
 /// asking, are thus refused.
-///
-/// # Errors
-/// 415.
 pub(crate) fn check_json(headers: &HeaderMap) -> Result<(), Problem> {
     let found = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let kind = found.and_then(|value| value.split(';').next()).unwrap_or_default().trim();

@@ -113,7 +113,6 @@ impl fmt::Display for Listen {
 #[error("cannot listen on {address}: {cause}; choose another address, port or path")]
 pub struct ListenError {
     pub address: Listen,
-    /// The system's error.
     pub cause: io::Error,
 }
 
@@ -185,9 +184,6 @@ impl Listener {
     }
 
     /// Returns the address to connect to: `http://IP:PORT`, with TLS `https://IP:PORT`, or `unix:PATH`.
-    ///
-    /// # Errors
-    /// The system's error.
     pub fn url(&self) -> io::Result<String> {
         match &self.socket {
             Socket::Tcp(socket) => {

@@ -69,7 +69,6 @@ impl Default for ConnectionLimits {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("requests still in progress {} s after the stop were cut off", after.as_secs_f64())]
 pub struct CutOff {
-    /// The deadline.
     pub after: Duration,
 }
 
@@ -80,9 +79,6 @@ impl From<CutOff> for io::Error {
 }
 
 /// Serves until `stop` completes, then lets requests in progress finish within the drain deadline.
-///
-/// # Errors
-/// [`CutOff`] when the deadline ended requests.
 pub async fn serve(
     router: Router,
     listener: impl Into<Listener>,

@@ -24,7 +24,6 @@ impl ResponseCounts {
     }
 }
 
-/// A histogram of durations.
 #[derive(Debug)]
 pub struct Histogram {
     /// Upper bounds of the buckets, seconds, ascending.
@@ -41,7 +40,6 @@ impl Histogram {
         Self { bounds_secs, counts, sum_us: AtomicU64::new(0) }
     }
 
-    /// Counts a duration.
     pub fn observe(&self, took: Duration) {
         let seconds = took.as_secs_f64();
         let bucket = self.bounds_secs.iter().position(|bound| seconds <= *bound);
@@ -65,7 +63,6 @@ impl Exposition {
         Self { prefix, text: String::new() }
     }
 
-    /// Returns the text.
     pub fn as_str(&self) -> &str {
         &self.text
     }
@@ -81,19 +78,16 @@ impl Exposition {
         let _ = writeln!(self.text, "{prefix}_{name}{suffix_and_labels} {value}");
     }
 
-    /// Adds a counter.
     pub fn counter(&mut self, name: &str, help: &str, counter: &AtomicU64) {
         self.family(name, "counter", help);
         self.sample(name, "", counter.load(Relaxed));
     }
 
-    /// Adds a gauge.
     pub fn gauge(&mut self, name: &str, help: &str, value: u64) {
         self.family(name, "gauge", help);
         self.sample(name, "", value);
     }
 
-    /// Adds a histogram.
     pub fn histogram(&mut self, name: &str, help: &str, histogram: &Histogram) {
         self.family(name, "histogram", help);
         let mut cumulated = 0;

@@ -22,7 +22,6 @@ const SUMMARY_COLUMN: usize = 36;
 /// A service, as its description and help text name it.
 #[derive(Clone, Copy, Debug)]
 pub struct About {
-    /// Name of the program.
     pub name: &'static str,
     pub version: &'static str,
     pub license: &'static str,

@@ -24,9 +24,7 @@ const MAX_NAME_CHARS: usize = 40;
 #[error("{parameter}: found {found}, expected {expected}")]
 pub struct RequestError {
     pub parameter: String,
-    /// The value found.
     pub found: String,
-    /// The values allowed.
     pub expected: String,
 }
 
@@ -91,9 +89,6 @@ pub struct Params<T>(pub T);
 
 impl<T: DeserializeOwned> Params<T> {
     /// Reads decoded `name=value` pairs.
-    ///
-    /// # Errors
-    /// A parameter that is wrong, unknown, missing, or repeated where it is no list.
     pub fn read(pairs: &[(String, String)]) -> Result<T, RequestError> {
         let mut reader = Pairs { pairs, known: Vec::new() };
         let read = T::deserialize(&mut reader)?;
@@ -108,9 +103,6 @@ impl<T: DeserializeOwned> Params<T> {
     }
 
     /// Reads a query string.
-    ///
-    /// # Errors
-    /// Those of [`Params::read`], or it is no query string.
     pub fn parse(uri: &axum::http::Uri) -> Result<T, RequestError> {
         let pairs = Query::<Vec<(String, String)>>::try_from_uri(uri);
         let refused = |text: String| RequestError::new("query string", &text, "name=value pairs");
@@ -178,7 +170,6 @@ impl<'de> Deserializer<'de> for &mut Pairs<'_> {
     }
 }
 
-/// The members of a struct that have values.
 struct Members<'a> {
     pairs: &'a [(String, String)],
     names: std::slice::Iter<'static, &'static str>,
@@ -209,7 +200,6 @@ impl<'de> MapAccess<'de> for Members<'_> {
     }
 }
 
-/// The values of a parameter.
 struct Values<'a>(Vec<&'a str>);
 
 impl<'a> Values<'a> {

@@ -33,7 +33,6 @@ struct Open {
 struct ReservedPlace {
     number: u64,
     peer: Option<IpAddr>,
-    /// Dropped to end the connection.
     _end: Sender<()>,
 }
 

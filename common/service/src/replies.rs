@@ -12,10 +12,8 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use crate::metrics::Exposition;
 use crate::problem::Problem;
 
-/// Makes the schema of a type.
 pub type SchemaOf = fn(&mut SchemaGenerator) -> Schema;
 
-/// A successful reply.
 pub struct Reply {
     pub status: StatusCode,
     /// Media types of the body, each with its schema; empty: no body.
@@ -33,7 +31,6 @@ impl Reply {
 
 /// What a handler returns.
 pub trait Described {
-    /// Describes the successful replies.
     fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply>;
 }
 
@@ -65,7 +62,6 @@ impl Described for Exposition {
 pub struct Binary;
 
 impl Binary {
-    /// Returns the schema of bytes.
     pub fn schema() -> Schema {
         json_schema!({ "type": "string", "format": "binary" })
     }
@@ -84,7 +80,6 @@ pub struct As<D> {
 }
 
 impl<D> As<D> {
-    /// Takes a response.
     pub fn new(response: impl IntoResponse) -> Self {
         Self { response: response.into_response(), described: PhantomData }
     }

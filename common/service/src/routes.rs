@@ -33,7 +33,6 @@ impl Parameter {
         Self { name, place: "path", summary, schema: SchemaGenerator::subschema_for::<T>, limits: Map::new() }
     }
 
-    /// Describes a header.
     pub fn of_header(name: &'static str, summary: &'static str) -> Self {
         Self { place: "header", ..Self::of_path::<String>(name, summary) }
     }
@@ -158,7 +157,6 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         self
     }
 
-    /// Returns the router and the table.
     pub(crate) fn into_parts(self) -> (Router<S>, Vec<Route>) {
         (self.router, self.table)
     }

@@ -5,9 +5,6 @@ use std::io;
 /// Returns a future that completes at ctrl-c or, on Unix, SIGTERM.
 ///
 /// The handlers are installed when this returns, so that no signal is lost before the first poll.
-///
-/// # Errors
-/// The system's error if it cannot install a handler.
 #[cfg(unix)]
 pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
     use tokio::signal::unix::{SignalKind, signal};
@@ -22,9 +19,6 @@ pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
 }
 
 /// Returns a future that completes at ctrl-c.
-///
-/// # Errors
-/// The system's error if it cannot install a handler.
 #[cfg(windows)]
 pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
     let mut interrupt = tokio::signal::windows::ctrl_c()?;

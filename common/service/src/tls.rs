@@ -29,28 +29,12 @@ pub struct TlsFiles {
 /// The file that is of no use.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// The file cannot be read, or does not hold the PEM that is expected.
     #[error("{}: {cause}, expected {expected} in PEM", path.display())]
-    File {
-        path: PathBuf,
-        /// What it should hold.
-        expected: &'static str,
-        /// The fault.
-        cause: String,
-    },
-    /// A Unix socket has no network between its ends.
+    File { path: PathBuf, expected: &'static str, cause: String },
     #[error("TLS is for IP:PORT, not for a Unix socket; leave --tls-cert and --tls-key out")]
     UnixSocket,
-    /// Certificate and key do not fit together.
     #[error("{} and {}: {cause}, expected a certificate and its own key", cert.display(), key.display())]
-    Pair {
-        /// The certificate's file.
-        cert: PathBuf,
-        /// The key's file.
-        key: PathBuf,
-        /// The fault.
-        cause: rustls::Error,
-    },
+    Pair { cert: PathBuf, key: PathBuf, cause: rustls::Error },
 }
 
 /// The versions of both files, read without their content.
@@ -62,7 +46,6 @@ struct ReadPair {
     key: Arc<CertifiedKey>,
 }
 
-/// The certificate in use.
 struct Certificate {
     files: TlsFiles,
     provider: Arc<CryptoProvider>,

@@ -10,7 +10,6 @@ pub struct NotCanonical {
     pub found: String,
 }
 
-/// Returns the canonical form of a value.
 pub fn canonical_json(value: &Value) -> Result<Vec<u8>, NotCanonical> {
     let mut out = Vec::new();
     write(value, &mut out)?;

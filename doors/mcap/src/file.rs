@@ -19,9 +19,6 @@ pub struct File<W: Write + Seek> {
 
 impl File<BufWriter<fs_err::File>> {
     /// Creates a file. `time_ns`: time of all its messages, nanoseconds since 1970.
-    ///
-    /// # Errors
-    /// The file cannot be created.
     pub fn create(path: &Path, time_ns: u64) -> Result<Self> {
         let options =
             WriteOptions::new().compression(None).library(concat!("slag-mcap ", env!("CARGO_PKG_VERSION")));
@@ -32,9 +29,6 @@ impl File<BufWriter<fs_err::File>> {
 
 impl<W: Write + Seek> File<W> {
     /// Writes a message to a topic.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     pub fn write(&mut self, topic: &str, (name, schema): Schema, message: &Value) -> Result<()> {
         let schema = self.writer.add_schema(name, "jsonschema", schema().to_string().as_bytes())?;
         let channel_id = self.writer.add_channel(schema, topic, "json", &BTreeMap::new())?;
@@ -44,9 +38,6 @@ impl<W: Write + Seek> File<W> {
     }
 
     /// Writes the end of the file.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     pub fn finish(mut self) -> Result<()> {
         self.writer.finish()?;
         Ok(self.writer.into_inner().flush()?)

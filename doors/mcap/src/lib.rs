@@ -16,9 +16,6 @@ use file::File;
 use messages::Stamp;
 
 /// Asks a robot and writes its answers; returns the number of messages. A robot that refuses leaves no file.
-///
-/// # Errors
-/// The token's file, the robot's refusal, or the file to write.
 pub fn record(args: &Args) -> Result<usize> {
     let robot = args.robot.open()?;
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);

@@ -17,7 +17,6 @@ const LETTERS_M: f64 = 0.15;
 pub struct Stamp<'a> {
     /// Nanoseconds since 1970.
     pub time_ns: u64,
-    /// Frame of all positions.
     pub frame: &'a str,
 }
 

@@ -20,9 +20,6 @@ pub struct RobotArgs {
 
 impl RobotArgs {
     /// Returns the robot, with the token of the file. Nothing is asked yet.
-    ///
-    /// # Errors
-    /// The file cannot be read.
     pub fn open(&self) -> io::Result<Robot> {
         let token = self.token_file.as_ref().map(fs_err::read_to_string).transpose()?;
         Ok(Robot::new(&self.robot, token.as_deref().map(str::trim)))

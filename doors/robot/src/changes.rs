@@ -5,7 +5,6 @@ use serde::Deserialize;
 /// What changed between two generations. Members that clients here do not need are left out.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Changes {
-    /// Name of the scene.
     pub scene: String,
     /// `m`, or `world` for scenes whose scale is unknown.
     pub unit: String,
@@ -29,10 +28,8 @@ pub struct Changes {
     pub none: Option<Miss>,
 }
 
-/// A generation that was compared.
 #[derive(Clone, Copy, Debug, Deserialize)]
 pub struct Compared {
-    /// Its number.
     pub generation: u64,
     /// When it was made, Unix seconds.
     pub created_unix_secs: u64,
@@ -41,11 +38,9 @@ pub struct Compared {
 /// A thing as it is or was.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Changed {
-    /// Its id in its generation.
     pub id: String,
     /// Its middle.
     pub position_in_world: [f64; 3],
-    /// Least corner of its box.
     pub box_min_in_world: [f64; 3],
     /// Greatest corner.
     pub box_max_in_world: [f64; 3],
@@ -64,7 +59,6 @@ pub struct Like {
 /// A thing that lies elsewhere.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Moved {
-    /// As it was.
     pub from: Changed,
     pub to: Changed,
     /// Between the positions.

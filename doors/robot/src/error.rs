@@ -8,40 +8,18 @@ pub(crate) const MAX_TEXT_BYTES: usize = 512;
 /// Why the robot gave no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {
-    /// The program does not answer.
     #[error(
         "{url} does not answer: {cause}; start `slag-edge serve` there, or give its address with --robot"
     )]
-    Unreachable {
-        /// What was asked.
-        url: String,
-        /// The network's error.
-        cause: Box<ureq::Error>,
-    },
-    /// The program refused the request, and says why.
+    Unreachable { url: String, cause: Box<ureq::Error> },
     #[error("the robot refused ({status}): {detail}")]
-    Refused {
-        /// HTTP status.
-        status: u16,
-        /// What the program says: what was found and what it expects.
-        detail: String,
-    },
-    /// A text that no robot takes.
+    Refused { status: u16, detail: String },
     #[error("a text has {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}; name the thing in a few words")]
-    TooLong {
-        /// Its length.
-        n_bytes: usize,
-    },
-    /// The answer is none of `slag-edge`.
+    TooLong { n_bytes: usize },
     #[error(
         "{url} answers, but not as slag-edge does: {cause}; see that --robot names a slag-edge of this version"
     )]
-    Foreign {
-        /// What was asked.
-        url: String,
-        /// What is wrong with the answer.
-        cause: String,
-    },
+    Foreign { url: String, cause: String },
 }
 
 impl RobotError {

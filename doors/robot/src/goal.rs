@@ -7,7 +7,6 @@ use crate::reply::Geographic;
 /// Places to stand near a thing. Members that clients here do not need are left out.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Goals {
-    /// Name of the scene.
     pub scene: String,
     /// The published state that all positions belong to.
     pub generation: u64,
@@ -15,7 +14,6 @@ pub struct Goals {
     pub thing: Option<GoalThing>,
     /// Best first.
     pub goals: Vec<Goal>,
-    /// Why there is none.
     pub none: Option<GoalMiss>,
 }
 

@@ -5,11 +5,9 @@ use serde::Deserialize;
 /// What is on board. Members that clients here do not need are left out.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Place {
-    /// Name of the scene.
     pub scene: String,
     /// The published state on board.
     pub generation: u64,
-    /// Frame of the positions.
     pub frame: String,
     /// `m`, or `world` for scenes whose scale is unknown.
     pub unit: String,
@@ -44,7 +42,6 @@ pub struct Cell {
 /// A box along the axes.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct Box3 {
-    /// Least corner.
     #[serde(rename = "box_min_in_world")]
     pub min: [f64; 3],
     /// Greatest corner.

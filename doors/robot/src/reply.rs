@@ -5,11 +5,9 @@ use serde::Deserialize;
 /// The results of a request, one for each question. Members that clients here do not need are left out.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Reply<A = Answer> {
-    /// Name of the scene.
     pub scene: String,
     /// The published state that all positions belong to.
     pub generation: u64,
-    /// Frame of the positions.
     pub frame: String,
     /// `m`, or `world` for scenes whose scale is unknown.
     pub unit: String,
@@ -17,7 +15,6 @@ pub struct Reply<A = Answer> {
     pub results: Vec<Results<A>>,
 }
 
-/// The answers to a question.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Results<A = Answer> {
     /// The phrase that a text with a relation was understood as.

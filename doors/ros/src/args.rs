@@ -99,9 +99,6 @@ enum Source {
 
 impl Args {
     /// Returns the node's settings.
-    ///
-    /// # Errors
-    /// A period that is no time.
     pub fn settings(&self) -> Result<Settings> {
         let mut interfaces = self.interface.clone();
         if self.localhost_only == 1 {

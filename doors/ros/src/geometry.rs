@@ -96,7 +96,6 @@ impl Rigid {
         Self { rotation, translation: rotation * -self.translation }
     }
 
-    /// Moves a point.
     pub fn apply(self, point: [f64; 3]) -> [f64; 3] {
         (self.rotation * DVec3::from_array(point) + self.translation).to_array()
     }

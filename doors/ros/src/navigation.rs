@@ -13,7 +13,6 @@ use crate::messages::{NavigationFeedback, NavigationGoal, NavigationResult, Pose
 /// Longest wait for the server to take a goal.
 const ACCEPT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// How a goal ended.
 pub enum Ended {
     Reached,
     Cancelled,
@@ -29,9 +28,6 @@ pub struct Navigator {
 impl Navigator {
     /// Makes the client of `/navigate_to_pose`. `service`, `topic`, `latched`: quality of the action's services,
     /// of its feedback, and of its status.
-    ///
-    /// # Errors
-    /// The middleware refuses.
     pub fn new(
         node: &mut Node,
         mapping: ServiceMapping,
@@ -51,9 +47,6 @@ impl Navigator {
 
     /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended. A message of `stop`
     /// cancels the goal; its end alone means that another goal takes its place, for which Nav2 gives this one up.
-    ///
-    /// # Errors
-    /// No server takes the goal, or it was not reached.
     pub async fn drive(
         &self,
         pose: PoseStamped,

@@ -75,15 +75,12 @@ pub enum GoalSink {
 pub struct Settings {
     /// Name of the node, and the namespace of its topics.
     pub name: String,
-    /// DDS domain.
     pub domain_id: u16,
     /// Addresses of the interfaces to use; empty: all.
     pub interfaces: Vec<IpAddr>,
     /// How services travel.
     pub middleware: Middleware,
-    /// Frame of the scene in ROS.
     pub scene_frame: String,
-    /// Frame of the robot.
     pub base_frame: String,
     /// Where the robot's position comes from.
     pub position: PositionSource,
@@ -149,9 +146,6 @@ struct Found {
 }
 
 /// Runs the node until `stop` completes.
-///
-/// # Errors
-/// A name that ROS does not take, or a domain that cannot be joined.
 pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()>) -> Result<()> {
     let mut participant = DomainParticipantBuilder::new(settings.domain_id);
     if !settings.interfaces.is_empty() {

@@ -26,9 +26,6 @@ impl Body {
     }
 
     /// Asks for places to stand near a thing; `place`: where the robot is, if that is known.
-    ///
-    /// # Errors
-    /// Why the robot refuses.
     pub fn stand(&self, robot: &Robot, text: &str, place: Option<[f64; 3]>) -> Result<Goals, String> {
         let mut parameters = self.parameters(place);
         parameters.extend([
@@ -40,9 +37,6 @@ impl Body {
     }
 
     /// Asks for the ground around the robot; `None` if it reaches none.
-    ///
-    /// # Errors
-    /// Why the robot refuses.
     pub fn ground(
         &self,
         robot: &Robot,
@@ -54,7 +48,6 @@ impl Body {
     }
 }
 
-/// Returns the reply to a call.
 pub fn reply(frame: &str, found: Result<Goals, String>) -> StandReply {
     let header = answers::header(frame);
     let none = Pose { position: [0.0; 3].into(), orientation: Quaternion::IDENTITY };

@@ -52,9 +52,6 @@ slag_common::named_members!(Area, AreaBall, AreaBox; Serialize);
 
 impl Area {
     /// Returns the area in the world frame.
-    ///
-    /// # Errors
-    /// The part that is out of bounds, or geographic in a scene without a geographic reference.
     pub(crate) fn in_world(&self, manifest: &Manifest) -> Result<Region, RequestError> {
         let point = |point: Point| point.in_world("region", manifest);
         let ball = self.ball.map(|AreaBall { centre, radius }| {

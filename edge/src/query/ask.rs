@@ -71,9 +71,6 @@ slag_common::named_members!(Ask);
 
 impl Ask {
     /// Returns the most time to compute.
-    ///
-    /// # Errors
-    /// It is nothing.
     pub(crate) fn time_budget(&self) -> Result<Option<Duration>, RequestError> {
         match self.time_budget_ms {
             Some(0) => Err(RequestError::new("time_budget_ms", "0", "at least 1")),
@@ -82,9 +79,6 @@ impl Ask {
     }
 
     /// Understands the questions for a generation. Where it has no objects, texts that name relations stay texts.
-    ///
-    /// # Errors
-    /// The first parameter that is wrong.
     pub(super) fn understand(self, snapshot: &Snapshot) -> Result<QueryRequest, RequestError> {
         let n = self.texts.len() + self.vectors.len() + self.phrases.len();
         if !(1..=MAX_TEXTS).contains(&n) {

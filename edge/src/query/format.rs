@@ -46,9 +46,6 @@ impl Reply {
     }
 
     /// Returns the reply in pieces of at most a fraction of a megabyte, each made on demand.
-    ///
-    /// # Errors
-    /// A piece is an error if it cannot be written.
     pub fn pieces(self, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
         match format {
             Format::Json => Box::new(json::Pieces::new(self)),

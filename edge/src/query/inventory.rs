@@ -107,7 +107,6 @@ impl Engine {
         Ok(page)
     }
 
-    /// Returns an object of a generation.
     pub fn object(
         &self,
         snapshot: &Snapshot,

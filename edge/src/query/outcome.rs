@@ -7,11 +7,9 @@ use super::relations::{Found, Miss, Witness};
 pub enum Outcome {
     /// To a text or a vector.
     Plain(Answers),
-    /// To a phrase.
     Related(RelatedAnswers),
 }
 
-/// The answers to a phrase.
 pub struct RelatedAnswers {
     /// What was found for each thing of the phrase.
     pub parts: Vec<Found>,

@@ -22,9 +22,7 @@ pub const MAX_CLUSTERS: usize = 10_000;
 pub const MAX_GAUSSIANS: usize = 1_000_000;
 /// Most answers in a page, over all questions.
 pub const MAX_PAGE: usize = MAX_CLUSTERS;
-/// Most texts in a request.
 pub const MAX_TEXTS: usize = 32;
-/// Most negatives in a request.
 pub const MAX_NEGATIVES: usize = 16;
 /// LERF's canonical negatives (Kerr et al. 2023, section 3.3).
 pub const CANONICAL_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
@@ -69,7 +67,6 @@ pub enum Negatives {
     None,
     /// [`CANONICAL_NEGATIVES`].
     Canonical,
-    /// These phrases.
     Phrases(Vec<String>),
 }
 
@@ -110,9 +107,6 @@ impl FromStr for Negatives {
 }
 
 /// Parses `X0,Y0,Z0,X1,Y1,Z1`: two opposite corners of a box.
-///
-/// # Errors
-/// The expected form.
 pub fn parse_box(text: &str) -> Result<Aabb, String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     match numbers.as_deref() {
@@ -125,9 +119,6 @@ pub fn parse_box(text: &str) -> Result<Aabb, String> {
 }
 
 /// Parses `X,Y,Z`.
-///
-/// # Errors
-/// The expected form.
 pub fn parse_point(text: &str) -> Result<DVec3, String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     match numbers.as_deref() {
@@ -262,9 +253,6 @@ impl QueryRequest {
     }
 
     /// Checks every limit that does not depend on the scene.
-    ///
-    /// # Errors
-    /// The first parameter outside its limits.
     pub fn check(&self) -> Result<(), RequestError> {
         let positive = |v: f64| v > 0.0 && v <= MAX_COORDINATE;
         let within = |v: DVec3| v.is_finite() && v.abs().max_element() <= MAX_COORDINATE;

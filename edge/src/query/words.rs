@@ -20,9 +20,6 @@ pub struct Words(
 );
 
 /// Checks a text that the text model is to encode. `parameter`: its name, for the error.
-///
-/// # Errors
-/// It is too long, has no words, or control characters.
 pub fn check_text(parameter: &str, text: &str) -> Result<(), RequestError> {
     if text.len() > MAX_TEXT_BYTES {
         let found = format!("{} bytes", text.len());

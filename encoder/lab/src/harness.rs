@@ -10,7 +10,6 @@ use slag_math::stats::{Rank, quantile};
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Machine {
     pub(crate) cpu: String,
-    /// Threads of the pool.
     pub(crate) n_threads: usize,
     platform: String,
     simd: &'static str,

@@ -56,7 +56,6 @@ pub(crate) fn remove(dir: &Path) -> std::io::Result<()> {
     if dir.exists() { fs_err::remove_dir_all(dir) } else { Ok(()) }
 }
 
-/// Returns a value as flags take it.
 pub(crate) fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
     let name = value.to_possible_value().map(|value| value.get_name().to_owned());
     name.ok_or_else(|| anyhow!("{value:?} has no name"))

@@ -40,9 +40,6 @@ pub enum AlignError {
 
 /// Aligns two sets of poses by the centres of the views with the same name, or else the same file name without its
 /// folder and extension.
-///
-/// # Errors
-/// [`AlignError`] if too few views are in both, or their centres do not determine a similarity.
 pub fn align(from: &[View], to: &[View]) -> Result<Alignment, AlignError> {
     let pairs_by = |key: fn(&View) -> &str| -> Vec<(DVec3, DVec3)> {
         let mut known: std::collections::BTreeMap<&str, Option<&View>> = std::collections::BTreeMap::new();

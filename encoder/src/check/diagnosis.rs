@@ -26,7 +26,6 @@ const HALVINGS: u32 = 6;
 /// Gain below which the refinement fits noise of the few small samples, dB: the frame stays as computed.
 const REFINED_GAIN_DB: f64 = 1.0;
 
-/// Trials that a diagnosis lists.
 const LISTED_TRIALS: usize = 10;
 
 /// A correction that was tried, and the mean PSNR it leads to.

@@ -14,7 +14,6 @@ use crate::raster::RasterView;
 pub enum Mistake {
     /// The camera axes are OpenGL's (x right, y up, z back).
     OpenGlAxes,
-    /// The transforms are world-from-camera.
     WorldFromCamera,
     /// Both, as in a NeRF `transforms.json`.
     WorldFromOpenGlCamera,
@@ -36,7 +35,10 @@ pub enum Mistake {
     /// The splat is mirrored along this axis, 0 to 2.
     Mirrored(usize),
     /// The splat has scales instead of their logarithms, or opacities instead of logits.
-    Activated { scales: bool, opacities: bool },
+    Activated {
+        scales: bool,
+        opacities: bool,
+    },
 }
 
 /// A similarity between the world of the poses and that of the splat, and why it may hold.

@@ -22,7 +22,6 @@ pub struct ViewCheck {
 /// Comparison of a scene with its photos.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {
-    /// The views in the given order.
     pub views: Vec<ViewCheck>,
     /// Mean of `psnr_db` over the views, dB.
     pub mean_psnr_db: f64,

@@ -243,9 +243,6 @@ pub async fn stopped() {
 }
 
 /// Starts the threads of the services.
-///
-/// # Errors
-/// If its threads cannot be started.
 pub fn runtime() -> Result<tokio::runtime::Runtime> {
     tokio::runtime::Builder::new_multi_thread()
         .enable_all()

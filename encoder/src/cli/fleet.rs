@@ -76,9 +76,6 @@ pub struct CoordinatorArgs {
 
 impl CoordinatorArgs {
     /// Encodes by the fleet that the flags name, or on this machine.
-    ///
-    /// # Errors
-    /// If the bucket cannot be opened, or the encode fails.
     pub(super) fn encode(
         &self,
         settings: &EncodeSettings,

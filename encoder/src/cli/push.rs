@@ -74,7 +74,6 @@ pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Res
     Ok(Exit::Done)
 }
 
-/// Returns the report as text.
 fn lines(args: &QdrantArgs, report: &qdrant::PushReport) -> String {
     let place = match args.layout {
         qdrant::Layout::One => format!("collection {}", args.collection),

@@ -62,8 +62,6 @@ pub struct SamArgs {
 
 impl SamArgs {
     /// Returns Segment Anything as the source of masks, if --segmenter names it.
-    /// # Errors
-    /// If it names a public model that is not pulled.
     pub(super) fn masks(&self, preset: &SamSettings) -> Result<Option<Masks>> {
         let Some(segmenter) = &self.segmenter else { return Ok(None) };
         let dir = commands::resolve(segmenter, &|name| std::env::var_os(name))?;

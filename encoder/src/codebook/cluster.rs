@@ -14,7 +14,6 @@ const FEW_CLUSTERS: usize = 16;
 /// and threads have work.
 const SPLIT_SHARE: usize = 8;
 
-/// Clusters of points.
 pub struct Clusters {
     /// `[n]`: cluster of each point.
     pub codes: Vec<u32>,

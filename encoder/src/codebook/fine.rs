@@ -10,7 +10,6 @@ pub struct FineResiduals {
     pub scales: Vec<f32>,
     /// `[n][m]`.
     pub values: Vec<i8>,
-    /// Errors of the decoded scores.
     pub errors: ScoreErrors,
 }
 

@@ -38,7 +38,6 @@ const BYTES_BESIDE_COMPONENTS: usize = 8;
 /// One centroid of an outlier for so many components of an embedding, in a cell of any size: a sixteenth of the
 /// bytes of its basis.
 const OUTLIERS_OF_DIM: usize = 16;
-/// Step of the centroids' components.
 const CENTROID_STEP: f32 = 1.0 / 127.0;
 /// Share of the residual code's error budget that the dimensions without a component may take.
 const TAIL_SHARE: f32 = 0.3;
@@ -87,7 +86,6 @@ impl Default for CodebookSettings {
 
 /// The metric and the texts that errors of scores are measured by.
 pub struct ScoreMetricContext {
-    /// Metric of score errors.
     pub metric: ScoreMetric,
     /// Texts whose scores are compared.
     pub bank: TextBank,
@@ -111,7 +109,6 @@ pub struct Codebook {
     pub basis_steps: Vec<f32>,
     /// `[K][m]`.
     pub centroids: Vec<i8>,
-    /// Step of the centroids' components.
     pub centroid_step: f32,
     /// `[K]`: largest distance of a member from its centroid.
     pub radii: Vec<f32>,

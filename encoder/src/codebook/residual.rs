@@ -12,7 +12,6 @@ use super::cluster::{clusters, nearest, squared_distance};
 use slag_math::eigen::eigen_symmetric;
 use slag_math::matrix::Rows;
 
-/// Residuals that codewords are trained on.
 const TRAINING_SAMPLE: usize = 6144;
 /// Most components of a subspace: 16 codewords say little about each of more.
 const MAX_SUBSPACE_COMPONENTS: usize = 8;

@@ -16,7 +16,6 @@ pub(crate) use things::{DiffError, Generation};
 /// What changed from one generation to another.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Diff {
-    /// The earlier generation.
     pub(crate) old_generation: u64,
     /// The later one.
     pub(crate) new_generation: u64,
@@ -41,9 +40,6 @@ pub(crate) struct Diff {
 }
 
 /// Compares two generations.
-///
-/// # Errors
-/// [`DiffError`] if a shard cannot be read, or the generations are of different encoders, whose vectors do not compare.
 pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, DiffError> {
     let (old_manifest, manifest) = (&old.published.manifest, &new.published.manifest);
     if old_manifest.encoder.id != manifest.encoder.id {

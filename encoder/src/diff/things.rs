@@ -8,7 +8,6 @@ use slag_common::shard::ShardLayout;
 
 use crate::store::{Published, StoreError, StoreReader};
 
-/// A generation of a store.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Generation<'a> {
     pub(crate) reader: &'a StoreReader,

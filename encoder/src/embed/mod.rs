@@ -50,8 +50,6 @@ pub enum PatchUse {
 impl PatchUse {
     /// Adds the vectors of regions to those of the crops, `[masks][dim]`, or mixes the patches into them; all are
     /// unit vectors.
-    /// # Errors
-    /// [`EmbedError::Patches`] where the encoder fails.
     pub(crate) fn add_to(
         &self,
         photo: &RgbImage,
@@ -107,16 +105,12 @@ fn crop_of(image: &RgbImage, (index, mask): (usize, &Mask)) -> Result<Crop, Embe
 }
 
 /// Returns the crop of each mask as the small square that the image encoder takes.
-/// # Errors
-/// [`EmbedError::Mask`] if a mask does not fit the image.
 pub fn squares(image: &RgbImage, masks: &[Mask], preprocess: &Preprocess) -> Result<Vec<Crop>, EmbedError> {
     let square = |mask| Ok(Crop::whole(preprocess.square(crop_of(image, mask)?.image())));
     masks.iter().enumerate().map(square).collect()
 }
 
 /// Returns a unit vector per crop, `[crops][dim]`; the first crop is that of mask `first`.
-/// # Errors
-/// [`EmbedError::Encode`] where the encoder fails.
 pub fn embed_crops(
     crops: &[Crop],
     first: usize,
@@ -134,8 +128,6 @@ pub fn embed_crops(
 /// `batch`: crops given to the encoder at once, its own preference if `None`. Batches depend on the masks
 /// alone, so that models whose vectors vary with the batch (8-bit ones with scales found at run time)
 /// give the same ones on every machine. Memory: one batch of crops, 48 MiB of pixels or one crop.
-/// # Errors
-/// [`EmbedError`] where a mask does not fit the image, or the encoder fails.
 pub fn embed_masks(
     image: &RgbImage,
     masks: &[Mask],

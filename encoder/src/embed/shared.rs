@@ -23,7 +23,6 @@ const VIEWS_PER_LANE: usize = 12;
 /// Crops of so many views, or of fewer with many masks.
 const CROPS_PER_LANE: u64 = 512;
 
-/// Opens an image encoder on a GPU.
 pub type OpenEncoder = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Send + Sync;
 
 /// Image encoders on GPUs that work off the crops of all views.
@@ -108,9 +107,6 @@ impl SharedEncoders {
     }
 
     /// Takes a lane for work of the caller's own.
-    ///
-    /// # Errors
-    /// [`ModelError`] if the model does not open.
     pub(crate) fn with_encoder<T>(
         &self,
         work: impl FnOnce(&mut dyn ImageEncoder) -> T,
@@ -250,7 +246,6 @@ impl Drop for Lost<'_> {
     }
 }
 
-/// A crop that is done.
 struct Done {
     request: u64,
     at: usize,

@@ -69,7 +69,6 @@ impl CellInWork {
 #[derive(Debug)]
 pub(super) struct FinishedCell {
     pub(super) record: CellRecord,
-    /// As of the cell in work.
     pub(super) fields: Vec<(String, Hash32)>,
     pub(super) n_subspaces: u32,
     pub(super) n_without_evidence: u64,
@@ -79,9 +78,6 @@ pub(super) struct FinishedCell {
 
 impl CellMaker<'_> {
     /// Lifts the cells and makes their shards, several at once.
-    ///
-    /// # Errors
-    /// [`EncodeError`]: of the first cell that failed.
     pub(super) fn build(
         &self,
         index: &ContributionIndex,
@@ -199,7 +195,6 @@ impl CellMaker<'_> {
     }
 }
 
-/// Cells that are not in work.
 struct FreeCells {
     cells: Mutex<Vec<CellInWork>>,
     given_back: Condvar,

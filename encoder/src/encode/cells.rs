@@ -33,7 +33,6 @@ pub(super) struct BuiltCells {
     pub(super) records: Vec<CellRecord>,
     /// Subspaces of each cell's residual code.
     pub(super) n_subspaces: Vec<u32>,
-    /// Contributions of each cell.
     pub(super) n_entries: Vec<u64>,
     pub(super) extras: Extras,
     pub(super) n_without_evidence: u64,

@@ -75,7 +75,6 @@ impl<'a> RunContext<'a> {
         self.start
     }
 
-    /// Returns the receiver of progress.
     pub(crate) fn progress(&self) -> &'a dyn Progress {
         self.progress
     }

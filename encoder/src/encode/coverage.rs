@@ -31,7 +31,6 @@ const WIDTH_PX: u32 = 192;
 const MARGIN: f64 = 0.05;
 /// Most pairs of a Gaussian and a view that are kept, 8 bytes each; of larger scenes every n-th Gaussian counts.
 const MAX_PAIRS: usize = 1 << 26;
-/// Most Gaussians that count.
 const MAX_GAUSSIANS: usize = 1 << 17;
 /// Steps of a quality of 1; what is less than half of one, a twentieth of the best view, does not show a Gaussian.
 const QUALITY_STEPS: f32 = 255.0;

@@ -79,7 +79,6 @@ pub enum EncodeError {
     NoEvidence { n_views: usize, n_views_without_masks: usize, n_masks: usize, n_entries: u64 },
     #[error("{}: hardly any of {n_gaussians} Gaussians can be seen (finite, positive scales, a rotation, not transparent); export the splat again", path.display())]
     NoGaussians { path: PathBuf, n_gaussians: usize },
-    /// A view has no pose, and `strict` is set.
     #[error("view {view} has no pose: {reason}; remove it from the poses, or leave out --strict")]
     NoPose { view: String, reason: String },
     #[error(transparent)]

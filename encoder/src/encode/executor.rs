@@ -26,9 +26,6 @@ pub(crate) trait Executor {
     ) -> Result<ViewsRun, EncodeError>;
 
     /// Called once, before the manifest is published.
-    ///
-    /// # Errors
-    /// [`EncodeError`] if another encode has taken this one's place.
     fn begin_publication(&self) -> Result<(), EncodeError> {
         Ok(())
     }

@@ -12,11 +12,9 @@ use slag_common::shard::Profile;
 /// Settings that no other beats, and what they cost.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Front {
-    /// The machine that measured.
     pub machine: String,
     /// Version and models.
     pub measured_with: String,
-    /// Scenes of the mean.
     pub n_scenes: usize,
     pub settings: Vec<FrontSetting>,
 }
@@ -50,7 +48,6 @@ pub struct Target {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Expectation {
     pub setting: FrontSetting,
-    /// Expected seconds.
     pub seconds: f64,
     /// Expected bytes of the profile's shards.
     pub bytes: f64,

@@ -18,7 +18,6 @@ const REGIONS_VERSION: u32 = 4;
 /// Stands for the rasterisers of a fleet: its machines have different ones.
 pub(crate) const OF_A_FLEET: &str = "fleet";
 
-/// The identities of an encode.
 pub(super) struct Identities {
     /// Hash of everything on which the contributions of all views depend.
     pub(super) of_scene: Hash32,
@@ -69,9 +68,6 @@ struct ViewIdentity<'a> {
 }
 
 /// Returns the identities of an encode of these inputs.
-///
-/// # Errors
-/// [`EncodeError::Segment`] if a file of masks cannot be read.
 pub(super) fn identities(
     settings: &EncodeSettings,
     engines: &Engines<'_>,

@@ -25,7 +25,6 @@ const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
 /// Of these, while it waits: its colours, whether the lens shows it, its depth.
 const WAITING_BYTES_PER_PX: u64 = 3 + 1 + 4;
 
-/// The inputs of an encode.
 pub(crate) struct Inputs {
     pub(crate) scene: Gaussians,
     pub(crate) split: CellSplit,
@@ -38,9 +37,6 @@ pub(crate) struct Inputs {
 
 impl Inputs {
     /// Reads scene, poses and geo-reference, and cuts the scene into cells.
-    ///
-    /// # Errors
-    /// [`EncodeError`] if one cannot be read, or nothing in it can be used.
     pub(super) fn read(settings: &EncodeSettings, context: &RunContext<'_>) -> Result<Self, EncodeError> {
         let inputs = &settings.inputs;
         let geo_reference = inputs.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
@@ -101,9 +97,6 @@ pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work:
 }
 
 /// Returns the numbers of views with a photo and of Gaussians.
-///
-/// # Errors
-/// [`EncodeError`] if scene or poses cannot be read.
 pub fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeError> {
     let scene = splat::read(&inputs.scene, &ReadOptions { with_sh_rest: false })?;
     let views = read_views(inputs)?.views;

@@ -16,7 +16,6 @@ const TREE: &str = "job";
 const IDENTITY_KEY: &[u8] = b"identity";
 /// Present while every finished view of the job is published.
 const PUBLISHED_KEY: &[u8] = b"published";
-/// The step that the job is at.
 const STEP_KEY: &[u8] = b"step";
 /// Followed by the view's identity.
 const VIEW_PREFIX: &str = "view/";
@@ -64,9 +63,6 @@ pub(crate) struct Job<'a> {
 impl<'a> Job<'a> {
     /// Takes up what an encode of the same scene left, or begins one. Views that it has done are done here, too,
     /// where their identities are the same. `id_of_view`: by name.
-    ///
-    /// # Errors
-    /// [`EncodeError::OtherJob`] if one of another scene or other settings is unfinished and `restart` is not set.
     pub(super) fn open(
         store: &'a Store,
         of_scene: Hash32,

@@ -14,7 +14,6 @@ use std::time::Instant;
 
 use super::report::StageReport;
 
-/// A stage of the pipeline.
 #[derive(Clone, Debug)]
 pub(super) struct Stage {
     pub(super) name: &'static str,
@@ -61,7 +60,6 @@ enum Failure<E> {
 enum Task<T> {
     /// Asks the source for an item, and takes it through the first stage.
     Begin,
-    /// Takes an item through a stage.
     Step(usize, T),
 }
 
@@ -123,7 +121,6 @@ struct Pipeline<'a, S, F> {
 }
 
 impl<S, F> Pipeline<'_, S, F> {
-    /// The work of one thread.
     fn work<T, E>(&self, state: &Mutex<State<T, E>>)
     where
         S: Iterator<Item = T>,

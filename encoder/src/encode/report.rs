@@ -15,7 +15,6 @@ use crate::occupancy::OccupancyReport;
 pub struct SkippedView {
     /// Its name.
     pub view: String,
-    /// Why it was left out.
     pub reason: String,
 }
 
@@ -56,7 +55,6 @@ pub struct CellReport {
     pub n_gaussians: u32,
     /// Contributions: pairs of a Gaussian and a region.
     pub n_entries: u64,
-    /// Centroids of its codebook.
     pub n_centroids: u32,
     /// Subspaces of the residual code, half a byte a Gaussian each; 0 where centroids suffice for every profile.
     pub n_subspaces: u32,
@@ -157,9 +155,7 @@ pub struct PhaseReport {
 
 #[derive(Clone, Debug, Serialize)]
 pub struct EncodeSummary {
-    /// The generation that was published.
     pub generation: u64,
-    /// Gaussians in cells.
     pub n_gaussians: u64,
     /// Gaussians without an embedding.
     pub n_without_evidence: u64,
@@ -184,14 +180,11 @@ pub struct EncodeSummary {
     pub n_views_without_masks: usize,
     /// Views that were left out.
     pub skipped_views: Vec<SkippedView>,
-    /// Masks embedded.
     pub n_masks: usize,
-    /// Regions of all views.
     pub n_regions: usize,
     /// Contributions: pairs of a Gaussian and a region.
     pub n_entries: u64,
     pub n_cells: usize,
-    /// Centroids in all cells.
     pub n_centroids: u64,
     /// The search for objects, if there was one.
     pub objects: Option<ObjectsReport>,
@@ -199,9 +192,7 @@ pub struct EncodeSummary {
     pub occupancy: Option<OccupancyReport>,
     /// Bytes of all shards, by profile.
     pub shard_bytes: BTreeMap<String, u64>,
-    /// The cost of each cell.
     pub cells: Vec<CellReport>,
-    /// The cost of each view.
     pub views: ViewsReport,
     /// Seconds spent in each stage, added over threads.
     pub busy_secs: BTreeMap<String, f64>,

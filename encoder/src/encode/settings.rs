@@ -79,11 +79,9 @@ pub struct ViewSettings {
     pub min_mask_px: u32,
     /// Width at which weights are rasterised.
     pub raster_width: RasterWidth,
-    /// Which weight is summed.
     pub weights: WeightKind,
     /// Whether slivers between masks join their neighbours.
     pub merges_slivers: bool,
-    /// Which parts of a photo have vectors.
     #[serde(default, skip_serializing_if = "Regions::are_masks")]
     pub regions: Regions,
 }
@@ -144,7 +142,6 @@ pub enum Masks {
     },
 }
 
-/// Width of the rasters of views.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum RasterWidth {
@@ -183,7 +180,6 @@ pub struct CellSettings {
 /// What is published, and where.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OutputSettings {
-    /// The store to publish into.
     pub store: PathBuf,
     pub scene_name: String,
     /// When it is made, seconds since 1970.
@@ -194,7 +190,6 @@ pub struct OutputSettings {
     pub text_model: bool,
 }
 
-/// How a run goes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RunSettings {
     /// Worker threads, and views worked on at a time.
@@ -203,7 +198,6 @@ pub struct RunSettings {
     pub memory_bytes: u64,
     /// Views used at most: the first ones of the order.
     pub views_limit: ViewsLimit,
-    /// The order in which views are taken.
     pub view_order: ViewOrder,
     /// Time from the start after which no view is begun; at least one view is used.
     pub time_budget: Option<Duration>,
@@ -318,9 +312,6 @@ impl EncodeSettings {
     }
 
     /// Checks every setting that has a range.
-    ///
-    /// # Errors
-    /// [`EncodeError::Setting`] with the first one that is out of its range.
     pub(crate) fn validate(&self) -> Result<(), EncodeError> {
         let Self { view, aggregation, cells, run, .. } = self;
         let codebook = &cells.shards.codebook;

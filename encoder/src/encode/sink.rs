@@ -17,7 +17,6 @@ pub(crate) struct ViewRecord {
 
 /// Brings photos and mask files to this machine.
 pub(crate) trait PhotoSource: Sync {
-    /// Returns the number of views that it brings at once.
     fn n_at_once(&self) -> usize;
 
     /// Brings the files of a view to where the view says; returns whether the view is still to be done.
@@ -26,7 +25,6 @@ pub(crate) trait PhotoSource: Sync {
 
 /// Keeps what a view leaves.
 pub(crate) trait ViewSink: Sync {
-    /// Returns the number of views that it keeps at once.
     fn n_at_once(&self) -> usize;
 
     /// Keeps a view's contributions and the outlines of its masks; on return they survive a power cut.

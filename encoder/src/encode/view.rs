@@ -65,7 +65,6 @@ pub(crate) struct ViewStages<'a> {
     n_unrepresentable: AtomicUsize,
 }
 
-/// The image encoders.
 enum Encoders {
     /// One for each view at work, on the processor; those that are not at work. They are opened as they are
     /// needed.
@@ -114,7 +113,6 @@ struct Cropped {
     partition: Partition,
 }
 
-/// The crops to embed.
 enum Crops {
     /// Squares of the model's size.
     Squares(Vec<Crop>),
@@ -227,7 +225,6 @@ impl<'a> ViewStages<'a> {
         &self.tools
     }
 
-    /// Returns the load of each GPU by the models of a stage.
     pub(super) fn loads(&self, stage: &str) -> Vec<GpuLoad> {
         match (stage, &self.encoders) {
             ("segment", _) => self.tools.segmenter.loads(),

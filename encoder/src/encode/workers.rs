@@ -24,9 +24,6 @@ fn start(n_threads: usize) -> Result<ThreadPool, ThreadPoolBuildError> {
 
 impl Workers {
     /// Starts `n_threads` threads.
-    ///
-    /// # Errors
-    /// If the system starts no more threads.
     pub(crate) fn start(n_threads: usize) -> Result<Self, ThreadPoolBuildError> {
         Ok(Self { shared: start(n_threads)?, alone: Mutex::default() })
     }

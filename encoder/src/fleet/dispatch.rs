@@ -13,9 +13,6 @@ pub(super) type OpenViews<'a> = &'a mut dyn FnMut() -> Result<Vec<usize>, FleetE
 /// Gives a worker its views, by their numbers in the plan.
 pub(super) trait Dispatcher: Sync {
     /// Called before views are taken, and again where [`Dispatcher::wait`] says so.
-    ///
-    /// # Errors
-    /// Those of `open`.
     fn offer(&self, open: OpenViews<'_>) -> Result<(), FleetError>;
 
     /// Returns the next view, without waiting; `None` if there is none at present.

@@ -86,9 +86,6 @@ pub(super) fn view_key(id: Hash32) -> String {
 }
 
 /// Reads a document.
-///
-/// # Errors
-/// [`FleetError::Damaged`] if it is not of the form expected.
 pub(super) fn parse<T: DeserializeOwned>(bucket: &Bucket, key: &str, bytes: &[u8]) -> Result<T, FleetError> {
     serde_json::from_slice(bytes).map_err(|e| FleetError::damaged(bucket, key, e))
 }

@@ -107,9 +107,6 @@ impl ViewFiles {
     }
 
     /// Returns the views as the pipeline takes them.
-    ///
-    /// # Errors
-    /// [`FleetError::View`] for a name that leads out of the folder.
     pub(super) fn views(&self) -> Result<Vec<View>, FleetError> {
         let view = |planned: &PlannedView| {
             let is_inside = |path: &Path| path.components().all(|part| matches!(part, Component::Normal(_)));

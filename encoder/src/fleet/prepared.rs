@@ -90,9 +90,6 @@ impl Prepared {
     }
 
     /// Checks that what the worker holds for scene and views fits into its memory.
-    ///
-    /// # Errors
-    /// [`FleetError::Memory`].
     pub(super) fn check_memory(&self, memory_bytes: u64, tools: &ViewTools<'_>) -> Result<(), FleetError> {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());

@@ -22,7 +22,6 @@ use super::dispatch::{Dispatcher, OpenViews};
 use super::error::FleetError;
 use super::run::Run;
 
-/// The consumer that all workers share.
 const CONSUMER: &str = "workers";
 /// Time that a request for work waits at the server.
 const PULL_WAIT: Duration = Duration::from_secs(1);
@@ -202,7 +201,6 @@ struct Held {
 
 #[derive(Default)]
 struct Messages {
-    /// Views that are not begun.
     waiting: VecDeque<usize>,
     dead: Vec<usize>,
     of_view: HashMap<usize, Arc<Message>>,

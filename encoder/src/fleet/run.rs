@@ -48,9 +48,6 @@ impl Run {
     }
 
     /// Begins the next run; one that has not ended is superseded.
-    ///
-    /// # Errors
-    /// [`FleetError::Superseded`] if another coordinator begins one at the same moment.
     pub(super) fn begin(bucket: &Bucket, plan: &RunPlan) -> Result<Self, FleetError> {
         let newest = Self::newest(bucket)?;
         if let Some((run, names)) = &newest
@@ -69,9 +66,6 @@ impl Run {
     }
 
     /// Returns the newest run and its plan, unless its views are done or it has ended.
-    ///
-    /// # Errors
-    /// [`FleetError::Version`] if another version of the program planned it.
     pub(super) fn open(bucket: &Bucket) -> Result<Option<(Self, RunPlan)>, FleetError> {
         let Some((run, names)) = Self::newest(bucket)? else { return Ok(None) };
         if [DONE, END].iter().any(|name| run.has(&names, name)) {
@@ -119,9 +113,6 @@ impl Run {
     }
 
     /// Ends the run by its publication.
-    ///
-    /// # Errors
-    /// [`FleetError::Superseded`] if another coordinator was first.
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
         // Only the run's own coordinator puts this.
         match bucket.claim(&self.key(END), documents::to_bytes(&End::Published)?)? {

@@ -53,9 +53,6 @@ impl ViewWork<'_> {
     }
 
     /// Does the views that there are; ends when no more are to be had at present.
-    ///
-    /// # Errors
-    /// [`FleetError`] that lies in no view.
     pub(super) fn run(&self, context: &RunContext<'_>) -> Result<(), FleetError> {
         let prepared = self.prepared;
         let stages = ViewStages::new(self.tools(), context);

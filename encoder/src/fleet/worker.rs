@@ -68,9 +68,6 @@ pub(super) fn pause(bucket: &Bucket) -> Duration {
 }
 
 /// Works for the runs in a bucket.
-///
-/// # Errors
-/// [`FleetError`]: what it had begun is left to others.
 pub(crate) fn work(
     bucket: &Arc<Bucket>,
     settings: &WorkerSettings,

@@ -30,9 +30,6 @@ struct GeoFile {
 }
 
 /// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; other fields are ignored.
-///
-/// # Errors
-/// [`GeoError`] if the file cannot be read, is malformed, or contains a coordinate out of range.
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let bytes = fs_err::read(path)?;
     let malformed = |source| GeoError::Json { path: path.to_owned(), source };

@@ -6,9 +6,6 @@ use std::io::{self, BufRead, Read};
 ///
 /// Segments are skipped by their lengths, so the marker of an embedded thumbnail does not count; coded data are
 /// searched.
-///
-/// # Errors
-/// Errors of the reader, except for the end of the file.
 pub(super) fn is_whole(mut file: impl BufRead) -> io::Result<bool> {
     match find_end(&mut file) {
         Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => Ok(false),

@@ -51,7 +51,6 @@ impl RotatedPhotos {
         }
     }
 
-    /// Warns once of all of them.
     pub fn warn(&self) {
         if let Some(line) = self.line() {
             tracing::warn!("{line}");
@@ -91,9 +90,6 @@ pub enum IngestError {
 }
 
 /// Returns the BLAKE3 hash of a file's content.
-///
-/// # Errors
-/// If the file cannot be read.
 pub fn hash_file(path: &Path) -> io::Result<Hash32> {
     Ok(Hash32::of_reader(fs_err::File::open(path)?)?.0)
 }
@@ -119,9 +115,6 @@ pub fn photo_area_px(view: &View) -> u64 {
 /// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay
 /// unchanged. Transparent pixels are outside of the photo. An EXIF orientation is applied where only the turned
 /// photo has its camera's size, and else ignored, see [`RotatedPhotos`].
-///
-/// # Errors
-/// [`IngestError`] if the file cannot be read or decoded, or its size does not match the camera.
 pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     let (photo, is_rotated) = decode(&view.image_path, &view.intrinsics)?;
     let intrinsics = view.intrinsics.scaled_to(photo.width(), photo.height());

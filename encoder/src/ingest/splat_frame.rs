@@ -42,9 +42,6 @@ pub struct FoundFrame {
 
 /// Looks for the file that states the frame of the splat at `scene`; `source` and `applied` are those of the
 /// poses.
-///
-/// # Errors
-/// [`PoseError`] if the file cannot be read.
 pub fn find_frame(
     scene: &Path,
     choice: &FrameChoice,

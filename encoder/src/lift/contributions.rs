@@ -23,7 +23,6 @@ const REGION_BITS: u32 = 20;
 pub const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
 /// Most regions, or masks, of all views and mixtures together.
 pub const MAX_IN_ALL: usize = u32::MAX as usize - 1;
-/// Most regions of a view.
 pub const MAX_REGIONS: usize = 1 << REGION_BITS;
 
 mod section {
@@ -65,7 +64,6 @@ pub struct Run {
 pub struct Contribution {
     /// The Gaussian, by its index within its cell.
     pub local: u32,
-    /// The region of the view.
     pub region: u32,
     /// Its weight, pixels.
     pub weight: f32,
@@ -289,12 +287,10 @@ impl ContributionFile {
         &self.runs
     }
 
-    /// Returns the number of regions of the view.
     pub fn n_regions(&self) -> usize {
         self.n_regions
     }
 
-    /// Returns the number of contributions of the view.
     pub fn n_entries(&self) -> u64 {
         self.n_entries
     }

@@ -20,7 +20,6 @@ use slag_math::simd::{InstructionSet, Work};
 pub(super) const MIN_MEAN_LENGTH: f32 = 1e-3;
 /// Gaussians processed together: their embeddings stay in a core's cache until they are scaled.
 const CHUNK: usize = 512;
-/// Components of a block.
 const BLOCK: usize = 128;
 /// Registers that hold sums: enough to hide the latency of an addition. A block fills them at any width.
 const REGISTERS: usize = 8;

@@ -130,7 +130,6 @@ impl ContributionIndex {
         &self.parts
     }
 
-    /// Returns the number of entries of all views.
     pub fn n_entries(&self) -> u64 {
         self.parts.iter().map(|part| part.n_entries).sum()
     }

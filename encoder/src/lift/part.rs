@@ -32,7 +32,6 @@ pub struct PartContributions {
     pub starts: Vec<u64>,
     /// Region of each entry, numbered over the whole scene.
     pub regions: Vec<u32>,
-    /// Weight of each entry.
     pub weights: Vec<f32>,
     /// `[N]`: `Σ_r a(k, r) n_r`, the evidence.
     pub total_weights: Vec<f32>,

@@ -29,8 +29,6 @@ pub struct SceneContributions<'a> {
 }
 
 impl SceneContributions<'_> {
-    /// # Errors
-    /// [`ContributionError::Cancelled`] if the user has asked to stop.
     pub(crate) fn check_cancelled(&self) -> Result<(), ContributionError> {
         match self.cancel.load(Ordering::Relaxed) {
             true => Err(ContributionError::Cancelled),

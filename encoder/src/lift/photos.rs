@@ -15,12 +15,10 @@ const VERSION: u32 = 2;
 /// The masks of a view's photo.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Photo {
-    /// Name of the view.
     pub name: String,
     pub outlines: Vec<MaskOutline>,
 }
 
-/// The outline of a mask in its photo.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 pub struct MaskOutline {
@@ -66,9 +64,6 @@ pub fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<(), Contr
 }
 
 /// Returns the bytes of the file of the outlines of a view's masks.
-///
-/// # Errors
-/// None: memory takes what is written.
 pub fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let n = outlines.len() as u64;
@@ -78,9 +73,6 @@ pub fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec<u8>> {
 }
 
 /// Reads the outlines of a view of `n_masks` masks.
-///
-/// # Errors
-/// [`ContributionError`], naming the file.
 pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<MaskOutline>, ContributionError> {
     let damaged = |source| ContributionError::Damaged { path: path.to_owned(), source };
     let bytes = AlignedBytes::read(path)?;

@@ -39,7 +39,6 @@ pub fn read_field(
     Ok(field)
 }
 
-/// Reads the region table of the published generation.
 pub fn read_regions(reader: &StoreReader) -> Result<RegionTable, ReadFieldError> {
     let bytes = read_extra(reader, EXTRA_REGIONS)?;
     RegionTable::from_bytes(&bytes)
@@ -52,7 +51,6 @@ fn read_extra(reader: &StoreReader, name: &str) -> Result<AlignedBytes, ReadFiel
     Ok(reader.read_object(*hash)?)
 }
 
-/// A published field cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadFieldError {
     #[error(transparent)]

@@ -151,7 +151,6 @@ impl Graph {
 }
 
 impl Superpoints {
-    /// Returns the number of Gaussians of each superpoint.
     pub fn sizes(&self) -> Vec<u32> {
         let mut sizes = vec![0; self.n];
         let known = self.of_gaussian.iter().filter(|superpoint| **superpoint != NO_SUPERPOINT);

@@ -28,9 +28,6 @@ struct SliceTask<'a> {
 
 impl ContributionIndex {
     /// Transposes the entries of a group from the views' order to the Gaussians'.
-    ///
-    /// # Errors
-    /// [`ContributionError::Damaged`] for an entry of a Gaussian that its slice does not have.
     pub fn transpose(
         &self,
         raw: &RawGroup,

@@ -18,7 +18,6 @@ impl Windows {
         Self { sizes: sizes.iter().map(|&size| u32::from(size)).filter(fits).collect(), width_px, height_px }
     }
 
-    /// Returns the windows as masks.
     pub fn masks(&self) -> Vec<Mask> {
         let mut masks = Vec::new();
         for &size in &self.sizes {

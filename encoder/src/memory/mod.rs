@@ -42,9 +42,7 @@ pub struct Reservation {
 /// The budget is too small.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MemoryError {
-    /// Bytes in the budget.
     pub available_bytes: u64,
-    /// Bytes needed at least.
     pub needed_bytes: u64,
     /// Whether no view was done yet.
     pub is_before_views: bool,
@@ -116,9 +114,6 @@ impl MemoryPlan {
     }
 
     /// Returns the bytes that the most expensive phase leaves for the contributions that are read at a time.
-    ///
-    /// # Errors
-    /// [`MemoryError`] if `contributions_bytes` do not fit beside the reservations of some phase.
     pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
         let phases = &PHASES[usize::from(!self.is_before_views)..];
         let most = phases.iter().copied().max_by_key(|phase| self.reserved_bytes(*phase));

@@ -28,7 +28,6 @@ impl Lattice {
         self.voxel * f64::from(BLOCK_EDGE)
     }
 
-    /// Returns the smallest corner of a block.
     pub(super) fn corner(self, at: BlockAt) -> DVec3 {
         DVec3::from(at.map(f64::from)) * self.block()
     }

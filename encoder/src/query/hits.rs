@@ -20,7 +20,6 @@ const F32_ROUNDING: f64 = 1e-7;
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Hit {
     pub index: u32,
-    /// Cosine with the query.
     pub cosine: f32,
     /// Mean, world frame.
     pub position_in_world: DVec3,

@@ -12,18 +12,14 @@ pub enum Precision {
     F32,
 }
 
-/// Description of an adapter.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct AdapterReport {
-    /// Name of the device.
     pub name: String,
-    /// Driver and its version.
     pub driver: String,
     /// Graphics interface: Vulkan, Metal, Dx12.
     pub backend: String,
     /// `discrete`, `integrated`, `virtual`, `software` or `other`.
     pub kind: &'static str,
-    /// Precision of the projection.
     pub precision: Precision,
     /// Largest buffer that a shader can access, bytes.
     pub max_binding_bytes: u64,

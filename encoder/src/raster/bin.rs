@@ -75,7 +75,6 @@ fn tile_row<'a>(parts: impl Iterator<Item = &'a [Candidate]>, width_px: u32) -> 
     tiles.map(|key| key as u32)
 }
 
-/// The outline of a footprint.
 struct Footprint<'a> {
     gaussian: &'a ScreenGaussian,
     reach2: f64,

@@ -61,7 +61,6 @@ impl TileRect {
 pub trait WeightSink {
     /// Consumes the weights at the pixels of vector `v` in row `y`; 0 at pixels without weight.
     fn add<S: Lanes>(&mut self, simd: S, member: u32, y: usize, v: usize, weights: S::f32s);
-    /// Ends the current Gaussian.
     fn end<S: Lanes>(&mut self, simd: S, member: u32);
 }
 

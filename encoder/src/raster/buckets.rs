@@ -47,7 +47,6 @@ impl<T: Copy + Zeroable> Buckets<T> {
 }
 
 impl<T> Buckets<T> {
-    /// Returns the items of a bucket.
     pub(super) fn of(&self, bucket: usize) -> &[T] {
         &self.items[self.starts[bucket]..self.starts[bucket + 1]]
     }
@@ -67,7 +66,6 @@ impl<T> Buckets<T> {
         })
     }
 
-    /// Returns the total number of items in all buckets.
     pub(super) fn n_items(&self) -> usize {
         self.items.len()
     }

@@ -133,7 +133,6 @@ struct Part {
 
 /// Sums weights per region of a tile.
 struct RegionSink {
-    /// Regions of the tile.
     regions: Vec<u32>,
     /// The regions of row `y` are `parts[first_part[y]..first_part[y + 1]]`.
     parts: Vec<Part>,

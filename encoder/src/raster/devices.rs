@@ -16,7 +16,6 @@ use super::view::RasterView;
 use super::weights::{ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
-/// The choice of the user.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum DeviceChoice {
     /// All GPUs, or the CPU if there are none. Software adapters (llvmpipe, WARP) are ignored.
@@ -25,7 +24,6 @@ pub enum DeviceChoice {
     /// All GPUs, or an error. A software adapter is used if there is no other.
     Gpu,
     Cpu,
-    /// The adapters with these numbers in the list.
     Adapters(Vec<usize>),
 }
 
@@ -87,9 +85,6 @@ pub struct Devices {
 
 impl Devices {
     /// Opens the chosen devices. Devices that fail are logged and left out.
-    ///
-    /// # Errors
-    /// [`DeviceError`] if no chosen device works and the choice excludes the CPU.
     pub fn open(choice: &DeviceChoice, options: GpuOptions) -> Result<Self, DeviceError> {
         let views_in_flight = options.views_in_flight.max(1);
         let all = if *choice == DeviceChoice::Cpu { Vec::new() } else { adapters() };

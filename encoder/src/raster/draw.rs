@@ -22,7 +22,6 @@ pub struct Drawing {
     pub depth: Vec<f32>,
     /// Opacity of the scene at the pixel, 0..=1: one minus the transmittance.
     pub coverage: Vec<f32>,
-    /// Statistics of the view.
     pub counters: ViewCounters,
 }
 

@@ -30,9 +30,6 @@ pub fn adapters() -> Vec<Adapter> {
 
 impl Adapter {
     /// Opens the device.
-    ///
-    /// # Errors
-    /// Never: there is no adapter.
     pub fn open(&self, _: Precision) -> Result<Device, RasterError> {
         match self.none {}
     }

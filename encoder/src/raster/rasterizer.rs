@@ -62,9 +62,6 @@ pub trait LoadedScene: Send + Sync {
     ///
     /// Pixels of [`NO_REGION`](crate::masks::NO_REGION) are blended but not recorded. The same input gives the
     /// same bits for any number of threads.
-    ///
-    /// # Errors
-    /// [`RasterError`] for inconsistent input or if a device fails.
     fn weights(
         &self,
         view: &RasterView,
@@ -73,9 +70,6 @@ pub trait LoadedScene: Send + Sync {
     ) -> Result<ViewWeights, RasterError>;
 
     /// Draws the scene over a background colour, in the colour space of its training.
-    ///
-    /// # Errors
-    /// [`RasterError`] for inconsistent input or if a device fails.
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
 
     /// Returns the GPUs that rasterise; `None` if views are rasterised on the caller's threads.

@@ -15,13 +15,11 @@ pub enum WeightKind {
 pub struct RegionWeight {
     /// Index of the Gaussian in the scene.
     pub gaussian: u32,
-    /// Region of the view.
     pub region: u32,
     /// Weight, pixels; above 0.
     pub weight: f32,
 }
 
-/// Statistics of one view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ViewCounters {
     /// Gaussians with a pixel of the image in their footprint; they may be occluded.
@@ -33,11 +31,9 @@ pub struct ViewCounters {
     pub unusable: usize,
 }
 
-/// Sparse weights of one view.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ViewWeights {
     /// Contributions above zero, ordered by (Gaussian, region); each pair occurs once.
     pub entries: Vec<RegionWeight>,
-    /// Statistics of the view.
     pub counters: ViewCounters,
 }

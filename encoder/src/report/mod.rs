@@ -14,9 +14,6 @@ use recorder::RecordedView;
 pub(crate) use recorder::Recorder;
 
 /// Makes the page of an encode that was recorded.
-///
-/// # Errors
-/// None: the summary is a record of numbers and texts.
 pub(crate) fn of_encode(
     scene: &str,
     summary: &EncodeSummary,

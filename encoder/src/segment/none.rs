@@ -4,7 +4,6 @@ use super::error::SegmentError;
 use super::segmenter::{SegmentInput, Segmenter};
 use crate::masks::Mask;
 
-/// Finds no masks.
 #[derive(Clone, Copy, Debug)]
 pub struct NoMasks;
 

@@ -20,17 +20,11 @@ pub trait Segmenter: Sync {
     fn identity(&self) -> String;
 
     /// Returns the hash of what this view's masks come from beside the photo: its mask file; `None` if nothing.
-    ///
-    /// # Errors
-    /// [`SegmentError`] if a mask file cannot be read.
     fn identity_of_view(&self, _view: &View) -> Result<Option<Hash32>, SegmentError> {
         Ok(None)
     }
 
     /// Checks that the views have masks, where these exist already; returns a sentence on those without.
-    ///
-    /// # Errors
-    /// [`SegmentError`] if no view has masks, or with `strict` if one has none.
     fn check_views(&self, _views: &[View], _strict: bool) -> Result<Option<String>, SegmentError> {
         Ok(None)
     }
@@ -52,9 +46,6 @@ pub trait Segmenter: Sync {
     }
 
     /// Returns the masks of a photo; they may overlap.
-    ///
-    /// # Errors
-    /// [`SegmentError`] if masks cannot be found or read.
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError>;
 }
 

@@ -50,7 +50,6 @@ impl GenerationRecord {
 enum Fault {
     /// Another process holds it.
     Held,
-    /// Its content is damaged.
     Damaged(String),
     /// The file system's.
     Failed(sled::Error),

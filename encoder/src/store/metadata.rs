@@ -40,7 +40,6 @@ pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Refreshed {
     pub(crate) timestamp_version: u64,
-    /// Version of the snapshot that it names.
     pub(crate) snapshot_version: u64,
     /// When clients refuse it, seconds since 1970.
     pub(crate) expires_unix_secs: u64,

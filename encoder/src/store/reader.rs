@@ -153,7 +153,6 @@ impl StoreReader {
         object_path(&self.dir, hash)
     }
 
-    /// Reads an object and verifies its hash.
     pub fn read_object(&self, hash: Hash32) -> Result<AlignedBytes, StoreError> {
         let path = self.object_path(hash);
         let bytes = AlignedBytes::read(&path)?;

@@ -28,9 +28,6 @@ pub(super) fn root_folder(store: &Path) -> PathBuf {
 }
 
 /// Reads a role's key.
-///
-/// # Errors
-/// [`StoreError::Io`] if it is not there, [`StoreError::Key`] for a damaged file.
 pub(super) fn read(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
     Ok(SigningKey::from_bytes(&read_hex_key(&key_path(store, role))?.0))
 }

@@ -38,7 +38,6 @@ pub(crate) struct BadObject {
 pub(crate) struct Verified {
     /// Objects that the current generation and the one before it list.
     pub(crate) n_files: usize,
-    /// Bytes read.
     pub(crate) len_bytes: u64,
     /// Bad ones, by hash.
     pub(crate) bad: Vec<BadObject>,

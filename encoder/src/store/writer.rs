@@ -91,9 +91,6 @@ impl Store {
     ///
     /// The object is durable on return. An object that is there already is kept if its content has its hash, else
     /// replaced.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`], from the callback too.
     pub(crate) fn put_object(
         &self,
         write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
@@ -181,7 +178,6 @@ impl Store {
         Ok(hash)
     }
 
-    /// Remembers which models the store was encoded with.
     pub(crate) fn remember_models(&self, record: &ModelsRecord) -> Result<(), StoreError> {
         let bytes = serde_json::to_vec(record).map_err(io::Error::from)?;
         self.replace(&ModelsRecord::path(&self.dir), &bytes)
@@ -190,9 +186,6 @@ impl Store {
     /// Removes objects and extras that neither the current manifest nor the one before it lists.
     ///
     /// Objects of an encode that has not published yet are removed too: prune after publishing.
-    ///
-    /// # Errors
-    /// [`StoreError`] if the current manifest or its extras cannot be read: then nothing is removed.
     pub fn prune(&self) -> Result<Pruned, StoreError> {
         let reader = self.reader()?;
         let both = || std::iter::once(reader.current()).chain(reader.previous());

@@ -19,7 +19,6 @@ use crate::diff::Diff;
 const DEFAULT_LIMIT: usize = 10;
 /// Most answers in a page.
 const MAX_LIMIT: usize = 1000;
-/// Most negatives of a question.
 const MAX_NEGATIVES: usize = 32;
 /// Longest photo that is sent.
 const MAX_PHOTO_BYTES: u64 = 64 << 20;

@@ -32,7 +32,6 @@ pub(crate) struct Viewed {
 }
 
 struct OpenedText {
-    /// Id of its space.
     id: Hash32,
     encoder: Box<dyn TextEncoder>,
     /// Vectors of everyday words, as far as they were needed; `None` of one that it does not know.

@@ -7,7 +7,6 @@ use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 
 /// A rasteriser and the tolerances of its arithmetic.
 pub struct Backend {
-    /// Its name in the table.
     pub name: &'static str,
     /// The rasteriser.
     pub rasterizer: Box<dyn Rasterizer>,

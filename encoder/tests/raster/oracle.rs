@@ -11,9 +11,7 @@ use slag_common::Gaussians;
 use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::{RasterView, WeightKind};
 
-/// A projected Gaussian of the oracle.
 pub struct Projected {
-    /// Index in the scene.
     pub index: usize,
     /// Camera z.
     pub depth: f64,

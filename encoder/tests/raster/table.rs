@@ -31,7 +31,6 @@ impl Case {
     }
 }
 
-/// A row of the table.
 pub struct Row {
     pub name: &'static str,
     pub range: &'static str,

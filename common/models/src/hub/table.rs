@@ -96,7 +96,6 @@ impl Entry {
 }
 
 impl Table {
-    /// Returns the table in the program.
     pub fn embedded() -> Result<Self, Box<toml::de::Error>> {
         toml::from_str(include_str!("../../models.toml")).map_err(Box::new)
     }

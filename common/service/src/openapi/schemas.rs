@@ -37,7 +37,6 @@ impl Default for Schemas {
 }
 
 impl Schemas {
-    /// Returns the schema of a type in replies.
     pub fn of_reply<T: JsonSchema>(&mut self) -> Value {
         tidied(self.replies.subschema_for::<T>(), true)
     }
@@ -47,7 +46,6 @@ impl Schemas {
         of(&mut self.replies)
     }
 
-    /// Returns the schema of a part of a request.
     pub fn of_request(&mut self, of: SchemaOf) -> Value {
         tidied(of(&mut self.requests), false)
     }

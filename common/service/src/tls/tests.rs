@@ -12,7 +12,6 @@ use super::*;
 use crate::listen::{Listen, bind};
 use crate::listener::{ConnectionLimits, serve};
 
-/// A certificate authority.
 struct Authority {
     issuer: Issuer<'static, KeyPair>,
     certificate: CertificateDer<'static>,

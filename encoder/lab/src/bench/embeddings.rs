@@ -7,13 +7,10 @@ use glam::DVec3;
 use slag_encoder::codebook::TextBank;
 use slag_math::random::mix64;
 
-/// Gaussians per cell.
 const CELL: usize = 62_500;
 /// Kinds of things; each has a text.
 const KINDS: usize = 400;
-/// Gaussians per thing.
 const THING: usize = 1_250;
-/// Views per thing.
 const VIEWS: usize = 6;
 /// Length of the noise that a view adds to its thing's vector.
 const VIEW_NOISE: f32 = 0.45;
@@ -26,7 +23,6 @@ const BORDER: f32 = 0.16;
 /// Dimensions that kinds and noise fill.
 const FILLED: usize = 128;
 
-/// A generated field.
 pub struct Field {
     n_gaussians: usize,
     dim: usize,
@@ -77,7 +73,6 @@ impl Field {
         Self { n_gaussians, dim, kinds }
     }
 
-    /// Returns the number of Gaussians per cell.
     pub fn cell_gaussians(&self) -> usize {
         CELL.min(self.n_gaussians)
     }

@@ -17,7 +17,6 @@ use slag_math::random::Random;
 
 use crate::harness::{Machine, Times, resident_bytes};
 
-/// Generated queries.
 const N_QUERIES: usize = 32;
 /// Queries used to measure recall: exact answers take long.
 const N_RECALL: usize = 16;

@@ -15,7 +15,6 @@ use slag_math::random::Random;
 
 /// Horizontal field of view of generated views.
 const FIELD_OF_VIEW_RAD: f64 = 65.0 * PI / 180.0;
-/// Viewpoints of a scene.
 const N_VIEWS: usize = 4;
 /// Objects on the ground of a generated scene.
 const N_OBJECTS: usize = 60;
@@ -25,7 +24,6 @@ const BACKDROP_HEIGHT_M: f64 = 8.0;
 /// Median standard deviation of a surface Gaussian, in spacings: neighbours overlap.
 const SPREAD: f64 = 0.5;
 
-/// A scene and views of it.
 pub(super) struct BenchScene {
     pub(super) name: String,
     pub(super) gaussians: Gaussians,

@@ -11,6 +11,5 @@ pub struct EdgeAnswer {
     pub size: DVec3,
     pub score: f32,
     pub n_gaussians: u64,
-    /// Distance from the robot.
     pub distance: Option<f64>,
 }

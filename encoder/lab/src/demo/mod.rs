@@ -41,7 +41,6 @@ const TOLERANCE_M: f64 = 0.25;
 /// Marks a folder as a demo's, so that the next demo may empty it.
 const MARKER: &str = "demo.json";
 
-/// How to run the demo.
 pub struct DemoOptions {
     /// Folder to work in.
     pub out: PathBuf,
@@ -66,7 +65,6 @@ pub struct DemoReport {
     /// A picture of each answer, and a map of the scene from above with the cells that the robot fetched.
     pub pictures: [PathBuf; 2],
     pub encode: EncodeSummary,
-    /// Bytes that the robot downloaded.
     pub downloaded_bytes: u64,
     /// The model's description of itself.
     pub about_model: String,
@@ -74,11 +72,9 @@ pub struct DemoReport {
     pub questions: Vec<Question>,
 }
 
-/// A question and its answer.
 #[derive(Debug, Serialize)]
 pub struct Question {
     pub text: String,
-    /// The best answer.
     pub answer: Option<EdgeAnswer>,
     /// Why there is no answer.
     pub reason: Option<serde_json::Value>,
@@ -122,9 +118,6 @@ impl DemoReport {
 
 impl Demo {
     /// Serves the shards and the robot's queries until it is stopped.
-    ///
-    /// # Errors
-    /// If a program cannot be started.
     pub fn keep(&self) -> Result<()> {
         let store = self.cache.with_file_name("store");
         let mut shards =
@@ -145,9 +138,6 @@ impl Demo {
 }
 
 /// Runs the demo.
-///
-/// # Errors
-/// The error of the step that failed, with the step's name.
 pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
     if !options.edge.is_file() {
         return Err(anyhow!(

@@ -52,7 +52,6 @@ fn luma([r, g, b]: [f32; 3]) -> f32 {
 pub(super) struct Panel<'a> {
     /// The question, written across the top.
     pub(super) question: &'a str,
-    /// The best answer.
     pub(super) answer: &'a EdgeAnswer,
     /// Cosine of each Gaussian with the question; NaN where it has no embedding.
     pub(super) cosines: Vec<f32>,

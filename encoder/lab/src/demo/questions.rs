@@ -16,7 +16,6 @@ pub(super) struct Asked<'a> {
     pub(super) truth: Vec<&'a TrueObject>,
 }
 
-/// A form of question.
 struct Form {
     /// Returns the question about a thing; `None` where the form does not fit the thing.
     text: fn(&TrueObject) -> Option<String>,

@@ -78,7 +78,6 @@ pub(crate) fn run(args: &LerfArgs) -> Result<LerfReport> {
     judge(&reader, &labels, &scene, &mut *encoder, &args.threshold)
 }
 
-/// A thing on a frame.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct LabelledThing {
     pub(super) category: String,
@@ -97,7 +96,6 @@ pub(super) struct LabelledFrame {
 
 #[derive(Clone, Debug)]
 pub(super) struct LerfLabels {
-    /// Frames that have a pose.
     pub(super) frames: Vec<LabelledFrame>,
     /// Names of frames without a pose.
     pub(super) without_view: Vec<String>,

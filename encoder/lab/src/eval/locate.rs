@@ -93,7 +93,6 @@ impl Try {
 pub(crate) struct LocateReport {
     change: Change,
     is_verified: bool,
-    /// Of all scenes.
     #[serde(flatten)]
     all: Figures,
     scenes: Vec<Figures>,

@@ -28,7 +28,6 @@ const COLUMNS: usize = 24;
 const ROWS: usize = 16;
 const PHOTO_PX: [u32; 2] = [320, 240];
 
-/// The encoded wall.
 struct Wall {
     dir: tempfile::TempDir,
     gaussians: Gaussians,

@@ -18,7 +18,6 @@ const SPACING: f64 = 1.1;
 /// The size of a scene of copies.
 #[derive(Clone, Copy, Debug)]
 pub struct CopiesSettings {
-    /// Copies of the splat.
     pub n_copies: u32,
     /// Photos, spread over the copies.
     pub n_views: u32,

@@ -25,7 +25,6 @@ use slag_math::random::Xorshift;
 
 /// Edge of the photos to take crops from.
 const PHOTO_PX: u32 = 208;
-/// Photos per scene.
 const N_PHOTOS: usize = 14;
 /// Masks with fewer pixels are ignored, as in `encode`.
 const MIN_MASK_PX: u32 = 200;
@@ -47,13 +46,10 @@ pub enum Split {
     Test,
 }
 
-/// Label of a crop.
 #[derive(Clone, Debug, Serialize)]
 pub struct Label {
     pub noun: usize,
-    /// Main colour.
     pub colour: Colour,
-    /// Main material.
     pub material: Material,
     /// Whether the pair of noun and colour is held out from training.
     pub held_out: bool,
@@ -123,7 +119,6 @@ pub fn write(
     Ok(crops.len())
 }
 
-/// Returns the crops of a scene.
 pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label)> {
     let allowed = |noun: &Noun, colour| split == Split::Test || !is_held_out(noun, colour);
     let layout = Layout::of_any_kind(seed, nouns, &allowed);

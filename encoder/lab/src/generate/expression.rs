@@ -2,7 +2,6 @@
 
 use slag_math::random::Xorshift;
 
-/// A parsed expression.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Expression {
     Number(f64),
@@ -31,9 +30,6 @@ pub enum Operator {
 
 impl Expression {
     /// Parses an expression with the variables `names`.
-    ///
-    /// # Errors
-    /// What was found and what was expected.
     pub fn parse(text: &str, names: &[String]) -> Result<Self, String> {
         let mut parser = Parser { rest: text.trim(), names, depth: 0 };
         let expression = parser.sum()?;

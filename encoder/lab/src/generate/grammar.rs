@@ -39,10 +39,8 @@ static OBJECTS: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/src/generate/objects
 
 #[derive(Debug, thiserror::Error)]
 pub enum GrammarError {
-    /// A file or folder cannot be read.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// A line is malformed.
     #[error("{}:{line}: {reason}", path.display())]
     Line { path: PathBuf, line: usize, reason: String },
 }
@@ -140,7 +138,6 @@ pub struct Object {
     pub parts: Vec<Part>,
     /// Its colours, the main one first.
     pub colours: Vec<Colour>,
-    /// Its main paint.
     pub paint: Paint,
     /// Surface for other things.
     pub top: Option<Top>,
@@ -185,9 +182,6 @@ fn exactly<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; 
 
 impl Noun {
     /// Parses an object file's text; the file's name is the noun.
-    ///
-    /// # Errors
-    /// [`GrammarError::Line`].
     pub fn parse(path: &Path, text: &str) -> Result<Self, GrammarError> {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().replace('_', " ");
         let mut noun = Self {

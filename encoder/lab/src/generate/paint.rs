@@ -22,9 +22,6 @@ macro_rules! named {
             }
 
             /// Returns the value with this word.
-            ///
-            /// # Errors
-            /// What was found and what was expected.
             pub fn parse(word: &str) -> Result<Self, String> {
                 Self::ALL.iter().copied().find(|known| known.word() == word).ok_or_else(|| {
                     format!("`{word}`, expected one of: {}", Self::ALL.iter().map(|k| k.word()).collect::<Vec<_>>().join(", "))
@@ -90,7 +87,6 @@ pub struct Paint {
     /// Colour under white light, 0 to 1.
     pub rgb: [f64; 3],
     pub material: Material,
-    /// Seed of the pattern.
     pub seed: u32,
 }
 

@@ -12,7 +12,6 @@ use super::render::{NOTHING, Photo};
 use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
 
-/// Photos per scene.
 const N_PHOTOS: u32 = 4;
 
 /// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`), `things.npy` (u16

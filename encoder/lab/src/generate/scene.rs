@@ -31,7 +31,6 @@ const N_TEST_VIEWS: u32 = 6;
 /// First id of things in the labels. Ids of floor, walls and other background begin at 1.
 const FIRST_ID: u16 = 10;
 
-/// A generated scene.
 pub struct Scene {
     /// The Gaussians; metres, z up.
     pub gaussians: Gaussians,
@@ -44,7 +43,6 @@ pub struct Scene {
     layout: Layout,
 }
 
-/// The label of an object.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TrueObject {
     /// Its id in masks and labels.
@@ -56,7 +54,6 @@ pub struct TrueObject {
     pub kinds: Vec<String>,
     /// Its colours, the main one first.
     pub colours: Vec<&'static str>,
-    /// Its main material.
     pub material: &'static str,
     /// Whether it is background, such as floor and walls.
     pub background: bool,
@@ -71,7 +68,6 @@ pub struct TrueObject {
     pub train_pixels: u64,
 }
 
-/// Paths of a written scene.
 pub struct WrittenScene {
     pub scene: PathBuf,
     /// The poses.

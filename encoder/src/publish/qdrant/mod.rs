@@ -126,7 +126,6 @@ pub(crate) enum PushError {
         "collection {collection:?} holds {n_points} points of other scenes than {scene:?}, and ids would collide; choose another collection"
     )]
     OtherScene { collection: String, scene: String, n_points: u64 },
-    /// The database refused a request, or was unreachable in all attempts.
     #[error(
         "{url}: {action}: {cause}; does Qdrant run there, and is this its gRPC port (6334 by default; 6333 is REST's)? Check the key and the database's log, then run the push again: it continues"
     )]
@@ -139,7 +138,6 @@ pub(crate) enum PushError {
     Shard { path: PathBuf, cause: ContainerError },
     #[error("the progress of the push cannot be recorded: {0}; check the store's free space and permissions")]
     Records(#[from] sled::Error),
-    /// The database counts another number of points than it acknowledged.
     #[error(
         "collection {collection:?} has {found} points, {expected} were pushed; another program may have changed it; run the push again: it starts over"
     )]

@@ -43,9 +43,6 @@ const STORE: [(u16, &str); 1] = [(500, "The service failed.")];
 const REQUEST_BODY_BYTES: usize = 1024;
 
 /// Returns the service of a store, without a listener.
-///
-/// # Errors
-/// [`StoreError`] if nothing is published or the store cannot be read.
 pub fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, StoreError> {
     router_with(dir, limits, access, Router::new())
 }

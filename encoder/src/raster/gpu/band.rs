@@ -6,7 +6,6 @@ use super::layout::ViewBlock;
 use crate::raster::constants::TILE_SIZE_PX;
 use crate::raster::error::RasterError;
 
-/// A band of a view.
 pub struct Band<'a> {
     pub device: &'a Device,
     pub chunks: &'a [SceneChunk],

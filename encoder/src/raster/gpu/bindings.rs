@@ -13,7 +13,6 @@ pub fn number<'a>(bindings: &[wgpu::BufferBinding<'a>]) -> Vec<(u32, wgpu::Buffe
     (0..).zip(bindings.iter().cloned()).collect()
 }
 
-/// Creates the bind group of a kernel.
 pub fn bind(
     device: &Device,
     kernel: &wgpu::ComputePipeline,

@@ -28,7 +28,6 @@ pub fn regions_bytes(n_px: usize) -> u64 {
 pub struct Size {
     /// Capacities for the output of the shaders.
     pub capacities: Capacities,
-    /// Tiles of a band.
     pub n_tiles: u32,
     /// Pixels of a band.
     pub n_px: u32,
@@ -36,7 +35,6 @@ pub struct Size {
     pub n_chunk: u32,
 }
 
-/// The buffers of all stages.
 pub struct Buffers {
     pub view: wgpu::Buffer,
     pub counters: wgpu::Buffer,

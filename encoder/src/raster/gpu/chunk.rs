@@ -10,7 +10,6 @@ use super::shader::{Counter, NONE, WORKGROUP_SIZE};
 /// Size of a Gaussian in device memory, bytes.
 pub const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
 
-/// A chunk of the scene on the device.
 pub struct SceneChunk {
     pub n_gaussians: u32,
     /// The [`Chunk`] and the [`ScanJob`] of its blocks, [`JOB_STRIDE_BYTES`] apart.

@@ -8,7 +8,6 @@ use super::shader::Kernels;
 use crate::raster::adapter::{AdapterReport, Precision};
 use crate::raster::error::RasterError;
 
-/// Describes an adapter.
 fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
     let info = adapter.get_info();
     let has_f64 = adapter.features().contains(wgpu::Features::SHADER_F64);
@@ -65,9 +64,6 @@ pub struct Device {
 
 impl Adapter {
     /// Opens the device and compiles the shaders. `precision` may be lower than that of the device.
-    ///
-    /// # Errors
-    /// [`RasterError::Device`] if the device does not meet the requirements of the shaders.
     pub fn open(&self, precision: Precision) -> Result<Device, RasterError> {
         let failed = |what: String| RasterError::Device { adapter: self.report.name.clone(), what };
         let limits = self.adapter.limits();

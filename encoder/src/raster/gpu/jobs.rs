@@ -14,7 +14,6 @@ pub const PAIR_WORDS: u32 = 2;
 /// Size of an entry, words.
 pub const ENTRY_WORDS: u32 = 4;
 
-/// The scans of a view.
 #[derive(Clone, Copy)]
 pub enum Scan {
     Digits(Counter),
@@ -28,7 +27,6 @@ pub enum Scan {
 pub enum SortKey {
     /// Depth of a visible Gaussian.
     Depth,
-    /// Tile of a pair.
     Tile,
     /// Visible Gaussian of an entry, then its region.
     MemberRegion,
@@ -40,7 +38,6 @@ pub const DIGIT_BITS: u32 = RADIX.ilog2();
 pub const MAX_PASSES: u32 = (u32::BITS + REGION_BITS).div_ceil(DIGIT_BITS);
 
 impl SortKey {
-    /// Returns the counter with the number of items.
     pub fn counter(self) -> Counter {
         match self {
             Self::Depth => Counter::Visible,
@@ -60,7 +57,6 @@ pub fn depth_keys() -> (u32, u32) {
 pub const SCAN_JOBS: u64 = 6;
 
 impl Scan {
-    /// Returns the index of the record.
     pub fn index(self) -> u64 {
         match self {
             Self::Digits(Counter::Visible) => 0,
@@ -89,7 +85,6 @@ pub fn bits_of(n: u32) -> u32 {
     u32::BITS - n.saturating_sub(1).leading_zeros()
 }
 
-/// Returns the binding of one record in a buffer.
 pub fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
     wgpu::BufferBinding {
         buffer,

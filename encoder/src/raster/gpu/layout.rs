@@ -31,7 +31,6 @@ pub struct SceneGaussian {
 }
 
 impl SceneGaussian {
-    /// Converts a Gaussian of a scene.
     pub fn new(scene: &Gaussians, index: usize, origin_in_world: DVec3) -> Self {
         let opacity = scene.opacities[index];
         if !scene.is_usable(index) || opacity < MIN_ALPHA {
@@ -60,7 +59,6 @@ fn high_and_low(value: DVec3) -> ([f32; 3], [f32; 3]) {
     (high.to_array(), (value - high.as_dvec3()).as_vec3().to_array())
 }
 
-/// A chunk of the scene.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct Chunk {
@@ -73,11 +71,9 @@ pub struct Chunk {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct ScanJob {
-    /// Counter with the number of items.
     pub items: u32,
     /// Upper limit of the number of items; the number itself if there is no counter.
     pub n_most: u32,
-    /// Items per block.
     pub block: u32,
     /// Values per block.
     pub columns: u32,
@@ -89,7 +85,6 @@ pub struct ScanJob {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct SortPass {
-    /// Counter with the number of items.
     pub items: u32,
     /// Words between keys.
     pub stride: u32,
@@ -111,7 +106,6 @@ pub struct SortPass {
 pub struct RegionSum {
     /// Index in the scene.
     pub gaussian: u32,
-    /// Region of the view.
     pub region: u32,
     /// Lower word of the sum.
     pub low: u32,
@@ -132,7 +126,6 @@ impl RegionSum {
     }
 }
 
-/// Background of a picture.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct Background {
@@ -144,7 +137,6 @@ pub struct Background {
 /// Capacities of the buffers of a workspace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Capacities {
-    /// Visible Gaussians.
     pub visible: u32,
     /// (Tile, Gaussian) pairs.
     pub pairs: u32,

@@ -45,7 +45,6 @@ use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
 use workspace::{Counts, PIXEL_BYTES, Workspace};
 
-/// A backend on one GPU.
 pub struct GpuRasterizer {
     device: Arc<Device>,
     options: GpuOptions,
@@ -81,7 +80,6 @@ impl Rasterizer for GpuRasterizer {
     }
 }
 
-/// A scene on a device.
 struct GpuScene<'s> {
     device: Arc<Device>,
     scene: &'s Gaussians,

@@ -23,7 +23,6 @@ pub const PIXEL_BYTES: u64 = 20;
 
 /// The resources of one view in flight.
 pub struct Workspace {
-    /// Capacities of the buffers.
     pub capacities: Capacities,
     n_tiles: u32,
     n_px: u32,

@@ -40,9 +40,6 @@ enum Source {
 
 impl GivenMasks {
     /// Opens a folder of masks or reads a COCO data set. `ignore_ids` are further background ids of id images.
-    ///
-    /// # Errors
-    /// [`SegmentError`] if the path does not exist or the data set is malformed.
     pub fn open(path: &Path, ignore_ids: Vec<u32>) -> Result<Self, SegmentError> {
         let source = if fs_err::metadata(path)?.is_dir() {
             Source::Folder(path.to_owned())
@@ -61,9 +58,6 @@ impl GivenMasks {
     }
 
     /// Returns the masks of a view; `None` if it has no file or entry.
-    ///
-    /// # Errors
-    /// [`SegmentError`] if the file is malformed or does not have the photo's size.
     pub fn load(&self, input: &SegmentInput<'_>) -> Result<Option<Vec<Mask>>, SegmentError> {
         let path = match &self.source {
             Source::DataSet { path, masks_of_image } => {

@@ -3,7 +3,6 @@
 use super::runs::RunMask;
 use crate::masks::BoxPx;
 
-/// A candidate mask.
 #[derive(Clone, Debug)]
 pub(super) struct Candidate {
     pub(super) mask: RunMask,

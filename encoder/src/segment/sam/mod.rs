@@ -51,9 +51,6 @@ pub struct SamSegmenter {
 impl SamSegmenter {
     /// Opens a model directory with a `[segment]` section in `model.toml`; `gpus`: those that share the photos,
     /// where the session asks for GPUs.
-    ///
-    /// # Errors
-    /// [`ModelError`] if a file is missing or does not match its description, or ONNX Runtime does not load.
     pub fn open(
         dir: &Path,
         settings: SamSettings,

@@ -122,7 +122,6 @@ fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
     gaps
 }
 
-/// Connected components of runs.
 struct Components {
     /// Component of each run, numbered in the order of a row-major scan.
     of_run: Vec<u32>,

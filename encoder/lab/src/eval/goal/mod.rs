@@ -133,7 +133,6 @@ fn verdict(truth: &Truth<'_>, thing: usize, reply: &Value) -> Result<Verdict> {
     Ok(Verdict::Pose { clearance_m, is_reached, shown, height_error_m })
 }
 
-/// A thing of the labels.
 struct Label {
     /// Pixels that show it, over all photos.
     n_pixels: u64,
@@ -208,7 +207,6 @@ pub(crate) struct GoalReport {
     missed: BTreeMap<String, usize>,
     /// Things that the robot truly does not reach.
     n_unreachable: usize,
-    /// Those with a pose.
     n_unreachable_with_pose: usize,
     n_poses: usize,
     /// Poses closer than the robot's radius to a true surface, by more than 3 cm.

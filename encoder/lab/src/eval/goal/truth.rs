@@ -13,9 +13,7 @@ use crate::generate::render::Solids;
 /// Largest horizontal distance to the thing.
 pub(super) const REACH_M: f64 = 0.8;
 pub(super) const SENSOR_HEIGHT_M: f64 = 0.4;
-/// Height of the robot.
 pub(super) const HEIGHT_M: f64 = 0.5;
-/// Highest step.
 pub(super) const STEP_M: f64 = 0.1;
 /// Least share of the thing's outline that must truly be shown.
 pub(super) const MIN_SHOWN: f64 = 0.1;
@@ -23,7 +21,6 @@ pub(super) const MIN_SHOWN: f64 = 0.1;
 const CELL_M: f64 = 0.02;
 /// Distance of the surface points that are looked at.
 const SPACING_M: f64 = 0.01;
-/// Most places that are looked from.
 const MAX_PLACES: usize = 60;
 /// The picture that decides whether a thing is shown.
 const PICTURE_PX: [u32; 2] = [240, 240];

@@ -49,7 +49,6 @@ pub(crate) struct RelationsArgs {
     n_views: u32,
 }
 
-/// A question with its truth.
 struct Question {
     asked: Asked,
     thing: String,
@@ -182,7 +181,6 @@ fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result
     }
 }
 
-/// Returns the thing that an answer is about.
 fn thing_of(things: &[TrueThing], answer: &Value) -> Option<usize> {
     let corner = |name: &str| serde_json::from_value::<DVec3>(answer[name].clone()).ok();
     let of = Aabb { min: corner("box_min_in_world")?, max: corner("box_max_in_world")? };
@@ -235,7 +233,6 @@ struct Counts {
     n_answers: usize,
     /// Answers that are a thing that is meant.
     n_answers_right: usize,
-    /// Things that are meant.
     n_meant: usize,
     /// Those among the answers.
     n_meant_found: usize,

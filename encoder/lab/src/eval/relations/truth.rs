@@ -18,7 +18,6 @@ const TOUCHES_M: f64 = 0.05;
 /// A thing on another is at least this far from the ground.
 const RAISED_M: f64 = 0.1;
 
-/// A thing of the layout.
 #[derive(Clone, Debug, Deserialize)]
 pub(super) struct TrueThing {
     pub(super) category: String,
@@ -85,7 +84,6 @@ impl TrueThing {
         Aabb { min: self.aabb_min, max: self.aabb_max }
     }
 
-    /// Returns whether a word names it.
     pub(super) fn is_called(&self, word: &str) -> bool {
         self.category == word || self.kinds.iter().any(|kind| kind == word)
     }

@@ -14,7 +14,6 @@ use ::qdrant_client::qdrant::{
 use ::qdrant_client::qdrant::{points_selector::PointsSelectorOneOf, vectors::VectorsOptions};
 use tonic::{Request, Response, Status};
 
-/// A point as stored.
 #[derive(Clone, Debug)]
 pub(super) struct Stored {
     pub(super) vector: Vec<f32>,
@@ -157,7 +156,6 @@ fn stored(point: PointStruct) -> Result<(u64, Stored), Status> {
     }
 }
 
-/// Returns whether a payload passes a filter of equalities.
 fn passes(payload: &HashMap<String, Value>, filter: &Filter) -> Result<bool, Status> {
     let holds = |condition: &Condition| {
         let Some(ConditionOneOf::Field(field)) = &condition.condition_one_of else {
