@@ -7,8 +7,7 @@ use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
 use super::embeddings::{make_unit, write_embeddings};
 use super::part::PartContributions;
-use super::starts;
-use super::table::RegionTable;
+use super::table::{RegionTable, are_starts};
 
 const MAGIC: [u8; 8] = *b"SLAGFELD";
 const VERSION: u32 = 1;
@@ -136,8 +135,8 @@ impl CellField {
             total_weights: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(6, "total weights", n)?]),
             mean_lengths: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(7, "mean lengths", n)?]),
         };
-        let consistent = starts::are_valid(&field.starts, n_entries)
-            && field.regions.iter().all(|r| (*r as usize) < n_regions);
+        let consistent =
+            are_starts(&field.starts, n_entries) && field.regions.iter().all(|r| (*r as usize) < n_regions);
         if consistent {
             return Ok(field);
         }

@@ -35,7 +35,6 @@ mod passes;
 pub mod photos;
 pub mod published;
 pub mod refine;
-mod starts;
 pub mod superpoint;
 mod table;
 #[cfg(test)]

@@ -14,7 +14,6 @@ use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 use slag_math::matrix::Rows;
 
 use super::contributions::{ContributionError, MAX_IN_ALL};
-use super::starts;
 use crate::masks::Mask;
 use crate::memory::{MemoryPlan, Phase};
 
@@ -234,7 +233,7 @@ impl RegionTable {
             },
         };
         let consistent = dim > 0
-            && starts::are_valid(&table.starts, n_listed)
+            && are_starts(&table.starts, n_listed)
             && table.masks.iter().all(|mask| (*mask as usize) < n_masks)
             && table.shares.iter().all(|share| share.is_finite() && *share >= 0.0);
         if consistent {
@@ -243,6 +242,11 @@ impl RegionTable {
         let what = "masks out of range, or weights that are not finite".into();
         Err(ContainerError::Damaged { offset_bytes: 0, what })
     }
+}
+
+/// Returns whether values ascend from 0 to `end`, as the starts of `starts.len() - 1` rows do.
+pub(super) fn are_starts(starts: &[u64], end: usize) -> bool {
+    starts.first() == Some(&0) && starts.is_sorted() && starts.last() == Some(&(end as u64))
 }
 
 #[cfg(test)]

@@ -4,9 +4,8 @@
 //! including those held out from training.
 
 use std::fmt;
-use std::path::PathBuf;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use clap::Args;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -41,9 +40,6 @@ pub(crate) struct EncoderArgs {
     /// Seed of the first scene; the others follow. The embedded encoders were trained on seeds 1000000 to 1012799.
     #[arg(long, default_value_t = 9_000_000)]
     seed: u64,
-    /// Writes a picture of the confusion matrix to this file.
-    #[arg(long, value_name = "PNG")]
-    confusion: Option<PathBuf>,
 }
 
 /// Correct answers over a set of crops.
@@ -138,7 +134,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
     let crop_times = Times::measure(0, N_TIMED, crop)?;
     let n = seen.len() as f64;
     let share = |count: u64, of: usize| threshold.map(|_| count as f64 / (n * of as f64));
-    let report = EncoderReport {
+    Ok(EncoderReport {
         encoder: models.encoder_id().name.clone(),
         n_scenes: seeds.end - seeds.start,
         first_seed: seeds.start,
@@ -150,11 +146,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
         found_absent: share(found[2], ABSENT.len()),
         ms_per_crop: crop_times.median_ms,
         ms_per_text: text_times.median_ms,
-    };
-    if let Some(path) = &args.confusion {
-        picture(&seen, nouns.len()).save(path).with_context(|| path.display().to_string())?;
-    }
-    Ok(report)
+    })
 }
 
 /// A crop's label, and its best noun, colour and material.
@@ -212,17 +204,6 @@ fn of_each_noun(seen: &[Seen], nouns: &[Noun]) -> Vec<NounReport> {
         }
     };
     counts.iter().enumerate().map(report).collect()
-}
-
-/// Draws the confusion matrix: a row per true noun, a column per answer; darker is more frequent.
-fn picture(seen: &[Seen], n_nouns: usize) -> image::GrayImage {
-    const EDGE_PX: u32 = 8;
-    let counts = confusion(seen, n_nouns);
-    image::GrayImage::from_fn(n_nouns as u32 * EDGE_PX, n_nouns as u32 * EDGE_PX, |x, y| {
-        let row = &counts[(y / EDGE_PX) as usize];
-        let share = row[(x / EDGE_PX) as usize] as f64 / row.iter().sum::<usize>().max(1) as f64;
-        image::Luma([(255.0 * (1.0 - share.sqrt())) as u8])
-    })
 }
 
 impl fmt::Display for EncoderReport {

@@ -5,12 +5,12 @@
 //!   "axis": "views by coverage", "name": "25 %",
 //!   "views": "--view-order coverage --views-limit 25%",
 //!   "lift": "--compact-error 0.1",
-//!   "eval": "", "profile": "compact"
+//!   "profile": "compact"
 //! }]}
 //! ```
 //!
 //! `axis` names the varied setting. `views` are the flags of `encode` that change the
-//! views' contributions; `lift` are its other flags; `eval` are flags of `eval labelled`. The shards of `profile`
+//! views' contributions; `lift` are its other flags. The shards of `profile`
 //! are evaluated and measured. All profiles are made, because the exact shards tell which Gaussian is
 //! which.
 //!
@@ -43,8 +43,6 @@ pub(super) struct Point {
     pub(super) views: String,
     #[serde(default)]
     pub(super) lift: String,
-    #[serde(default)]
-    pub(super) eval: String,
     #[serde(default = "compact")]
     pub(super) profile: Profile,
 }
@@ -67,7 +65,7 @@ impl Grid {
 
     pub(super) fn parse(text: &str) -> Result<Self> {
         let grid: Self = serde_json::from_str(text).context(
-            "expected {\"points\": [..]}, each with axis and name, and optionally views, lift, eval, profile",
+            "expected {\"points\": [..]}, each with axis and name, and optionally views, lift, profile",
         )?;
         for (number, point) in grid.points.iter().enumerate() {
             if grid.points[..number].iter().any(|p| p.axis == point.axis && p.name == point.name) {

@@ -106,7 +106,7 @@ fn measure_group<'p>(
 fn file_name(scene: &SceneFiles, point: &Point, programs: &Programs) -> String {
     let dir = scene.dir.canonicalize().unwrap_or_else(|_| scene.dir.clone());
     // The first word is the version of the figures: files of another one are not read.
-    let key = format!("4 {dir:?} {point:?} {}", programs.made_by);
+    let key = format!("5 {dir:?} {point:?} {}", programs.made_by);
     format!("{}-{}.json", scene.name, &blake3::hash(key.as_bytes()).to_hex()[..16])
 }
 
@@ -122,9 +122,9 @@ impl Run<'_> {
     fn measure(&self, views_seconds: &mut Option<f64>) -> Result<Result<Figures, &'static str>> {
         let (point, programs) = (self.point, self.programs);
         let expand = |flags: &str| expand(flags, self.scene, programs.segmenter.as_ref());
-        let (views, lift, eval) = match [expand(&point.views)?, expand(&point.lift)?, expand(&point.eval)?] {
-            [Ok(views), Ok(lift), Ok(eval)] => (views, lift, eval),
-            [Err(reason), ..] | [_, Err(reason), _] | [.., Err(reason)] => return Ok(Err(reason)),
+        let (views, lift) = match [expand(&point.views)?, expand(&point.lift)?] {
+            [Ok(views), Ok(lift)] => (views, lift),
+            [Err(reason), _] | [_, Err(reason)] => return Ok(Err(reason)),
         };
         // The duration of views that an earlier run left is unknown.
         if views_seconds.is_none() {
@@ -139,7 +139,7 @@ impl Run<'_> {
         }
         let own_views = figure(&encoded, "views_secs")?;
         let of_views = *views_seconds.get_or_insert(own_views);
-        let judged = self.evaluate(&eval)?;
+        let judged = self.evaluate()?;
         let n_gaussians = figure(&encoded, "n_gaussians")?.max(1.0);
         let all = &judged["multi_class"][0];
         Ok(Ok(Figures {
@@ -174,12 +174,12 @@ impl Run<'_> {
     }
 
     /// Evaluates the store's shards of the point's profile.
-    fn evaluate(&self, eval: &[String]) -> Result<Value> {
+    fn evaluate(&self) -> Result<Value> {
         let mut command = Command::new(&self.programs.lab);
         command.args(["--json", "eval", "labelled", "--truth"]).arg(&self.scene.dir);
         command.arg("--store").arg(self.store);
         command.args(["--profile", self.point.profile.name()]);
-        json_of(command.args(&self.programs.models).args(eval))
+        json_of(command.args(&self.programs.models))
     }
 }
 

@@ -34,7 +34,7 @@ pub(crate) struct TradeoffArgs {
     out: PathBuf,
     /// What to measure: `full`; `quick`, a small grid with the scenes' own masks (ten minutes on two cores);
     /// `paper`, the paper's four configurations of SAM's grid and image step (needs --segmenter); or a file: JSON,
-    /// {"points": [..]} of axis, name, and flags (views, lift, eval, profile).
+    /// {"points": [..]} of axis, name, and flags (views, lift, profile).
     #[arg(long, value_name = "full|quick|paper|FILE", default_value = "full")]
     grid: PathBuf,
     /// Model directory of Segment Anything; without it the points that need one are left out.

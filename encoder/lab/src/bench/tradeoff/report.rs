@@ -123,7 +123,7 @@ impl TradeoffReport {
     }
 
     /// Returns the settings that no other beats in seconds or bytes, on the mean of the scenes; only those that a
-    /// user can give on any scene: without placeholders, flags of the evaluation, or a view of the machine.
+    /// user can give on any scene: without placeholders, and flags of the machine.
     fn front(&self) -> Front {
         let scenes = self.scenes();
         let of_views = |f: &Figures| f.views_seconds + f.coverage_seconds;
@@ -137,7 +137,7 @@ impl TradeoffReport {
             let point = seconds.point;
             let flags = [point.views.as_str(), point.lift.as_str()].join(" ");
             let is_of_machine = ["{", "--threads", "--device", "--every"].iter().any(|f| flags.contains(f));
-            if is_of_machine || !point.eval.is_empty() {
+            if is_of_machine {
                 continue;
             }
             let setting = FrontSetting {

@@ -17,8 +17,8 @@ fn scene(dir: &Path, true_masks: Option<PathBuf>) -> SceneFiles {
 }
 
 fn point(axis: &str, name: &str, views: &str, lift: &str) -> Point {
-    let [axis, name, views, lift, eval] = [axis, name, views, lift, ""].map(str::to_owned);
-    Point { axis, name, views, lift, eval, profile: Profile::Compact }
+    let [axis, name, views, lift] = [axis, name, views, lift].map(str::to_owned);
+    Point { axis, name, views, lift, profile: Profile::Compact }
 }
 
 fn figures(scene: &str, point: Point, seconds: f64, miou: f64) -> Figures {
