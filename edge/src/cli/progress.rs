@@ -10,7 +10,7 @@ use super::failure::Failure;
 use super::output::print_pairs;
 
 pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
-    let tally = |t: &Tally| format!("{} shards, {} bytes", t.n_shards, t.bytes);
+    let tally = |t: &Tally| format!("{} shards, {}", t.n_shards, ByteSize(t.bytes));
     let trust = match (report.root_version, report.is_first_contact) {
         (Some(version), true) => {
             format!("root {version}, trusted at first contact: compare it with the store's")
@@ -23,7 +23,7 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
         ("generation", report.generation.to_string()),
         ("encoder", format!("{} ({})", report.encoder_name, report.encoder_id)),
         ("cells", format!("{} within {} of {}", report.n_cells, report.radius, report.centre_in_world)),
-        ("downloaded", format!("{} ({} bytes resumed)", tally(&report.downloaded), report.resumed_bytes)),
+        ("downloaded", format!("{} ({} resumed)", tally(&report.downloaded), ByteSize(report.resumed_bytes))),
         ("kept", tally(&report.kept)),
         ("spare", tally(&report.spare)),
         ("freed", tally(&report.freed)),

@@ -5,6 +5,7 @@ use crate::query::Status;
 use crate::store::Snapshot;
 use clap::Args;
 use serde::Serialize;
+use slag_common::ByteSize;
 
 use super::args::CacheArgs;
 use super::failure::{Failure, store_failure};
@@ -64,6 +65,6 @@ fn print_status(status: &Status, pinned_scene: Option<String>) -> Result<(), Fai
         ("shards", format!("{} of {} cells", status.shards.len(), status.n_cells_in_scene)),
         ("bad cells", if bad_cells.is_empty() { "none".into() } else { bad_cells.join(", ") }),
         ("Gaussians", status.n_gaussians.to_string()),
-        ("bytes", status.len_bytes.to_string()),
+        ("size", ByteSize(status.len_bytes).to_string()),
     ])
 }
