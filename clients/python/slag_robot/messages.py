@@ -112,13 +112,14 @@ class Result:
     answers: Sequence[Answer]
     """The answers, best first."""
     area_fetched: Optional[bool] = None
-    """Whether all of the requested region is on board."""
+    """Whether the whole region asked for was fetched; absent without `radius` and `box`."""
     bad_cells: Sequence[Mapping[str, Any]] = ()
-    """Cells in the requested region whose shards could not be fetched; absent if there are none."""
+    """Cells in the region asked for whose shards could not be fetched."""
     clustering: Optional[Mapping[str, Any]] = None
-    """How matches were grouped."""
+    """How matches were clustered; only for `kind=clusters`."""
     is_exact: Optional[bool] = None
-    """Whether the matches are exactly the Gaussians that reach the threshold."""
+    """Whether exactly the Gaussians at or above the threshold match. Otherwise a Gaussian with a score within
+    `score_error_bound` of the threshold may be misplaced."""
     n_matching: Optional[int] = None
     """Gaussians that match."""
     n_searched: Optional[int] = None
@@ -128,10 +129,10 @@ class Result:
     parts: Sequence[Mapping[str, Any]] = ()
     """For phrases: the things that they name."""
     score_error_bound: Optional[float] = None
-    """Bound of the error of every score."""
+    """Bound on the error of every score."""
     score_error_likely: Optional[float] = None
-    """For 95 of 100 questions (90 with negatives), 99 of 100 scores of each shard err by no more, measured over texts
-    that the codebook was not made for; absent where answers are exact or it was not measured."""
+    """For 95 of 100 questions, 99 of 100 scores of each shard err by no more: measured over texts that the codebook
+    was not made for. With negatives, for 90 of 100. Absent if answers are exact or it was not measured."""
     score_kind: Optional[str] = None
     """Meaning of scores."""
     threshold: Optional[float] = None
