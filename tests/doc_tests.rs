@@ -14,8 +14,8 @@ const MAX_LINE: usize = 120;
 const MAX_ROW: usize = 200;
 const MAX_COLUMNS: usize = 8;
 /// Flags of other projects' programs and of scripts, which documents name beside ours.
-const OTHER_FLAGS: [&str; 5] =
-    ["--alignment_type", "--container", "--help", "--no-normalize-world-space", "--ref_is_gps"];
+const OTHER_FLAGS: [&str; 6] =
+    ["--alignment_type", "--container", "--help", "--help-all", "--no-normalize-world-space", "--ref_is_gps"];
 
 /// Returns the documents, relative to the project's root, with their texts.
 fn documents() -> Vec<(PathBuf, String)> {

@@ -111,7 +111,7 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         notes.push(write_frame(path, &report)?);
     }
     report.notes = notes;
-    let next = if report.diagnosis.is_none() { next::of_check(args) } else { String::new() };
+    let next = if report.diagnosis.is_none() { next::of_check(input) } else { String::new() };
     print(json, &report, format!("{report}{next}"))?;
     let is_partial = !missing.is_empty() || !report.unreadable.is_empty() || n_left_out > 0;
     Ok(match (&report.diagnosis, is_partial) {

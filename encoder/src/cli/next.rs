@@ -9,7 +9,7 @@ use glam::DVec3;
 use slag_common::frames::Aabb;
 use slag_common::manifest::Manifest;
 
-use super::check::CheckArgs;
+use super::common::InputArgs;
 use crate::store::StoreReader;
 use crate::store::ceremony::default_root_folder;
 use crate::store::metadata::MetadataReader;
@@ -55,8 +55,7 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
 }
 
 /// Returns the lines of inputs that fit.
-pub(super) fn of_check(args: &CheckArgs) -> String {
-    let input = &args.input;
+pub(super) fn of_check(input: &InputArgs) -> String {
     let images = input.images.as_ref().map_or(String::new(), |dir| format!(" --images {}", shell_word(dir)));
     format!(
         "\nnext\n  slag-encoder encode --scene {} --views {}{images} --store STORE\n",
