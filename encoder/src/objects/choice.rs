@@ -6,7 +6,7 @@
 //! none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: an object
 //! wins over its parts if views agree on it nearly as well.
 //!
-//! A node without consensus is no object, nor is one that no two photos show whole: of a road, each photo's mask
+//! A node without consensus is no object, nor is one that no photo shows whole: of a road, each photo's mask
 //! agrees with all that the photo sees of it, and none tells where it ends.
 
 use std::collections::BTreeMap;
@@ -23,9 +23,7 @@ const MIN_CONSENSUS: f64 = 0.3;
 /// A mask with more than this intersection over union shows the node: a majority of their union, so that no mask
 /// shows two nodes that have nothing in common.
 const SAME_IOU: f64 = 0.5;
-/// An object needs masks in this many views: a single view has none to agree with.
-const MIN_VIEWS: usize = 2;
-/// Of which the photo's edge cuts off at most a tenth of the outline.
+/// An object needs a view whose mask shows it, of which the photo's edge cuts off at most a tenth of the outline.
 const WHOLE: f32 = 0.9;
 /// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
 const LEAST_UNCUT: f32 = 0.05;
@@ -108,14 +106,14 @@ fn views_of(sightings: &Sightings, superpoint: usize, sizes: Sizes<'_>) -> NodeV
 /// Returns the worth of a node of `n` Gaussians as an object; 0 if it is none.
 fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     let judges = views.values().filter(|view| u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS);
-    let (mut sum, mut weights, mut n_same) = (0.0, 0.0, 0);
+    let (mut sum, mut weights, mut is_whole) = (0.0, 0.0, false);
     for view in judges {
         let uncut = f64::from(view.uncut.max(LEAST_UNCUT));
         let weight = uncut * uncut;
         (sum, weights) = (sum + weight * view.agreement, weights + weight);
-        n_same += usize::from(view.agreement > SAME_IOU && view.uncut >= WHOLE);
+        is_whole |= view.agreement > SAME_IOU && view.uncut >= WHOLE;
     }
-    if n < min_gaussians || n_same < MIN_VIEWS || sum < MIN_CONSENSUS * weights {
+    if n < min_gaussians || !is_whole || sum < MIN_CONSENSUS * weights {
         return 0.0;
     }
     let consensus = sum / weights;

@@ -162,7 +162,7 @@ fn oracle(
         }
         let weights: f64 = agreements.iter().map(|(_, weight)| weight).sum();
         let consensus = agreements.iter().map(|(best, weight)| best * weight).sum::<f64>() / weights;
-        let is_thing = set.len() >= 10 && n_same >= 2 && consensus >= 0.3;
+        let is_thing = set.len() >= 10 && n_same >= 1 && consensus >= 0.3;
         if is_thing { consensus.powi(8) * (set.len() as f64).powf(0.25) } else { 0.0 }
     };
     let worths: Vec<f64> = sets.iter().map(|set| worth(&gaussians(set))).collect();
