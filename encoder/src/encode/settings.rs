@@ -366,6 +366,7 @@ impl EncodeSettings {
                 cells.occupancy.is_none() || is_metric,
                 "a robot's size is in metres, the scene's units are not known to be; give --metric if they are metres",
             ),
+            ("min_view_share", aggregation.min_view_share <= 1.0, "expected a share of 0 to 1"),
             (
                 "position_error",
                 !matches!(cells.limits.position_error, PositionError::Within(error) if !is_positive(error)),
@@ -429,5 +430,6 @@ mod tests {
         };
         assert_eq!(refused(&without_unit), "occupancy");
         assert_eq!(refused(&|s| s.aggregation.superpoint = f32::INFINITY), "aggregation");
+        assert_eq!(refused(&|s| s.aggregation.min_view_share = 1.5), "min_view_share");
     }
 }
