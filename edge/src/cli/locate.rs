@@ -15,7 +15,8 @@ use super::output::{print_json, print_pairs};
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-edge locate photo.jpg --focal-px 554.3\n\
-    \x20 slag-edge locate photo.jpg --focal-px 554.3 --gravity 0,1,0 --json\n";
+    \x20 slag-edge locate photo.jpg --focal-px 554.3 --gravity 0,1,0 --json\n\
+    \x20 slag-edge locate photo.jpg --focal-px 554.3 --cache /var/lib/slag\n";
 
 #[derive(Debug, Args)]
 #[command(before_help = EXAMPLES)]
