@@ -25,7 +25,7 @@ pub fn layered(command: Command) -> Command {
 fn first_sentence_first(arg: Arg) -> Arg {
     let Some(all) = arg.get_help().map(StyledStr::to_string) else { return arg };
     let long = arg.get_long_help().map_or_else(|| all.clone(), StyledStr::to_string);
-    let end = all.find(". ").into_iter().chain(all.find("; ")).chain(all.find(": ")).min();
+    let end = all.find(". ").into_iter().chain(all.find("; ")).min();
     // Texts end with the default where the program chooses it.
     let default = all.rfind(" [default:").map_or("", |at| &all[at..]);
     match end {
