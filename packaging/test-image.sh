@@ -39,12 +39,7 @@ PYTHON
 }
 # Runs a program in its image; the network is this machine's.
 inside() {
-    exec_in "$work/$1/bundle/rootfs" "$@"
-}
-exec_in() {
-    root=$1
-    shift
-    chroot "$root" /usr/bin/env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/tmp "$@"
+    chroot "$work/$1/bundle/rootfs" /usr/bin/env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/tmp "$@"
 }
 
 unpack slag-encoder "$encoder_image"

@@ -31,7 +31,7 @@ mkdir "$root/root/data"
 cp -r "$scene"/point_cloud.ply "$scene"/sparse "$scene"/images "$root/root/data/"
 
 # The commands of the section, continued lines joined, without comments.
-sed -n '/^## With your own scene/,/^## Figures/p' README.md | sed -n 's/^    *//p; /\\$/!s/$//' |
+sed -n '/^## With your own scene/,/^## Figures/p' README.md | sed -n 's/^    *//p' |
     sed -n '/^\(\.\/install\|export\|slag-\|--\)/p' | sed -e ':a' -e '/\\$/N; s/\\\n *//; ta' -e 's/ *# .*$//' >"$work/commands"
 grep -q . "$work/commands" || { echo "newcomer: README has no commands" >&2; exit 1; }
 
