@@ -35,6 +35,10 @@ pub(super) fn lines(
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
     };
+    let without_masks = match summary.n_views_without_masks {
+        0 => String::new(),
+        n => format!(", {n} of {} photos have none", summary.n_views),
+    };
     let coverage = summary.coverage.map_or(String::new(), |CoverageReport { coverage, seen }| {
         let (coverage, seen, secs) = (100.0 * coverage, 100.0 * seen, summary.coverage_secs);
         format!("coverage   {coverage:.1} % of all views, {seen:.1} % of the Gaussians seen; found in {secs:.1} s\n")
@@ -43,8 +47,8 @@ pub(super) fn lines(
         let (n, of_masks) = (found.n_objects, found.n_masks_of_objects);
         let n_others = found.n_masks - of_masks;
         format!(
-            "objects    {n} of {of_masks} masks, {} Gaussians; {n_others} other masks\n",
-            found.n_gaussians
+            "objects    {n} of {of_masks} masks, {} Gaussians, up to {:.1} m; {n_others} other masks\n",
+            found.n_gaussians, found.largest_m
         )
     });
     let occupancy = summary.occupancy.as_ref().map_or(String::new(), |found| {
@@ -73,8 +77,8 @@ pub(super) fn lines(
     format!(
         "{of_target}published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} of {} ({} resumed, {} without masks)\n{lost}{coverage}{skipped}{encoder}{images_on}\
-         masks      {} in {} regions, {} contributions\n\
+         views      {} of {} ({} resumed)\n{lost}{coverage}{skipped}{encoder}{images_on}\
+         masks      {} in {} regions, {} contributions; {:.1} a photo{}\n\
          cells      {} with {} centroids\n\
          {objects}{occupancy}shards     {sizes}\n\
          seconds    {:.1}; by stage, all threads: {busy}\n\
@@ -87,10 +91,11 @@ pub(super) fn lines(
         summary.n_views,
         summary.n_views_with_photo,
         summary.n_views_resumed,
-        summary.n_views_without_masks,
         summary.n_masks,
         summary.n_regions,
         summary.n_entries,
+        summary.n_masks as f64 / summary.n_views.max(1) as f64,
+        without_masks,
         summary.n_cells,
         summary.n_centroids,
         summary.wall_secs,

@@ -14,6 +14,7 @@ use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 use slag_math::matrix::Rows;
 
 use super::contributions::{ContributionError, MAX_IN_ALL};
+use crate::masks::Mask;
 use crate::memory::{MemoryPlan, Phase};
 
 const MAGIC: [u8; 8] = *b"SLAGREGN";
@@ -37,7 +38,7 @@ pub struct RegionTable {
     masks: Vec<u32>,
     /// Weight of each of these; empty if all are 1.
     shares: Vec<f32>,
-    /// `[n_masks]`: level of each mask, 0 the coarsest; empty if there is one level.
+    /// `[n_masks]`: level of each mask, as of [`Mask::level`]; empty if there is one level.
     levels: Vec<u8>,
 }
 
@@ -113,7 +114,7 @@ impl RegionTable {
         self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
     }
 
-    /// Sets the level of each mask, `[n_masks]`, 0 the coarsest.
+    /// Sets the level of each mask, `[n_masks]`.
     pub(crate) fn set_levels(&mut self, levels: Vec<u8>) {
         self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
     }
@@ -143,6 +144,12 @@ impl RegionTable {
     /// Returns the masks of a region, whatever their weights.
     pub(crate) fn all_masks_of(&self, region: usize) -> &[u32] {
         &self.masks[self.listed(region)]
+    }
+
+    /// Returns whether a region has only masks that are no thing's: of a view, no fillers and others overlap.
+    pub(crate) fn is_filled(&self, region: usize) -> bool {
+        let level = |mask: &u32| self.levels.get(*mask as usize).copied().unwrap_or_default();
+        self.all_masks_of(region).iter().all(|mask| level(mask) == Mask::FILLER)
     }
 
     /// Returns the masks of a region, and the weight of each.

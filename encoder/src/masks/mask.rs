@@ -32,11 +32,15 @@ pub struct Mask {
     pub inside: Vec<bool>,
     /// Number of pixels.
     pub area_px: u32,
-    /// Coarseness, if the segmenter has several levels: 0 is the coarsest (whole objects).
+    /// Coarseness, if the segmenter has several levels: 0 is the coarsest (whole objects); or [`Mask::FILLER`].
     pub level: u8,
 }
 
 impl Mask {
+    /// The level of a mask that only gives pixels without any other a place: its outline is nobody's, so it says
+    /// nothing of things.
+    pub const FILLER: u8 = u8::MAX;
+
     /// Returns whether the mask contains a pixel of the image.
     pub fn contains(&self, x: u32, y: u32) -> bool {
         let BoxPx { x0, y0, x1, y1 } = self.box_px;

@@ -2,9 +2,12 @@
 //!
 //! A view's agreement with a node is the best intersection over union between one of its masks and what it sees of
 //! the node. A node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan
-//! et al., CVPR 2024, judges masks). The nodes are chosen, none part of another, for which the sum of consensus^8
-//! n^(1/4) is largest, n the number of Gaussians: an object wins over its parts if views agree on it nearly as
-//! well. A node without consensus is no object.
+//! et al., CVPR 2024, judges masks), where masks that the photo's edge cuts off count less. The nodes are chosen,
+//! none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: an object
+//! wins over its parts if views agree on it nearly as well.
+//!
+//! A node without consensus is no object, nor is one that no photo shows whole: of a road, each photo's mask
+//! agrees with all that the photo sees of it, and none tells where it ends.
 
 use std::collections::BTreeMap;
 
@@ -20,8 +23,10 @@ const MIN_CONSENSUS: f64 = 0.3;
 /// A mask with more than this intersection over union shows the node: a majority of their union, so that no mask
 /// shows two nodes that have nothing in common.
 const SAME_IOU: f64 = 0.5;
-/// An object needs masks in this many views: a single view has none to agree with.
-const MIN_VIEWS: usize = 2;
+/// An object needs a view whose mask shows it, of which the photo's edge cuts off at most a tenth of the outline.
+const WHOLE: f32 = 0.9;
+/// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
+const LEAST_UNCUT: f32 = 0.05;
 
 /// What a view shows of a node.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -32,16 +37,20 @@ struct NodeView {
     masks: Vec<(u32, u32)>,
     /// The best intersection over union of a mask.
     agreement: f64,
+    /// Share of that mask's outline that the photo's edge does not cut off; 1 without one.
+    uncut: f32,
 }
 
 /// What all views show of a node.
 type NodeViews = BTreeMap<u32, NodeView>;
 
-/// Numbers of Gaussians.
+/// What is known of masks, and numbers of Gaussians.
 #[derive(Clone, Copy)]
 pub(super) struct Sizes<'a> {
     /// `[n_masks]`: sightings under each mask.
     pub(super) of_masks: &'a [u32],
+    /// `[n_masks]`: 1 - truncation.
+    pub(super) uncut_shares: &'a [f32],
     /// `[n]`: Gaussians of each superpoint.
     pub(super) of_superpoints: &'a [u32],
     /// Fewest Gaussians of an object.
@@ -51,7 +60,7 @@ pub(super) struct Sizes<'a> {
 impl NodeView {
     fn of(of_view: &ViewSighting<'_>) -> Self {
         let masks = of_view.masks.iter().filter(|of| of.n > 0).map(|of| (of.mask, of.n)).collect();
-        Self { n: of_view.n, masks, agreement: 0.0 }
+        Self { n: of_view.n, masks, agreement: 0.0, uncut: 1.0 }
     }
 
     /// Adds what the view shows of other Gaussians.
@@ -76,16 +85,19 @@ impl NodeView {
         })
     }
 
-    fn judge(&mut self, n_of_mask: &[u32]) {
-        self.agreement = self.ious(n_of_mask).map(|(_, iou)| iou).fold(0.0, f64::max);
+    fn judge(&mut self, sizes: Sizes<'_>) {
+        let best =
+            self.ious(sizes.of_masks).reduce(|best, other| if other.1 > best.1 { other } else { best });
+        (self.agreement, self.uncut) =
+            best.map_or((0.0, 1.0), |(mask, iou)| (iou, sizes.uncut_shares[mask as usize]));
     }
 }
 
 /// Returns what views show of a superpoint.
-fn views_of(sightings: &Sightings, superpoint: usize, n_of_mask: &[u32]) -> NodeViews {
+fn views_of(sightings: &Sightings, superpoint: usize, sizes: Sizes<'_>) -> NodeViews {
     let of_view = |of_view: ViewSighting<'_>| {
         let mut view = NodeView::of(&of_view);
-        view.judge(n_of_mask);
+        view.judge(sizes);
         (of_view.view, view)
     };
     sightings.of(superpoint).filter(|of_view| of_view.n > 0).map(of_view).collect()
@@ -94,15 +106,17 @@ fn views_of(sightings: &Sightings, superpoint: usize, n_of_mask: &[u32]) -> Node
 /// Returns the worth of a node of `n` Gaussians as an object; 0 if it is none.
 fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     let judges = views.values().filter(|view| u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS);
-    let (mut sum, mut n_judges, mut n_same) = (0.0, 0u32, 0);
+    let (mut sum, mut weights, mut is_whole) = (0.0, 0.0, false);
     for view in judges {
-        (sum, n_judges) = (sum + view.agreement, n_judges + 1);
-        n_same += usize::from(view.agreement > SAME_IOU);
+        let uncut = f64::from(view.uncut.max(LEAST_UNCUT));
+        let weight = uncut * uncut;
+        (sum, weights) = (sum + weight * view.agreement, weights + weight);
+        is_whole |= view.agreement > SAME_IOU && view.uncut >= WHOLE;
     }
-    let consensus = sum / f64::from(n_judges.max(1));
-    if n < min_gaussians || n_same < MIN_VIEWS || consensus < MIN_CONSENSUS {
+    if n < min_gaussians || !is_whole || sum < MIN_CONSENSUS * weights {
         return 0.0;
     }
+    let consensus = sum / weights;
     let square = consensus * consensus;
     let fourth = square * square;
     // Only operations that give the same bits everywhere.
@@ -138,9 +152,9 @@ pub(super) fn objects(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> V
 
 /// Returns the worth of each node.
 fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
-    let Sizes { of_masks, of_superpoints, min_gaussians } = sizes;
+    let Sizes { of_superpoints, min_gaussians, .. } = sizes;
     let alone = |superpoint: usize| {
-        worth(&views_of(sightings, superpoint, of_masks), of_superpoints[superpoint], min_gaussians)
+        worth(&views_of(sightings, superpoint, sizes), of_superpoints[superpoint], min_gaussians)
     };
     let mut worths: Vec<f64> = (0..tree.n_leaves).into_par_iter().map(alone).collect();
     let mut n_of = of_superpoints.to_vec();
@@ -149,7 +163,7 @@ fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
         let Some(parts) = tree.parts_of(node) else { continue };
         let mut take = |part: usize| match views_of_node.remove(&part) {
             Some(views) => views,
-            None => views_of(sightings, part, of_masks),
+            None => views_of(sightings, part, sizes),
         };
         let [mut views, mut fewer] = parts.map(&mut take);
         if fewer.len() > views.len() {
@@ -158,7 +172,7 @@ fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
         for (view, other) in fewer {
             let of_view = views.entry(view).or_default();
             of_view.add(other);
-            of_view.judge(of_masks);
+            of_view.judge(sizes);
         }
         let n = parts.iter().map(|part| n_of[*part]).sum();
         n_of.push(n);

@@ -53,11 +53,17 @@ pub(super) fn find_among(
     let mut n_of_mask = vec![0; table.n_masks()];
     sightings.masks().for_each(|(_, of_mask)| n_of_mask[of_mask.mask as usize] += of_mask.n);
     let n_of_superpoint = superpoints.sizes();
-    let sizes =
-        Sizes { of_masks: &n_of_mask, of_superpoints: &n_of_superpoint, min_gaussians: MIN_GAUSSIANS };
+    let outlines = scene.photos.iter().flat_map(|photo| &photo.outlines);
+    let uncut_shares: Vec<f32> = outlines.map(MaskOutline::uncut_share).collect();
+    let sizes = Sizes {
+        of_masks: &n_of_mask,
+        uncut_shares: &uncut_shares,
+        of_superpoints: &n_of_superpoint,
+        min_gaussians: MIN_GAUSSIANS,
+    };
     let object_of_superpoint = choice::objects(&tree, &sightings, sizes);
     let object_of_mask = choice::objects_of_masks(&object_of_superpoint, &sightings, &n_of_mask);
-    let masks = Masks::new(scene, &sightings, &object_of_superpoint, &object_of_mask);
+    let masks = Masks::new(scene, &sightings, &object_of_superpoint, &object_of_mask, uncut_shares);
     let of_gaussian = |gaussian: &u32| {
         let superpoint = superpoints.of_gaussian[*gaussian as usize];
         object_of_superpoint.get(superpoint as usize).copied().flatten().unwrap_or(NONE)
@@ -72,6 +78,7 @@ pub(super) fn find_among(
         n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),
         n_masks: table.n_masks(),
         n_masks_of_objects: objects.iter().map(|object| object.n_masks as usize).sum(),
+        largest_m: objects.iter().map(|object| object.box_in_world.size().max_element()).fold(0.0, f64::max),
     };
     Ok(SceneObjects { objects, object_of, calibration, report })
 }
@@ -96,15 +103,15 @@ impl Masks {
         sightings: &Sightings,
         object_of_superpoint: &[Option<u32>],
         object_of_mask: &[Option<u32>],
+        uncut_shares: Vec<f32>,
     ) -> Self {
         let n_objects = object_of_superpoint.iter().flatten().max().map_or(0, |last| *last as usize + 1);
-        let outlines = scene.photos.iter().flat_map(|photo| &photo.outlines);
         let places = (0u32..).zip(scene.index.n_masks_of_view());
         let mut masks = Self {
             of_object: vec![Vec::new(); n_objects],
             weights: vec![0.0; object_of_mask.len()],
             own_weights: vec![0.0; object_of_mask.len()],
-            uncut_shares: outlines.map(MaskOutline::uncut_share).collect(),
+            uncut_shares,
             places: places.flat_map(|(view, n)| (0..n as u32).map(move |mask| (view, mask))).collect(),
         };
         for (mask, object) in (0u32..).zip(object_of_mask) {

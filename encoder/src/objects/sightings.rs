@@ -69,6 +69,10 @@ impl Sightings {
     ) -> Result<Self, ContributionError> {
         let regions = (0u32..).zip(scene.index.n_regions_of_view());
         let view_of_region: Vec<u32> = regions.flat_map(|(view, n)| std::iter::repeat_n(view, n)).collect();
+        let outlined = Outlined {
+            is_outlined: (0..view_of_region.len()).map(|region| !table.is_filled(region)).collect(),
+            view_of_region: &view_of_region,
+        };
         let mut entries = Vec::new();
         for contributions in scene.index.transposed_parts(table, scene.group_bytes) {
             scene.check_cancelled()?;
@@ -78,7 +82,7 @@ impl Sightings {
             let found: Vec<Vec<Entry>> = chunks
                 .map(|(at, gaussians)| {
                     let first = at * GAUSSIANS_PER_TASK;
-                    of_gaussians(&contributions, first, gaussians, superpoints, &view_of_region)
+                    of_gaussians(&contributions, first, gaussians, superpoints, &outlined)
                 })
                 .collect();
             found.into_iter().for_each(|mut found| entries.append(&mut found));
@@ -142,13 +146,21 @@ impl Sightings {
     }
 }
 
+/// The regions of all views.
+struct Outlined<'a> {
+    view_of_region: &'a [u32],
+    /// Whether a region has masks with outlines. What a view only fills, it does not see: it cannot say where a
+    /// thing ends.
+    is_outlined: Vec<bool>,
+}
+
 /// Returns what regions show of the superpoints of some Gaussians, which are consecutive in a part.
 fn of_gaussians(
     contributions: &PartContributions,
     first: usize,
     gaussians: &[u32],
     superpoints: &Superpoints,
-    view_of_region: &[u32],
+    outlined: &Outlined<'_>,
 ) -> Vec<Entry> {
     let mut found = Vec::new();
     for (k, gaussian) in (first..).zip(gaussians) {
@@ -157,10 +169,12 @@ fn of_gaussians(
             continue;
         }
         let entries = contributions.entries_of(k);
-        let (regions, weights) = (&contributions.regions[entries.clone()], &contributions.weights[entries]);
-        let seen = seen(regions, weights, view_of_region);
+        let entries = contributions.regions[entries.clone()].iter().zip(&contributions.weights[entries]);
+        let entries = entries.filter(|(region, _)| outlined.is_outlined[**region as usize]);
+        let (regions, weights): (Vec<u32>, Vec<f32>) = entries.unzip();
+        let seen = seen(&regions, &weights, outlined.view_of_region);
         let mut seen = seen.iter().peekable();
-        found.extend(regions.iter().zip(weights).map(|(region, weight)| {
+        found.extend(regions.iter().zip(&weights).map(|(region, weight)| {
             let n = u32::from(seen.next_if_eq(&region).is_some());
             Entry { superpoint, region: *region, n, weight: f64::from(*weight) }
         }));

@@ -18,6 +18,7 @@ use crate::lift::superpoint::Superpoints;
 use crate::lift::{
     Contribution, ContributionError, ContributionIndex, RegionTable, SceneContributions, ViewContributions,
 };
+use crate::masks::Mask;
 
 /// Things in a row of cells, in files of contributions; thing i's masks have the vector of axis i.
 struct World {
@@ -162,6 +163,32 @@ fn objects_are_the_things_for_any_threads_and_memory() {
             assert_eq!(pool.install(|| world.objects(group_bytes)), found, "{n_threads} {group_bytes}");
         }
     }
+}
+
+/// By hand: views of fillers see nothing, so objects, their masks and their consensus are those of the others.
+#[test]
+fn fillers_are_no_evidence() {
+    let mut world = world();
+    let of_all = world.objects(u64::MAX);
+    let n_masks = world.photos.iter().flat_map(|photo| &photo.outlines).count();
+    let is_filler = |mask: usize| mask < 6;
+    world.table.set_levels((0..n_masks).map(|mask| if is_filler(mask) { Mask::FILLER } else { 0 }).collect());
+    let found = world.objects(u64::MAX);
+    let n_masks_of =
+        |found: &SceneObjects| found.objects.iter().map(|object| object.n_masks).collect::<Vec<_>>();
+    assert_eq!((n_masks_of(&of_all), n_masks_of(&found)), (vec![6; 3], vec![4; 3]));
+    world.table.set_levels(vec![Mask::FILLER; n_masks]);
+    assert!(world.objects(u64::MAX).objects.is_empty());
+}
+
+/// By hand: of the thing 0 all photos cut a quarter of the outline off, then one of them a tenth.
+#[test]
+fn what_no_photo_shows_whole_is_no_object() {
+    let mut world = world();
+    world.photos.iter_mut().for_each(|photo| photo.outlines[0].cut_px = 10);
+    assert_eq!(world.objects(u64::MAX).objects.len(), 2);
+    world.photos[1].outlines[0].cut_px = 4;
+    assert_eq!(world.objects(u64::MAX).objects.len(), 3);
 }
 
 #[test]

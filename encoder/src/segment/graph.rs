@@ -56,6 +56,7 @@ pub struct GraphSettings {
     /// A mask is dropped if its intersection over union with a mask of a coarser level exceeds this.
     pub max_overlap_iou: f32,
     /// A mask is dropped if the boundaries predicted along its outline are less than this on average; 0 keeps all.
+    /// What only such masks cover is divided as at the finest level, so that every pixel shows something.
     pub min_support: f32,
     /// Largest number of masks per image; the largest masks are kept.
     pub max_masks: usize,
@@ -128,11 +129,11 @@ impl ModelPool {
 }
 
 impl GraphSegmenter {
-    /// Creates a segmenter without the model; only the first 256 scales count.
+    /// Creates a segmenter without the model; only the first 255 scales count.
     pub fn new(mut settings: GraphSettings) -> Self {
-        settings.scales.truncate(256);
+        settings.scales.truncate(usize::from(Mask::FILLER));
         settings.max_side_px = settings.max_side_px.max(1);
-        let identity = format!("graph 2, {settings:?}");
+        let identity = format!("graph 3, {settings:?}");
         Self { settings, identity, model: None }
     }
 
@@ -192,6 +193,8 @@ impl Segmenter for GraphSegmenter {
             .collect();
 
         let mut masks = Vec::new();
+        // The finest component of each pixel that no mask covers.
+        let mut rest = levels.last().map_or(Vec::new(), |finest| finest.of_pixel.clone());
         for (level, labels) in levels.iter().enumerate() {
             let repeats = labels.repeats_of(&levels[..level], self.settings.max_overlap_iou);
             let n_components = labels.area_px.len();
@@ -200,12 +203,23 @@ impl Segmenter for GraphSegmenter {
             });
             let is_confirmed =
                 |label: usize| support.as_ref().is_none_or(|of| of[label] >= self.settings.min_support);
+            let is_kept =
+                |label: usize| labels.area_px[label] >= min_area_px && !repeats[label] && is_confirmed(label);
+            let is_kept: Vec<bool> = (0..n_components).map(is_kept).collect();
+            let covered = labels.of_pixel.iter().map(|label| is_kept.get(*label as usize) == Some(&true));
+            rest.iter_mut()
+                .zip(covered)
+                .filter(|(_, covered)| *covered)
+                .for_each(|(rest, _)| *rest = NO_REGION);
             let all = masks_of_labels(&labels.of_pixel, raster.width_px, n_components, u64::MAX);
-            let kept = all.unwrap_or_default().into_iter().filter(|(label, mask)| {
-                let label = *label as usize;
-                mask.area_px >= min_area_px && !repeats[label] && is_confirmed(label)
-            });
+            let kept = all.unwrap_or_default().into_iter().filter(|(label, _)| is_kept[*label as usize]);
             masks.extend(kept.map(|(_, mask)| Mask { level: level as u8, ..mask }));
+        }
+        if boundaries.is_some() {
+            let n_components = levels.last().map_or(0, |finest| finest.area_px.len());
+            let fillers = masks_of_labels(&rest, raster.width_px, n_components, u64::MAX).unwrap_or_default();
+            let fillers = fillers.into_iter().filter(|(_, mask)| mask.area_px >= min_area_px);
+            masks.extend(fillers.map(|(_, mask)| Mask { level: Mask::FILLER, ..mask }));
         }
         self.keep_largest(&mut masks);
         let (columns, rows) = (nearest(raster.width_px, width_px), nearest(raster.height_px, height_px));

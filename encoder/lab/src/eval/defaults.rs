@@ -13,7 +13,7 @@ use super::instances::InstanceReport;
 use super::judge::{EvalKind, JudgeSettings, judge};
 use super::run::{MaskSource, Runner, ScenesArgs, truth_of};
 use crate::scenes::SceneFiles;
-use crate::table::{Table, figure};
+use crate::table::{Table, figure, percent};
 
 /// Encodes of a scene: given and automatic masks, the plain average and the default.
 const N_ENCODES: usize = 4;
@@ -91,16 +91,23 @@ pub(crate) fn run(args: &ScenesArgs, progress: &dyn Progress) -> Result<Defaults
 impl fmt::Display for DefaultsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let columns = ["scene", "masks", "method", "by", "mIoU", "AP", "AUC"];
-        let of_things = ["found at IoU 0.25 and 0.5", "objects that are two things", "things split"];
+        let of_things = [
+            "found at IoU 0.25 and 0.5",
+            "objects that are two things",
+            "things split",
+            "Gaussians in objects",
+        ];
         let mut table = Table::new(columns.into_iter().chain(of_things));
         for row in &self.rows {
             let mut cells = vec![row.scene.clone(), row.masks.name().to_owned()];
             cells.extend([row.method.to_owned(), row.kind.to_string()]);
             cells.extend([row.miou, row.average_precision, row.area_under_roc].map(figure));
             if let Some(found) = &row.instances {
-                let InstanceReport { any, n_merged_objects, n_objects, n_split_things, .. } = found;
+                let InstanceReport { any, n_merged_objects, n_objects, n_in_objects, n_split_things, .. } =
+                    found;
                 cells.push(any.to_string());
                 cells.extend([format!("{n_merged_objects} of {n_objects}"), n_split_things.to_string()]);
+                cells.push(percent(n_in_objects[0] as u64, n_in_objects[1] as u64));
             }
             table.row(cells);
         }

@@ -6,6 +6,7 @@ use std::fmt;
 use serde::Serialize;
 
 use super::truth::Truth;
+use crate::table::percent;
 use slag_encoder::objects::NONE;
 
 /// Share of an object or a thing that counts as a piece of it.
@@ -39,6 +40,8 @@ impl fmt::Display for Recall {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct InstanceReport {
     pub(crate) n_objects: usize,
+    /// Gaussians that belong to one, and all: the others' superpoints abstain.
+    pub(crate) n_in_objects: [usize; 2],
     /// Objects that are two things (under-segmentation): two labels, floors and walls included, have a quarter of
     /// it each.
     pub(crate) n_merged_objects: usize,
@@ -54,8 +57,13 @@ pub(crate) struct InstanceReport {
 
 impl fmt::Display for InstanceReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { n_objects, n_merged_objects, n_split_things, any, of_words, best_of_words } = self;
-        writeln!(f, "{n_objects} objects; things found at IoU 0.25 and 0.5, by any object: {any}")?;
+        let Self { n_objects, n_in_objects, n_merged_objects, n_split_things, any, of_words, best_of_words } =
+            self;
+        let share = percent(n_in_objects[0] as u64, n_in_objects[1] as u64);
+        writeln!(
+            f,
+            "{n_objects} objects of {share} of all Gaussians; things found at IoU 0.25 and 0.5, by any object: {any}"
+        )?;
         writeln!(
             f,
             "  by objects above the threshold for the word: {of_words}; by the word's best objects: {best_of_words}"
@@ -121,7 +129,8 @@ pub(super) fn report(
             best_of_words.count(best_iou(thing, &|object| order.contains(&object)));
         }
     }
-    InstanceReport { n_objects, n_merged_objects, n_split_things, any, of_words, best_of_words }
+    let n_in_objects = [object_of.iter().filter(|object| **object != NONE).count(), object_of.len()];
+    InstanceReport { n_objects, n_in_objects, n_merged_objects, n_split_things, any, of_words, best_of_words }
 }
 
 #[cfg(test)]
@@ -151,6 +160,7 @@ mod tests {
         // Object 2 is half thing and half wall; thing 8 is a quarter of object 1 and half of object 2.
         let whole = found(vec![0.0; 3]);
         assert_eq!((whole.n_objects, whole.n_merged_objects, whole.n_split_things), (3, 1, 1));
+        assert_eq!(whole.n_in_objects, [8, 10]);
         let recall = |n, n_at_25, n_at_50| Recall { n, n_at_25, n_at_50 };
         let report = found(vec![0.9, 0.6, 0.1]);
         assert_eq!(

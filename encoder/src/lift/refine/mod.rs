@@ -31,6 +31,7 @@ use super::passes::SceneContributions;
 use super::photos::{MaskOutline, Photo};
 use super::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
 use super::table::RegionTable;
+use crate::masks::Mask;
 use crate::memory::{self, MemoryPlan, Phase};
 use mixture::{Mixtures, PartSums, SuperpointSums};
 use points::{AXES, Point};
@@ -64,9 +65,15 @@ pub struct PendingRefinement {
     scales: Vec<(f32, Superpoints)>,
 }
 
-/// Returns the weight of each mask of some photos: (1 - truncation)^power.
+/// Weight of a filler beside other masks: where a view outlines a thing, another that does not says little.
+const FILLER_WEIGHT: f32 = 0.1;
+
+/// Returns the weight of each mask of some photos: (1 - truncation)^power, less for fillers.
 fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
-    let weight = |outline: &MaskOutline| outline.uncut_share().max(LEAST_MASK_WEIGHT).powf(power);
+    let weight = |outline: &MaskOutline| {
+        let of_kind = if outline.level == u32::from(Mask::FILLER) { FILLER_WEIGHT } else { 1.0 };
+        of_kind * outline.uncut_share().max(LEAST_MASK_WEIGHT).powf(power)
+    };
     photos.iter().flat_map(|photo| &photo.outlines).map(weight).collect()
 }
 

@@ -87,9 +87,16 @@ fn views() -> Vec<ViewContributions> {
 }
 
 /// The same box for all masks, of which the photos' edges cut off between nothing and all.
+fn is_filler(v: usize, mask: usize) -> bool {
+    (v + mask).is_multiple_of(5)
+}
+
 fn photos() -> Vec<Photo> {
-    let outline =
-        |v: u32, mask: u32| MaskOutline { box_px: [4, 4, 14, 14], cut_px: (v * 6 + mask) % 41, level: 0 };
+    let outline = |v: u32, mask: u32| MaskOutline {
+        box_px: [4, 4, 14, 14],
+        cut_px: (v * 6 + mask) % 41,
+        level: if is_filler(v as usize, mask as usize) { Mask::FILLER.into() } else { 0 },
+    };
     let photo =
         |v: u32| Photo { name: v.to_string(), outlines: (0..6).map(|mask| outline(v, mask)).collect() };
     (0..7).map(photo).collect()
@@ -164,7 +171,8 @@ fn norm(v: &[f64]) -> f64 {
 /// What masks count, by the definition, with everything in float64 and no axes.
 fn oracle_counts(views: &[ViewContributions], settings: &Aggregation) -> Vec<Vec<f64>> {
     let whole = |v: usize, mask: usize| {
-        (1.0 - ((v * 6 + mask) % 41) as f64 / 40.0).max(0.01).powf(settings.truncation_power.into())
+        let of_kind = if is_filler(v, mask) && settings.truncation_power > 0.0 { 0.1 } else { 1.0 };
+        of_kind * (1.0 - ((v * 6 + mask) % 41) as f64 / 40.0).max(0.01).powf(settings.truncation_power.into())
     };
     (0..views.len()).map(|v| (0..6).map(|mask| whole(v, mask)).collect()).collect()
 }

@@ -63,7 +63,12 @@ fn random_views(random: &mut Random) -> Views {
 
 /// The definition, set by set: each superpoint's object, numbered by their first superpoints, and the masks of
 /// each.
-fn oracle(views: &Views, pairs: &[(u32, u32)], superpoint_of: &[u32]) -> (Vec<Option<usize>>, Vec<usize>) {
+fn oracle(
+    views: &Views,
+    pairs: &[(u32, u32)],
+    superpoint_of: &[u32],
+    uncut: impl Fn(usize, u32) -> f64,
+) -> (Vec<Option<usize>>, Vec<usize>) {
     type Set = BTreeSet<u32>;
     let n = superpoint_of.iter().max().map_or(0, |last| *last as usize + 1);
     let gaussians = |superpoints: &[usize]| -> Set {
@@ -144,18 +149,20 @@ fn oracle(views: &Views, pairs: &[(u32, u32)], superpoint_of: &[u32]) -> (Vec<Op
         mask.intersection(&of_view).count() as f64 / mask.union(&of_view).count() as f64
     };
     let worth = |set: &Set| {
-        let (mut agreements, mut n_same) = (Vec::new(), 0);
+        let (mut agreements, mut n_same) = (Vec::<(f64, f64)>::new(), 0);
         for (view, masks) in masks.iter().enumerate() {
             let n_seen = seen(view, set).len();
             if n_seen == 0 || 10 * n_seen < set.len() {
                 continue;
             }
-            let best = masks.values().map(|mask| iou(view, mask, set)).fold(0.0, f64::max);
-            agreements.push(best);
-            n_same += usize::from(best > 0.5);
+            let ious = masks.iter().map(|(mask, of)| (iou(view, of, set), uncut(view, *mask)));
+            let (best, uncut) = ious.fold((0.0, 1.0), |best, of| if of.0 > best.0 { of } else { best });
+            agreements.push((best, uncut.max(0.05).powi(2)));
+            n_same += usize::from(best > 0.5 && uncut >= 0.9);
         }
-        let consensus = agreements.iter().sum::<f64>() / agreements.len().max(1) as f64;
-        let is_thing = set.len() >= 10 && n_same >= 2 && consensus >= 0.3;
+        let weights: f64 = agreements.iter().map(|(_, weight)| weight).sum();
+        let consensus = agreements.iter().map(|(best, weight)| best * weight).sum::<f64>() / weights;
+        let is_thing = set.len() >= 10 && n_same >= 1 && consensus >= 0.3;
         if is_thing { consensus.powi(8) * (set.len() as f64).powf(0.25) } else { 0.0 }
     };
     let worths: Vec<f64> = sets.iter().map(|set| worth(&gaussians(set))).collect();
@@ -185,10 +192,16 @@ fn objects_are_those_of_the_definition() {
     for seed in 0..16 {
         let mut random = Random::new(seed);
         for views in [made_views(&mut random), random_views(&mut random)] {
-            let (world, superpoints) = world_of(&views);
+            let (mut world, superpoints) = world_of(&views);
+            // Outlines of boxes of 10 x 10 pixels, half of them cut off somewhere.
+            let outlines = world.photos.iter_mut().flat_map(|photo| &mut photo.outlines);
+            outlines.for_each(|outline| outline.cut_px = random.below(9_u32).saturating_sub(4) * 3);
+            let uncut = |view: usize, mask: u32| {
+                1.0 - f64::from(world.photos[view].outlines[mask as usize].cut_px) / 40.0
+            };
             let found = world.objects_of(Some(&superpoints), u64::MAX, false).expect("not cancelled");
             let pairs = near::pairs(&world.gaussians, &superpoints);
-            let (expected, n_masks) = oracle(&views, &pairs, &superpoints.of_gaussian);
+            let (expected, n_masks) = oracle(&views, &pairs, &superpoints.of_gaussian, uncut);
             let mut object_of = vec![None; superpoints.n];
             for (cell, of_cell) in world.split.cells.iter().zip(&found.object_of) {
                 for (gaussian, object) in
