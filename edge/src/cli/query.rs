@@ -129,15 +129,9 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
         return Ok(());
     }
     let found = &answers.searched;
-    let exactness = match found.is_exact {
-        true => "exactly".to_owned(),
-        false => match found.score_error_likely {
-            Some(likely) => format!(
-                "99 of 100 scores within ±{likely:.3} (for 95 of 100 questions), all within ±{:.3}",
-                found.score_error_bound
-            ),
-            None => format!("scores within ±{:.3}", found.score_error_bound),
-        },
+    let exactness = match found.score_error_likely.filter(|_| !found.is_exact) {
+        Some(likely) => format!("; 99 of 100 scores within ±{likely:.3}"),
+        None => String::new(),
     };
     let (n, threshold) = (found.n_matching, found.threshold);
     let source = match found.threshold_source {
@@ -147,7 +141,7 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
         ThresholdSource::Relevancy => "closer than any negative",
     };
     let searched = found.n_searched;
-    writeln!(io::stderr(), "{n} Gaussians of {searched} reach {threshold}, {source} ({exactness})")?;
+    writeln!(io::stderr(), "{n} Gaussians of {searched} reach {threshold}, {source}{exactness}")?;
     if found.area_fetched == Some(false) {
         writeln!(io::stderr(), "part of that area is not on board; fetch it for a complete answer")?;
     }

@@ -3,11 +3,14 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, Searched, Whole};
+use super::answers::{
+    Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, Reason, Searched, Whole,
+};
 use super::cluster::{Cluster, Grouping, cluster};
 use super::extent::Extent;
 use super::frame::unit;
 use super::objects::{self, FoundObject};
+use super::outcome::RelatedAnswers;
 use super::rank::{Order, Ranked};
 use super::reason;
 use super::request::{AnswerKind, QueryRequest};
@@ -23,6 +26,8 @@ use slag_common::manifest::Manifest;
 /// Answers a checked request about a scene: one answer for each question, in their order. `questions`: their
 /// names, and their vectors, each with those of its negatives.
 ///
+/// Without a kind, a question that no object answers is answered by clusters.
+///
 /// The same scene, vectors and request give the same answers for any number of threads, asked alone or
 /// together. `scratch`: buffers of earlier answers, or new ones, and what the request may use.
 /// # Errors
@@ -33,24 +38,58 @@ pub fn answer(
     (labels, questions): (&[&str], &[Question]),
     request: &QueryRequest,
 ) -> Result<Vec<Answers>, ScoreError> {
-    let asked = labels.iter().copied().zip(questions);
-    let kind = request.kind.unwrap_or(if scene.index.is_empty() {
-        AnswerKind::Clusters
-    } else {
-        AnswerKind::Objects
-    });
-    if kind == AnswerKind::Objects {
-        let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
-        let budget = scratch.budget();
-        let answer = |((text, question), scored)| {
-            let used_bytes = budget.used_bytes();
-            let answers = answer_objects(scene, text, question, scored, budget, request);
-            budget.check()?;
-            budget.give_back_to(used_bytes, answers.answers.len_bytes());
+    match request.kind {
+        Some(AnswerKind::Objects) => by_objects(scratch, scene, (labels, questions), request),
+        Some(kind) => by_gaussians(scratch, scene, (labels, questions), kind, request),
+        None if scene.index.is_empty() => {
+            by_gaussians(scratch, scene, (labels, questions), AnswerKind::Clusters, request)
+        }
+        None => {
+            let mut answers = by_objects(scratch, scene, (labels, questions), request)?;
+            let is_open = |at: &usize| answers[*at].answers.is_empty();
+            let open: Vec<usize> = (0..answers.len()).filter(is_open).collect();
+            if open.is_empty() {
+                return Ok(answers);
+            }
+            // Ground is no object, and neither is what few photos outline.
+            let of_open: (Vec<&str>, Vec<Question>) =
+                open.iter().map(|at| (labels[*at], questions[*at].clone())).unzip();
+            let of_open = (of_open.0.as_slice(), of_open.1.as_slice());
+            let clusters = by_gaussians(scratch, scene, of_open, AnswerKind::Clusters, request)?;
+            let found = open.into_iter().zip(clusters).filter(|(_, found)| !found.answers.is_empty());
+            found.for_each(|(at, found)| answers[at] = found);
             Ok(answers)
-        };
-        return asked.zip(&scored).map(answer).collect();
+        }
     }
+}
+
+/// Answers questions with objects.
+fn by_objects(
+    scratch: &mut Scratch,
+    scene: &Scene<'_>,
+    (labels, questions): (&[&str], &[Question]),
+    request: &QueryRequest,
+) -> Result<Vec<Answers>, ScoreError> {
+    let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
+    let budget = scratch.budget();
+    let answer = |((text, question), scored)| {
+        let used_bytes = budget.used_bytes();
+        let answers = answer_objects(scene, text, question, scored, budget, request);
+        budget.check()?;
+        budget.give_back_to(used_bytes, answers.answers.len_bytes());
+        Ok(answers)
+    };
+    labels.iter().copied().zip(questions).zip(&scored).map(answer).collect()
+}
+
+/// Answers questions with Gaussians, or with clusters of them.
+fn by_gaussians(
+    scratch: &mut Scratch,
+    scene: &Scene<'_>,
+    (labels, questions): (&[&str], &[Question]),
+    kind: AnswerKind,
+    request: &QueryRequest,
+) -> Result<Vec<Answers>, ScoreError> {
     let searches =
         Search::batch(scratch, scene.shards, questions, request.region.clone(), request.precision)?;
     let budget = scratch.budget();
@@ -61,7 +100,7 @@ pub fn answer(
         budget.give_back_to(used_bytes, answers.answers.len_bytes());
         Ok(answers)
     };
-    asked.zip(&searches).map(answer).collect()
+    labels.iter().copied().zip(questions).zip(&searches).map(answer).collect()
 }
 
 /// Answers a question with the objects that match; no centroid is scored.
@@ -178,6 +217,34 @@ fn answer_gaussians(
         },
         reason: found.is_empty().then(|| reason::of_gaussians(search, scale, request, threshold, n_matching)),
         answers: found,
+        ..empty
+    }
+}
+
+/// Returns the answers to a phrase as answers to a text: without degrees, and without what they are related to.
+pub(super) fn of_related(
+    scene: &Scene<'_>,
+    text: &str,
+    related: RelatedAnswers,
+    question: &Question,
+    request: &QueryRequest,
+) -> Answers {
+    let scale = Scale::of(question);
+    let threshold = scale.threshold(request, scene.manifest, objects::calibration(scene.objects));
+    let answers: Vec<ClusterAnswer> = related.answers.into_iter().map(|(answer, ..)| answer).collect();
+    let best_score = |thing: &str| related.parts.iter().find(|part| part.thing == thing)?.best_score;
+    let reason = related.miss.map(|miss| Reason {
+        kind: miss.kind,
+        best_score: best_score(&miss.thing),
+        best_position_in_world: None,
+        detail: miss.detail,
+    });
+    let empty = empty(scene, (text, AnswerKind::Objects), scale, threshold, request);
+    let n_matching = answers.iter().map(|answer| answer.n_gaussians).sum();
+    Answers {
+        searched: Searched { n_matching, ..empty.searched },
+        reason,
+        answers: Found::Clusters(answers),
         ..empty
     }
 }

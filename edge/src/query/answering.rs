@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use slag_service::params::RequestError;
 
-use super::answer::{answer, object_answer};
+use super::answer::{answer, object_answer, of_related};
 use super::ask::Ask;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::outcome::{Outcome, RelatedAnswers};
@@ -29,10 +29,12 @@ impl Engine {
     }
 
     /// Answers a request that is in the world frame already, as [`Engine::ask`] does.
-    pub fn answer(&self, request: QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
+    pub fn answer(&self, mut request: QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
         request.check()?;
         let on_board = self.on_board()?;
         on_board.check()?;
+        request.understand(&on_board.snapshot);
+        request.check()?;
         self.answer_on(on_board, request, budget)
     }
 
@@ -66,10 +68,21 @@ impl Engine {
                     budget
                         .take(vectors.len() * (snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES));
                     budget.check().map_err(ScoreError::from)?;
-                    let related = self
-                        .on_scene(snapshot, budget, |_, scene| related(scene, phrase, &vectors, &request))?;
+                    let work = |_: &mut Scratch, scene: &Scene<'_>| {
+                        let related = related(scene, phrase, &vectors, &request)?;
+                        Ok::<_, QueryError>(match request.paged {
+                            true => Outcome::Related(related),
+                            false => Outcome::Plain(of_related(
+                                scene,
+                                asked.label(),
+                                related,
+                                &vectors[0],
+                                &request,
+                            )),
+                        })
+                    };
+                    outcomes[at] = Some(self.on_scene(snapshot, budget, work)?);
                     budget.check().map_err(ScoreError::from)?;
-                    outcomes[at] = Some(Outcome::Related(related));
                     continue;
                 }
             };
@@ -122,7 +135,7 @@ fn related(
             relevance: related.score as f32,
             distance: request.near.map(|near| near.distance(place)),
         };
-        let answer = object_answer(scene, ranked, candidate.score, &Region::default(), false);
+        let answer = object_answer(scene, ranked, candidate.score, &Region::default(), request.members);
         (answer, related.degree, related.to)
     });
     Ok(RelatedAnswers { parts, miss: None, answers: described.collect() })

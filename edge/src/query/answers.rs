@@ -293,6 +293,14 @@ pub enum ReasonKind {
     ClustersTooSmall,
     /// The region asked for holds nothing that could match.
     NothingThere,
+    /// Of a phrase: nothing on board is such a thing.
+    NoSuchThing,
+    /// Of a phrase: such things are on board, but none is so placed.
+    NoSuchPair,
+    /// Of a phrase: there are fewer of them than counted.
+    TooFew,
+    /// Of a phrase: such things are on board, but none in the region asked for.
+    NotInRegion,
 }
 
 /// Reason for an empty answer, with the nearest miss.

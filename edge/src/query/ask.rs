@@ -8,7 +8,7 @@ use serde::Deserialize;
 use super::area::Area;
 use super::format::Format;
 use super::point::Point;
-use super::relations::{self, Phrase};
+use super::relations::Phrase;
 use super::request::{
     AnswerKind, Asked, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives,
     QueryRequest, RequestError,
@@ -85,21 +85,11 @@ impl Ask {
             let expected = format!("1 to {MAX_TEXTS} texts, vectors and phrases together");
             return Err(RequestError::new("texts", &format!("{n} questions"), expected));
         }
-        let is_of_objects =
-            matches!(self.kind, None | Some(AnswerKind::Objects)) && !snapshot.objects.is_empty();
-        let with_relations = self.relations.unwrap_or(true) && is_of_objects && self.format.is_none();
-        let texts = self.texts.into_iter().map(|text| {
-            let phrase = if with_relations { relations::understand(&text) } else { None };
-            // A phrase that breaks a limit is one text for the text model, as one without relations is.
-            match phrase.filter(|phrase| phrase.check().is_ok()) {
-                Some(phrase) => Asked::Phrase { text: Some(text), phrase },
-                None => Asked::Text(text),
-            }
-        });
+        let texts = self.texts.into_iter().map(Asked::Text);
         let vectors = self.vectors.into_iter().enumerate().map(|(at, vector)| Asked::Vector { at, vector });
         let phrases = self.phrases.into_iter().map(|phrase| Asked::Phrase { text: None, phrase });
         let manifest = &snapshot.manifest;
-        let request = QueryRequest {
+        let mut request = QueryRequest {
             asked: texts.chain(vectors).chain(phrases).collect(),
             negatives: self.negatives,
             limit: self.limit,
@@ -115,6 +105,9 @@ impl Ask {
             precision: self.precision,
             members: self.format == Some(Format::Ply),
         };
+        if self.relations.unwrap_or(true) {
+            request.understand(snapshot);
+        }
         request.check()?;
         Ok(request)
     }

@@ -11,6 +11,7 @@ use slag_common::shard::ShardView;
 use slag_models::{InferenceError, SessionOptions};
 
 use super::carried;
+use super::relations;
 use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
 use super::words::check_text;
@@ -109,7 +110,8 @@ impl OnBoard {
     /// Returns the vector of a text.
     pub(super) fn encode(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
         check_text("text", text)?;
-        Ok(self.text.encode(text)?)
+        let thing = relations::asked_thing(text);
+        Ok(self.text.encode(thing.as_deref().unwrap_or(text))?)
     }
 
     /// Returns the vectors of a request's negatives.

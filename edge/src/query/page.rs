@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, ReasonKind, Searched};
 use super::frame::{FRAME, UNITS, unit};
 use super::outcome::{Outcome, RelatedAnswers};
-use super::relations::{self, MissKind, Phrase, Witness};
+use super::relations::{self, Phrase, Witness};
 use super::reply::Reply;
 use super::request::{AnswerKind, Asked};
 
@@ -72,7 +72,7 @@ struct AskedFor<'a> {
 #[schemars(rename = "None")]
 struct Nothing<'a> {
     /// The reason.
-    kind: NothingKind,
+    kind: ReasonKind,
     /// The same in words.
     detail: &'a str,
     /// The part of a phrase that failed.
@@ -86,14 +86,6 @@ struct Nothing<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<[f64; 3]>")]
     best_position_in_world: Option<DVec3>,
-}
-
-#[derive(Serialize, JsonSchema)]
-#[serde(untagged)]
-#[schemars(inline)]
-enum NothingKind {
-    Plain(ReasonKind),
-    Related(MissKind),
 }
 
 /// An object, a cluster or a Gaussian.
@@ -210,7 +202,7 @@ impl<'a> Nothing<'a> {
     fn of_plain(answers: &'a Answers) -> Option<Self> {
         let reason = answers.reason.as_ref()?;
         Some(Self {
-            kind: NothingKind::Plain(reason.kind),
+            kind: reason.kind,
             detail: &reason.detail,
             thing: None,
             best_score: reason.best_score,
@@ -223,7 +215,7 @@ impl<'a> Nothing<'a> {
         let miss = related.miss.as_ref()?;
         let part = related.parts.iter().find(|part| part.thing == miss.thing);
         Some(Self {
-            kind: NothingKind::Related(miss.kind),
+            kind: miss.kind,
             detail: &miss.detail,
             thing: Some(&miss.thing),
             best_score: part.and_then(|part| part.best_score),

@@ -10,9 +10,10 @@ use serde::de::value::Error;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 
-use super::relations::Phrase;
+use super::relations::{self, Phrase};
 use super::words::check_text;
 use crate::score::{Ball, MAX_COORDINATE, Precision, Region};
+use crate::store::Snapshot;
 
 pub use slag_service::params::RequestError;
 
@@ -144,7 +145,8 @@ impl Asked {
         match self {
             Self::Text(text) => text,
             Self::Vector { .. } => "vector",
-            Self::Phrase { phrase, .. } => &phrase.thing,
+            Self::Phrase { text: Some(text), .. } => text,
+            Self::Phrase { text: None, phrase } => &phrase.thing,
         }
     }
 
@@ -239,6 +241,20 @@ impl QueryRequest {
             min_count: DEFAULT_MIN_COUNT,
             precision: Precision::default(),
             members: false,
+        }
+    }
+
+    /// Understands texts that name a relation, where answers are objects and the generation has them.
+    pub(super) fn understand(&mut self, snapshot: &Snapshot) {
+        if !matches!(self.kind, None | Some(AnswerKind::Objects)) || snapshot.objects.is_empty() {
+            return;
+        }
+        for asked in &mut self.asked {
+            let Asked::Text(text) = asked else { continue };
+            // A phrase that breaks a limit is one text for the text model, as one without relations is.
+            if let Some(phrase) = relations::understand(text).filter(|phrase| phrase.check().is_ok()) {
+                *asked = Asked::Phrase { text: Some(std::mem::take(text)), phrase };
+            }
         }
     }
 

@@ -16,7 +16,8 @@ use rayon::prelude::*;
 use super::sightings::{Sightings, ViewSighting};
 use super::tree::Tree;
 
-/// A view judges a node if it sees at least this share of it, in tenths: one side is enough.
+/// A view judges a node if it sees at least this share of it, in tenths: one side is enough. What it sees without
+/// an outline is no part of any of its masks.
 const OBSERVED_TENTHS: u64 = 1;
 /// Nodes below this consensus are no objects.
 const MIN_CONSENSUS: f64 = 0.3;
@@ -105,7 +106,10 @@ fn views_of(sightings: &Sightings, superpoint: usize, sizes: Sizes<'_>) -> NodeV
 
 /// Returns the worth of a node of `n` Gaussians as an object; 0 if it is none.
 fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
-    let judges = views.values().filter(|view| u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS);
+    // A view that outlines nothing of the node says nothing of it.
+    let is_judge =
+        |view: &&NodeView| !view.masks.is_empty() && u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS;
+    let judges = views.values().filter(is_judge);
     let (mut sum, mut weights, mut is_whole) = (0.0, 0.0, false);
     for view in judges {
         let uncut = f64::from(view.uncut.max(LEAST_UNCUT));

@@ -21,7 +21,7 @@ pub(super) struct ViewSighting<'a> {
     pub(super) view: u32,
     /// The superpoint's Gaussians that it sees.
     pub(super) n: u32,
-    /// The masks that show it, ascending.
+    /// The masks that show it, ascending, but for fillers: their outlines are nobody's.
     pub(super) masks: &'a [MaskSighting],
 }
 
@@ -69,10 +69,6 @@ impl Sightings {
     ) -> Result<Self, ContributionError> {
         let regions = (0u32..).zip(scene.index.n_regions_of_view());
         let view_of_region: Vec<u32> = regions.flat_map(|(view, n)| std::iter::repeat_n(view, n)).collect();
-        let outlined = Outlined {
-            is_outlined: (0..view_of_region.len()).map(|region| !table.is_filled(region)).collect(),
-            view_of_region: &view_of_region,
-        };
         let mut entries = Vec::new();
         for contributions in scene.index.transposed_parts(table, scene.group_bytes) {
             scene.check_cancelled()?;
@@ -82,7 +78,7 @@ impl Sightings {
             let found: Vec<Vec<Entry>> = chunks
                 .map(|(at, gaussians)| {
                     let first = at * GAUSSIANS_PER_TASK;
-                    of_gaussians(&contributions, first, gaussians, superpoints, &outlined)
+                    of_gaussians(&contributions, first, gaussians, superpoints, &view_of_region)
                 })
                 .collect();
             found.into_iter().for_each(|mut found| entries.append(&mut found));
@@ -104,12 +100,13 @@ impl Sightings {
                 let first = sightings.masks.len();
                 let n_seen = of_view.iter().map(|entry| entry.n).sum();
                 sightings.views.push((view_of(&of_view[0]), n_seen, first));
+                let outlined = of_view.iter().filter(|entry| !table.is_filled(entry.region as usize));
                 let of_entry = |entry: &Entry| {
                     let masks = table.all_masks_of(entry.region as usize).iter();
                     let (n, weight) = (entry.n, entry.weight);
                     masks.map(move |mask| MaskSighting { mask: *mask, n, weight })
                 };
-                let mut masks: Vec<MaskSighting> = of_view.iter().flat_map(of_entry).collect();
+                let mut masks: Vec<MaskSighting> = outlined.flat_map(of_entry).collect();
                 masks.sort_by_key(|of_mask| of_mask.mask);
                 masks.dedup_by(|next, kept| {
                     let is_same = next.mask == kept.mask;
@@ -146,21 +143,13 @@ impl Sightings {
     }
 }
 
-/// The regions of all views.
-struct Outlined<'a> {
-    view_of_region: &'a [u32],
-    /// Whether a region has masks with outlines. What a view only fills, it does not see: it cannot say where a
-    /// thing ends.
-    is_outlined: Vec<bool>,
-}
-
 /// Returns what regions show of the superpoints of some Gaussians, which are consecutive in a part.
 fn of_gaussians(
     contributions: &PartContributions,
     first: usize,
     gaussians: &[u32],
     superpoints: &Superpoints,
-    outlined: &Outlined<'_>,
+    view_of_region: &[u32],
 ) -> Vec<Entry> {
     let mut found = Vec::new();
     for (k, gaussian) in (first..).zip(gaussians) {
@@ -169,12 +158,10 @@ fn of_gaussians(
             continue;
         }
         let entries = contributions.entries_of(k);
-        let entries = contributions.regions[entries.clone()].iter().zip(&contributions.weights[entries]);
-        let entries = entries.filter(|(region, _)| outlined.is_outlined[**region as usize]);
-        let (regions, weights): (Vec<u32>, Vec<f32>) = entries.unzip();
-        let seen = seen(&regions, &weights, outlined.view_of_region);
+        let (regions, weights) = (&contributions.regions[entries.clone()], &contributions.weights[entries]);
+        let seen = seen(regions, weights, view_of_region);
         let mut seen = seen.iter().peekable();
-        found.extend(regions.iter().zip(&weights).map(|(region, weight)| {
+        found.extend(regions.iter().zip(weights).map(|(region, weight)| {
             let n = u32::from(seen.next_if_eq(&region).is_some());
             Entry { superpoint, region: *region, n, weight: f64::from(*weight) }
         }));

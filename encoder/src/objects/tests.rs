@@ -165,7 +165,7 @@ fn objects_are_the_things_for_any_threads_and_memory() {
     }
 }
 
-/// By hand: views of fillers see nothing, so objects, their masks and their consensus are those of the others.
+/// By hand: views that only fill judge nothing, so objects, their masks and their consensus are those of the others.
 #[test]
 fn fillers_are_no_evidence() {
     let mut world = world();

@@ -81,12 +81,32 @@ pub fn understand(text: &str) -> Option<Phrase> {
         return None;
     }
     let lower = text.to_lowercase();
-    let words: Vec<&str> =
-        lower.split_whitespace().map(|word| word.trim_matches(['.', ',', '?', '!', '"'])).collect();
-    let words: Vec<&str> = words.into_iter().filter(|word| !word.is_empty()).collect();
-    let opening = OPENINGS.iter().filter_map(|opening| starts(&words, opening)).max().unwrap_or(0);
-    let phrase = phrase(&words[opening..], &mut { MAX_THINGS })?;
+    let words = words(&lower);
+    let phrase = phrase(&words[opening(&words)..], &mut { MAX_THINGS })?;
     (!phrase.is_asker() && (phrase.pick.is_some() || phrase.relation.is_some())).then_some(phrase)
+}
+
+/// Returns the thing that a text asks for, such as "sofa" for "Where is the sofa?"; `None` where nothing stands before
+/// a thing.
+pub fn asked_thing(text: &str) -> Option<String> {
+    let lower = text.to_lowercase();
+    let words = words(&lower);
+    let thing = match opening(&words) {
+        0 => return None,
+        opening => without_article(&words[opening..]),
+    };
+    (!thing.is_empty()).then(|| thing.join(" "))
+}
+
+/// Returns the words of a text without the signs around them.
+fn words(lower: &str) -> Vec<&str> {
+    let words = lower.split_whitespace().map(|word| word.trim_matches(['.', ',', '?', '!', '"']));
+    words.filter(|word| !word.is_empty()).collect()
+}
+
+/// Returns the number of words before the thing.
+fn opening(words: &[&str]) -> usize {
+    OPENINGS.iter().filter_map(|opening| starts(words, opening)).max().unwrap_or(0)
 }
 
 /// Returns the number of words of `pattern` if `words` begin with it.

@@ -9,6 +9,6 @@ mod rank;
 
 pub use candidates::{Found, Things, metre};
 pub use geometry::{HOLDS, Scale, Viewer};
-pub use grammar::understand;
+pub use grammar::{asked_thing, understand};
 pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation};
-pub use rank::{Miss, MissKind, Related, Witness, relate};
+pub use rank::{Miss, Related, Witness, relate};

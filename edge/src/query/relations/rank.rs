@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::candidates::{Candidate, Things};
 use super::geometry::{self, HOLDS, Scale, Solid, Viewer};
 use super::phrase::{By, Phrase, Pick, Place};
+use crate::query::answers::ReasonKind;
 
 /// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not
 /// win over a sure one.
@@ -40,25 +41,11 @@ pub struct Witness {
     pub score: Option<f32>,
 }
 
-/// Which part of a phrase failed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum MissKind {
-    /// Nothing on board is such a thing.
-    NoSuchThing,
-    /// Such things are on board, but none is so placed.
-    NoSuchPair,
-    /// There are fewer of them than counted.
-    TooFew,
-    /// Such things are on board, but none in the region asked for.
-    NotInRegion,
-}
-
 /// Why nothing was found.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Miss {
     /// The part that failed.
-    pub kind: MissKind,
+    pub kind: ReasonKind,
     /// The same in words.
     pub detail: String,
     /// The thing that is missing, or not so placed.
@@ -69,7 +56,7 @@ pub struct Miss {
 }
 
 impl Miss {
-    fn new(kind: MissKind, thing: &str, detail: String) -> Self {
+    fn new(kind: ReasonKind, thing: &str, detail: String) -> Self {
         Self { kind, detail, thing: thing.to_owned(), best_degree: None }
     }
 }
@@ -100,7 +87,7 @@ pub fn relate(
     let of = things.of(&phrase.thing);
     let missing = || {
         let detail = format!("nothing {} is in the region asked for", quoted(&phrase.thing));
-        Miss::new(MissKind::NotInRegion, &phrase.thing, detail)
+        Miss::new(ReasonKind::NotInRegion, &phrase.thing, detail)
     };
     if !of.is_empty() && !of.iter().any(|candidate| candidate.is_inside) {
         return Err(missing());
@@ -118,7 +105,7 @@ impl<'b> Measure<'_, 'b> {
         let all = self.things.of(&phrase.thing);
         if all.is_empty() {
             let detail = format!("nothing on board is {}", quoted(&phrase.thing));
-            return Err(Miss::new(MissKind::NoSuchThing, &phrase.thing, detail));
+            return Err(Miss::new(ReasonKind::NoSuchThing, &phrase.thing, detail));
         }
         let mut found = match &phrase.relation {
             None => (0..all.len()).map(|at| alone(at, &all[at])).collect(),
@@ -129,7 +116,7 @@ impl<'b> Measure<'_, 'b> {
         let described = quoted(&phrase.thing);
         if found.is_empty() {
             let detail = format!("nothing {described} that is so placed is in the region asked for");
-            return Err(Miss::new(MissKind::NotInRegion, &phrase.thing, detail));
+            return Err(Miss::new(ReasonKind::NotInRegion, &phrase.thing, detail));
         }
         match &phrase.pick {
             None => Ok(found),
@@ -177,7 +164,7 @@ impl<'b> Measure<'_, 'b> {
             let and = others.map_or(String::new(), |(other, _)| format!(" and {}", quoted(&other.thing)));
             let (thing, of, is) = (quoted(&phrase.thing), quoted(&place.of.thing), place.is);
             let detail = format!("{thing} and {of}{and} are on board, but no {thing} is {is} {of}{and}");
-            let miss = Miss::new(MissKind::NoSuchPair, &phrase.thing, detail);
+            let miss = Miss::new(ReasonKind::NoSuchPair, &phrase.thing, detail);
             return Err(Miss { best_degree: Some(best_degree), ..miss });
         }
         Ok(found)
@@ -235,7 +222,7 @@ impl<'b> Measure<'_, 'b> {
         let n = found.len();
         if n < pick.n {
             let detail = format!("{} was asked for, but {n} fit", nth(pick.n, &phrase.thing));
-            return Err(Miss::new(MissKind::TooFew, &phrase.thing, detail));
+            return Err(Miss::new(ReasonKind::TooFew, &phrase.thing, detail));
         }
         let mut chosen = found.swap_remove(pick.n - 1);
         chosen.to.extend(origin.map(|origin| origin.witness.clone()));

@@ -264,3 +264,17 @@ fn world_of(views: &Views) -> (World, Superpoints) {
     };
     (World::new(gaussians, split, &views), superpoints)
 }
+
+/// By hand: two views have one mask for things 0 and 1, four outline thing 0 and only fill thing 1. Together they have
+/// the consensus (2 + 4 / 2) / 6, thing 0 alone (2 / 2 + 4) / 6, and thing 1 is what no outline shows.
+#[test]
+fn what_views_outline_ends_where_they_only_fill() {
+    let masks = |view: u32, gaussian: u32| BTreeSet::from([u32::from(view >= 2 && gaussian >= PER_ROW)]);
+    let view = |view| (0..2 * PER_ROW).map(|gaussian| (gaussian, masks(view, gaussian))).collect();
+    let (mut world, superpoints) = world_of(&(0..6).map(view).collect());
+    let levels = [0, 0].into_iter().chain([0, Mask::FILLER].repeat(4));
+    world.table.set_levels(levels.collect());
+    let found = world.objects_of(Some(&superpoints), u64::MAX, false).expect("not cancelled");
+    let sizes: Vec<u32> = found.objects.iter().map(|object| object.n_gaussians).collect();
+    assert_eq!(sizes, [PER_ROW]);
+}
