@@ -56,8 +56,15 @@ pub fn answer(
                 open.iter().map(|at| (labels[*at], questions[*at].clone())).unzip();
             let of_open = (of_open.0.as_slice(), of_open.1.as_slice());
             let clusters = by_gaussians(scratch, scene, of_open, AnswerKind::Clusters, request)?;
-            let found = open.into_iter().zip(clusters).filter(|(_, found)| !found.answers.is_empty());
-            found.for_each(|(at, found)| answers[at] = found);
+            for (at, clusters) in open.into_iter().zip(clusters) {
+                match (&mut answers[at].reason, &clusters.reason) {
+                    // Neither answers: both say why.
+                    (Some(of_objects), Some(of_clusters)) => {
+                        of_objects.detail = format!("{}; {}", of_objects.detail, of_clusters.detail);
+                    }
+                    _ => answers[at] = clusters,
+                }
+            }
             Ok(answers)
         }
     }
