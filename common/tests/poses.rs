@@ -274,21 +274,29 @@ fn photos_and_models_are_found_and_choices_are_said() {
 fn transforms_of_other_programs_are_read() {
     let dir = tempfile::tempdir().unwrap();
     fs_err::create_dir(dir.path().join("images")).unwrap();
-    fs_err::write(dir.path().join("images/a.jpg"), "").unwrap();
+    fs_err::create_dir(dir.path().join("images/left")).unwrap();
+    for name in ["a.jpg", "left/a.jpg", "my photo ä.jpg"] {
+        fs_err::write(dir.path().join("images").join(name), "").unwrap();
+    }
     let matrix = "[[1,0,0,1],[0,1,0,2],[0,0,1,3],[0,0,0,1]]";
     let frame = |path: &str, matrix: &str| {
         format!(r#"{{"file_path": "{path}", "sharpness":NaN, "transform_matrix": {matrix}}}"#)
     };
     let frames = [
         frame("C:\\\\Users\\\\anna\\\\a.jpg", matrix),
+        frame("images/my%20photo%20%c3%a4.jpg", matrix),
+        frame("/data/left/a.jpg", matrix),
         frame("/home/NaN/b.jpg", &matrix.replace('3', "-Infinity")),
     ];
     let json = format!("\u{feff}{{\"fl_x\": 60, \"w\": 64, \"h\": 48, \"frames\": [{}]}}", frames.join(","));
     fs_err::write(dir.path().join("transforms.json"), json).unwrap();
     for images in [None, Some(dir.path().join("images"))] {
         let set = poses::read(dir.path(), images.as_deref()).unwrap();
-        assert_eq!((set.views.len(), set.views[0].name.as_str()), (1, "a.jpg"));
-        assert!(set.views[0].image_path.is_file());
+        assert!(set.views.iter().all(|view| view.image_path.is_file()), "{:?}", set.views);
+        let name = |view: &View| view.name.trim_start_matches("images/").to_owned();
+        let mut names: Vec<String> = set.views.iter().map(name).collect();
+        names.sort_unstable();
+        assert_eq!(names, ["a.jpg", "left/a.jpg", "my photo ä.jpg"]);
         assert_eq!(set.damaged[0].0, "/home/NaN/b.jpg");
     }
     let cameras = read_files(&[("transforms.json", b"[{\"id\": 0}]")]).unwrap_err().to_string();

@@ -335,6 +335,7 @@ mod tests {
             assert!(matches!(refused, Err(TextError::Encode(InferenceError::EmptyText))), "{text}");
         }
         assert_eq!(words_of("a man’s T-shirt, size 3.5").as_deref(), Some("a man’s T-shirt size 3.5"));
+        assert_eq!(words_of("so\u{ad}fa🪑ch\u{200b}air").as_deref(), Some("sofa chair"));
         assert_eq!(words_of("чашка на столе").as_deref(), Some("чашка на столе"));
     }
 

@@ -6,7 +6,8 @@ use glam::DAffine3;
 use image::{Rgb, RgbImage};
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::{
-    GeoError, IngestError, RotatedPhotos, Undistorter, load_image, missing_images, read_geo_reference,
+    GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, load_image, missing_images,
+    read_geo_reference,
 };
 use slag_test_support::{needs_shared, shared};
 
@@ -225,6 +226,23 @@ fn absent_and_damaged_images_are_named() {
     assert!(matches!(load_image(&damaged), Err(IngestError::Decode { path, .. }) if path.ends_with("a.png")));
     let views = [damaged, absent.clone()];
     assert_eq!(missing_images(&views), [&absent]);
+
+    // A JPEG that was copied in part, and more pixels than there is memory for.
+    let mut random = slag_math::random::Random::new(3);
+    let path = dir.path().join("c.jpg");
+    RgbImage::from_fn(160, 120, |_, _| Rgb([random.bits() as u8; 3])).save(&path).unwrap();
+    let photo = view(&path, camera(Distortion::None));
+    load_image(&photo).expect("whole");
+    let bytes = fs_err::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    fs_err::write(&path, &bytes[..middle]).unwrap();
+    assert!(matches!(load_image(&photo), Err(IngestError::Cut { .. })));
+    let zeros = [&bytes[..middle], &[0; 300], &bytes[middle + 300..]].concat();
+    fs_err::write(&path, zeros).unwrap();
+    assert!(matches!(load_image(&photo), Err(IngestError::Zeros { .. })));
+    let error = check_memory(&photo, 160 * 120).expect_err("a byte a pixel").to_string();
+    assert!(error.contains("c.jpg") && error.contains("160 x 120 px"), "{error}");
+    check_memory(&photo, 1 << 20).expect("enough");
 }
 
 #[needs_shared]

@@ -30,8 +30,13 @@ impl PhotoFinder {
     }
 
     /// Returns the photo at the longest ending of `path` that exists in the folder, with the stated file name or
-    /// else in other letters or with the ending of another photo format; and that ending.
+    /// else in other letters or with the ending of another photo format, or with `%20` for a space as in addresses;
+    /// and that ending.
     pub(super) fn find(&mut self, path: &str) -> Option<(PathBuf, String)> {
+        self.find_as_written(path).or_else(|| self.find_as_written(&without_escapes(path)?))
+    }
+
+    fn find_as_written(&mut self, path: &str) -> Option<(PathBuf, String)> {
         let parts: Vec<&str> = Path::new(path)
             .components()
             .filter_map(|part| match part {
@@ -75,6 +80,18 @@ impl PhotoFinder {
         let first = moved.first()?;
         Some(format!("{} photos have other names than the poses say, such as {first}", moved.len()))
     }
+}
+
+/// Returns the text with `%20` and the like as the characters that they stand for; `None` without any.
+fn without_escapes(text: &str) -> Option<String> {
+    let (mut bytes, mut rest) = (Vec::new(), text.as_bytes());
+    while let [byte, after @ ..] = rest {
+        let code = after.get(..2).filter(|_| *byte == b'%').and_then(|code| std::str::from_utf8(code).ok());
+        let code = code.and_then(|code| u8::from_str_radix(code, 16).ok());
+        bytes.push(code.unwrap_or(*byte));
+        rest = if code.is_some() { &after[2..] } else { after };
+    }
+    String::from_utf8(bytes).ok().filter(|found| found != text)
 }
 
 fn stem_of(path: &Path) -> Option<String> {

@@ -184,6 +184,22 @@ mod tests {
         }
     }
 
+    /// In a process of its own, whose environment names a proxy.
+    #[test]
+    fn a_proxy_of_the_environment_is_for_other_machines() {
+        const PROXY: &str = "http://192.0.2.1:3128";
+        if std::env::var("HTTP_PROXY").as_deref() != Ok(PROXY) {
+            let name = "client::tests::a_proxy_of_the_environment_is_for_other_machines";
+            let mut again = std::process::Command::new(std::env::current_exe().expect("this program"));
+            let run = again.args(["--exact", name]).env("HTTP_PROXY", PROXY).output().expect("starts");
+            let said = String::from_utf8_lossy(&run.stdout);
+            assert!(run.status.success() && said.contains("1 passed"), "{said}");
+            return;
+        }
+        let has_proxy = |url| Robot::new(url, None).agent.config().proxy().is_some();
+        assert_eq!([has_proxy("http://127.0.0.1:7734"), has_proxy("http://10.0.0.1:7734")], [false, true]);
+    }
+
     /// Nobody listens: a text that is too long is refused before anything is sent.
     #[test]
     fn long_texts_are_not_sent() {

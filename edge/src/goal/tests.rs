@@ -293,6 +293,8 @@ fn the_robots_height_decides_where_it_stands() {
         assert!(goal.position_in_world.z.abs() < 0.1, "{goal:?}");
     }
     assert_eq!(poses(0.35), Err(NoGoal::Unreachable), "no way leads off the table");
+    let above = stand(&world, &request, START.with_z(2.0), &points());
+    assert_eq!(above, Err(NoGoal::UnknownGround), "a floor so far below is that of another storey");
     let deep = stand(&world, &request, DVec3::new(1.45, 3.0, 0.0), &points());
     assert_eq!(deep, Err(NoGoal::UnknownGround), "no floor is near enough");
 }

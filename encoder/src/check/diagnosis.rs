@@ -1,5 +1,7 @@
 //! Finds the mistake that explains why drawings and photos differ.
 
+use std::cell::Cell;
+
 use glam::{DQuat, DVec3};
 use serde::Serialize;
 use slag_common::{Gaussians, Similarity};
@@ -27,6 +29,9 @@ const HALVINGS: u32 = 6;
 const REFINED_GAIN_DB: f64 = 1.0;
 
 const LISTED_TRIALS: usize = 10;
+/// Pairs of a tile and a Gaussian that all trials may draw, beside 1,000 times those of the inputs as given: with
+/// the cameras in a heap of Gaussians, each is drawn everywhere.
+const MAX_PAIRS: usize = 200_000_000;
 
 /// A correction that was tried, and the mean PSNR it leads to.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -97,13 +102,15 @@ impl Samples {
         means: &Means,
         options: &CheckOptions,
     ) -> Result<Diagnosis, CheckError> {
+        let (given_psnr_db, n_pairs) = mean_psnr_db(&self.views, loaded, None)?;
         let search = Search {
             samples: &self.views,
             scene,
             loaded,
             rasterizer,
             flat_psnr_db: mean(self.views.iter().map(CheckView::flat_psnr_db)),
-            given_psnr_db: self.psnr_db(loaded, None)?,
+            given_psnr_db,
+            pairs_left: Cell::new(n_pairs.saturating_mul(1000).saturating_add(MAX_PAIRS)),
             suspected: options.suspicions.iter().filter_map(|suspicion| suspicion.mistake).collect(),
         };
         let tried = search.run(&options.frames)?;
@@ -118,26 +125,28 @@ impl Samples {
             advice: Vec::new(),
         };
         diagnosis.advice = advice(&diagnosis, means);
+        if !search.goes_on() {
+            let what = "the search ended early: too many Gaussians lie at one place to draw all corrections";
+            diagnosis.advice.push(what.into());
+        }
         Ok(diagnosis)
-    }
-
-    fn psnr_db(&self, scene: &dyn LoadedScene, mistake: Option<Mistake>) -> Result<f64, CheckError> {
-        mean_psnr_db(&self.views, scene, mistake)
     }
 }
 
+/// Returns the mean PSNR of the samples, dB, and how many pairs of a tile and a Gaussian were drawn.
 fn mean_psnr_db(
     samples: &[CheckView],
     scene: &dyn LoadedScene,
     mistake: Option<Mistake>,
-) -> Result<f64, CheckError> {
-    let mut sum = 0.0;
+) -> Result<(f64, usize), CheckError> {
+    let (mut sum, mut n_pairs) = (0.0, 0usize);
     for sample in samples {
         let view = mistake.map_or(sample.view, |mistake| mistake.corrected(&sample.view));
         let drawing = CheckView { view, ..sample.clone() }.draw(scene)?;
         sum += sample.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
+        n_pairs = n_pairs.saturating_add(drawing.counters.pairs);
     }
-    Ok(sum / samples.len() as f64)
+    Ok((sum / samples.len() as f64, n_pairs))
 }
 
 /// The search for the correction with which drawings match photos best.
@@ -148,6 +157,8 @@ struct Search<'a> {
     rasterizer: &'a dyn Rasterizer,
     flat_psnr_db: f64,
     given_psnr_db: f64,
+    /// Pairs that may yet be drawn.
+    pairs_left: Cell<usize>,
     /// Mistakes that the data suggest.
     suspected: Vec<Mistake>,
 }
@@ -158,20 +169,15 @@ impl Search<'_> {
     /// refined.
     fn run(&self, frames: &[FrameCandidate]) -> Result<Vec<Trial>, CheckError> {
         let mut tried = Vec::new();
-        for mistake in &self.suspected {
-            tried.push(self.trial(*mistake)?);
-        }
+        self.try_all(self.suspected.iter().copied(), &mut tried)?;
         if !tried.iter().any(|trial| self.explains(trial)) {
             let frames = frames.iter().map(|frame| Mistake::Frame(*frame));
-            for mistake in Mistake::common().into_iter().chain(frames) {
-                tried.push(self.trial(mistake)?);
-            }
+            self.try_all(Mistake::common().into_iter().chain(frames), &mut tried)?;
         }
         if !tried.iter().any(|trial| self.explains(trial)) {
             let n = (SWEEP_LIMIT.ln() / SWEEP_STEP.ln()).floor() as i32;
-            for power in (-n..=n).filter(|power| *power != 0) {
-                tried.push(self.trial(Mistake::SceneScale(SWEEP_STEP.powi(power)))?);
-            }
+            let powers = (-n..=n).filter(|power| *power != 0);
+            self.try_all(powers.map(|power| Mistake::SceneScale(SWEEP_STEP.powi(power))), &mut tried)?;
         }
         tried.sort_by(|a, b| b.psnr_db.total_cmp(&a.psnr_db));
         if let Some(first) = tried.first_mut() {
@@ -181,11 +187,27 @@ impl Search<'_> {
         Ok(tried)
     }
 
+    fn try_all(
+        &self,
+        mistakes: impl Iterator<Item = Mistake>,
+        tried: &mut Vec<Trial>,
+    ) -> Result<(), CheckError> {
+        for mistake in mistakes.take_while(|_| self.goes_on()) {
+            tried.push(self.trial(mistake)?);
+        }
+        Ok(())
+    }
+
+    fn goes_on(&self) -> bool {
+        self.pairs_left.get() > 0
+    }
+
     fn trial(&self, mistake: Mistake) -> Result<Trial, CheckError> {
-        let psnr_db = match mistake.corrected_splat(self.scene) {
+        let (psnr_db, n_pairs) = match mistake.corrected_splat(self.scene) {
             Some(scene) => mean_psnr_db(self.samples, &*self.rasterizer.load(&scene)?, None)?,
             None => mean_psnr_db(self.samples, self.loaded, Some(mistake))?,
         };
+        self.pairs_left.set(self.pairs_left.get().saturating_sub(n_pairs));
         Ok(Trial { mistake, psnr_db })
     }
 
@@ -216,7 +238,8 @@ impl Search<'_> {
         let mut step = FIRST_STEP;
         for _ in 0..=HALVINGS + 2 {
             for direction in 0..directions {
-                let Some(similarity) = found.mistake.splat_from_poses() else { break };
+                let similarity = found.mistake.splat_from_poses().filter(|_| self.goes_on());
+                let Some(similarity) = similarity else { break };
                 let moved = self.trial(with(moved(similarity, direction, step, centre, diagonal)))?;
                 if moved.psnr_db > found.psnr_db {
                     found = moved;

@@ -9,6 +9,7 @@ use slag_common::poses::SplatFrame;
 use slag_common::{View, durable, poses, splat};
 
 use super::common::{Exit, InputArgs, print};
+use super::memory::free_memory_bytes;
 use super::next;
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
 use crate::ingest::{self, FoundFrame, LoadedImage, RotatedPhotos};
@@ -83,7 +84,9 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     // One at a time: a photo is loaded when the check reaches it.
     let rotated = RotatedPhotos::default();
     let views = (0..n).map(|i| {
-        let loaded = ingest::load_image(&there[i * there.len() / n])?;
+        let view = &there[i * there.len() / n];
+        ingest::check_memory(view, free_memory_bytes().unwrap_or(u64::MAX))?;
+        let loaded = ingest::load_image(view)?;
         rotated.add(&loaded);
         let LoadedImage { view: View { name, intrinsics, camera_from_world, .. }, image, valid, .. } = loaded;
         let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());

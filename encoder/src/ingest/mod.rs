@@ -11,7 +11,9 @@ use std::sync::{Mutex, PoisonError};
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
-use slag_common::{Distortion, Hash32, Intrinsics, View};
+use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View};
+
+use jpeg::Damage;
 
 pub use geo::{GeoError, read_geo_reference};
 pub use splat_frame::{Activated, FoundFrame, FrameChoice, find_frame};
@@ -19,6 +21,9 @@ pub use undistort::Undistorter;
 
 /// Largest factor between the size in the intrinsics and that of downscaled photos.
 const MAX_DOWNSCALE: u32 = 64;
+/// Bytes that a pixel takes while its photo is loaded: eight as read (16 bits, transparent), three as colours; three
+/// without distortion, once the first are gone, and its place before.
+const LOADED_BYTES_PER_PX: u64 = 11;
 
 /// An undistorted photo.
 #[derive(Clone, Debug)]
@@ -79,6 +84,13 @@ pub enum IngestError {
     },
     #[error("{}: the file ends before its image does; copy the photo again", path.display())]
     Cut { path: PathBuf },
+    #[error("{}: a piece of the image is zeros, which no camera writes; copy the photo again", path.display())]
+    Zeros { path: PathBuf },
+    #[error(
+        "{}: {} x {} px take {needed} while they are loaded, and {free} are free; give smaller copies",
+        path.display(), size_px[0], size_px[1]
+    )]
+    TooLarge { path: PathBuf, size_px: [u32; 2], needed: ByteSize, free: ByteSize },
     #[error("{}: a HEIC or AVIF image; convert the photos to JPEG, for example with heif-convert", path.display())]
     Heif { path: PathBuf },
     #[error(
@@ -99,15 +111,30 @@ pub fn missing_images(views: &[View]) -> Vec<&View> {
     views.iter().filter(|view| !view.image_path.is_file()).collect()
 }
 
-/// Returns the pixels of a view's photo by its header; those of the camera where the header cannot be read.
+/// Returns the pixels of a view's photo, see [`photo_size_px`].
 pub fn photo_area_px(view: &View) -> u64 {
+    photo_size_px(view).map(u64::from).iter().product()
+}
+
+/// Returns the size of a view's photo by its header; that of the camera where the header cannot be read.
+fn photo_size_px(view: &View) -> [u32; 2] {
     let of_header =
         || ImageReader::open(&view.image_path).ok()?.with_guessed_format().ok()?.into_dimensions().ok();
     let of_camera = (view.intrinsics.width_px, view.intrinsics.height_px);
     let (width_px, height_px) = of_header()
         .filter(|(width_px, height_px)| is_scale_of(&view.intrinsics, *width_px, *height_px))
         .unwrap_or(of_camera);
-    u64::from(width_px) * u64::from(height_px)
+    [width_px, height_px]
+}
+
+/// Checks that a view's photo can be loaded within the free memory.
+pub fn check_memory(view: &View, free_bytes: u64) -> Result<(), IngestError> {
+    let needed_bytes = photo_area_px(view).saturating_mul(LOADED_BYTES_PER_PX);
+    if needed_bytes <= free_bytes {
+        return Ok(());
+    }
+    let (path, size_px) = (view.image_path.clone(), photo_size_px(view));
+    Err(IngestError::TooLarge { path, size_px, needed: ByteSize(needed_bytes), free: ByteSize(free_bytes) })
 }
 
 /// Loads the photo of a view and undistorts it.
@@ -153,8 +180,11 @@ fn decode(path: &Path, camera: &Intrinsics) -> Result<(DynamicImage, bool), Inge
         return Err(IngestError::Heif { path: path.to_owned() });
     }
     let reader = ImageReader::new(open()?).with_guessed_format()?;
-    if reader.format() == Some(ImageFormat::Jpeg) && !jpeg::is_whole(open()?)? {
-        return Err(IngestError::Cut { path: path.to_owned() });
+    let damage = if reader.format() == Some(ImageFormat::Jpeg) { jpeg::damage(open()?)? } else { None };
+    match damage {
+        Some(Damage::Cut) => return Err(IngestError::Cut { path: path.to_owned() }),
+        Some(Damage::Zeros) => return Err(IngestError::Zeros { path: path.to_owned() }),
+        None => {}
     }
     let mut decoder = reader.into_decoder().map_err(failed)?;
     let (width_px, height_px) = decoder.dimensions();

@@ -244,6 +244,13 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
         photos.iter().map(view).collect()
     };
     assert_eq!(suspicions(&scene, &views(&photos)), []);
+    let said = |opacity: f32, n: usize| -> String {
+        let mut damaged = scene.clone();
+        damaged.opacities[..n].fill(opacity);
+        suspicions(&damaged, &views(&photos)).into_iter().map(|s| s.text).collect()
+    };
+    assert!(said(1e-3, scene.len()).contains("all Gaussians are transparent"));
+    assert!(said(f32::NAN, scene.len() / 2 + 1).contains("cannot be drawn"));
     let diagnosed = |scene: &Gaussians, photos: &[CheckView]| {
         let suspicions = suspicions(scene, &views(photos));
         assert_eq!(suspicions.len(), 1, "{suspicions:?}");
@@ -315,9 +322,11 @@ fn unreadable_photos_are_left_out_and_hidden_pixels_do_not_count() {
 struct Counting {
     loads: AtomicUsize,
     draws: AtomicUsize,
+    /// Pairs that each drawing after the first two counts.
+    pairs_of_trials: usize,
 }
 
-struct CountingScene<'s>(Box<dyn LoadedScene + 's>, &'s AtomicUsize);
+struct CountingScene<'s>(Box<dyn LoadedScene + 's>, &'s Counting);
 
 impl LoadedScene for CountingScene<'_> {
     fn weights(
@@ -330,8 +339,10 @@ impl LoadedScene for CountingScene<'_> {
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
-        self.1.fetch_add(1, Ordering::Relaxed);
-        self.0.draw(view, background)
+        let n_drawn = self.1.draws.fetch_add(1, Ordering::Relaxed);
+        let mut drawing = self.0.draw(view, background)?;
+        drawing.counters.pairs = if n_drawn < 2 { 0 } else { self.1.pairs_of_trials };
+        Ok(drawing)
     }
 }
 
@@ -345,7 +356,7 @@ impl Rasterizer for Counted {
 
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         self.0.loads.fetch_add(1, Ordering::Relaxed);
-        Ok(Box::new(CountingScene(CpuRasterizer.load(scene)?, &self.0.draws)))
+        Ok(Box::new(CountingScene(CpuRasterizer.load(scene)?, self.0)))
     }
 }
 
@@ -362,4 +373,15 @@ fn photos_are_loaded_one_at_a_time_and_the_scene_once() {
     assert_eq!(report.views.len(), 9);
     assert!(report.diagnosis.is_some() && counting.draws.load(Ordering::Relaxed) > 100);
     assert_eq!(counting.loads.load(Ordering::Relaxed), 1 + 3, "mirrored along three axes");
+}
+
+/// Corrections that draw a heap of Gaussians everywhere are tried until 200 million pairs were drawn.
+#[test]
+fn a_heap_of_gaussians_ends_the_search() {
+    let counting = Counting { pairs_of_trials: 50_000_000, ..Counting::default() };
+    let counting: &'static Counting = Box::leak(Box::new(counting));
+    let options = CheckOptions::default();
+    let report = check(&Gaussians::default(), [Ok(tiny_view())], &Counted(counting), &options).unwrap();
+    assert_eq!(counting.draws.load(Ordering::Relaxed), 1 + 1 + 4);
+    assert!(report.to_string().contains("the search ended early"), "{report}");
 }

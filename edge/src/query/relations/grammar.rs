@@ -255,14 +255,15 @@ mod tests {
             let read = std::thread::Builder::new().stack_size(2 << 20).spawn(move || understand(&text));
             read.expect("a thread").join().expect("no overflow")
         };
-        let relations = |n: usize| format!("a {}", "on a ".repeat(n));
+        // No article, which would be nothing.
+        let relations = |n: usize| format!("b {}", "on b ".repeat(n));
         assert_eq!(read(relations(7)).map(|phrase| phrase.check()), Some(Ok(())));
         let long = [
             relations(8),
             relations(9_000),
-            "a between ".repeat(9_000) + &"and b ".repeat(9_000),
+            "c between ".repeat(9_000) + &"and b ".repeat(9_000),
             "the ".repeat(12_000) + "mug on the table",
-            "nearest a from ".repeat(9_000) + "b",
+            "nearest c from ".repeat(9_000) + "b",
         ];
         for text in long {
             let shown: String = text.chars().take(40).collect();
