@@ -31,6 +31,12 @@ pub(super) fn lines(
         .map(|(p, b)| format!("{p} {}", ByteSize(*b)))
         .collect::<Vec<_>>()
         .join(", ");
+    let drawn = match summary.n_views_drawn {
+        0 => String::new(),
+        n => format!(
+            "drawn      {n} views are drawings of the splat, no photos: small things and signs may be missed\n"
+        ),
+    };
     let skipped = match summary.skipped_views.len() {
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
@@ -73,7 +79,7 @@ pub(super) fn lines(
     format!(
         "{of_target}published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} of {} ({} resumed, {} without masks)\n{lost}{coverage}{skipped}{encoder}{images_on}\
+         views      {} of {} ({} resumed, {} without masks)\n{drawn}{lost}{coverage}{skipped}{encoder}{images_on}\
          masks      {} in {} regions, {} contributions\n\
          cells      {} with {} centroids\n\
          {objects}{occupancy}shards     {sizes}\n\

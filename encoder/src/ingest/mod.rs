@@ -1,5 +1,6 @@
 //! Ingest: loads photos as ideal pinhole images of known size.
 
+mod drawn;
 mod geo;
 mod jpeg;
 mod splat_frame;
@@ -13,6 +14,7 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
 use slag_common::{Distortion, Hash32, Intrinsics, View};
 
+pub use drawn::drawn_from;
 pub use geo::{GeoError, read_geo_reference};
 pub use splat_frame::{Activated, FoundFrame, FrameChoice, find_frame};
 pub use undistort::Undistorter;
