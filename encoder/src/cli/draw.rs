@@ -1,5 +1,6 @@
 //! `plan` and `draw`: images of a splat, of planned views and of given ones.
 
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, anyhow};
@@ -104,8 +105,9 @@ pub(super) fn draw(args: &DrawArgs, progress: &dyn Progress, json: bool) -> Resu
     let set = poses::read(&args.views, None)?;
     set.notes.iter().chain(&set.left_out()).for_each(|note| tracing::warn!("{note}"));
     let views: Vec<DrawnView> = set.views.iter().map(drawn_view).collect();
-    if let Some(twice) = views.windows(2).find(|pair| pair[0].name == pair[1].name) {
-        return Err(anyhow!("two views would be drawn into {}; rename one of them", twice[0].name));
+    let mut names = HashSet::new();
+    if let Some(twice) = views.iter().find(|view| !names.insert(&view.name)) {
+        return Err(anyhow!("two views would be drawn into {}; rename one of them", twice.name));
     }
     let out = &args.drawing.out;
     viewpoints::draw(out, &views, devices.load(&scene)?.as_ref(), &name, json!({}), progress)?;

@@ -9,7 +9,7 @@ use super::looks::{look_along, look_at};
 use super::space::{Space, VOXEL, WIDTH};
 
 /// Most candidates; each costs a small drawing.
-pub(super) const MOST: usize = 1400;
+pub(super) const MOST: usize = 600;
 const N_HEADINGS: usize = 8;
 /// Heights of cameras in a room and how far they look down: height in parts of the room's, radians.
 const INDOOR: [(f64, f64); 2] = [(0.4, 0.05), (0.6, 0.25)];

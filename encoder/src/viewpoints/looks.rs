@@ -33,7 +33,7 @@ pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
 const MAX_HOLES: f32 = 0.1;
 const MAX_NEAR: f32 = 0.2;
 const MAX_HAZE: f32 = 0.15;
-const MAX_LARGE: f32 = 0.5;
+const MAX_LARGE: f32 = 0.7;
 /// An object need not fill the image.
 const MAX_HOLES_OF_OBJECT: f32 = 0.97;
 

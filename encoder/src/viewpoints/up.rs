@@ -53,11 +53,13 @@ pub(super) fn find(scene: &Gaussians) -> Result<Up, ViewpointError> {
     let vertical = peaks.iter().filter(is_rival).map(|(axis, _)| *axis);
     let of_normals = vertical.min_by(|a, b| height(a).total_cmp(&height(b)));
     tracing::debug!("normals: {peaks:?}");
-    let axis = match of_normals {
-        Some(axis) => axis,
-        None => least_spread(scene).ok_or(ViewpointError::NoUp)?,
-    };
-    Ok(with_sign(scene, axis))
+    match of_normals {
+        Some(axis) => Ok(with_sign(scene, axis)),
+        None => {
+            let axis = least_spread(scene).ok_or(ViewpointError::NoUp)?;
+            Ok(Up { axis, sign: Sign::Unknown })
+        }
+    }
 }
 
 /// Returns normals of flat Gaussians, with weights that the largest do not rule.
