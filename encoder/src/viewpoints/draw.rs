@@ -9,14 +9,14 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 use slag_common::{Intrinsics, durable};
 
-use super::ViewpointPlan;
 use super::looks::pinhole;
+use super::plan::{Viewpoint, ViewpointPlan};
 use crate::progress::Progress;
 use crate::raster::{Drawing, LoadedScene, RasterError, RasterView};
 
 /// Name of the poses file.
 pub const POSES_FILE: &str = "transforms.json";
-/// Size of drawings: that of a video, which masks and crops are made for.
+/// Size of drawings, pixels: that of the photos that the segmenter learnt on, enlarged little.
 const SIZE_PX: [u32; 2] = [800, 600];
 /// What shows through holes: grey is no thing's outline.
 const BACKGROUND: [f32; 3] = [0.5; 3];
@@ -42,7 +42,7 @@ pub struct DrawnView {
 pub fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
     let [width_px, height_px] = SIZE_PX;
     let intrinsics = pinhole(width_px, height_px);
-    let view = |(number, viewpoint): (usize, &super::Viewpoint)| DrawnView {
+    let view = |(number, viewpoint): (usize, &Viewpoint)| DrawnView {
         name: format!("drawn-{number:04}.png"),
         view: RasterView { camera_from_world: viewpoint.camera_from_world, intrinsics },
         about: json!({ "verdict": viewpoint.verdict }),

@@ -1,22 +1,19 @@
 //! A small drawing of a candidate: can it be trusted, and which Gaussians does it show?
 
-use std::fmt;
-
 use glam::{DAffine3, DMat3, DVec3};
-use serde::Serialize;
 use slag_common::{Distortion, Gaussians, Intrinsics};
 
-use super::SceneKind;
-use super::space::{Space, WIDTH};
+use super::plan::{SceneKind, Verdict};
+use super::space::WIDTH;
 use crate::masks::RegionMap;
-use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer, WeightKind};
+use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
 
 /// Size of the drawings, pixels.
 const SIZE_PX: [u32; 2] = [80, 60];
 /// Tangent of half the horizontal field of view, 60 degrees: that of a phone's main camera.
-pub(super) const HALF_WIDTH: f64 = 0.577_350_269;
+const HALF_WIDTH: f64 = 0.577_350_269;
 /// Opacity below which a pixel is a hole.
-pub(super) const MIN_COVERED: f32 = 0.5;
+const MIN_COVERED: f32 = 0.5;
 /// Difference of expected and median depth, relative to the latter, from which a pixel is hazy.
 const HAZY: f64 = 0.15;
 /// Depth below which a pixel is near.
@@ -26,67 +23,9 @@ const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
 /// Weight of a Gaussian that is seen, pixels of the drawing.
 const MIN_WEIGHT: f32 = 0.05;
 /// Sides from which a Gaussian can be seen, around the vertical.
-pub(super) const N_SIDES: usize = 8;
+const N_SIDES: usize = 8;
 /// Bytes of what a candidate shows: eight a Gaussian, of which a pixel shows few.
 pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
-/// Most of each that a view may have, 0 to 1.
-const MAX_HOLES: f32 = 0.1;
-const MAX_NEAR: f32 = 0.2;
-const MAX_HAZE: f32 = 0.15;
-const MAX_LARGE: f32 = 0.7;
-/// An object need not fill the image.
-const MAX_HOLES_OF_OBJECT: f32 = 0.97;
-
-/// How far a drawing can be trusted; shares of 0 to 1.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Verdict {
-    /// Pixels through which nothing is seen.
-    pub holes: f32,
-    /// Pixels whose surface is too near to be sharp.
-    pub near: f32,
-    /// Pixels whose expected and median depths differ: no clear surface.
-    pub haze: f32,
-    /// Weight of Gaussians that are large on the screen: no detail.
-    pub large: f32,
-}
-
-/// Why a view cannot be trusted.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Fault {
-    Holes,
-    Near,
-    Haze,
-    Large,
-}
-
-impl Fault {
-    pub(super) const ALL: [Self; 4] = [Self::Holes, Self::Near, Self::Haze, Self::Large];
-}
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Holes => "look into holes",
-            Self::Near => "are too near to something",
-            Self::Haze => "look through haze",
-            Self::Large => "show no detail",
-        })
-    }
-}
-
-impl Verdict {
-    /// Returns why a view is not to be used; `None` if it is good.
-    pub fn fault(&self, kind: SceneKind) -> Option<Fault> {
-        let holes = if kind == SceneKind::Object { MAX_HOLES_OF_OBJECT } else { MAX_HOLES };
-        let limits = [
-            (self.holes, holes, Fault::Holes),
-            (self.near, MAX_NEAR, Fault::Near),
-            (self.haze, MAX_HAZE, Fault::Haze),
-            (self.large, MAX_LARGE, Fault::Large),
-        ];
-        limits.into_iter().find(|(found, limit, _)| found > limit).map(|(.., fault)| fault)
-    }
-}
 
 /// What a candidate shows.
 pub(super) struct Look {
@@ -205,18 +144,4 @@ fn depths(layers: &mut [Layer]) -> Option<(f64, f64)> {
 fn side(towards: DVec3) -> u8 {
     let turns = towards.y.atan2(towards.x) / std::f64::consts::TAU + 0.5;
     ((turns * N_SIDES as f64) as u8).min(N_SIDES as u8 - 1)
-}
-
-/// Returns whether the scene seen from above has more of large Gaussians than from below: what no photo has seen, as
-/// the underside of the ground, nothing makes small.
-pub(super) fn large_from_above(space: &Space, rasterizer: &dyn Rasterizer) -> Result<bool, RasterError> {
-    let loaded = rasterizer.load(&space.scene)?;
-    let large = |sign: f64| {
-        let eye = DVec3::new(0.0, 0.0, sign * (space.half.z + 0.6 * WIDTH));
-        let look = look(loaded.as_ref(), &space.scene, look_at(eye, DVec3::ZERO), SceneKind::Outdoor)?;
-        Ok::<_, RasterError>(look.verdict.large)
-    };
-    let (above, below) = (large(1.0)?, large(-1.0)?);
-    tracing::debug!("large from above {above:.2}, from below {below:.2}");
-    Ok(above > below)
 }

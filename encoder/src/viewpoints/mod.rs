@@ -3,34 +3,34 @@
 //! | step | result | file |
 //! |---|---|---|
 //! | up | the upward direction, from the normals of flat Gaussians | `up.rs` |
-//! | space | the scene turned, centred and scaled to a width of 10; its occupied voxels and its kind | `space.rs` |
-//! | candidates | cameras in free places, by kind | `candidates.rs` |
+//! | space | the scene turned, centred and scaled to a width of 10; its occupied voxels | `space.rs` |
+//! | candidates | the kind of scene; cameras in free places, by kind | `candidates.rs` |
 //! | looks | a small drawing of each candidate: can it be trusted, and which Gaussians does it show? | `looks.rs` |
-//! | choice | those that together show most, greedily | `choice.rs` |
+//! | choice | those that together show most, greedily | here |
 //! | draw | images, and the poses file that says that they are drawings | `draw.rs` |
 
 mod candidates;
-mod choice;
 mod draw;
 mod looks;
+mod plan;
 mod space;
 mod up;
 
-use std::fmt;
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use glam::{DAffine3, DVec3};
+use glam::DVec3;
 use rayon::prelude::*;
-use serde::Serialize;
 use slag_common::Gaussians;
 
-use crate::memory::{MemoryError, MemoryPlan, Phase};
+use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{RasterError, Rasterizer};
 use looks::Look;
 use space::Space;
 
 pub use draw::{DrawError, DrawnView, POSES_FILE, draw, views_of};
-pub use looks::{Fault, Verdict};
+pub use plan::{Fault, SceneKind, Verdict, Viewpoint, ViewpointError, ViewpointPlan, ViewpointSettings};
 
 /// Views where nothing else is asked for: more find no more (twice as many gain 1 % of average precision).
 pub const DEFAULT_N_VIEWS: usize = 48;
@@ -40,97 +40,14 @@ const MIN_GOOD: usize = 12;
 const ENOUGH_GAUSSIANS: usize = 1 << 18;
 const MAX_STRIDE: usize = 4;
 
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct ViewpointSettings {
-    pub n_views: usize,
-    /// The upward direction, world; found from the Gaussians where absent.
-    pub up: Option<DVec3>,
-}
+/// Gain of a Gaussian's first, second, third and further view, tenths.
+const GAINS: [u32; 4] = [10, 6, 4, 1];
+/// Gain from a side that no view has shown yet, and from one that a view has shown, fifths.
+const NEW_SIDE: u32 = 5;
+const USED_SIDE: u32 = 2;
 
-/// What the Gaussians show.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SceneKind {
-    /// Rooms: something is overhead.
-    Indoor,
-    /// Ground under an open sky.
-    Outdoor,
-    /// A thing with nothing around it.
-    Object,
-}
-
-/// A camera of a plan.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Viewpoint {
-    pub camera_from_world: DAffine3,
-    pub verdict: Verdict,
-}
-
-/// The cameras from which to draw a scene, each the one that shows most after those before it.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct ViewpointPlan {
-    pub kind: SceneKind,
-    /// Unit, world.
-    pub up_in_world: DVec3,
-    pub views: Vec<Viewpoint>,
-    pub n_candidates: usize,
-    pub n_good: usize,
-    /// Share of the Gaussians that any candidate shows which the views show, 0 to 1.
-    pub seen: f64,
-}
-
-#[derive(Debug, thiserror::Error)]
-pub enum ViewpointError {
-    #[error(transparent)]
-    Raster(#[from] RasterError),
-    #[error(transparent)]
-    Memory(#[from] MemoryError),
-    #[error(
-        "no views can be planned: {n} Gaussians are opaque and finite, expected at least {expected}; give photos with --views"
-    )]
-    Empty { n: usize, expected: usize },
-    #[error(
-        "the Gaussians do not tell which way is up; give it with --up X,Y,Z, for example --up 0,0,1 where z points up"
-    )]
-    NoUp,
-    #[error("--up {0}: expected three finite numbers, not all 0")]
-    BadUp(DVec3),
-    #[error(
-        "only {n_good} of {n_candidates} planned views of this {kind} scene can be trusted ({faults}); give photos with --views, \
-         remove floaters from the splat, or state its upward direction with --up X,Y,Z"
-    )]
-    FewViews { kind: SceneKind, n_good: usize, n_candidates: usize, faults: String },
-    #[error("interrupted while views were planned; run the same command again")]
-    Interrupted,
-}
-
-impl fmt::Display for SceneKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Indoor => "indoor",
-            Self::Outdoor => "outdoor",
-            Self::Object => "object",
-        })
-    }
-}
-
-impl fmt::Display for ViewpointPlan {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let DVec3 { x, y, z } = self.up_in_world;
-        write!(
-            f,
-            "{} views of an {} scene with up ({x:.2}, {y:.2}, {z:.2}), of {} candidates {} good; they show {:.0} % of the \
-             Gaussians that can be seen",
-            self.views.len(),
-            self.kind,
-            self.n_candidates,
-            self.n_good,
-            100.0 * self.seen
-        )
-    }
-}
-
-/// Plans the views of a scene within `memory_bytes`, the scene's included. The plan does not depend on the number of threads, nor on the scene's scale.
+/// Plans the views of a scene within `memory_bytes`, the scene's included. The plan does not depend on the number of
+/// threads, nor on the scene's scale.
 ///
 /// # Errors
 /// [`ViewpointError`] where views cannot be trusted; it says what to give.
@@ -149,20 +66,20 @@ pub fn plan(
     memory.reserve(Phase::Views, "Gaussians that views are planned by", 2 * thin_bytes);
     memory.reserve(Phase::Views, "what planned views show", candidates::MOST as u64 * looks::LOOK_BYTES);
     memory.rest(0)?;
-    let thin = space::thinned(scene, stride);
+    let thin = space::thinned(scene, stride)?;
     let up = match settings.up {
         Some(up) => {
             up::Up { axis: up.try_normalize().ok_or(ViewpointError::BadUp(up))?, sign: up::Sign::Known }
         }
         None => up::find(&thin)?,
     };
-    let mut space = Space::new(&thin, up.axis)?;
+    let mut space = Space::new(&thin, up.axis);
     drop(thin);
-    if up.sign == up::Sign::Unknown && looks::large_from_above(&space, rasterizer)? {
+    if up.sign == up::Sign::Unknown && large_from_above(&space, rasterizer)? {
         space = space.upside_down();
     }
     let loaded = rasterizer.load(&space.scene)?;
-    let kind = space.kind(loaded.as_ref())?;
+    let kind = candidates::kind_of(&space, loaded.as_ref())?;
     let cameras = candidates::of(kind, &space);
     let n_candidates = cameras.len();
     let looked = cameras.into_par_iter().map(|camera| {
@@ -183,7 +100,7 @@ pub fn plan(
             faults: faults(&bad, kind),
         });
     }
-    let (chosen, seen) = choice::greedy(&good, space.scene.len(), settings.n_views);
+    let (chosen, seen) = greedy(&good, space.scene.len(), settings.n_views);
     let views = chosen.into_iter().map(|at| Viewpoint {
         camera_from_world: space.camera_from_world(good[at].camera),
         verdict: good[at].verdict,
@@ -205,4 +122,66 @@ fn faults(bad: &[Look], kind: SceneKind) -> String {
     let told: Vec<String> =
         all.into_iter().filter(|(_, n)| *n > 0).map(|(fault, n)| format!("{n} {fault}")).collect();
     told.join(", ")
+}
+
+/// Returns whether the scene seen from above has more of large Gaussians than from below: what no photo has seen, as
+/// the underside of the ground, nothing makes small.
+fn large_from_above(space: &Space, rasterizer: &dyn Rasterizer) -> Result<bool, RasterError> {
+    let loaded = rasterizer.load(&space.scene)?;
+    let large = |sign: f64| {
+        let eye = DVec3::new(0.0, 0.0, sign * (space.half.z + 0.6 * space::WIDTH));
+        let look =
+            looks::look(loaded.as_ref(), &space.scene, looks::look_at(eye, DVec3::ZERO), SceneKind::Outdoor)?;
+        Ok::<_, RasterError>(look.verdict.large)
+    };
+    let (above, below) = (large(1.0)?, large(-1.0)?);
+    tracing::debug!("large from above {above:.2}, from below {below:.2}");
+    Ok(above > below)
+}
+
+/// How often a Gaussian is seen, and from which sides.
+#[derive(Clone, Copy, Default)]
+struct Seen {
+    n_views: u8,
+    sides: u8,
+}
+
+impl Seen {
+    fn gain(self, side: u8) -> u32 {
+        let gain = GAINS[usize::from(self.n_views).min(GAINS.len() - 1)];
+        gain * if self.sides & (1 << side) == 0 { NEW_SIDE } else { USED_SIDE }
+    }
+}
+
+/// Returns at most `n_views` looks, each the one that gains most after those before it, and the share of the Gaussians
+/// seen by any look that they see. Ties go to the first. Gains only fall, so most need not be computed again (Minoux
+/// 1978).
+fn greedy(looks: &[Look], n_gaussians: usize, n_views: usize) -> (Vec<usize>, f64) {
+    let mut state = vec![Seen::default(); n_gaussians];
+    let gain = |state: &[Seen], look: &Look| -> u64 {
+        look.seen.iter().map(|(gaussian, side)| u64::from(state[*gaussian as usize].gain(*side))).sum()
+    };
+    // (gain, first look, how many were chosen when the gain was computed)
+    let mut heap: BinaryHeap<_> =
+        looks.iter().enumerate().map(|(at, look)| (gain(&state, look), Reverse(at), 0)).collect();
+    let mut chosen = Vec::new();
+    while chosen.len() < n_views
+        && let Some((_, Reverse(at), n_then)) = heap.pop()
+    {
+        if n_then != chosen.len() {
+            heap.push((gain(&state, &looks[at]), Reverse(at), chosen.len()));
+            continue;
+        }
+        for (gaussian, side) in &looks[at].seen {
+            let seen = &mut state[*gaussian as usize];
+            seen.n_views = seen.n_views.saturating_add(1);
+            seen.sides |= 1 << side;
+        }
+        chosen.push(at);
+    }
+    let mut by_any = vec![false; n_gaussians];
+    looks.iter().flat_map(|look| &look.seen).for_each(|(gaussian, _)| by_any[*gaussian as usize] = true);
+    let n_any = by_any.iter().filter(|seen| **seen).count();
+    let n_seen = state.iter().filter(|seen| seen.n_views > 0).count();
+    (chosen, n_seen as f64 / n_any.max(1) as f64)
 }

@@ -4,10 +4,8 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use slag_common::Gaussians;
 use slag_math::eigen::eigen_symmetric;
 
-use super::looks::{self, MIN_COVERED};
+use super::plan::ViewpointError;
 use super::up::{self, TRIMMED};
-use super::{SceneKind, ViewpointError};
-use crate::raster::{LoadedScene, RasterError};
 
 /// Widest side of the scene without strays: far more than the rasteriser's near plane.
 pub(super) const WIDTH: f64 = 10.0;
@@ -21,12 +19,6 @@ const MAX_SCALE: f32 = 0.1 * WIDTH as f32;
 /// Standard deviations of a Gaussian that it occupies.
 const REACH: f64 = 1.5;
 const MIN_GAUSSIANS: usize = 100;
-/// Share of the columns with ground that have, above a gap, something overhead, from which a scene is indoor. A yard
-/// has 11 %, a drone scene 23 %.
-const MIN_OVERHEAD: f64 = 0.5;
-/// Share of holes, inward from a ring, from which a scene is a single object.
-const MIN_HOLES: f32 = 0.5;
-const N_RING: usize = 12;
 
 pub(super) struct Space {
     /// In the planner's axes: z up, x along the longest horizontal side, the middle of the scene at the origin.
@@ -42,7 +34,7 @@ pub(super) struct Space {
 }
 
 /// Takes every n-th usable Gaussian, enlarged so that surfaces stay closed, without colours.
-pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Gaussians {
+pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Result<Gaussians, ViewpointError> {
     let mut thin = Gaussians::default();
     let grown = (stride as f32).sqrt();
     for i in (0..scene.len()).filter(|i| scene.is_usable(*i)).step_by(stride) {
@@ -52,15 +44,15 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Gaussians {
         thin.opacities.push(scene.opacities[i]);
         thin.sh_dc.push([0.0; 3]);
     }
-    thin
+    let n_solid = thin.opacities.iter().filter(|opacity| **opacity >= MIN_OPACITY).count();
+    if n_solid < MIN_GAUSSIANS {
+        return Err(ViewpointError::Empty { n: n_solid, expected: MIN_GAUSSIANS });
+    }
+    Ok(thin)
 }
 
 impl Space {
-    pub(super) fn new(thin: &Gaussians, up: DVec3) -> Result<Self, ViewpointError> {
-        let n_solid = thin.opacities.iter().filter(|opacity| **opacity >= MIN_OPACITY).count();
-        if n_solid < MIN_GAUSSIANS {
-            return Err(ViewpointError::Empty { n: n_solid, expected: MIN_GAUSSIANS });
-        }
+    pub(super) fn new(thin: &Gaussians, up: DVec3) -> Self {
         let x_axis = longest_side(thin, up);
         let axes = [x_axis, up.cross(x_axis), up];
         let ranges = axes.map(|axis| up::extent(thin, axis).unwrap_or_default());
@@ -68,7 +60,7 @@ impl Space {
         let middle = DVec3::from_array(ranges.map(|(low, high)| 0.5 * (low + high)));
         let world_from_plan = DMat3::from_cols(axes[0], axes[1], axes[2]);
         let scale = size.max_element().max(f64::MIN_POSITIVE) / WIDTH;
-        Ok(Self::placed(thin, world_from_plan, world_from_plan * middle, scale, 0.5 * size / scale))
+        Self::placed(thin, world_from_plan, world_from_plan * middle, scale, 0.5 * size / scale)
     }
 
     /// Brings a scene in world axes into those of the planner, and finds its occupied voxels.
@@ -185,42 +177,6 @@ impl Space {
         };
         let half = self.half;
         along(half.x).flat_map(move |x| along(half.y).map(move |y| (x, y)))
-    }
-
-    pub(super) fn kind(&self, loaded: &dyn LoadedScene) -> Result<SceneKind, RasterError> {
-        let ground = 0.6 * self.half.z - self.half.z;
-        let gap = 0.8 * self.half.z;
-        let (mut n_ground, mut n_overhead, mut n) = (0, 0, 0);
-        for (x, y) in self.lattice(2.0 * VOXEL) {
-            let column: Vec<f64> = self.column(x, y).collect();
-            let is_ground = column.first().is_some_and(|low| *low < ground);
-            n += 1;
-            n_ground += usize::from(is_ground);
-            n_overhead += usize::from(is_ground && column.windows(2).any(|pair| pair[1] - pair[0] > gap));
-        }
-        let overhead = f64::from(n_overhead as u32) / f64::from(n_ground.max(1) as u32);
-        let cameras = (0..N_RING).map(|i| {
-            let angle = std::f64::consts::TAU * i as f64 / N_RING as f64;
-            let eye = DVec3::new(self.half.x * angle.cos(), self.half.y * angle.sin(), 0.0) * 0.9;
-            looks::look_at(eye, DVec3::ZERO)
-        });
-        let holes = cameras.map(|camera| {
-            let look = looks::look(loaded, &self.scene, camera, SceneKind::Outdoor)?;
-            Ok(look.verdict.holes)
-        });
-        let holes = holes.collect::<Result<Vec<f32>, RasterError>>()?.iter().sum::<f32>() / N_RING as f32;
-        let filled = f64::from(n_ground as u32) / f64::from(n.max(1));
-        tracing::debug!(
-            "half {:?}: {overhead:.2} overhead, ground {filled:.2}, ring holes {holes:.2} (covered from {MIN_COVERED})",
-            self.half
-        );
-        Ok(if holes >= MIN_HOLES {
-            SceneKind::Object
-        } else if overhead >= MIN_OVERHEAD {
-            SceneKind::Indoor
-        } else {
-            SceneKind::Outdoor
-        })
     }
 }
 

@@ -6,7 +6,7 @@ use slag_common::Gaussians;
 use slag_math::eigen::eigen_symmetric;
 use slag_math::stats::trimmed_range;
 
-use super::ViewpointError;
+use super::plan::ViewpointError;
 
 /// Directions that are tried, on a half of the sphere: the nearest is within 3 degrees.
 const N_DIRECTIONS: usize = 1000;
