@@ -55,3 +55,4 @@ pub mod segment;
 pub mod shard;
 pub mod store;
 pub(crate) mod view;
+pub mod viewpoints;

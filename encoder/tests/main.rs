@@ -9,6 +9,7 @@ mod lift_extremes;
 mod raster;
 mod segment;
 mod segment_hostile;
+mod viewpoints;
 
 #[global_allocator]
 static ALLOCATOR: slag_test_support::CountingAllocator = slag_test_support::CountingAllocator;

@@ -54,9 +54,22 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     let input = &args.input;
     let mut scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
     input.activated.undo(&mut scene);
-    let mut set = poses::read(&input.views, input.images.as_deref())?;
+    let views = input
+        .views
+        .as_ref()
+        .context("check compares the splat with photos; give their poses with --views")?;
+    let mut set = poses::read(views, input.images.as_deref())?;
     let mut notes = set.notes.clone();
-    let frame = ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?;
+    let drawn_from = ingest::drawn_from(views);
+    if let Some(splat) = &drawn_from {
+        notes.push(format!(
+            "the images are no photos: they were drawn from {splat}, so that they fit says little"
+        ));
+    }
+    let frame = match drawn_from {
+        Some(_) => None,
+        None => ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?,
+    };
     let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;
     if let Some(n) = input.every {
         set = set.every(n);

@@ -104,14 +104,14 @@ pub struct InputArgs {
     #[arg(long, value_name = "FILE", help_heading = "Inputs")]
     pub scene: PathBuf,
     /// Poses: the folder of a COLMAP model, a nerfstudio transforms.json, or a ScanNet scene folder (color/,
-    /// pose/, intrinsic/).
+    /// pose/, intrinsic/). `encode` without them plans views of the splat and draws them in place of photos.
     #[arg(long, value_name = "PATH", help_heading = "Inputs")]
-    pub views: PathBuf,
+    pub views: Option<PathBuf>,
     /// Folder of the photos, if they are not beside the poses.
-    #[arg(long, value_name = "DIR", help_heading = "Inputs")]
+    #[arg(long, value_name = "DIR", requires = "views", help_heading = "Inputs")]
     pub images: Option<PathBuf>,
     /// Takes every Nth frame, counted by the numbers in the file names.
-    #[arg(long, value_name = "N", help_heading = "Inputs")]
+    #[arg(long, value_name = "N", requires = "views", help_heading = "Inputs")]
     pub every: Option<NonZeroU32>,
     /// Says how the splat's frame follows from that of the poses: `auto` for dataparser_transforms.json beside the
     /// splat, where nerfstudio's export lies with the file of its training run; `none` where both have one frame;

@@ -13,6 +13,7 @@ use super::common::{
     Exit, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
     print, profile_parser, warn_of_expiry,
 };
+use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
 use super::next;
 use super::sam::SamArgs;
@@ -22,15 +23,16 @@ use crate::cells::PositionError;
 #[cfg(not(feature = "fleet"))]
 use crate::encode;
 use crate::encode::front::Expectation;
-use crate::encode::{DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, MAX_CELL_GAUSSIANS, Masks};
+use crate::encode::{DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, MAX_CELL_GAUSSIANS, Masks, ViewsLimit};
 use crate::occupancy::OccupancySettings;
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::report::{self, Recorder};
+use crate::viewpoints::{DEFAULT_N_VIEWS, POSES_FILE, ViewpointSettings};
 
 const EXAMPLES: &str = "Examples:\n\
-    \x20 slag-encoder encode --scene splat.ply --views sparse/0 --store STORE\n\
+    \x20 slag-encoder encode --scene splat.ply --store STORE\n\
     \x20 slag-encoder encode --scene splat.ply --views sparse/0 --store STORE --models clip-vit-base-patch32-int8 --text-model\n\
     \x20 slag-encoder encode --scene splat.ply --views transforms.json --store STORE --preset fast --time-budget 60\n";
 
@@ -93,6 +95,8 @@ pub struct EncodeArgs {
     /// memory].
     #[arg(long, value_name = "BYTES", value_parser = parse_memory, help_heading = "Machine")]
     memory: Option<u64>,
+    #[command(flatten)]
+    up: UpArgs,
     /// Name of the scene [default: the name of the store's folder].
     #[arg(long, value_name = "NAME", help_heading = "Output", hide_short_help = true)]
     name: Option<String>,
@@ -162,8 +166,9 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     let beside = input.scene.with_file_name("geo.json");
     let geo = args.geo.clone().or_else(|| beside.is_file().then_some(beside));
     let metric = args.metric || geo.is_some();
-    let mut settings =
-        EncodeSettings::new(input.scene.clone(), input.views.clone(), args.store.clone(), metric);
+    let drawn = || args.store.join("drawn").join(POSES_FILE);
+    let views = input.views.clone().unwrap_or_else(drawn);
+    let mut settings = EncodeSettings::new(input.scene.clone(), views, args.store.clone(), metric);
     let EncodeSettings { inputs, run, .. } = &mut settings;
     inputs.images = input.images.clone();
     inputs.added = args.added.clone();
@@ -180,6 +185,13 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     run.keep_views = args.keep_views || !args.added.is_empty() || !args.dropped.is_empty();
     run.allow_empty = args.allow_empty;
     choices.apply(&mut settings);
+    if input.views.is_none() {
+        let n_views = match settings.run.views_limit {
+            ViewsLimit::Count(n) => n,
+            ViewsLimit::All | ViewsLimit::Share(_) => DEFAULT_N_VIEWS,
+        };
+        settings.inputs.planned = Some(ViewpointSettings { n_views, up: args.up.up });
+    }
     match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
         ("auto", None) => {}
         ("auto", Some(masks)) => settings.view.masks = masks,
@@ -244,6 +256,12 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let next = if json { String::new() } else { next::of_store(&settings.output.store)? };
     print(json, &summary, lines + &next)?;
     warn_of_expiry(&settings.output.store);
+    if summary.n_views_drawn > 0 {
+        let n = summary.n_views_drawn;
+        tracing::warn!(
+            "{n} views are drawings of the splat, not photos; docs/inputs.md says what photos find beyond them"
+        );
+    }
     if let (Some(path), Some(recorder)) = (&args.report, &recorder) {
         fs_err::write(path, report::of_encode(&settings.output.scene_name, &summary, recorder)?)?;
     }

@@ -5,6 +5,7 @@ mod choices;
 pub mod common;
 pub mod devices;
 mod diff;
+pub mod draw;
 mod encode;
 #[cfg(feature = "fleet")]
 mod fleet;
@@ -58,6 +59,8 @@ impl Cli {
             && match &self.command {
                 Command::Check(args) => args.device != DeviceChoice::Cpu,
                 Command::Encode(args) => args.device != DeviceChoice::Cpu,
+                Command::Plan(args) => args.drawing.device != DeviceChoice::Cpu,
+                Command::Draw(args) => args.drawing.device != DeviceChoice::Cpu,
                 #[cfg(feature = "fleet")]
                 Command::Worker(args) => args.device != DeviceChoice::Cpu,
                 Command::Devices => true,
@@ -76,6 +79,13 @@ pub enum Command {
     /// by
     /// --write-frame for `encode --splat-frame`.
     Check(check::CheckArgs),
+    /// Plans views of a splat without photos, and draws them.
+    ///
+    /// Writes images and a transforms.json with a verdict for each: holes, near, haze, large, as shares of the image.
+    /// `encode` without --views does the same by itself.
+    Plan(draw::PlanArgs),
+    /// Draws a splat at given poses: images, and a transforms.json that says so.
+    Draw(draw::DrawArgs),
     /// Encodes a scene into a store.
     Encode(Box<encode::EncodeArgs>),
     /// Does views and cells of an encode that another machine coordinates (`encode --blobs`), until it is
@@ -119,6 +129,8 @@ pub fn run(cli: Cli) -> Exit {
     let progress = progress::shown(cli.output.shows_progress());
     let result = match cli.command {
         Command::Check(args) => check::run(&args, json),
+        Command::Plan(args) => draw::plan(&args, progress.as_ref(), json),
+        Command::Draw(args) => draw::draw(&args, progress.as_ref(), json),
         Command::Encode(args) => encode::run(&args, progress.as_ref(), json),
         #[cfg(feature = "fleet")]
         Command::Worker(args) => fleet::run(&args, json),

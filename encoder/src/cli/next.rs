@@ -56,11 +56,11 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
 
 /// Returns the lines of inputs that fit.
 pub(super) fn of_check(input: &InputArgs) -> String {
+    let views = input.views.as_ref().map_or(String::new(), |path| format!(" --views {}", shell_word(path)));
     let images = input.images.as_ref().map_or(String::new(), |dir| format!(" --images {}", shell_word(dir)));
     format!(
-        "\nnext\n  slag-encoder encode --scene {} --views {}{images} --store STORE\n",
-        shell_word(&input.scene),
-        shell_word(&input.views)
+        "\nnext\n  slag-encoder encode --scene {}{views}{images} --store STORE\n",
+        shell_word(&input.scene)
     )
 }
 

@@ -31,6 +31,12 @@ pub(super) fn lines(
         .map(|(p, b)| format!("{p} {}", ByteSize(*b)))
         .collect::<Vec<_>>()
         .join(", ");
+    let drawn = match summary.n_views_drawn {
+        0 => String::new(),
+        n => format!(
+            "drawn      {n} views are drawings of the splat, no photos: small things and signs may be missed\n"
+        ),
+    };
     let skipped = match summary.skipped_views.len() {
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
@@ -77,7 +83,7 @@ pub(super) fn lines(
     format!(
         "{of_target}published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} of {} ({} resumed)\n{lost}{coverage}{skipped}{encoder}{images_on}\
+         views      {} of {} ({} resumed)\n{drawn}{lost}{coverage}{skipped}{encoder}{images_on}\
          masks      {} in {} regions, {} contributions; {:.1} a photo{}\n\
          cells      {} with {} centroids\n\
          {objects}{occupancy}shards     {sizes}\n\

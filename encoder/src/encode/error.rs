@@ -14,6 +14,7 @@ use crate::memory::MemoryError;
 use crate::raster::RasterError;
 use crate::segment::SegmentError;
 use crate::store::StoreError;
+use crate::viewpoints::{DrawError, ViewpointError};
 
 /// Why an encode ended without a new generation.
 #[derive(Debug, thiserror::Error)]
@@ -34,6 +35,10 @@ pub enum EncodeError {
     Poses(#[from] PoseError),
     #[error(transparent)]
     Geo(#[from] GeoError),
+    #[error(transparent)]
+    Viewpoints(#[from] ViewpointError),
+    #[error(transparent)]
+    Draw(#[from] DrawError),
     #[error(transparent)]
     Ingest(#[from] IngestError),
     #[error(transparent)]

@@ -179,6 +179,7 @@ mod tests {
             views: vec![view],
             missing: Vec::new(),
             geo_reference: None,
+            n_drawn: 0,
         }
     }
 

@@ -33,6 +33,8 @@ pub(crate) struct Inputs {
     /// The views whose photo is missing, in the same order.
     pub(super) missing: Vec<SkippedView>,
     pub(super) geo_reference: Option<GeoReference>,
+    /// Views whose images are drawings of the splat.
+    pub(super) n_drawn: usize,
 }
 
 impl Inputs {
@@ -43,9 +45,13 @@ impl Inputs {
         let options = ReadOptions { with_sh_rest: false };
         let mut scene = context.time("read", || splat::read(&inputs.scene, &options))?;
         inputs.activated.undo(&mut scene);
-        let set = read_views(inputs)?;
+        let (set, n_drawn) = read_views(inputs)?;
         let damaged = set.damaged;
-        let frame = ingest::find_frame(&inputs.scene, &inputs.splat_frame, set.source, set.applied)?;
+        let frame = match ingest::drawn_from(&inputs.views) {
+            // Drawn where the splat is.
+            Some(_) => None,
+            None => ingest::find_frame(&inputs.scene, &inputs.splat_frame, set.source, set.applied)?,
+        };
         if let Some(frame) = frame {
             tracing::info!("{frame}; the splat is brought into the world of the poses");
             frame.to_poses(&mut scene);
@@ -77,7 +83,7 @@ impl Inputs {
             );
             return Err(EncodeError::Setting { setting: "position_error", problem });
         }
-        Ok(Self { scene, split, views, missing, geo_reference })
+        Ok(Self { scene, split, views, missing, geo_reference, n_drawn })
     }
 }
 
@@ -99,16 +105,20 @@ pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work:
 /// Returns the numbers of views with a photo and of Gaussians.
 pub fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeError> {
     let scene = splat::read(&inputs.scene, &ReadOptions { with_sh_rest: false })?;
-    let views = read_views(inputs)?.views;
+    if let Some(planned) = &inputs.planned {
+        return Ok((planned.n_views, scene.len()));
+    }
+    let views = read_views(inputs)?.0.views;
     Ok((views.len() - ingest::missing_images(&views).len(), scene.len()))
 }
 
-/// Reads the poses of every nth frame.
-fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
+/// Reads the poses of every nth frame, and counts those whose images are drawings.
+fn read_views(inputs: &InputSettings) -> Result<(ViewSet, usize), EncodeError> {
     let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;
     set.notes.iter().for_each(|note| tracing::warn!("{note}"));
+    let mut n_drawn = ingest::drawn_from(&inputs.views).map_or(0, |_| set.views.len());
     for path in &inputs.added {
-        add_views(&mut set, &inputs.views, path)?;
+        n_drawn += add_views(&mut set, &inputs.views, path)?;
     }
     if let Some(n) = inputs.every {
         let n_frames = set.views.len() + set.without_pose.len();
@@ -119,11 +129,12 @@ fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
         tracing::info!("{left_out}");
     }
     drop_views(&mut set.views, &inputs.dropped)?;
-    Ok(set)
+    Ok((set, n_drawn))
 }
 
-/// Adds the views of another poses file. `first`: the file of those that are there, for errors.
-fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<(), EncodeError> {
+/// Adds the views of another poses file, and returns how many are drawings. `first`: the file of those that are
+/// there, for errors.
+fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, EncodeError> {
     let added = poses::read(path, None)?;
     if added.applied != set.applied {
         return Err(EncodeError::AddedFrame { first: first.to_owned(), path: path.to_owned() });
@@ -133,11 +144,12 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<(), EncodeE
         let view = view.name.clone();
         return Err(EncodeError::AddedTwice { view, first: first.to_owned(), path: path.to_owned() });
     }
+    let n_drawn = ingest::drawn_from(path).map_or(0, |_| added.views.len());
     set.views.extend(added.views);
     set.views.sort_by(|a, b| a.name.cmp(&b.name));
     set.without_pose.extend(added.without_pose);
     set.without_pose.sort();
-    Ok(())
+    Ok(n_drawn)
 }
 
 /// Leaves out the views of these names.

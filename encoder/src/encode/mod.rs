@@ -2,6 +2,7 @@
 //!
 //! | step | result | file |
 //! |---|---|---|
+//! | draw | planned views of a splat without photos | `drawings.rs` |
 //! | plan | inputs read and checked, memory reserved, the order of views | `plan.rs` |
 //! | run views | a file of contributions per view, in the job's folder | `views.rs`, `view.rs`, `pipeline.rs`, `job.rs` |
 //! | look around | free and occupied places, if they are asked for | `views.rs` |
@@ -18,6 +19,7 @@ mod cell;
 mod cells;
 mod context;
 pub mod coverage;
+mod drawings;
 mod engines;
 mod error;
 mod executor;
@@ -98,6 +100,9 @@ pub(crate) fn encode_by(
     let context = RunContext::new(settings.run.threads, progress, cancel)?;
     // First of all, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.output.store)?;
+    if let Some(planned) = &settings.inputs.planned {
+        drawings::make(settings, planned, engines, &context)?;
+    }
     let inputs = inputs::Inputs::read(settings, &context)?;
     context.begin_phase(Phase::Plan);
     let plan = plan::plan(settings, engines, &store, &inputs, &executor.rasterizer(engines), &context)?;

@@ -275,7 +275,8 @@ mod tests {
         settings.run.memory_bytes = 100_000 * 204;
         let scene = Gaussians { means_in_world: vec![glam::DVec3::ZERO; 100_000], ..Gaussians::default() };
         let split = CellSplit::default();
-        let inputs = Inputs { scene, split, views: Vec::new(), missing: Vec::new(), geo_reference: None };
+        let inputs =
+            Inputs { scene, split, views: Vec::new(), missing: Vec::new(), geo_reference: None, n_drawn: 0 };
         let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
         let engines = Engines::new(&models, &session, &CpuRasterizer);
         let refused =

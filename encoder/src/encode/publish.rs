@@ -140,6 +140,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         n_rejected: manifest.n_rejected,
         n_views: views.used.len(),
         n_views_with_photo: plan.inputs.views.len(),
+        n_views_drawn: plan.inputs.n_drawn,
         view_order: plan.settings.run.view_order,
         coverage: views.coverage,
         coverage_secs: plan.coverage_secs,

@@ -164,6 +164,8 @@ pub struct EncodeSummary {
     pub n_views: usize,
     /// Views whose photo exists.
     pub n_views_with_photo: usize,
+    /// Views whose image is a drawing of the splat, no photo.
+    pub n_views_drawn: usize,
     /// The order in which views were taken.
     pub view_order: ViewOrder,
     /// What the used views show of what all views show, where the order is by coverage.

@@ -18,6 +18,7 @@ use crate::occupancy::OccupancySettings;
 use crate::raster::WeightKind;
 use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
+use crate::viewpoints::ViewpointSettings;
 
 /// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and
 /// no better answers (generated scenes of seeds 601 to 605, and the labelled house).
@@ -52,6 +53,8 @@ pub struct InputSettings {
     pub scene: PathBuf,
     /// The poses: a COLMAP model, a transforms.json or a ScanNet scene folder.
     pub views: PathBuf,
+    /// How views are planned that have no photos; they are drawn, and kept with their poses at `views`.
+    pub planned: Option<ViewpointSettings>,
     /// The photos' folder, where it is not beside the poses.
     pub images: Option<PathBuf>,
     /// Poses of further photos in the same world, which lie where these files say.
@@ -254,6 +257,7 @@ impl EncodeSettings {
             inputs: InputSettings {
                 scene,
                 views,
+                planned: None,
                 images: None,
                 added: Vec::new(),
                 dropped: Vec::new(),

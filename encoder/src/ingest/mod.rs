@@ -1,5 +1,6 @@
 //! Ingest: loads photos as ideal pinhole images of known size.
 
+mod drawn;
 mod geo;
 mod jpeg;
 mod splat_frame;
@@ -15,6 +16,7 @@ use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View};
 
 use jpeg::Damage;
 
+pub use drawn::drawn_from;
 pub use geo::{GeoError, read_geo_reference};
 pub use splat_frame::{Activated, FoundFrame, FrameChoice, find_frame};
 pub use undistort::Undistorter;

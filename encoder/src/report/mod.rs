@@ -36,6 +36,12 @@ pub(crate) fn of_encode(
         summary.wall_secs,
         summary.encoder
     ));
+    if summary.n_views_drawn > 0 {
+        page.paragraph(&format!(
+            "{} of the views are drawings of the splat, no photos.",
+            summary.n_views_drawn
+        ));
+    }
     page.heading("Left out");
     match summary.skipped_views.len() {
         0 => page.paragraph("No view was left out."),

@@ -10,7 +10,7 @@ use slag_encoder::store::StoreReader;
 use std::fmt::Display;
 
 use crate::bench::{load, query, raster, robot, tradeoff};
-use crate::eval::{defaults, encoder, goal, judge, lerf, locate, masks, relations, run, scannet};
+use crate::eval::{defaults, encoder, goal, judge, lerf, locate, masks, relations, run, scannet, splat_only};
 
 /// `eval`.
 #[derive(Debug, Subcommand)]
@@ -19,6 +19,8 @@ pub(crate) enum EvalCommand {
     Labelled(judge::LabelledArgs),
     /// Compares the plain average with the default on labelled scenes, with true and automatic masks.
     Defaults(run::ScenesArgs),
+    /// Compares drawings of planned views with as many photos on labelled scenes, with automatic masks.
+    SplatOnly(run::ScenesArgs),
     /// Judges segmenters without words: by labelled photos, by coverage, and by agreement between views.
     Masks(masks::MasksArgs),
     /// Evaluates a store on LangSplat's labels of LERF scenes (LERF-OVS).
@@ -46,6 +48,7 @@ pub(super) fn eval(command: &EvalCommand, progress: &dyn Progress, json: bool) -
             show(json, &judge::judge(&reader, &truth, &mut *encoder, &args.judge)?, true)
         }
         EvalCommand::Defaults(args) => show(json, &defaults::run(args, progress)?, true),
+        EvalCommand::SplatOnly(args) => show(json, &splat_only::run(args, progress)?, true),
         EvalCommand::Masks(args) => show(json, &masks::run(args, progress)?, true),
         EvalCommand::Lerf(args) => {
             let report = lerf::run(args)?;

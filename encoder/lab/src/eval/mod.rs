@@ -20,4 +20,5 @@ pub(crate) mod relations;
 pub(crate) mod run;
 mod scan;
 pub(crate) mod scannet;
+pub(crate) mod splat_only;
 mod truth;

@@ -1,0 +1,139 @@
+//! The kind of a scene, and cameras in its free places.
+
+use std::f64::consts::{PI, TAU};
+
+use glam::{DAffine3, DVec3};
+
+use super::looks::{look, look_along, look_at};
+use super::plan::SceneKind;
+use super::space::{Space, VOXEL, WIDTH};
+use crate::raster::{LoadedScene, RasterError};
+
+/// Most candidates; each costs a small drawing.
+pub(super) const MOST: usize = 600;
+const N_HEADINGS: usize = 8;
+/// Heights of cameras in a room and how far they look down: height in parts of the room's, radians.
+const INDOOR: [(f64, f64); 2] = [(0.4, 0.05), (0.6, 0.25)];
+/// Free distance around a camera in a room, in parts of its height.
+const CLEARANCE: f64 = 0.12;
+/// Heights of cameras above the ground, in parts of the scene's width, and how far they look down, radians.
+const OUTDOOR: [(f64, f64); 3] = [(0.05, 0.1), (0.1, 0.3), (0.2, 0.6)];
+/// Rings around an object: elevation, radians, and distance in parts of the one from which it fills the image.
+const RINGS: [(f64, f64); 6] = [(-0.2, 1.0), (0.1, 1.0), (0.1, 0.6), (0.45, 1.0), (0.45, 0.6), (0.95, 1.0)];
+const N_AROUND: usize = 24;
+/// Share of the columns with ground that have, above a gap, something overhead, from which a scene is indoor. A yard
+/// has 11 %, a drone scene 23 %.
+const MIN_OVERHEAD: f64 = 0.5;
+/// Share of holes, inward from a ring, from which a scene is a single object.
+const MIN_HOLES: f32 = 0.5;
+const N_RING: usize = 12;
+
+/// Returns what the Gaussians show.
+pub(super) fn kind_of(space: &Space, loaded: &dyn LoadedScene) -> Result<SceneKind, RasterError> {
+    let ground = 0.6 * space.half.z - space.half.z;
+    let gap = 0.8 * space.half.z;
+    let (mut n_ground, mut n_overhead, mut n) = (0, 0, 0);
+    for (x, y) in space.lattice(2.0 * VOXEL) {
+        let column: Vec<f64> = space.column(x, y).collect();
+        let is_ground = column.first().is_some_and(|low| *low < ground);
+        n += 1;
+        n_ground += usize::from(is_ground);
+        n_overhead += usize::from(is_ground && column.windows(2).any(|pair| pair[1] - pair[0] > gap));
+    }
+    let overhead = f64::from(n_overhead as u32) / f64::from(n_ground.max(1) as u32);
+    let cameras = (0..N_RING).map(|i| {
+        let angle = TAU * i as f64 / N_RING as f64;
+        let eye = DVec3::new(space.half.x * angle.cos(), space.half.y * angle.sin(), 0.0) * 0.9;
+        look_at(eye, DVec3::ZERO)
+    });
+    let holes = cameras.map(|camera| {
+        let look = look(loaded, &space.scene, camera, SceneKind::Outdoor)?;
+        Ok(look.verdict.holes)
+    });
+    let holes = holes.collect::<Result<Vec<f32>, RasterError>>()?.iter().sum::<f32>() / N_RING as f32;
+    let filled = f64::from(n_ground as u32) / f64::from(n.max(1));
+    tracing::debug!(
+        "half {:?}: {overhead:.2} overhead, ground {filled:.2}, ring holes {holes:.2}",
+        space.half
+    );
+    Ok(if holes >= MIN_HOLES {
+        SceneKind::Object
+    } else if overhead >= MIN_OVERHEAD {
+        SceneKind::Indoor
+    } else {
+        SceneKind::Outdoor
+    })
+}
+
+pub(super) fn of(kind: SceneKind, space: &Space) -> Vec<DAffine3> {
+    match kind {
+        SceneKind::Indoor => standing(space, INDOOR.len(), indoor_places),
+        SceneKind::Outdoor => standing(space, OUTDOOR.len(), outdoor_places),
+        SceneKind::Object => rings(space),
+    }
+}
+
+/// Returns cameras with all headings at the places of the finest lattice that has few enough.
+fn standing(
+    space: &Space,
+    n_heights: usize,
+    places_of: fn(&Space, f64, f64) -> Vec<(DVec3, f64)>,
+) -> Vec<DAffine3> {
+    let area = 4.0 * space.half.x * space.half.y;
+    let mut step = (area * (n_heights * N_HEADINGS) as f64 / (2.0 * MOST as f64)).sqrt().max(2.0 * VOXEL);
+    let places = loop {
+        let places: Vec<(DVec3, f64)> =
+            space.lattice(step).flat_map(|(x, y)| places_of(space, x, y)).collect();
+        if places.len() * N_HEADINGS <= MOST {
+            break places;
+        }
+        step *= 1.1;
+    };
+    let headings = places.into_iter().enumerate().flat_map(|(number, (at, down))| {
+        (0..N_HEADINGS).map(move |heading| {
+            // Every second place looks between the headings of the others.
+            let angle = TAU * (heading as f64 + 0.5 * (number % 2) as f64) / N_HEADINGS as f64;
+            look_along(at, DVec3::new(angle.cos() * down.cos(), angle.sin() * down.cos(), -down.sin()))
+        })
+    });
+    headings.collect()
+}
+
+/// Returns free places between floor and ceiling, with how far cameras look down there.
+fn indoor_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
+    let height = 2.0 * space.half.z;
+    let places =
+        INDOOR.into_iter().map(|(part, down)| (DVec3::new(x, y, part * height - space.half.z), down));
+    let is_in_room = |at: DVec3| {
+        let above = space.column(x, y).next_back().is_some_and(|high| high > at.z + 0.2 * height);
+        let below = space.column(x, y).next().is_some_and(|low| low < at.z);
+        above && below
+    };
+    places.filter(|(at, _)| is_in_room(*at) && space.is_clear(*at, (CLEARANCE * height).max(VOXEL))).collect()
+}
+
+/// Returns free places above the ground, with how far cameras look down there.
+fn outdoor_places(space: &Space, x: f64, y: f64) -> Vec<(DVec3, f64)> {
+    let Some(ground) = space.column(x, y).next() else { return Vec::new() };
+    let places =
+        OUTDOOR.into_iter().map(|(part, down)| (DVec3::new(x, y, ground + part * WIDTH), down, part));
+    let clear = places.filter(|(at, _, part)| space.is_clear(*at, 0.5 * part.min(0.1) * WIDTH));
+    clear.map(|(at, down, _)| (at, down)).collect()
+}
+
+/// Returns cameras around an object that look at its middle, and at its upper and lower part from near.
+fn rings(space: &Space) -> Vec<DAffine3> {
+    let fills = space.half.length() / (PI / 8.0).sin();
+    let around = RINGS.into_iter().flat_map(|(elevation, part)| {
+        let heights = if part < 1.0 { vec![-0.5, 0.0, 0.5] } else { vec![0.0] };
+        heights.into_iter().flat_map(move |height| (0..N_AROUND).map(move |i| (elevation, part, height, i)))
+    });
+    let camera = |(elevation, part, height, i): (f64, f64, f64, usize)| {
+        let angle = TAU * i as f64 / N_AROUND as f64;
+        let direction =
+            DVec3::new(angle.cos() * elevation.cos(), angle.sin() * elevation.cos(), elevation.sin());
+        let target = DVec3::new(0.0, 0.0, height * space.half.z);
+        look_at(target + direction * fills * part, target)
+    };
+    around.map(camera).collect()
+}

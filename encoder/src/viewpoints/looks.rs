@@ -1,0 +1,147 @@
+//! A small drawing of a candidate: can it be trusted, and which Gaussians does it show?
+
+use glam::{DAffine3, DMat3, DVec3};
+use slag_common::{Distortion, Gaussians, Intrinsics};
+
+use super::plan::{SceneKind, Verdict};
+use super::space::WIDTH;
+use crate::masks::RegionMap;
+use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
+
+/// Size of the drawings, pixels.
+const SIZE_PX: [u32; 2] = [80, 60];
+/// Tangent of half the horizontal field of view, 60 degrees: that of a phone's main camera.
+const HALF_WIDTH: f64 = 0.577_350_269;
+/// Opacity below which a pixel is a hole.
+const MIN_COVERED: f32 = 0.5;
+/// Difference of expected and median depth, relative to the latter, from which a pixel is hazy.
+const HAZY: f64 = 0.15;
+/// Depth below which a pixel is near.
+const NEAR: f64 = 0.035 * WIDTH;
+/// Standard deviation on the screen from which a Gaussian is large: 24 px of a photo 640 px wide.
+const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
+/// Weight of a Gaussian that is seen, pixels of the drawing.
+const MIN_WEIGHT: f32 = 0.05;
+/// Sides from which a Gaussian can be seen, around the vertical.
+const N_SIDES: usize = 8;
+/// Bytes of what a candidate shows: eight a Gaussian, of which a pixel shows few.
+pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
+
+/// What a candidate shows.
+pub(super) struct Look {
+    /// Camera from the planner's axes.
+    pub(super) camera: DAffine3,
+    pub(super) verdict: Verdict,
+    /// Gaussians that are seen, and from which side.
+    pub(super) seen: Vec<(u32, u8)>,
+}
+
+/// Returns the camera at a place that looks along a direction, upright.
+pub(super) fn look_along(eye: DVec3, direction: DVec3) -> DAffine3 {
+    let forward = direction.normalize();
+    let right = forward.cross(DVec3::Z).try_normalize().unwrap_or(DVec3::X);
+    let camera_from_plan = DMat3::from_cols(right, forward.cross(right), forward).transpose();
+    DAffine3 { matrix3: camera_from_plan, translation: -(camera_from_plan * eye) }
+}
+
+pub(super) fn look_at(eye: DVec3, target: DVec3) -> DAffine3 {
+    look_along(eye, target - eye)
+}
+
+/// Returns an ideal camera with the planner's field of view.
+pub(super) fn pinhole(width_px: u32, height_px: u32) -> Intrinsics {
+    let focal_px = 0.5 * f64::from(width_px) / HALF_WIDTH;
+    Intrinsics {
+        width_px,
+        height_px,
+        focal_x_px: focal_px,
+        focal_y_px: focal_px,
+        centre_x_px: 0.5 * f64::from(width_px),
+        centre_y_px: 0.5 * f64::from(height_px),
+        distortion: Distortion::None,
+    }
+}
+
+/// A Gaussian at a pixel.
+#[derive(Clone, Copy)]
+struct Layer {
+    depth: f64,
+    weight: f64,
+}
+
+/// Draws the weight of each Gaussian at each pixel, and judges it.
+pub(super) fn look(
+    loaded: &dyn LoadedScene,
+    scene: &Gaussians,
+    camera: DAffine3,
+    kind: SceneKind,
+) -> Result<Look, RasterError> {
+    let [width_px, height_px] = SIZE_PX;
+    let n_px = width_px * height_px;
+    let regions = RegionMap { width_px, height_px, region_of_pixel: (0..n_px).collect(), n_regions: n_px };
+    let intrinsics = pinhole(width_px, height_px);
+    let view = RasterView { camera_from_world: camera, intrinsics };
+    let weights = loaded.weights(&view, &regions, WeightKind::Blend)?;
+    let eye = camera.inverse().translation;
+    let mut of_pixel: Vec<Vec<Layer>> = vec![Vec::new(); n_px as usize];
+    let (mut large, mut total) = (0.0, 0.0);
+    let mut seen = Vec::new();
+    for entries in weights.entries.chunk_by(|a, b| a.gaussian == b.gaussian) {
+        let gaussian = entries[0].gaussian as usize;
+        let mean = scene.means_in_world[gaussian];
+        let depth = camera.transform_point3(mean).z;
+        let sum: f32 = entries.iter().map(|entry| entry.weight).sum();
+        let scale = f64::from(scene.scales[gaussian].into_iter().fold(0.0, f32::max));
+        total += f64::from(sum);
+        if scale * intrinsics.focal_x_px > LARGE_PX * depth {
+            large += f64::from(sum);
+        }
+        if sum >= MIN_WEIGHT {
+            seen.push((entries[0].gaussian, side(eye - mean)));
+        }
+        for entry in entries {
+            of_pixel[entry.region as usize].push(Layer { depth, weight: entry.weight.into() });
+        }
+    }
+    let near = if kind == SceneKind::Object { 0.0 } else { NEAR };
+    let (mut n_covered, mut n_near, mut n_hazy) = (0u32, 0u32, 0u32);
+    for layers in &mut of_pixel {
+        let Some((expected, median)) = depths(layers) else { continue };
+        n_covered += 1;
+        n_near += u32::from(median < near);
+        n_hazy += u32::from((expected - median).abs() > HAZY * median);
+    }
+    let share = |n: u32, of: u32| n as f32 / of.max(1) as f32;
+    let verdict = Verdict {
+        holes: 1.0 - share(n_covered, n_px),
+        near: share(n_near, n_covered),
+        haze: share(n_hazy, n_covered),
+        large: (large / f64::max(total, f64::MIN_POSITIVE)) as f32,
+    };
+    if verdict.fault(kind).is_some() {
+        seen = Vec::new();
+    }
+    Ok(Look { camera, verdict, seen })
+}
+
+/// Returns expected and median depth of a pixel; `None` for a hole.
+fn depths(layers: &mut [Layer]) -> Option<(f64, f64)> {
+    let total: f64 = layers.iter().map(|layer| layer.weight).sum();
+    if total < f64::from(MIN_COVERED) {
+        return None;
+    }
+    layers.sort_by(|a, b| a.depth.total_cmp(&b.depth));
+    let expected = layers.iter().map(|layer| layer.weight * layer.depth).sum::<f64>() / total;
+    let mut below = 0.0;
+    let median = layers.iter().find(|layer| {
+        below += layer.weight;
+        below >= 0.5 * total
+    });
+    Some((expected, median.map_or(expected, |layer| layer.depth)))
+}
+
+/// Returns the side from which a Gaussian is seen, by the direction to the camera.
+fn side(towards: DVec3) -> u8 {
+    let turns = towards.y.atan2(towards.x) / std::f64::consts::TAU + 0.5;
+    ((turns * N_SIDES as f64) as u8).min(N_SIDES as u8 - 1)
+}

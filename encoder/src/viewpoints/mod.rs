@@ -1,0 +1,187 @@
+//! Viewpoints: where to draw a splat that has no photos, from its Gaussians alone.
+//!
+//! | step | result | file |
+//! |---|---|---|
+//! | up | the upward direction, from the normals of flat Gaussians | `up.rs` |
+//! | space | the scene turned, centred and scaled to a width of 10; its occupied voxels | `space.rs` |
+//! | candidates | the kind of scene; cameras in free places, by kind | `candidates.rs` |
+//! | looks | a small drawing of each candidate: can it be trusted, and which Gaussians does it show? | `looks.rs` |
+//! | choice | those that together show most, greedily | here |
+//! | draw | images, and the poses file that says that they are drawings | `draw.rs` |
+
+mod candidates;
+mod draw;
+mod looks;
+mod plan;
+mod space;
+mod up;
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use glam::DVec3;
+use rayon::prelude::*;
+use slag_common::Gaussians;
+
+use crate::memory::{MemoryPlan, Phase};
+use crate::raster::{RasterError, Rasterizer};
+use looks::Look;
+use space::Space;
+
+pub use draw::{DrawError, DrawnView, POSES_FILE, draw, views_of};
+pub use plan::{Fault, SceneKind, Verdict, Viewpoint, ViewpointError, ViewpointPlan, ViewpointSettings};
+
+/// Views where nothing else is asked for: more find no more (twice as many gain 1 % of average precision).
+pub const DEFAULT_N_VIEWS: usize = 48;
+/// Fewer good candidates than this cannot show a scene from several sides.
+const MIN_GOOD: usize = 12;
+/// Gaussians that suffice for a plan, enlarged: a quarter plans nearly as well as all, a sixteenth does not.
+const ENOUGH_GAUSSIANS: usize = 1 << 18;
+const MAX_STRIDE: usize = 4;
+
+/// Gain of a Gaussian's first, second, third and further view, tenths.
+const GAINS: [u32; 4] = [10, 6, 4, 1];
+/// Gain from a side that no view has shown yet, and from one that a view has shown, fifths.
+const NEW_SIDE: u32 = 5;
+const USED_SIDE: u32 = 2;
+
+/// Plans the views of a scene within `memory_bytes`, the scene's included. The plan does not depend on the number of
+/// threads, nor on the scene's scale.
+///
+/// # Errors
+/// [`ViewpointError`] where views cannot be trusted; it says what to give.
+pub fn plan(
+    scene: &Gaussians,
+    rasterizer: &dyn Rasterizer,
+    settings: &ViewpointSettings,
+    memory_bytes: u64,
+    cancel: &AtomicBool,
+) -> Result<ViewpointPlan, ViewpointError> {
+    let stride = (scene.len() / ENOUGH_GAUSSIANS).clamp(1, MAX_STRIDE);
+    // A column each of means, rotations, scales, opacities and colours, and what candidates show.
+    let mut memory = MemoryPlan::new(memory_bytes);
+    memory.reserve(Phase::Always, "the scene with its colours", scene.len_bytes());
+    let thin_bytes = Gaussians::decoded_bytes(scene.len() / stride, 0) as u64;
+    memory.reserve(Phase::Views, "Gaussians that views are planned by", 2 * thin_bytes);
+    memory.reserve(Phase::Views, "what planned views show", candidates::MOST as u64 * looks::LOOK_BYTES);
+    memory.rest(0)?;
+    let thin = space::thinned(scene, stride)?;
+    let up = match settings.up {
+        Some(up) => {
+            up::Up { axis: up.try_normalize().ok_or(ViewpointError::BadUp(up))?, sign: up::Sign::Known }
+        }
+        None => up::find(&thin)?,
+    };
+    let mut space = Space::new(&thin, up.axis);
+    drop(thin);
+    if up.sign == up::Sign::Unknown && large_from_above(&space, rasterizer)? {
+        space = space.upside_down();
+    }
+    let loaded = rasterizer.load(&space.scene)?;
+    let kind = candidates::kind_of(&space, loaded.as_ref())?;
+    let cameras = candidates::of(kind, &space);
+    let n_candidates = cameras.len();
+    let looked = cameras.into_par_iter().map(|camera| {
+        if cancel.load(Ordering::Relaxed) {
+            return Err(ViewpointError::Interrupted);
+        }
+        Ok(looks::look(loaded.as_ref(), &space.scene, camera, kind)?)
+    });
+    let looked = looked.collect::<Vec<_>>().into_iter().collect::<Result<Vec<Look>, ViewpointError>>()?;
+    let (good, bad): (Vec<Look>, Vec<Look>) =
+        looked.into_iter().partition(|look| look.verdict.fault(kind).is_none());
+    tracing::debug!("{kind}: {n_candidates} candidates, {} good; {}", good.len(), faults(&bad, kind));
+    if good.len() < MIN_GOOD.min(settings.n_views) {
+        return Err(ViewpointError::FewViews {
+            kind,
+            n_good: good.len(),
+            n_candidates,
+            faults: faults(&bad, kind),
+        });
+    }
+    let (chosen, seen) = greedy(&good, space.scene.len(), settings.n_views);
+    let views = chosen.into_iter().map(|at| Viewpoint {
+        camera_from_world: space.camera_from_world(good[at].camera),
+        verdict: good[at].verdict,
+    });
+    Ok(ViewpointPlan {
+        kind,
+        up_in_world: space.up_in_world(),
+        views: views.collect(),
+        n_candidates,
+        n_good: good.len(),
+        seen,
+    })
+}
+
+/// Returns how many views fail for which reason.
+fn faults(bad: &[Look], kind: SceneKind) -> String {
+    let count = |fault| bad.iter().filter(|look| look.verdict.fault(kind) == Some(fault)).count();
+    let all = Fault::ALL.map(|fault| (fault, count(fault)));
+    let told: Vec<String> =
+        all.into_iter().filter(|(_, n)| *n > 0).map(|(fault, n)| format!("{n} {fault}")).collect();
+    told.join(", ")
+}
+
+/// Returns whether the scene seen from above has more of large Gaussians than from below: what no photo has seen, as
+/// the underside of the ground, nothing makes small.
+fn large_from_above(space: &Space, rasterizer: &dyn Rasterizer) -> Result<bool, RasterError> {
+    let loaded = rasterizer.load(&space.scene)?;
+    let large = |sign: f64| {
+        let eye = DVec3::new(0.0, 0.0, sign * (space.half.z + 0.6 * space::WIDTH));
+        let look =
+            looks::look(loaded.as_ref(), &space.scene, looks::look_at(eye, DVec3::ZERO), SceneKind::Outdoor)?;
+        Ok::<_, RasterError>(look.verdict.large)
+    };
+    let (above, below) = (large(1.0)?, large(-1.0)?);
+    tracing::debug!("large from above {above:.2}, from below {below:.2}");
+    Ok(above > below)
+}
+
+/// How often a Gaussian is seen, and from which sides.
+#[derive(Clone, Copy, Default)]
+struct Seen {
+    n_views: u8,
+    sides: u8,
+}
+
+impl Seen {
+    fn gain(self, side: u8) -> u32 {
+        let gain = GAINS[usize::from(self.n_views).min(GAINS.len() - 1)];
+        gain * if self.sides & (1 << side) == 0 { NEW_SIDE } else { USED_SIDE }
+    }
+}
+
+/// Returns at most `n_views` looks, each the one that gains most after those before it, and the share of the Gaussians
+/// seen by any look that they see. Ties go to the first. Gains only fall, so most need not be computed again (Minoux
+/// 1978).
+fn greedy(looks: &[Look], n_gaussians: usize, n_views: usize) -> (Vec<usize>, f64) {
+    let mut state = vec![Seen::default(); n_gaussians];
+    let gain = |state: &[Seen], look: &Look| -> u64 {
+        look.seen.iter().map(|(gaussian, side)| u64::from(state[*gaussian as usize].gain(*side))).sum()
+    };
+    // (gain, first look, how many were chosen when the gain was computed)
+    let mut heap: BinaryHeap<_> =
+        looks.iter().enumerate().map(|(at, look)| (gain(&state, look), Reverse(at), 0)).collect();
+    let mut chosen = Vec::new();
+    while chosen.len() < n_views
+        && let Some((_, Reverse(at), n_then)) = heap.pop()
+    {
+        if n_then != chosen.len() {
+            heap.push((gain(&state, &looks[at]), Reverse(at), chosen.len()));
+            continue;
+        }
+        for (gaussian, side) in &looks[at].seen {
+            let seen = &mut state[*gaussian as usize];
+            seen.n_views = seen.n_views.saturating_add(1);
+            seen.sides |= 1 << side;
+        }
+        chosen.push(at);
+    }
+    let mut by_any = vec![false; n_gaussians];
+    looks.iter().flat_map(|look| &look.seen).for_each(|(gaussian, _)| by_any[*gaussian as usize] = true);
+    let n_any = by_any.iter().filter(|seen| **seen).count();
+    let n_seen = state.iter().filter(|seen| seen.n_views > 0).count();
+    (chosen, n_seen as f64 / n_any.max(1) as f64)
+}

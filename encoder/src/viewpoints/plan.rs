@@ -1,0 +1,158 @@
+//! What a plan consists of, and when a view can be trusted.
+
+use std::fmt;
+
+use glam::{DAffine3, DVec3};
+use serde::Serialize;
+
+use crate::memory::MemoryError;
+use crate::raster::RasterError;
+
+/// Most of each that a view may have, 0 to 1.
+const MAX_HOLES: f32 = 0.1;
+const MAX_NEAR: f32 = 0.2;
+const MAX_HAZE: f32 = 0.15;
+const MAX_LARGE: f32 = 0.7;
+/// An object need not fill the image.
+const MAX_HOLES_OF_OBJECT: f32 = 0.97;
+
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct ViewpointSettings {
+    pub n_views: usize,
+    /// The upward direction, world; found from the Gaussians where absent.
+    pub up: Option<DVec3>,
+}
+
+/// What the Gaussians show.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SceneKind {
+    /// Rooms: something is overhead.
+    Indoor,
+    /// Ground under an open sky.
+    Outdoor,
+    /// A thing with nothing around it.
+    Object,
+}
+
+/// A camera of a plan.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Viewpoint {
+    pub camera_from_world: DAffine3,
+    pub verdict: Verdict,
+}
+
+/// The cameras from which to draw a scene, each the one that shows most after those before it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ViewpointPlan {
+    pub kind: SceneKind,
+    /// Unit, world.
+    pub up_in_world: DVec3,
+    pub views: Vec<Viewpoint>,
+    pub n_candidates: usize,
+    pub n_good: usize,
+    /// Share of the Gaussians that any candidate shows which the views show, 0 to 1.
+    pub seen: f64,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum ViewpointError {
+    #[error(transparent)]
+    Raster(#[from] RasterError),
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
+    #[error(
+        "no views can be planned: {n} Gaussians are opaque and finite, expected at least {expected}; give photos with --views"
+    )]
+    Empty { n: usize, expected: usize },
+    #[error(
+        "the Gaussians do not tell which way is up; give it with --up X,Y,Z, for example --up 0,0,1 where z points up"
+    )]
+    NoUp,
+    #[error("--up {0}: expected three finite numbers, not all 0")]
+    BadUp(DVec3),
+    #[error(
+        "only {n_good} of {n_candidates} planned views of this {kind} scene can be trusted ({faults}); give photos with --views, \
+         remove floaters from the splat, or state its upward direction with --up X,Y,Z"
+    )]
+    FewViews { kind: SceneKind, n_good: usize, n_candidates: usize, faults: String },
+    #[error("interrupted while views were planned; run the same command again")]
+    Interrupted,
+}
+
+impl fmt::Display for SceneKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Indoor => "indoor",
+            Self::Outdoor => "outdoor",
+            Self::Object => "object",
+        })
+    }
+}
+
+impl fmt::Display for ViewpointPlan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let DVec3 { x, y, z } = self.up_in_world;
+        write!(
+            f,
+            "{} views of an {} scene with up ({x:.2}, {y:.2}, {z:.2}), of {} candidates {} good; they show {:.0} % of the \
+             Gaussians that can be seen",
+            self.views.len(),
+            self.kind,
+            self.n_candidates,
+            self.n_good,
+            100.0 * self.seen
+        )
+    }
+}
+
+/// How far a drawing can be trusted; shares of 0 to 1.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Verdict {
+    /// Pixels through which nothing is seen.
+    pub holes: f32,
+    /// Pixels whose surface is too near to be sharp.
+    pub near: f32,
+    /// Pixels whose expected and median depths differ: no clear surface.
+    pub haze: f32,
+    /// Weight of Gaussians that are large on the screen: no detail.
+    pub large: f32,
+}
+
+/// Why a view cannot be trusted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fault {
+    Holes,
+    Near,
+    Haze,
+    Large,
+}
+
+impl Fault {
+    pub(super) const ALL: [Self; 4] = [Self::Holes, Self::Near, Self::Haze, Self::Large];
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Holes => "look into holes",
+            Self::Near => "are too near to something",
+            Self::Haze => "look through haze",
+            Self::Large => "show no detail",
+        })
+    }
+}
+
+impl Verdict {
+    /// Returns why a view is not to be used; `None` if it is good.
+    pub fn fault(&self, kind: SceneKind) -> Option<Fault> {
+        let holes = if kind == SceneKind::Object { MAX_HOLES_OF_OBJECT } else { MAX_HOLES };
+        let limits = [
+            (self.holes, holes, Fault::Holes),
+            (self.near, MAX_NEAR, Fault::Near),
+            (self.haze, MAX_HAZE, Fault::Haze),
+            (self.large, MAX_LARGE, Fault::Large),
+        ];
+        limits.into_iter().find(|(found, limit, _)| found > limit).map(|(.., fault)| fault)
+    }
+}

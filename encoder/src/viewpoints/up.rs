@@ -1,0 +1,155 @@
+//! The upward direction: Gaussians of floors, tables and ceilings are flat, and their normals agree.
+
+use glam::{DMat3, DQuat, DVec3};
+use rayon::prelude::*;
+use slag_common::Gaussians;
+use slag_math::eigen::eigen_symmetric;
+use slag_math::stats::trimmed_range;
+
+use super::plan::ViewpointError;
+
+/// Directions that are tried, on a half of the sphere: the nearest is within 3 degrees.
+const N_DIRECTIONS: usize = 1000;
+/// Cosine of the angle within which normals agree, 8 degrees.
+const AGREE: f64 = 0.990;
+/// Shortest of the axes of a flat Gaussian, relative to the next: 0.3 leaves those of surfaces.
+const FLAT: f64 = 0.3;
+/// Share of the normals that a direction needs.
+const MIN_SUPPORT: f64 = 0.08;
+/// Share, of the best direction's support, from which another direction is as well a surface's.
+const RIVAL: f64 = 0.3;
+/// Least spread, relative to the next, from which no axis is the vertical.
+const MAX_SPREAD: f64 = 0.6;
+/// Gaussians below this opacity are no surface.
+const MIN_OPACITY: f32 = 0.3;
+/// How far the median height lies below the middle, relative to the height, before it tells up from down.
+const MIN_SKEW: f64 = 0.03;
+/// Share that is trimmed at either end of an extent.
+pub(super) const TRIMMED: f64 = 0.02;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Sign {
+    Known,
+    /// The axis may point down.
+    Unknown,
+}
+
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Up {
+    /// Unit.
+    pub(super) axis: DVec3,
+    pub(super) sign: Sign,
+}
+
+/// Finds the vertical: the direction that most normals have; of several alike, as those of walls and floors, the one
+/// along which the scene extends least. Without any, the axis of least spread.
+pub(super) fn find(scene: &Gaussians) -> Result<Up, ViewpointError> {
+    let normals = normals(scene);
+    let total: f64 = normals.iter().map(|(_, weight)| weight).sum();
+    let peaks = if total > 0.0 { peaks(&normals, total) } else { Vec::new() };
+    let best = peaks.first().map_or(0.0, |peak| peak.1);
+    let is_rival = |peak: &&(DVec3, f64)| peak.1 >= RIVAL * best && best >= MIN_SUPPORT;
+    let height = |axis: &DVec3| extent(scene, *axis).map_or(f64::MAX, |(low, high)| high - low);
+    let vertical = peaks.iter().filter(is_rival).map(|(axis, _)| *axis);
+    let of_normals = vertical.min_by(|a, b| height(a).total_cmp(&height(b)));
+    tracing::debug!("normals: {peaks:?}");
+    match of_normals {
+        Some(axis) => Ok(with_sign(scene, axis)),
+        None => {
+            let axis = least_spread(scene).ok_or(ViewpointError::NoUp)?;
+            Ok(Up { axis, sign: Sign::Unknown })
+        }
+    }
+}
+
+/// Returns normals of flat Gaussians, with weights that the largest do not rule.
+fn normals(scene: &Gaussians) -> Vec<(DVec3, f64)> {
+    let is_solid = |i: &usize| scene.opacities[*i] >= MIN_OPACITY;
+    let flat = (0..scene.len()).filter(is_solid).filter_map(|i| {
+        let scales = scene.scales[i].map(f64::from);
+        let mut axes = [0, 1, 2];
+        axes.sort_by(|a, b| scales[*a].total_cmp(&scales[*b]));
+        let [least, next, most] = axes.map(|axis| scales[axis]);
+        let [w, x, y, z] = scene.rotations_wxyz[i].map(f64::from);
+        let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+        (least < FLAT * next).then(|| (rotation.col(axes[0]), next * most))
+    });
+    let mut flat: Vec<(DVec3, f64)> = flat.collect();
+    let mut areas: Vec<f64> = flat.iter().map(|(_, area)| *area).collect();
+    let most = slag_math::stats::median(&mut areas).unwrap_or(0.0) * 4.0;
+    flat.iter_mut().for_each(|(_, area)| *area = area.min(most));
+    flat
+}
+
+/// Returns the directions that most normals have, far from each other, best first, with their share of the weight.
+fn peaks(normals: &[(DVec3, f64)], total: f64) -> Vec<(DVec3, f64)> {
+    // A spiral of equal areas over the upper half of the sphere.
+    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    let direction = |i: usize| {
+        let z = (i as f64 + 0.5) / N_DIRECTIONS as f64;
+        let (radius, angle) = ((1.0 - z * z).sqrt(), golden * i as f64);
+        DVec3::new(radius * angle.cos(), radius * angle.sin(), z)
+    };
+    let support = |axis: DVec3| {
+        let agree = normals.iter().filter(|(normal, _)| normal.dot(axis).abs() >= AGREE);
+        agree.map(|(_, weight)| weight).sum::<f64>() / total
+    };
+    let tried = (0..N_DIRECTIONS).into_par_iter().map(|i| (direction(i), support(direction(i))));
+    let mut tried: Vec<(DVec3, f64)> = tried.collect();
+    tried.sort_by(|a, b| b.1.total_cmp(&a.1));
+    let mut found: Vec<(DVec3, f64)> = Vec::new();
+    for (start, _) in tried {
+        // 37 degrees from another peak.
+        if found.len() < 3 && found.iter().all(|(axis, _)| axis.dot(start).abs() < 0.8) {
+            let axis = (0..4).fold(start, |axis, _| refined(normals, axis));
+            found.push((axis, support(axis)));
+        }
+    }
+    found.sort_by(|a, b| b.1.total_cmp(&a.1));
+    found
+}
+
+/// Returns the mean of the normals that agree with an axis.
+fn refined(normals: &[(DVec3, f64)], axis: DVec3) -> DVec3 {
+    let agree = normals.iter().filter(|(normal, _)| normal.dot(axis).abs() >= AGREE);
+    let sum: DVec3 = agree.map(|(normal, weight)| *normal * normal.dot(axis).signum() * *weight).sum();
+    sum.try_normalize().unwrap_or(axis)
+}
+
+/// Returns the axis along which the Gaussians spread least, if they do so clearly.
+fn least_spread(scene: &Gaussians) -> Option<DVec3> {
+    let n = scene.len().max(1) as f64;
+    let mean = scene.means_in_world.iter().sum::<DVec3>() / n;
+    // Far Gaussians, of a sky, count as one at the edge.
+    let mut distances: Vec<f64> = scene.means_in_world.iter().map(|at| at.distance(mean)).collect();
+    let edge = 2.0 * slag_math::stats::median(&mut distances)?;
+    let mut covariance = DMat3::ZERO;
+    for at in &scene.means_in_world {
+        let offset = (*at - mean).clamp_length_max(edge);
+        covariance += DMat3::from_cols(offset * offset.x, offset * offset.y, offset * offset.z);
+    }
+    let (values, vectors) = eigen_symmetric(covariance.to_cols_array().to_vec(), 3);
+    let axis = DVec3::from_slice(&vectors[6..9]);
+    (values[2].max(0.0).sqrt() < MAX_SPREAD * values[1].max(0.0).sqrt()).then_some(axis)
+}
+
+/// Returns the range of solid Gaussians along an axis, without strays.
+pub(super) fn extent(scene: &Gaussians, axis: DVec3) -> Option<(f64, f64)> {
+    let solid = (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY);
+    let mut along: Vec<f64> = solid.map(|i| scene.means_in_world[i].dot(axis)).collect();
+    trimmed_range(&mut along, TRIMMED)
+}
+
+/// Points an axis upward: things stand on the ground, so that most of a scene lies in the lower half of its height.
+fn with_sign(scene: &Gaussians, axis: DVec3) -> Up {
+    let solid = (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY);
+    let mut heights: Vec<f64> = solid.map(|i| scene.means_in_world[i].dot(axis)).collect();
+    let (Some((low, high)), Some(middle)) = (extent(scene, axis), slag_math::stats::median(&mut heights))
+    else {
+        return Up { axis, sign: Sign::Unknown };
+    };
+    let skew = (0.5 * (low + high) - middle) / (high - low).max(f64::MIN_POSITIVE);
+    tracing::debug!("axis {axis:?}, height {}, skew {skew}", high - low);
+    let sign = if skew.abs() < MIN_SKEW { Sign::Unknown } else { Sign::Known };
+    Up { axis: if skew < 0.0 { -axis } else { axis }, sign }
+}

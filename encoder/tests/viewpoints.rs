@@ -1,0 +1,170 @@
+//! Planned views of splats without photos.
+
+use std::sync::atomic::AtomicBool;
+
+use glam::{DQuat, DVec3};
+use slag_common::Gaussians;
+use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
+use slag_encoder::ingest::drawn_from;
+use slag_encoder::progress::Silent;
+use slag_encoder::raster::CpuRasterizer;
+use slag_encoder::viewpoints::{
+    POSES_FILE, SceneKind, ViewpointError, ViewpointPlan, ViewpointSettings, plan,
+};
+use slag_lab::generate::{Scene, grammar};
+use slag_math::random::Random;
+use slag_models::{ModelDir, SessionOptions};
+
+/// Distance between the Gaussians of a surface.
+const SPACING: f64 = 0.1;
+
+/// Adds a flat Gaussian every 0.1 units of a rectangle.
+fn add_rectangle(scene: &mut Gaussians, corner: DVec3, a: DVec3, b: DVec3) {
+    let rotation = DQuat::from_rotation_arc(DVec3::Z, a.cross(b).normalize());
+    let n = [a, b].map(|side| (side.length() / SPACING).round() as i32);
+    for (i, j) in (0..n[0]).flat_map(|i| (0..n[1]).map(move |j| (i, j))) {
+        let at = |k: i32, n: i32| (f64::from(k) + 0.5) / f64::from(n);
+        scene.means_in_world.push(corner + a * at(i, n[0]) + b * at(j, n[1]));
+        scene.rotations_wxyz.push([rotation.w, rotation.x, rotation.y, rotation.z].map(|q| q as f32));
+        scene.scales.push([0.07, 0.07, 0.002]);
+        scene.opacities.push(0.97);
+        scene.sh_dc.push([0.1; 3]);
+    }
+}
+
+/// A closed room of 6 x 4 x 2.6, z up, with three tables.
+fn room() -> Gaussians {
+    let mut scene = Gaussians::default();
+    let (x, y, z) = (DVec3::X * 6.0, DVec3::Y * 4.0, DVec3::Z * 2.6);
+    for (corner, a, b) in [(DVec3::ZERO, x, y), (DVec3::ZERO, x, z), (DVec3::ZERO, y, z)] {
+        add_rectangle(&mut scene, corner, a, b);
+        add_rectangle(&mut scene, x + y + z - a - b, a, b);
+    }
+    for at in [DVec3::new(1.0, 1.0, 0.0), DVec3::new(3.5, 2.0, 0.0), DVec3::new(4.6, 0.4, 0.0)] {
+        add_rectangle(&mut scene, at + DVec3::Z * 0.7, DVec3::X, DVec3::Y);
+        add_rectangle(&mut scene, at, DVec3::X, DVec3::Z * 0.7);
+        add_rectangle(&mut scene, at, DVec3::Y, DVec3::Z * 0.7);
+    }
+    scene
+}
+
+/// Moves a scene: turned, then scaled, then shifted.
+fn moved(scene: &Gaussians, turn: DQuat, scale: f64, shift: DVec3) -> Gaussians {
+    let turned = |[w, x, y, z]: [f32; 4]| {
+        let q = turn * DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());
+        [q.w, q.x, q.y, q.z].map(|v| v as f32)
+    };
+    Gaussians {
+        means_in_world: scene.means_in_world.iter().map(|at| turn * *at * scale + shift).collect(),
+        rotations_wxyz: scene.rotations_wxyz.iter().map(|rotation| turned(*rotation)).collect(),
+        scales: scene.scales.iter().map(|s| s.map(|s| (f64::from(s) * scale) as f32)).collect(),
+        ..scene.clone()
+    }
+}
+
+fn plan_of(scene: &Gaussians, up: Option<DVec3>) -> Result<ViewpointPlan, ViewpointError> {
+    let settings = ViewpointSettings { n_views: 16, up };
+    plan(scene, &CpuRasterizer, &settings, 1 << 30, &AtomicBool::new(false))
+}
+
+/// Oracle: the room's walls, and what is up in it.
+#[test]
+fn views_of_a_room_are_in_the_room_upright_for_any_number_of_threads() {
+    let scene = room();
+    let with = |n_threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().unwrap();
+        pool.install(|| plan_of(&scene, None)).unwrap()
+    };
+    let plan = with(1);
+    assert_eq!(plan, with(3));
+    assert_eq!((plan.kind, plan.views.len()), (SceneKind::Indoor, 16));
+    assert!(plan.up_in_world.dot(DVec3::Z) > 0.9998, "{:?}", plan.up_in_world);
+    assert!(plan.seen > 0.9, "{}", plan.seen);
+    for view in &plan.views {
+        let at = view.camera_from_world.inverse().translation;
+        assert!(at.cmpgt(DVec3::ZERO).all() && at.cmplt(DVec3::new(6.0, 4.0, 2.6)).all(), "{at:?}");
+        // Rows of the rotation are the camera's axes in the world; y is down.
+        assert!(view.camera_from_world.matrix3.row(1).z < -0.8);
+        assert_eq!(view.verdict.fault(plan.kind), None);
+    }
+}
+
+/// However a scene is turned, up is up; however it is scaled, the views are the same.
+#[test]
+fn plans_follow_the_scene() {
+    let mut random = Random::new(48);
+    let scene = room();
+    for _ in 0..3 {
+        let axis =
+            DVec3::from_slice(&random.unit_vector(3).iter().map(|v| f64::from(*v)).collect::<Vec<_>>());
+        let turn = DQuat::from_axis_angle(axis.normalize(), random.between(0.0, 6.0));
+        let plan = plan_of(&moved(&scene, turn, 1.0, axis * 30.0), None).unwrap();
+        let up = turn * DVec3::Z;
+        assert!(plan.up_in_world.dot(up) > 0.9998, "{:?}, not {up:?}", plan.up_in_world);
+    }
+    let plan = plan_of(&scene, None).unwrap();
+    let (scale, shift) = (0.37, DVec3::new(5.0, -2.0, 1.0));
+    let scaled = plan_of(&moved(&scene, DQuat::IDENTITY, scale, shift), None).unwrap();
+    for (a, b) in plan.views.iter().zip(&scaled.views) {
+        let [a, b] = [a, b].map(|view| view.camera_from_world.inverse());
+        assert!(a.matrix3.abs_diff_eq(b.matrix3, 1e-5), "{a:?} {b:?}");
+        assert!((a.translation * scale + shift).abs_diff_eq(b.translation, 1e-4), "{a:?} {b:?}");
+    }
+}
+
+/// What cannot be planned is refused, and the message says what to give.
+#[test]
+fn splats_that_tell_too_little_are_refused() {
+    let refused = |scene: &Gaussians, up| plan_of(scene, up).expect_err("refused").to_string();
+    assert!(refused(&Gaussians::default(), None).contains("--views"));
+    let mut random = Random::new(7);
+    let mut fog = Gaussians::default();
+    for _ in 0..6000 {
+        let at = [0; 3].map(|_| random.between(-1.0, 1.0));
+        fog.means_in_world.push(DVec3::from(at).normalize_or_zero() * random.unit());
+        fog.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        fog.scales.push([0.03; 3]);
+        fog.opacities.push(0.4);
+        fog.sh_dc.push([0.0; 3]);
+    }
+    assert!(refused(&fog, None).contains("--up"));
+    // Floaters in all free places of the room.
+    let mut floaters = room();
+    for _ in 0..3000 {
+        let at = [6.0, 4.0, 2.6].map(|side| random.between(0.0, side));
+        floaters.means_in_world.push(at.into());
+        floaters.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        floaters.scales.push([0.08; 3]);
+        floaters.opacities.push(0.25);
+        floaters.sh_dc.push([0.0; 3]);
+    }
+    let message = refused(&floaters, Some(DVec3::Z));
+    assert!(message.contains("haze") && message.contains("--views"), "{message}");
+}
+
+/// A generated room without its photos becomes a store, whose summary and poses say that its images are drawings.
+#[test]
+fn a_splat_alone_is_encoded() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut room = Scene::new(&[grammar::SceneKind::Room], 1, 3, &grammar::nouns(None).unwrap());
+    let files = room.write(folder.path(), &Silent).unwrap();
+    let store = folder.path().join("store");
+    let poses = store.join("drawn").join(POSES_FILE);
+    let mut settings = EncodeSettings::new(files.scene.clone(), poses.clone(), store, true);
+    settings.inputs.planned = Some(ViewpointSettings { n_views: 6, up: None });
+    settings.view.masks = Masks::Graph;
+    settings.run.keep_views = true;
+    let (models, session) = (ModelDir::colours(), SessionOptions::new("".into()));
+    let engines = Engines::new(&models, &session, &CpuRasterizer);
+    let encode =
+        |settings: &EncodeSettings| encode::encode(settings, &engines, &Silent, &false.into()).unwrap();
+    let first = encode(&settings);
+    assert_eq!((first.n_views, first.n_views_drawn, first.n_views_resumed), (6, 6, 0));
+    assert!(first.n_masks > 6 && first.n_without_evidence < first.n_gaussians / 2, "{first:?}");
+    assert_eq!(drawn_from(&poses).as_deref(), Some("scene.ply"));
+    assert_eq!(drawn_from(&files.views), None);
+    // The same plan is not made twice; another one is.
+    assert_eq!(encode(&settings).n_views_resumed, 6);
+    settings.inputs.planned = Some(ViewpointSettings { n_views: 7, up: None });
+    assert_eq!(encode(&settings).n_views, 7);
+}
