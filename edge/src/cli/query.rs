@@ -44,8 +44,8 @@ pub struct QueryArgs {
     /// Least score of a match: a cosine, or with negatives a relevancy [default: the scene's; 0.5].
     #[arg(long, allow_hyphen_values = true)]
     pub threshold: Option<f32>,
-    /// Kind of answers: objects, clusters or gaussians [default: objects if the scene has them, else
-    /// clusters].
+    /// Kind of answers: objects, clusters or gaussians [default: objects, and clusters for what no object
+    /// answers].
     #[arg(long)]
     pub kind: Option<AnswerKind>,
     /// Edge of the voxels used for clustering, world units [default: 0.25 m, or the scene's].

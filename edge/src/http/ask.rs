@@ -26,7 +26,7 @@ pub struct AskParams {
     #[serde(default)]
     #[schemars(with = "Vec<Words>", length(max = MAX_NEGATIVES), example = ["wall, floor"])]
     negative: Vec<String>,
-    /// Kind of answers; by default objects where the scene has them, else clusters.
+    /// Kind of answers; by default objects, and clusters for what no object answers.
     #[schemars(example = &"objects")]
     kind: Option<AnswerKind>,
     /// Most answers to a text. Over all texts at most 10,000, or 1,000,000 Gaussians that come at once.

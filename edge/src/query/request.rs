@@ -211,7 +211,7 @@ pub struct QueryRequest {
     pub heading_rad: Option<f64>,
     /// The part of space to search.
     pub region: Region,
-    /// Kind of answers; if absent, objects where the scene has them, else clusters.
+    /// Kind of answers; if absent, objects, and clusters for a question that no object answers.
     pub kind: Option<AnswerKind>,
     /// Edge of the voxels used for clustering, world units; the scene's own if absent.
     pub voxel: Option<f64>,

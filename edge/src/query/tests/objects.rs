@@ -70,10 +70,30 @@ fn objects_answer_first_and_once() {
     assert_eq!(clusters_of(&scene), clusters_of(&without.map(|thing| thing.build(false))));
 }
 
+/// By hand: the best object has 0.8, the best Gaussians 0.9.
+#[test]
+fn what_no_object_answers_clusters_do() {
+    let scene = scene_of_objects();
+    let ask_above = |threshold, kind| {
+        ask(&scene, |request, _| (request.threshold, request.kind) = (Some(threshold), kind))
+    };
+    assert_eq!(ask_above(0.7, None).kind, AnswerKind::Objects);
+    let found = ask_above(0.89, None);
+    assert!(!found.answers.is_empty());
+    assert_eq!(found, ask_above(0.89, Some(AnswerKind::Clusters)));
+    let reason = ask_above(0.95, None).reason.expect("no answer").detail;
+    assert!(reason.contains("no object reaches 0.95") && reason.contains("no Gaussian of the"), "{reason}");
+}
+
 #[test]
 fn objects_abstain_and_keep_to_the_region() {
     let scene = scene_of_objects();
-    let ask_objects = |edit: &dyn Fn(&mut QueryRequest)| ask(&scene, |request, _| edit(request));
+    let ask_objects = |edit: &dyn Fn(&mut QueryRequest)| {
+        ask(&scene, |request, _| {
+            request.kind = Some(AnswerKind::Objects);
+            edit(request);
+        })
+    };
     // Below the threshold: the reason names the best object and its position.
     let answers = ask_objects(&|request| request.threshold = Some(0.9));
     let reason = answers.reason.as_ref().expect("no answer");
