@@ -44,8 +44,7 @@ impl SceneRenderer<'_> {
 
 impl Renderer for SceneRenderer<'_> {
     fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering> {
-        let told = |error: &RasterError| tracing::warn!("a pose is not verified: {error}");
-        self.draw(camera_from_world, intrinsics).inspect_err(told).ok()
+        self.draw(camera_from_world, intrinsics).ok()
     }
 }
 

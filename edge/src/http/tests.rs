@@ -28,7 +28,6 @@ mod answers;
 mod attacks;
 mod changes;
 mod goal;
-mod locate;
 mod openapi;
 mod ply;
 mod v1;
