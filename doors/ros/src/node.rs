@@ -33,6 +33,8 @@ const KEPT: usize = 4;
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
 /// Longest wait until a goal is cancelled.
 const STOP_TIMEOUT: Duration = Duration::from_secs(3);
+/// Time for what was written last to leave the process.
+const SEND_TIME: Duration = Duration::from_millis(500);
 /// Time between looks whether the robot's program answers.
 const WATCH_PERIOD: Duration = Duration::from_secs(5);
 /// Pause after a failed read, so that a broken topic does not burn the CPU.
@@ -249,6 +251,8 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     stop.await;
     if let Some(navigation) = &watched.navigation {
         navigation.stop().await;
+        // DDS sends in the background: a call to cancel must not end with the process.
+        tokio::time::sleep(SEND_TIME).await;
     }
     Ok(())
 }
