@@ -57,6 +57,12 @@ pub struct Landmarks<'a> {
 }
 
 impl<'a> Landmarks<'a> {
+    /// Returns the number of landmarks.
+    #[expect(clippy::len_without_is_empty, reason = "a shard without landmarks has no such sections")]
+    pub fn len(&self) -> usize {
+        self.records.len()
+    }
+
     pub fn iter(&self) -> impl Iterator<Item = Landmark> + use<'a> {
         let (origin, step) = (DVec3::from(self.header.origin_in_world), DVec3::from(self.header.step));
         self.records.iter().map(move |record| Landmark {

@@ -1,31 +1,34 @@
 //! Finds the camera of a photo by the landmarks on board.
 
-use std::path::{Path, PathBuf};
+use std::io::Cursor;
 
 use glam::{DMat3, DQuat, DVec3};
-use image::{ImageReader, Limits};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader};
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::frames::Geographic;
 use slag_common::{Distortion, Intrinsics};
-use slag_locate::{CODE_VERSION, Grey, Located, Map, Outcome, Photo, locate};
+use slag_locate::{
+    CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, locate, map_bytes, working_bytes,
+};
 
 use crate::store::Snapshot;
 
-/// Largest side of a photo, pixels, and the bytes that decoding it may take.
+/// Longest file of a photo.
+pub const MAX_PHOTO_BYTES: usize = 32 << 20;
+/// Largest side of a photo, pixels, and most pixels.
 const MAX_SIDE_PX: u32 = 16_384;
-const MAX_DECODE_BYTES: u64 = 512 << 20;
+const MAX_PX: u64 = 50_000_000;
 
 /// Why a photo cannot be located at all.
 #[derive(Debug, thiserror::Error)]
 pub enum LocateError {
-    #[error("{0}; check that the file exists and may be read")]
-    Io(#[from] std::io::Error),
-    #[error("{}: {source}; give a JPEG, PNG or WebP of at most {MAX_SIDE_PX} pixels a side", path.display())]
-    Decode {
-        path: PathBuf,
-        #[source]
-        source: image::ImageError,
-    },
+    #[error("no photo: {0}; give a JPEG, PNG or WebP")]
+    Decode(#[from] ImageError),
+    #[error(
+        "the photo has {width} x {height} pixels, expected at most {MAX_SIDE_PX} a side and {MAX_PX} in all"
+    )]
+    TooLarge { width: u32, height: u32 },
     #[error(
         "cell {cell_id} has landmarks of version {found}, this program matches version {CODE_VERSION}; use a program of the matching version, or encode again"
     )]
@@ -39,27 +42,87 @@ pub struct Camera {
     pub centre_px: Option<[f64; 2]>,
     /// Direction of gravity in the camera's frame (x right, y down, z forward).
     pub gravity: Option<DVec3>,
+    /// Where it may be.
+    pub prior: Option<Prior>,
 }
 
-#[derive(Clone, Debug, PartialEq, Serialize)]
+/// Where the camera is.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(tag = "state", rename_all = "lowercase")]
 pub enum Answer {
-    Found {
-        /// The camera, world frame; east, north, up of the scene's origin if it has one.
-        position_in_world: [f64; 3],
-        /// World from camera with REP-103's axes (x forward, y left, z up).
-        rotation_xyzw: [f64; 4],
-        /// World from camera with the axes of images (x right, y down, z forward).
-        optical_rotation_xyzw: [f64; 4],
-        /// Of x, y, z and rotations about the world's x, y, z; square world units and square radians, row by row.
-        covariance: Vec<f64>,
-        n_inliers: usize,
-        #[serde(skip_serializing_if = "Option::is_none")]
-        geographic: Option<Geographic>,
+    /// One pose agrees with enough landmarks.
+    Found(Pose),
+    /// Poses that agree with some landmarks: too few, or as many as another place does.
+    Unsure {
+        /// Why none is the answer.
+        reason: String,
+        /// Best first.
+        candidates: Vec<Pose>,
     },
+    /// The photo has no place here.
     Lost {
+        /// Why.
         reason: String,
     },
+}
+
+/// Pose of a camera.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+pub struct Pose {
+    /// The camera, world frame; east, north, up of the scene's origin if it has one.
+    pub position_in_world: [f64; 3],
+    /// World from camera with the axes of REP-103 (x forward, y left, z up): x, y, z, w.
+    pub rotation_xyzw: [f64; 4],
+    /// World from camera with the axes of images (x right, y down, z forward): x, y, z, w.
+    pub optical_rotation_xyzw: [f64; 4],
+    /// Of x, y, z and rotations about the world's x, y, z, row by row: 36 numbers, square world units and radians.
+    pub covariance: Vec<f64>,
+    /// Landmarks that agree with the pose.
+    pub n_inliers: usize,
+    /// The same on the earth, where the scene has a geo-reference.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub geographic: Option<Geographic>,
+}
+
+/// A photo whose size is known, and whose pixels are not read yet.
+pub struct PhotoFile<'a> {
+    decoder: Box<dyn ImageDecoder + 'a>,
+}
+
+impl<'a> PhotoFile<'a> {
+    /// Reads the head of a JPEG, PNG or WebP.
+    ///
+    /// # Errors
+    /// The bytes are no such picture, or one that is too large.
+    pub fn open(bytes: &'a [u8]) -> Result<Self, LocateError> {
+        let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(ImageError::from)?;
+        let decoder: Box<dyn ImageDecoder + 'a> = Box::new(reader.into_decoder()?);
+        let (width, height) = decoder.dimensions();
+        if width.max(height) > MAX_SIDE_PX || u64::from(width) * u64::from(height) > MAX_PX {
+            return Err(LocateError::TooLarge { width, height });
+        }
+        Ok(Self { decoder })
+    }
+
+    /// Returns the bytes that locating it takes at most, besides those of the map.
+    pub fn working_bytes(&self) -> usize {
+        let (width, height) = self.decoder.dimensions();
+        let n_px = width as usize * height as usize;
+        // Decoding: pixels as they are stored, as RGB, and a progressive JPEG's coefficients. Then grey.
+        let decoding = self.decoder.total_bytes() as usize + n_px * (3 + 6);
+        decoding.max(n_px * size_of::<f32>() + working_bytes(width as usize, height as usize))
+    }
+
+    fn grey(self) -> Result<Grey, LocateError> {
+        let rgb = DynamicImage::from_decoder(self.decoder)?.into_rgb8();
+        Ok(Grey::from_rgb8(rgb.width() as usize, rgb.height() as usize, rgb.as_raw()))
+    }
+}
+
+/// Returns the bytes that the landmarks on board take as a map.
+pub fn map_working_bytes(snapshot: &Snapshot) -> usize {
+    let landmarks = snapshot.shards.iter().filter_map(|shard| shard.landmarks());
+    map_bytes(landmarks.map(|landmarks| landmarks.len()).sum())
 }
 
 /// Returns the landmarks on board.
@@ -80,9 +143,9 @@ pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
 ///
 /// # Errors
 /// [`LocateError`]. A photo that shows another place is no error: its answer is [`Answer::Lost`].
-pub fn answer(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer, LocateError> {
+pub fn answer(snapshot: &Snapshot, photo: PhotoFile<'_>, camera: &Camera) -> Result<Answer, LocateError> {
     let map = map_on_board(snapshot)?;
-    let grey = read(photo)?;
+    let grey = photo.grey()?;
     let (width, height) = (grey.width as f64, grey.height as f64);
     let [centre_x_px, centre_y_px] = camera.centre_px.unwrap_or([width / 2.0, height / 2.0]);
     let intrinsics = Intrinsics {
@@ -94,40 +157,38 @@ pub fn answer(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answ
         centre_y_px,
         distortion: Distortion::None,
     };
-    let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: camera.gravity };
+    let (gravity_in_camera, prior) = (camera.gravity, camera.prior);
+    let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera, prior };
+    let pose = |located: &Located| Pose::of(snapshot, located);
     Ok(match locate(&map, &photo, None) {
-        Outcome::Found(found) => found_answer(snapshot, &found),
+        Outcome::Found(found) => Answer::Found(pose(&found)),
+        Outcome::Unsure(candidates) => {
+            let reason = match candidates.len() {
+                1 => "too few landmarks agree with the best pose",
+                _ => "poses in several places agree with the photo",
+            };
+            Answer::Unsure { reason: reason.into(), candidates: candidates.iter().map(pose).collect() }
+        }
         Outcome::Lost(reason) => Answer::Lost { reason: reason.to_string() },
     })
 }
 
-fn found_answer(snapshot: &Snapshot, found: &Located) -> Answer {
-    let world_from_camera = found.camera_from_world.inverse();
-    // Of the image's axes: forward is z, left is -x, up is -y.
-    let camera_from_body = DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y);
-    let rotation = |matrix: DMat3| DQuat::from_mat3(&matrix).normalize().to_array();
-    let at = world_from_camera.translation;
-    Answer::Found {
-        position_in_world: at.to_array(),
-        rotation_xyzw: rotation(world_from_camera.matrix3 * camera_from_body),
-        optical_rotation_xyzw: rotation(world_from_camera.matrix3),
-        covariance: found.covariance.to_vec(),
-        n_inliers: found.n_inliers,
-        geographic: snapshot.manifest.geo_reference.map(|geo| geo.geographic_from_world(at)),
+impl Pose {
+    fn of(snapshot: &Snapshot, located: &Located) -> Self {
+        let world_from_camera = located.camera_from_world.inverse();
+        // Of the image's axes: forward is z, left is -x, up is -y.
+        let camera_from_body = DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y);
+        let rotation = |matrix: DMat3| DQuat::from_mat3(&matrix).normalize().to_array();
+        let at = world_from_camera.translation;
+        Self {
+            position_in_world: at.to_array(),
+            rotation_xyzw: rotation(world_from_camera.matrix3 * camera_from_body),
+            optical_rotation_xyzw: rotation(world_from_camera.matrix3),
+            covariance: located.covariance.to_vec(),
+            n_inliers: located.n_inliers,
+            geographic: snapshot.manifest.geo_reference.map(|geo| geo.geographic_from_world(at)),
+        }
     }
-}
-
-fn read(path: &Path) -> Result<Grey, LocateError> {
-    let mut reader =
-        ImageReader::new(std::io::BufReader::new(fs_err::File::open(path)?)).with_guessed_format()?;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_SIDE_PX);
-    limits.max_image_height = Some(MAX_SIDE_PX);
-    limits.max_alloc = Some(MAX_DECODE_BYTES);
-    reader.limits(limits);
-    let decoded = reader.decode().map_err(|source| LocateError::Decode { path: path.to_owned(), source })?;
-    let rgb = decoded.into_rgb8();
-    Ok(Grey::from_rgb8(rgb.width() as usize, rgb.height() as usize, rgb.as_raw()))
 }
 
 #[cfg(test)]

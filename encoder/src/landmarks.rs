@@ -44,7 +44,8 @@ impl SceneRenderer<'_> {
 
 impl Renderer for SceneRenderer<'_> {
     fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering> {
-        self.draw(camera_from_world, intrinsics).ok()
+        let told = |error: &RasterError| tracing::warn!("a pose is not verified: {error}");
+        self.draw(camera_from_world, intrinsics).inspect_err(told).ok()
     }
 }
 

@@ -7,6 +7,7 @@ use slag_common::Intrinsics;
 use slag_common::landmarks::Landmark;
 
 use crate::code::{Code, distance};
+use crate::map::middle;
 use crate::pose::Pinhole;
 
 /// Views that a view's points are looked for in: those that look at places nearest to its own.
@@ -41,7 +42,10 @@ type Ranked = (usize, Vec<(usize, usize)>);
 /// A point that several views show is taken once.
 pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
     let finders: Vec<Finder<'_>> = views.iter().map(Finder::new).collect();
-    let middles: Vec<DVec3> = views.iter().map(middle).collect();
+    let middles: Vec<DVec3> = views
+        .iter()
+        .map(|view| middle(view.observations.iter().map(|o| o.point_in_world).collect()))
+        .collect();
     let mut chosen: Vec<Vec<bool>> = views.iter().map(|view| vec![false; view.observations.len()]).collect();
     let mut hidden = chosen.clone();
     // By view: observations with the others that show the same point, those with most first.
@@ -85,15 +89,6 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
             return landmarks;
         }
     }
-}
-
-/// Returns the median of what a view sees.
-fn middle(view: &MappingView) -> DVec3 {
-    DVec3::from([0, 1, 2].map(|axis| {
-        let mut values: Vec<f64> = view.observations.iter().map(|o| o.point_in_world[axis]).collect();
-        values.sort_by(f64::total_cmp);
-        values.get(values.len() / 2).copied().unwrap_or(0.0)
-    }))
 }
 
 /// Finds the feature of a view at a place.

@@ -18,8 +18,9 @@ pub fn code(descriptor: &Descriptor) -> Code {
     let mut centred = *descriptor;
     centred.iter_mut().zip(mean).for_each(|(v, m)| *v -= f32::from(*m) * MEAN_STEP);
     let bit = |direction: &[u8]| {
-        let product: f32 = direction.iter().zip(&centred).map(|(d, v)| f32::from(*d as i8) * v).sum();
-        u128::from(product > 0.0)
+        let mut along = [0.0; DIM];
+        along.iter_mut().zip(direction).for_each(|(a, d)| *a = f32::from(*d as i8));
+        u128::from(slag_math::dot(&along, &centred) > 0.0)
     };
     directions.chunks_exact(DIM).enumerate().map(|(at, direction)| bit(direction) << at).sum()
 }

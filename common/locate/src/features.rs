@@ -10,15 +10,15 @@ const SCALES: usize = 3;
 const SIGMA: f32 = 1.6;
 /// Blur that a photo is taken to have, pixels.
 const CAMERA_SIGMA: f32 = 0.5;
-/// Least contrast of a keypoint, of 0..=1. Lowe has 0.03 for the interpolated difference; half of it leaves enough
-/// keypoints on plain walls, and [`Settings::limit`] the strongest.
-const MIN_CONTRAST: f32 = 0.015;
+/// Least contrast of a keypoint, of 0..=1. Lowe has 0.03; on plain walls of rooms most keypoints that two photos share
+/// are weaker, and elsewhere the strongest are taken.
+const MIN_CONTRAST: f32 = 0.0067;
 /// Largest ratio of the principal curvatures: above it lies an edge (Lowe 2004, 4.1).
 const MAX_CURVATURE_RATIO: f32 = 10.0;
 /// Pixels at the border of each octave without keypoints.
 const BORDER: usize = 5;
 const MAX_STEPS: usize = 5;
-/// Pixels up to which a photo keeps its size: the pictures of its largest octave take 96 bytes a pixel.
+/// Pixels up to which a photo keeps its size: see [`working_bytes`].
 const MAX_PX: usize = 1_500_000;
 /// Shortest side of an octave, pixels.
 const MIN_SIDE: usize = 16;
@@ -48,8 +48,12 @@ pub(crate) struct Keypoint {
     pub(crate) contrast: f32,
 }
 
-/// A keypoint, the photo's pixels that one of its octave has, and its descriptors with their angles.
-type Described = (Keypoint, f32, Vec<(f32, Descriptor)>);
+/// The pictures of an octave.
+struct Octave {
+    layers: Vec<Grey>,
+    /// Width of its pixels, in the photo's.
+    pixel: f32,
+}
 
 /// Returns the strongest `limit` features of a photo, strongest first; ties by position.
 pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
@@ -61,34 +65,45 @@ pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
     let first = (SIGMA * SIGMA - 4.0 * CAMERA_SIGMA * CAMERA_SIGMA).sqrt();
     let mut base = photo.doubled().blurred(first);
     let mut pixel = 0.5 * factor as f32;
-    let mut found: Vec<Described> = Vec::new();
+    let mut octaves: Vec<Octave> = Vec::new();
+    let mut found: Vec<(usize, Keypoint)> = Vec::new();
     while base.width >= MIN_SIDE && base.height >= MIN_SIDE {
         let layers = blurred_layers(base);
         let mut keypoints = extrema(&layers);
-        // No more of one octave than of all: bounds the work on noise.
+        // No more of one octave than of all: bounds the memory on noise.
         keypoints.sort_by(stronger);
         keypoints.truncate(limit);
-        for keypoint in keypoints {
-            let layer = &layers[keypoint.layer];
-            let described = orientations(layer, &keypoint).into_iter();
-            let described = described.map(|angle| (angle, describe(layer, &keypoint, angle))).collect();
-            found.push((keypoint, pixel, described));
-        }
+        found.extend(keypoints.into_iter().map(|keypoint| (octaves.len(), keypoint)));
         base = layers[SCALES].halved();
+        octaves.push(Octave { layers, pixel });
         pixel *= 2.0;
     }
-    found.sort_by(|(a, p, _), (b, q, _)| stronger(a, b).then(p.total_cmp(q)));
-    let of_keypoint = |(keypoint, pixel, described): Described| {
-        described.into_iter().map(move |(angle, descriptor)| Feature {
+    found.sort_by(|(p, a), (q, b)| stronger(a, b).then(p.cmp(q)));
+    let of_keypoint = |(octave, keypoint): (usize, Keypoint)| {
+        let Octave { layers, pixel } = &octaves[octave];
+        let layer = &layers[keypoint.layer];
+        orientations(layer, &keypoint).into_iter().map(move |angle| Feature {
             // Pixel 0 of the doubled picture is the middle of the photo's first pixel.
             at: [keypoint.x, keypoint.y].map(|c| f64::from(c * pixel) + 0.5 * f64::from(factor)),
             sigma: keypoint.sigma * pixel,
             angle,
             contrast: keypoint.contrast,
-            descriptor,
+            descriptor: describe(layer, &keypoint, angle),
         })
     };
     found.into_iter().flat_map(of_keypoint).take(limit).collect()
+}
+
+/// Returns the bytes that finding the features of a photo takes at most, the photo itself not counted.
+pub fn working_bytes(width: usize, height: usize) -> usize {
+    let mut n_px = width * height;
+    while n_px > MAX_PX {
+        n_px /= 4;
+    }
+    // The halved photo, and of the photo doubled in width and height each layer, the sum of all octaves, and a
+    // picture between two passes.
+    let n_layers = SCALES + 3;
+    n_px.max(width * height / 4) * size_of::<f32>() + 4 * n_px * size_of::<f32>() * (n_layers * 4 / 3 + 2)
 }
 
 fn stronger(a: &Keypoint, b: &Keypoint) -> std::cmp::Ordering {

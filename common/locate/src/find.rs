@@ -18,10 +18,19 @@ pub const MAX_FEATURES: usize = 1200;
 const MIN_FEATURES: usize = 30;
 /// Fewest inliers of a pose that no rendering verifies: twice what photos of other scenes reach.
 const MIN_INLIERS: usize = 24;
+/// Fewest inliers of a pose that is told as a candidate.
+const MIN_UNSURE_INLIERS: usize = 12;
+/// Share of the best pose's inliers from which a pose elsewhere is its rival.
+const RIVAL_SHARE: f64 = 0.7;
 /// Fewest inliers among matches with a rendering at the pose.
-const MIN_RENDERED_INLIERS: usize = 30;
-/// Fewest inliers for which a rendering is tried.
-const MIN_CANDIDATE_INLIERS: usize = 6;
+const MIN_RENDERED_INLIERS: usize = 20;
+/// Fewest inliers among them for which another rendering, at the pose that they give, is tried.
+const MIN_NEARER_INLIERS: usize = 8;
+/// Renderings for one proposed pose, and proposed poses for which there are renderings.
+const MAX_RENDERINGS: usize = 2;
+const MAX_PROPOSALS: usize = 4;
+/// Fewest inliers of a proposed pose.
+const MIN_PROPOSED_INLIERS: usize = 5;
 /// Least spread of the inliers on the photo: standard deviation along their shorter axis, as a share of its width.
 const MIN_SPREAD: f64 = 0.04;
 /// Largest angle between the stated direction of gravity and the one that the pose gives: 10 degrees.
@@ -34,7 +43,31 @@ pub struct Photo<'a> {
     pub intrinsics: &'a Intrinsics,
     /// Direction of gravity in the camera's frame; the world's is down z.
     pub gravity_in_camera: Option<DVec3>,
+    pub prior: Option<Prior>,
 }
+
+/// Where a camera may be: poses beyond three standard deviations are refused.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Prior {
+    pub position_in_world: DVec3,
+    pub sigma: f64,
+}
+
+impl Photo<'_> {
+    /// Returns what is known about the photo that a pose contradicts.
+    fn contradiction(&self, camera_from_world: &DAffine3) -> Option<Reason> {
+        let down = camera_from_world.transform_vector3(DVec3::NEG_Z);
+        if self.gravity_in_camera.is_some_and(|gravity| down.angle_between(gravity) > MAX_GRAVITY_ANGLE) {
+            return Some(Reason::Gravity);
+        }
+        let Prior { position_in_world, sigma } = self.prior?;
+        let at = camera_from_world.inverse().translation;
+        (at.distance(position_in_world) > PRIOR_SIGMAS * sigma).then_some(Reason::Prior)
+    }
+}
+
+/// Standard deviations of a [`Prior`] within which poses lie.
+const PRIOR_SIGMAS: f64 = 3.0;
 
 /// A camera that was found.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,6 +84,8 @@ pub struct Located {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
     Found(Box<Located>),
+    /// Poses of which none is certain, best first.
+    Unsure(Vec<Located>),
     Lost(Reason),
 }
 
@@ -70,6 +105,8 @@ pub enum Reason {
     NoSpread,
     /// The pose contradicts the direction of gravity.
     Gravity,
+    /// The pose is far from where the camera may be.
+    Prior,
 }
 
 impl std::fmt::Display for Reason {
@@ -93,11 +130,14 @@ impl std::fmt::Display for Reason {
             Self::Gravity => {
                 write!(f, "the best pose contradicts the direction of gravity by more than 10 degrees")
             }
+            Self::Prior => write!(f, "the best pose lies beyond three sigma of the place that was given"),
         }
     }
 }
 
 /// Finds the camera of a photo. Same input, same answer.
+///
+/// Without a renderer a pose needs more inliers. Where a rendering cannot be drawn its pose is not verified.
 pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> Outcome {
     if map.is_empty() {
         return Outcome::Lost(Reason::EmptyMap);
@@ -106,65 +146,136 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     if found.len() < MIN_FEATURES {
         return Outcome::Lost(Reason::FewFeatures { found: found.len() });
     }
-    let camera = Pinhole::new(photo.intrinsics);
     let at = found.iter().map(|feature| ideal(photo.intrinsics, feature)).collect();
     let query = Query { at, codes: found.iter().map(|feature| code(&feature.descriptor)).collect() };
     let size_px = DVec2::new(f64::from(photo.intrinsics.width_px), f64::from(photo.intrinsics.height_px));
-    let Some(agreed) = coarse(map, &query, &camera) else {
-        return Outcome::Lost(Reason::NoPose { inliers: 0 });
-    };
-    let n_coarse = agreed.inliers.len();
-    if n_coarse < MIN_CANDIDATE_INLIERS {
-        return Outcome::Lost(Reason::NoPose { inliers: n_coarse });
+    let search = Search { map, photo, query, camera: Pinhole::new(photo.intrinsics), size_px };
+    let mut proposals = search.proposals();
+    let inliers = proposals.first().map_or(0, |best| best.inliers.len());
+    let contradiction = |one: &Agreed| photo.contradiction(&one.camera_from_world);
+    let refused = proposals.iter().find_map(contradiction);
+    proposals.retain(|one| contradiction(one).is_none());
+    if proposals.is_empty() {
+        return Outcome::Lost(refused.unwrap_or(Reason::NoPose { inliers }));
     }
-    let guided = query.match_guided(map, &camera, &agreed.camera_from_world, size_px);
-    let mut agreed = locally_refined(&camera, agreed.camera_from_world, &guided);
-    let mut is_verified = false;
-    if let Some(renderer) = renderer {
-        let matches =
-            match_rendering(renderer, &agreed.camera_from_world, photo.intrinsics, &found, &query.at);
-        let seen = ransac(&camera, &matches, SEED);
-        let n = seen.as_ref().map_or(0, |seen| seen.inliers.len());
-        match seen.filter(|_| n >= MIN_RENDERED_INLIERS) {
-            Some(seen) => (agreed, is_verified) = (seen, true),
-            None => return Outcome::Lost(Reason::NoPose { inliers: n }),
-        }
-    } else if n_coarse < MIN_INLIERS {
-        return Outcome::Lost(Reason::NoPose { inliers: n_coarse });
+    match renderer {
+        Some(renderer) => search.verified(&proposals, renderer, &found),
+        None => search.unverified(&proposals),
     }
-    judge(&camera, agreed, photo, size_px, is_verified)
 }
 
 /// Seed of all random choices.
 const SEED: u64 = 47;
 
-/// Returns the pose on which matches with the map agree, after those of all views or of a few.
-fn coarse(map: &Map, query: &Query, camera: &Pinhole) -> Option<Agreed> {
-    let all = query.match_all(map);
-    let first = ransac(camera, &all, SEED);
-    let votes = first.as_ref().filter(|first| first.inliers.len() >= MIN_INLIERS).map(|first| &first.inliers);
-    let of_views = query.match_views(map, votes.unwrap_or(&all));
-    let second = ransac(camera, &of_views, SEED);
-    first.into_iter().chain(second).max_by_key(|agreed| agreed.inliers.len())
+/// A photo that is being located.
+struct Search<'a> {
+    map: &'a Map,
+    photo: &'a Photo<'a>,
+    query: Query,
+    camera: Pinhole,
+    size_px: DVec2,
 }
 
-/// Returns the pose, unless its inliers or gravity speak against it.
-fn judge(camera: &Pinhole, agreed: Agreed, photo: &Photo<'_>, size_px: DVec2, is_verified: bool) -> Outcome {
-    let Agreed { camera_from_world, inliers, .. } = agreed;
-    if spread(&inliers) < MIN_SPREAD * size_px.x {
-        return Outcome::Lost(Reason::NoSpread);
+impl Search<'_> {
+    /// Returns poses on which matches with the map agree, those with most inliers first: of matches with all
+    /// landmarks and with those of a few views; unless the first suffice, also of matches with single places, of
+    /// which two may look alike.
+    fn proposals(&self) -> Vec<Agreed> {
+        let agreed = |matches: &[Match]| ransac(&self.camera, matches, SEED);
+        let all = self.query.match_all(self.map);
+        let first = agreed(&all);
+        let votes =
+            first.as_ref().filter(|first| first.inliers.len() >= MIN_INLIERS).map(|first| &first.inliers);
+        let second = agreed(&self.query.match_views(self.map, votes.unwrap_or(&all)));
+        let suffices = votes.is_some();
+        let mut found: Vec<Agreed> = first.into_iter().chain(second).collect();
+        if !suffices {
+            found.extend(self.query.match_places(self.map).filter_map(|matches| agreed(&matches)));
+        }
+        found.retain(|one| one.inliers.len() >= MIN_PROPOSED_INLIERS);
+        found.sort_by_key(|one| std::cmp::Reverse(one.inliers.len()));
+        let mut distinct: Vec<Agreed> = Vec::new();
+        for one in found {
+            if !distinct.iter().any(|other| self.is_same(&one, other)) {
+                distinct.push(one);
+            }
+        }
+        distinct
     }
-    if let Some(gravity) = photo.gravity_in_camera {
-        let down = camera_from_world.transform_vector3(DVec3::NEG_Z);
-        if down.angle_between(gravity) > MAX_GRAVITY_ANGLE {
-            return Outcome::Lost(Reason::Gravity);
+
+    fn is_same(&self, a: &Agreed, b: &Agreed) -> bool {
+        let [a, b] = [a, b].map(|one| one.camera_from_world.inverse().translation);
+        a.distance_squared(b) <= SAME_POSE * self.map.same_place
+    }
+
+    /// Returns a pose refined on the landmarks that it shows where the photo does.
+    fn guided(&self, one: &Agreed) -> Agreed {
+        let pose = one.camera_from_world;
+        let matches = self.query.match_guided(self.map, &self.camera, &pose, self.size_px);
+        locally_refined(&self.camera, pose, &matches)
+    }
+
+    /// Returns the first pose at which a rendering shows what the photo does.
+    fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Outcome {
+        let mut most = 0;
+        for one in proposals.iter().take(MAX_PROPOSALS) {
+            let mut pose = self.guided(one).camera_from_world;
+            for _ in 0..MAX_RENDERINGS {
+                let matches = match_rendering(renderer, &pose, self.photo.intrinsics, found, &self.query.at);
+                let Some(seen) = ransac(&self.camera, &matches, SEED) else { break };
+                let n = seen.inliers.len();
+                most = most.max(n);
+                if n >= MIN_RENDERED_INLIERS {
+                    match self.located(&seen, true) {
+                        Ok(located) => return Outcome::Found(Box::new(located)),
+                        Err(_) => break,
+                    }
+                }
+                if n < MIN_NEARER_INLIERS {
+                    break;
+                }
+                pose = seen.camera_from_world;
+            }
+        }
+        Outcome::Lost(Reason::NoPose { inliers: most })
+    }
+
+    fn unverified(&self, proposals: &[Agreed]) -> Outcome {
+        let n = |one: &Agreed| one.inliers.len();
+        let most = n(&proposals[0]);
+        let enough = |one: &&Agreed| n(one) >= MIN_UNSURE_INLIERS.max((RIVAL_SHARE * most as f64) as usize);
+        let candidates: Vec<&Agreed> = proposals.iter().filter(enough).take(MAX_PROPOSALS).collect();
+        let located = candidates.iter().map(|one| self.located(&self.guided(one), false));
+        let located: Vec<Result<Located, Reason>> = located.collect();
+        match located.as_slice() {
+            [] => Outcome::Lost(Reason::NoPose { inliers: most }),
+            [Err(reason)] => Outcome::Lost(*reason),
+            [Ok(one)] if most >= MIN_INLIERS => Outcome::Found(Box::new(one.clone())),
+            _ => Outcome::Unsure(located.into_iter().flatten().collect()),
         }
     }
-    let Some(covariance) = covariance(camera, &camera_from_world, &inliers) else {
-        return Outcome::Lost(Reason::NoSpread);
-    };
-    Outcome::Found(Box::new(Located { camera_from_world, covariance, n_inliers: inliers.len(), is_verified }))
+
+    /// Returns the pose, unless its inliers or what is known about the photo speak against it.
+    fn located(&self, agreed: &Agreed, is_verified: bool) -> Result<Located, Reason> {
+        let Agreed { camera_from_world, inliers, .. } = agreed;
+        if spread(inliers) < MIN_SPREAD * self.size_px.x {
+            return Err(Reason::NoSpread);
+        }
+        if let Some(reason) = self.photo.contradiction(camera_from_world) {
+            return Err(reason);
+        }
+        let covariance = covariance(&self.camera, camera_from_world, inliers).ok_or(Reason::NoSpread)?;
+        Ok(Located {
+            camera_from_world: *camera_from_world,
+            covariance,
+            n_inliers: inliers.len(),
+            is_verified,
+        })
+    }
 }
+
+/// Squared distance of two cameras that stand in one place, in the map's.
+const SAME_POSE: f64 = 25.0;
 
 /// Returns the standard deviation of the matches' places along their shorter axis, pixels.
 fn spread(matches: &[Match]) -> f64 {

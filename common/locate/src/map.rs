@@ -14,6 +14,8 @@ pub struct Map {
     pub(crate) landmarks: Vec<Landmark>,
     /// By view: indices of landmarks.
     pub(crate) of_views: BTreeMap<u16, Vec<u32>>,
+    /// By view: the median of its landmarks' positions.
+    middles: BTreeMap<u16, DVec3>,
     /// Squared distance up to which two landmarks are one place.
     pub(crate) same_place: f64,
 }
@@ -24,15 +26,21 @@ impl Map {
         for (index, landmark) in (0..).zip(&landmarks) {
             of_views.entry(landmark.view).or_default().push(index);
         }
+        let positions = |of: &[u32]| of.iter().map(|at| landmarks[*at as usize].position_in_world).collect();
+        let middles = of_views.iter().map(|(view, of)| (*view, middle(positions(of)))).collect();
         // Medians: a few landmarks far away do not make the scene large.
-        let median = |of: &dyn Fn(&Landmark) -> f64| {
-            let mut values: Vec<f64> = landmarks.iter().map(of).collect();
-            values.sort_by(f64::total_cmp);
-            values.get(values.len() / 2).copied().unwrap_or(0.0)
-        };
-        let middle = DVec3::from([0, 1, 2].map(|axis| median(&|l| l.position_in_world[axis])));
-        let size = median(&|l| l.position_in_world.distance(middle));
-        Self { of_views, same_place: (SAME_PLACE * size).powi(2), landmarks }
+        let of_all = middle(landmarks.iter().map(|l| l.position_in_world).collect());
+        let size = median(landmarks.iter().map(|l| l.position_in_world.distance(of_all)).collect());
+        Self { of_views, middles, same_place: (SAME_PLACE * size).powi(2), landmarks }
+    }
+
+    /// Returns the landmarks of the `n` views that show places nearest to those of a view, itself included.
+    pub(crate) fn around(&self, view: u16, n: usize) -> Vec<u32> {
+        let middle = self.middles[&view];
+        let mut views: Vec<(u16, f64)> =
+            self.middles.iter().map(|(other, at)| (*other, at.distance_squared(middle))).collect();
+        views.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
+        views.iter().take(n).flat_map(|(view, _)| self.of_views[view].iter().copied()).collect()
     }
 
     /// Returns the number of landmarks.
@@ -43,4 +51,19 @@ impl Map {
     pub fn is_empty(&self) -> bool {
         self.landmarks.is_empty()
     }
+}
+
+/// Returns the bytes of a map of `n` landmarks: in it, and in its views' lists and one more, for a median.
+pub fn map_bytes(n: usize) -> usize {
+    n * (size_of::<Landmark>() + 2 * size_of::<u32>() + 2 * size_of::<DVec3>())
+}
+
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// Returns the median of points, along each axis.
+pub(crate) fn middle(points: Vec<DVec3>) -> DVec3 {
+    DVec3::from([0, 1, 2].map(|axis| median(points.iter().map(|point| point[axis]).collect())))
 }

@@ -1,6 +1,6 @@
 //! Features of a photo matched with landmarks.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::{DAffine3, DVec2};
 
@@ -18,7 +18,10 @@ const MAX_RATIO_OF_VIEWS: f32 = 0.9;
 const MAX_GUIDED_DISTANCE: u32 = 44;
 /// Pixels around a feature in which its landmark lies, given the pose.
 const GUIDED_PX: f64 = 12.0;
+/// Views that are matched together.
 const N_VIEWS: usize = 8;
+/// Views around which landmarks are matched by themselves.
+const N_PLACES: usize = 8;
 
 /// The features to match: places on an ideal pinhole's image, pixels, and codes.
 pub(crate) struct Query {
@@ -45,11 +48,26 @@ impl Query {
         for vote in votes {
             *of_views.entry(map.landmarks[vote.landmark].view).or_default() += 1;
         }
-        let mut views: Vec<(u16, usize)> = of_views.into_iter().collect();
-        views.sort_by_key(|(view, n)| (std::cmp::Reverse(*n), *view));
-        let landmarks: Vec<u32> =
-            views.iter().take(N_VIEWS).flat_map(|(view, _)| map.of_views[view].clone()).collect();
+        let views = ranked(of_views).into_iter().take(N_VIEWS);
+        let landmarks: Vec<u32> = views.flat_map(|view| map.of_views[&view].clone()).collect();
         self.match_among(map, &landmarks, MAX_RATIO_OF_VIEWS)
+    }
+
+    /// Matches each feature with the landmarks around each of the views for which most features vote: a feature
+    /// votes for all views with a landmark nearly as like it as the best.
+    pub(crate) fn match_places<'a>(&'a self, map: &'a Map) -> impl Iterator<Item = Vec<Match>> + use<'a> {
+        let mut votes: BTreeMap<u16, usize> = BTreeMap::new();
+        for code in &self.codes {
+            let distances = map.landmarks.iter().map(|landmark| distance(*code, landmark.code));
+            let distances: Vec<u32> = distances.collect();
+            let least = distances.iter().copied().min().unwrap_or(u32::MAX);
+            let limit = MAX_DISTANCE.min((least as f32 / MAX_RATIO_OF_VIEWS) as u32);
+            let near = distances.iter().zip(&map.landmarks).filter(|(bits, _)| **bits <= limit);
+            let views: BTreeSet<u16> = near.map(|(_, landmark)| landmark.view).collect();
+            views.into_iter().for_each(|view| *votes.entry(view).or_default() += 1);
+        }
+        let views = ranked(votes).into_iter().take(N_PLACES);
+        views.map(move |view| self.match_among(map, &map.around(view, N_VIEWS), MAX_RATIO_OF_VIEWS))
     }
 
     fn match_among(&self, map: &Map, landmarks: &[u32], max_ratio: f32) -> Vec<Match> {
@@ -102,4 +120,11 @@ impl Query {
         }
         of_landmark.into_iter().map(|(landmark, (_, feature))| self.matched(map, feature, landmark)).collect()
     }
+}
+
+/// Returns views by their votes, those with most first.
+fn ranked(votes: BTreeMap<u16, usize>) -> Vec<u16> {
+    let mut views: Vec<(u16, usize)> = votes.into_iter().collect();
+    views.sort_by_key(|(view, n)| (std::cmp::Reverse(*n), *view));
+    views.into_iter().map(|(view, _)| view).collect()
 }

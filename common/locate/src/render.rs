@@ -2,15 +2,16 @@
 
 use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
+use slag_math::dot;
 
-use crate::describe::Descriptor;
 use crate::features::{Feature, features};
 use crate::find::MAX_FEATURES;
 use crate::grey::Grey;
 use crate::pose::Match;
 
-/// Largest distance of descriptors, as a share of the second best's (Lowe 2004, 7.1).
-const MAX_RATIO: f32 = 0.8;
+/// Largest distance of descriptors, as a share of the second best's (Lowe 2004, 7.1): poses are near, so most
+/// features have their match.
+const MAX_RATIO: f32 = 0.9;
 /// Largest step of the depth between neighbouring pixels of a surface, as a share of the depth.
 const MAX_DEPTH_STEP: f32 = 0.05;
 
@@ -58,11 +59,10 @@ pub(crate) fn match_rendering(
     let pinhole = intrinsics.without_distortion();
     let Some(rendering) = renderer.render(camera_from_world, &pinhole) else { return Vec::new() };
     let rendered = features(&rendering.grey, MAX_FEATURES);
-    let product = |a: &Descriptor, b: &Descriptor| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
     let n = rendered.len();
     let mut products = vec![0.0; photo.len() * n];
     for (row, feature) in products.chunks_exact_mut(n.max(1)).zip(photo) {
-        row.iter_mut().zip(&rendered).for_each(|(p, r)| *p = product(&feature.descriptor, &r.descriptor));
+        row.iter_mut().zip(&rendered).for_each(|(p, r)| *p = dot(&feature.descriptor, &r.descriptor));
     }
     let best_of_rendered: Vec<usize> = (0..n)
         .map(|r| {

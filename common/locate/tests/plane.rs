@@ -4,8 +4,8 @@
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use slag_common::{Distortion, Intrinsics};
 use slag_locate::{
-    Grey, Map, MappingView, Observation, Outcome, Photo, Reason, Renderer, Rendering, build, code, features,
-    locate,
+    Grey, Landmark, Located, Map, MappingView, Observation, Outcome, Photo, Prior, Reason, Renderer,
+    Rendering, build, code, features, locate,
 };
 use slag_math::random::mix64;
 
@@ -68,6 +68,10 @@ impl Renderer for Floor {
 }
 
 fn map_of(floor: u64) -> Map {
+    Map::new(floor_landmarks(floor))
+}
+
+fn floor_landmarks(floor: u64) -> Vec<Landmark> {
     let view = |view: u16| {
         let at = DVec3::new(f64::from(view % 3) - 1.0, f64::from(view / 3) - 1.0, 0.0);
         let camera_from_world = looking(at + DVec3::new(0.3, -1.5, 2.0), at);
@@ -81,7 +85,7 @@ fn map_of(floor: u64) -> Map {
         let observations = features(&drawn.grey, 600).into_iter().filter_map(observation).collect();
         MappingView { view, intrinsics: INTRINSICS, camera_from_world, observations }
     };
-    Map::new(build(&(0..9).map(view).collect::<Vec<_>>(), 3000))
+    build(&(0..9).map(view).collect::<Vec<_>>(), 3000)
 }
 
 #[test]
@@ -89,7 +93,7 @@ fn a_photo_is_located_and_another_floor_is_lost() {
     let map = map_of(1);
     let truth = looking(DVec3::new(0.6, -1.1, 1.7), DVec3::new(0.2, 0.3, 0.0));
     let grey = draw(1, &truth, &INTRINSICS).grey;
-    let photo = Photo { grey: &grey, intrinsics: &INTRINSICS, gravity_in_camera: None };
+    let photo = Photo { grey: &grey, intrinsics: &INTRINSICS, gravity_in_camera: None, prior: None };
     for renderer in [None, Some(&Floor(1) as &dyn Renderer)] {
         let Outcome::Found(found) = locate(&map, &photo, renderer) else { panic!("lost") };
         let moved = (found.camera_from_world.inverse().translation - truth.inverse().translation).length();
@@ -108,10 +112,41 @@ fn a_photo_is_located_and_another_floor_is_lost() {
     };
     assert!(matches!(gravity(DVec3::NEG_Z), Outcome::Found(_)));
     assert_eq!(gravity(DVec3::new(0.3, 0.0, -1.0)), Outcome::Lost(Reason::Gravity));
+    let near = |position_in_world: DVec3| {
+        let prior = Some(Prior { position_in_world, sigma: 0.5 });
+        locate(&map, &Photo { prior, ..photo }, None)
+    };
+    assert!(matches!(near(DVec3::new(0.0, 0.0, 1.7)), Outcome::Found(_)));
+    assert_eq!(near(DVec3::new(0.6, -1.1, 4.0)), Outcome::Lost(Reason::Prior));
     // Another floor; and the right pose, but the splat shows another floor.
     let other = draw(2, &truth, &INTRINSICS).grey;
     assert!(matches!(locate(&map, &Photo { grey: &other, ..photo }, None), Outcome::Lost(_)));
     assert!(matches!(locate(&map, &photo, Some(&Floor(2))), Outcome::Lost(Reason::NoPose { .. })));
+}
+
+/// The same floor twice, 50 m apart: both poses are told, unless it is known which it is.
+#[test]
+fn places_that_look_alike_are_candidates() {
+    let once = floor_landmarks(1);
+    let away = DVec3::new(50.0, 0.0, 0.0);
+    let again = once.iter().map(|one| Landmark {
+        position_in_world: one.position_in_world + away,
+        view: one.view + 9,
+        ..*one
+    });
+    let map = Map::new(once.iter().copied().chain(again).collect());
+    let truth = looking(DVec3::new(0.6, -1.1, 1.7), DVec3::new(0.2, 0.3, 0.0));
+    let grey = draw(1, &truth, &INTRINSICS).grey;
+    let photo = Photo { grey: &grey, intrinsics: &INTRINSICS, gravity_in_camera: None, prior: None };
+    let Outcome::Unsure(candidates) = locate(&map, &photo, None) else { panic!("two places") };
+    let at = truth.inverse().translation;
+    for place in [at, at + away] {
+        let is_there = |one: &Located| one.camera_from_world.inverse().translation.distance(place) < 0.1;
+        assert_eq!(candidates.iter().filter(|one| is_there(one)).count(), 1, "{place}");
+    }
+    let prior = Some(Prior { position_in_world: at + away, sigma: 5.0 });
+    let Outcome::Found(found) = locate(&map, &Photo { prior, ..photo }, None) else { panic!("one place") };
+    assert!(found.camera_from_world.inverse().translation.distance(at + away) < 0.1);
 }
 
 #[test]
@@ -133,10 +168,11 @@ fn hostile_photos_are_lost() {
     ] {
         let intrinsics =
             Intrinsics { width_px: grey.width as u32, height_px: grey.height as u32, ..INTRINSICS };
-        let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: Some(DVec3::NAN) };
+        let photo =
+            Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: Some(DVec3::NAN), prior: None };
         assert!(matches!(locate(&map, &photo, None), Outcome::Lost(_)), "{} x {}", grey.width, grey.height);
     }
     let grey = noise(64, 64);
-    let photo = Photo { grey: &grey, intrinsics: &INTRINSICS, gravity_in_camera: None };
+    let photo = Photo { grey: &grey, intrinsics: &INTRINSICS, gravity_in_camera: None, prior: None };
     assert_eq!(locate(&Map::new(Vec::new()), &photo, None), Outcome::Lost(Reason::EmptyMap));
 }

@@ -111,16 +111,16 @@ fn too_slow(error: &axum::Error) -> Option<TooSlow> {
     None
 }
 
-/// Checks that a body is said to be JSON. Forms and plain text, which a page of any origin can post without
-/// asking, are thus refused.
-pub(crate) fn check_json(headers: &HeaderMap) -> Result<(), Problem> {
+/// Checks that a body is said to be of one of some media types. Forms and plain text, which a page of any origin can
+/// post without asking, are thus refused.
+pub(crate) fn check_type(headers: &HeaderMap, media_types: &[&str]) -> Result<(), Problem> {
     let found = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let kind = found.and_then(|value| value.split(';').next()).unwrap_or_default().trim();
-    if kind.eq_ignore_ascii_case("application/json") {
+    if media_types.iter().any(|expected| kind.eq_ignore_ascii_case(expected)) {
         return Ok(());
     }
     let shown: String = kind.chars().take(60).collect();
-    let detail = format!("the body's Content-Type is {shown:?}, expected application/json");
+    let detail = format!("the body's Content-Type is {shown:?}, expected {}", media_types.join(" or "));
     Err(Problem::new(
         StatusCode::UNSUPPORTED_MEDIA_TYPE,
         "unsupported-media-type",

@@ -112,13 +112,15 @@ fn operation(route: &Route, of_all: &[(u16, &'static str)], problem: &Value, sch
             .or_insert_with(|| json!({ "description": description, "content": content }));
     };
     route.errors.iter().chain(of_all).for_each(|(status, description)| refuse(*status, description));
-    if let Some(body) = route.body {
+    if let Some(body) = &route.body {
         if !route.reads {
             operation["security"] = json!([{}, { "token": [] }]);
         }
-        let schema = schemas.of_request(body);
-        operation["requestBody"] =
-            json!({ "required": true, "content": { "application/json": { "schema": schema } } });
+        let schema = schemas.of_request(body.schema);
+        operation["requestBody"] = json!({ "required": true });
+        for media_type in body.media_types {
+            operation["requestBody"]["content"][media_type] = json!({ "schema": schema });
+        }
         let of_bodies = OF_BODIES.iter().filter(|(status, _)| *status != 401 || !route.reads);
         of_bodies.for_each(|(status, description)| refuse(*status, description));
     } else if takes_query || route.parameters.iter().any(|parameter| parameter.place == "path") {
@@ -174,7 +176,7 @@ const OF_BODIES: [(u16, &str); 6] = [
     ),
     (408, "The body was not complete in time."),
     (413, "The body is too long."),
-    (415, "The body is not said to be application/json."),
+    (415, "The body's Content-Type is none that the resource takes."),
 ];
 
 pub(crate) fn sentence(summary: &str) -> String {

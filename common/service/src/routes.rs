@@ -13,7 +13,7 @@ use schemars::{JsonSchema, SchemaGenerator};
 use serde_json::{Map, Value};
 
 use crate::body;
-use crate::replies::{Answering, Described, Reply, SchemaOf};
+use crate::replies::{Answering, Binary, Described, Reply, SchemaOf};
 
 /// A part of the path, or a header that counts.
 #[derive(Clone, Debug)]
@@ -44,6 +44,13 @@ impl Parameter {
     }
 }
 
+/// What the body of a request is.
+#[derive(Clone, Debug)]
+pub(crate) struct BodyOf {
+    pub(crate) media_types: &'static [&'static str],
+    pub(crate) schema: SchemaOf,
+}
+
 #[derive(Clone, Debug)]
 pub struct Route {
     /// Method; a GET route takes HEAD as well.
@@ -61,7 +68,7 @@ pub struct Route {
     pub reads: bool,
     /// Statuses and meanings of its own errors.
     pub errors: Vec<(u16, &'static str)>,
-    pub(crate) body: Option<SchemaOf>,
+    pub(crate) body: Option<BodyOf>,
     pub(crate) replies: fn(&mut SchemaGenerator) -> Vec<Reply>,
 }
 
@@ -120,10 +127,38 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         max_body_bytes: usize,
         handler: H,
     ) -> Self {
-        let whole = from_fn(move |request: Request, next: Next| whole_body(max_body_bytes, request, next));
+        let body = BodyOf { media_types: &["application/json"], schema: SchemaGenerator::subschema_for::<B> };
+        self.post_of::<T, H>(path, summary, body, max_body_bytes, handler)
+    }
+
+    /// The same for bytes of some media types.
+    pub fn post_bytes<T: 'static, H: Handler<T, S> + Answering<T>>(
+        self,
+        path: &'static str,
+        summary: &'static str,
+        media_types: &'static [&'static str],
+        max_body_bytes: usize,
+        handler: H,
+    ) -> Self {
+        let body = BodyOf { media_types, schema: |_| Binary::schema() };
+        self.post_of::<T, H>(path, summary, body, max_body_bytes, handler)
+    }
+
+    fn post_of<T: 'static, H: Handler<T, S> + Answering<T>>(
+        self,
+        path: &'static str,
+        summary: &'static str,
+        body: BodyOf,
+        max_body_bytes: usize,
+        handler: H,
+    ) -> Self {
+        let media_types = body.media_types;
+        let whole = from_fn(move |request: Request, next: Next| {
+            whole_body(media_types, max_body_bytes, request, next)
+        });
         let handler = post(handler).route_layer(whole);
         let mut routes = self.add::<T, H>(Method::POST, path, summary, handler);
-        routes.last(|route| route.body = Some(SchemaGenerator::subschema_for::<B>));
+        routes.last(|route| route.body = Some(body));
         routes
     }
 
@@ -163,9 +198,14 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
 }
 
 /// Hands a request on with its body read.
-async fn whole_body(max_bytes: usize, request: Request, next: Next) -> Response {
+async fn whole_body(
+    media_types: &'static [&'static str],
+    max_bytes: usize,
+    request: Request,
+    next: Next,
+) -> Response {
     let (head, body) = request.into_parts();
-    let checked = match body::check_json(&head.headers) {
+    let checked = match body::check_type(&head.headers, media_types) {
         Ok(()) => body::read(body, max_bytes).await,
         Err(problem) => Err(problem),
     };

@@ -1,11 +1,13 @@
 //! `locate`.
 
-use std::path::PathBuf;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::DVec3;
+use slag_locate::Prior;
 
-use crate::locate::{Answer, Camera, LocateError, answer};
+use crate::locate::{Answer, Camera, LocateError, MAX_PHOTO_BYTES, PhotoFile, Pose, answer};
 use crate::query::parse_point;
 use crate::store::Snapshot;
 
@@ -33,6 +35,12 @@ pub struct LocateArgs {
     /// contradict it are refused.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     pub gravity: Option<DVec3>,
+    /// Where the camera may be, world frame, with --sigma: poses elsewhere are refused.
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "sigma", allow_hyphen_values = true)]
+    pub near: Option<DVec3>,
+    /// Standard deviation of --near, world units: poses beyond three of it are refused.
+    #[arg(long, value_name = "UNITS", value_parser = parse_sigma, requires = "near")]
+    pub sigma: Option<f64>,
     #[command(flatten)]
     pub cache: CacheArgs,
     /// Print the answer as JSON.
@@ -45,36 +53,60 @@ fn parse_focal(text: &str) -> Result<f64, String> {
     focal.ok_or_else(|| "expected pixels, at least 1".into())
 }
 
+fn parse_sigma(text: &str) -> Result<f64, String> {
+    let sigma = text.parse().ok().filter(|sigma: &f64| *sigma > 0.0 && sigma.is_finite());
+    sigma.ok_or_else(|| "expected world units, more than 0".into())
+}
+
 pub fn run(args: LocateArgs) -> Result<(), Failure> {
     let cache = args.cache.open()?;
     let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
     let centre_px = args.centre_px.map(|centre| [centre[0], centre[1]]);
-    let camera = Camera { focal_px: args.focal_px, centre_px, gravity: args.gravity };
-    let found = answer(&snapshot, &args.photo, &camera).map_err(|error| match error {
-        LocateError::Io(error) => error.into(),
-        LocateError::Decode { .. } => Failure::Failed("photo", error.into()),
-        LocateError::Version { .. } => Failure::Failed("store", error.into()),
-    })?;
+    let prior =
+        args.near.zip(args.sigma).map(|(position_in_world, sigma)| Prior { position_in_world, sigma });
+    let camera = Camera { focal_px: args.focal_px, centre_px, gravity: args.gravity, prior };
+    let found = located(&snapshot, &args.photo, &camera)?;
     if args.json {
         return print_json(&found);
     }
     match found {
-        Answer::Lost { reason } => print_pairs(&[("lost", reason)]),
-        Answer::Found { position_in_world, rotation_xyzw, covariance, n_inliers, geographic, .. } => {
-            let numbers = |of: &[f64]| of.iter().map(|v| format!("{v:.4}")).collect::<Vec<_>>().join(",");
-            // The standard deviation along the worst axis of the world.
-            let sigma = [0, 7, 14].map(|at| covariance[at]).into_iter().fold(0.0, f64::max).sqrt();
-            let mut pairs = vec![
-                ("position", numbers(&position_in_world)),
-                ("rotation_xyzw", numbers(&rotation_xyzw)),
-                ("sigma", format!("{sigma:.4}")),
-                ("landmarks", n_inliers.to_string()),
-            ];
-            if let Some(at) = geographic {
-                let place = format!("{:.7},{:.7},{:.2}", at.latitude_deg, at.longitude_deg, at.height_m);
-                pairs.push(("lat, lon, height", place));
-            }
-            print_pairs(&pairs)
+        Answer::Found(pose) => print_pairs(&pairs(&pose)),
+        Answer::Unsure { reason, candidates } => {
+            print_pairs(&[("unsure", reason)])?;
+            candidates.iter().try_for_each(|pose| print_pairs(&pairs(pose)))
         }
+        Answer::Lost { reason } => print_pairs(&[("lost", reason)]),
     }
+}
+
+fn located(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer, Failure> {
+    let of_photo = |error: LocateError| match error {
+        LocateError::Version { .. } => Failure::Failed("store", error.into()),
+        error => Failure::Failed("photo", anyhow::anyhow!("{}: {error}", photo.display())),
+    };
+    let mut bytes = Vec::new();
+    fs_err::File::open(photo)?.take(MAX_PHOTO_BYTES as u64 + 1).read_to_end(&mut bytes)?;
+    if bytes.len() > MAX_PHOTO_BYTES {
+        let error =
+            anyhow::anyhow!("{}: longer than {MAX_PHOTO_BYTES} bytes; make it smaller", photo.display());
+        return Err(Failure::Failed("photo", error));
+    }
+    PhotoFile::open(&bytes).and_then(|opened| answer(snapshot, opened, camera)).map_err(of_photo)
+}
+
+fn pairs(pose: &Pose) -> Vec<(&'static str, String)> {
+    let numbers = |of: &[f64]| of.iter().map(|v| format!("{v:.4}")).collect::<Vec<_>>().join(",");
+    // The standard deviation along the worst axis of the world.
+    let sigma = [0, 7, 14].map(|at| pose.covariance[at]).into_iter().fold(0.0, f64::max).sqrt();
+    let mut pairs = vec![
+        ("position", numbers(&pose.position_in_world)),
+        ("rotation_xyzw", numbers(&pose.rotation_xyzw)),
+        ("sigma", format!("{sigma:.4}")),
+        ("landmarks", pose.n_inliers.to_string()),
+    ];
+    if let Some(at) = pose.geographic {
+        let place = format!("{:.7},{:.7},{:.2}", at.latitude_deg, at.longitude_deg, at.height_m);
+        pairs.push(("lat, lon, height", place));
+    }
+    pairs
 }

@@ -43,6 +43,7 @@ macro_rules! texts {
 }
 
 texts! {
+    XyText([f64; 2]), several(NUMBER, 2, 2), xy;
     XyzText(DVec3), several(NUMBER, 3, 3), parse_point;
     LatLonText(LatLon), format!("^{LAT_LON}(,{NUMBER})?$"), lat_lon;
     BoxText(Aabb), several(NUMBER, 6, 6), parse_box;
@@ -59,6 +60,10 @@ fn several(value: &str, least: usize, most: usize) -> String {
 
 fn numbers(text: &str) -> Option<Vec<f64>> {
     text.split(',').map(|number| number.trim().parse().ok()).collect()
+}
+
+fn xy(text: &str) -> Result<[f64; 2], &'static str> {
+    numbers(text).and_then(|numbers| numbers.try_into().ok()).ok_or("x,y")
 }
 
 fn lat_lon(text: &str) -> Result<LatLon, &'static str> {

@@ -28,6 +28,7 @@ mod answers;
 mod attacks;
 mod changes;
 mod goal;
+mod locate;
 mod openapi;
 mod ply;
 mod v1;

@@ -3,6 +3,7 @@
 mod changes;
 mod events;
 mod goal;
+mod locate;
 mod map;
 mod objects;
 mod view;
@@ -15,6 +16,7 @@ use super::app::App;
 use super::forms::ObjectIdText;
 use super::problem::{BUDGET, NO_PLACES, SCENE, TEXTS, TIME_BUDGET};
 use super::query;
+use crate::locate::MAX_PHOTO_BYTES;
 use crate::query::Ask;
 
 /// Adds the routes.
@@ -59,7 +61,17 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .errors(&[NO_PLACES, TEXTS[1]])
         .get("/v1/floor", "the ground around the robot: unknown, obstacle, ground, reached", goal::floor)
         .errors(&SCENE)
-        .errors(&[NO_PLACES, BUDGET]);
+        .errors(&[NO_PLACES, BUDGET])
+        .post_bytes(
+            "/v1/locate",
+            "where the camera of a photo is: found, unsure with candidates, or lost",
+            locate::PHOTOS,
+            MAX_PHOTO_BYTES,
+            locate::locate,
+        )
+        .reads()
+        .errors(&SCENE)
+        .errors(&[(409, "The landmarks on board are of another version."), BUDGET]);
     to.get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
         .details(
             "At first the present state. event: generation, with scene, generation, frame, n_cells, n_objects and n_bad_cells, or null without a scene; event: following, as the member following of /status. The stream ends when the service stops.",

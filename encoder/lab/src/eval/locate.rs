@@ -1,12 +1,14 @@
 //! `eval locate`: photos that the map has not seen, located in it; photos of the other scenes must not be.
 //!
-//! The map is made of three quarters of a scene's photos. The rest, and the photos of `test/`, are the queries.
+//! The map is made of three quarters of a scene's photos. The rest, and the photos of `test/`, are the queries. One
+//! that is unsure counts as lost.
 
 use std::fmt;
 use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
+use clap::builder::RangedU64ValueParser;
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -17,7 +19,7 @@ use slag_encoder::ingest;
 use slag_encoder::landmarks::{self, SceneRenderer};
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
-use slag_locate::{Grey, Map, MappingView, Outcome, Photo, Reason, Renderer, locate};
+use slag_locate::{Grey, Map, MappingView, Outcome, Photo, Renderer, locate};
 
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure};
@@ -47,14 +49,16 @@ pub(crate) struct LocateArgs {
     /// [default: all].
     #[arg(long, value_name = "A,B", value_delimiter = ',', num_args = 2)]
     map_views: Option<Vec<usize>>,
+    /// Of each four photos in the order of names, the one that is a query: 0 to 3.
+    #[arg(long, value_name = "N", default_value_t = HELD_OUT - 1, value_parser = RangedU64ValueParser::<usize>::new().range(0..HELD_OUT as u64))]
+    fold: usize,
     /// Tells each query that was not found where it is.
     #[arg(long)]
     list: bool,
 }
 
 /// How queries differ from their photos.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
-#[serde(rename_all = "lowercase")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Change {
     None,
     /// 40 % of the light.
@@ -79,28 +83,29 @@ struct Located {
 
 /// A query's result: errors in metres and degrees, where it was found.
 struct Try {
-    found: Result<[f64; 2], Reason>,
+    found: Result<[f64; 2], String>,
     secs: f64,
 }
 
 impl Try {
     fn is_within(&self, metres: f64, degrees: f64) -> bool {
-        self.found.is_ok_and(|[m, deg]| m <= metres && deg <= degrees)
+        self.found.as_ref().is_ok_and(|[m, deg]| *m <= metres && *deg <= degrees)
     }
 }
 
+/// In JSON the figures of all scenes together.
 #[derive(Debug, Serialize)]
+#[serde(transparent)]
 pub(crate) struct LocateReport {
-    change: Change,
-    is_verified: bool,
-    #[serde(flatten)]
     all: Figures,
+    #[serde(skip)]
     scenes: Vec<Figures>,
 }
 
 /// Shares of queries, of a scene or of all.
 #[derive(Debug, Serialize)]
 struct Figures {
+    #[serde(skip)]
     name: String,
     n: usize,
     n_foreign: usize,
@@ -115,6 +120,7 @@ struct Figures {
     median_secs: Option<f64>,
     bytes_per_million: Option<f64>,
     /// Time for making the map.
+    #[serde(skip)]
     map_secs: f64,
 }
 
@@ -122,12 +128,7 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
     let files = SceneFiles::find_all(&args.scenes)?;
     progress.begin("locate", "scene", files.len() as u64, 0);
     let scenes = files.iter().map(|files| prepare(files, args)).collect::<Result<Vec<_>>>()?;
-    let mut report = LocateReport {
-        change: args.change,
-        is_verified: !args.unverified,
-        all: Figures::default(),
-        scenes: Vec::new(),
-    };
+    let mut report = LocateReport { all: Figures::default(), scenes: Vec::new() };
     let (mut all_tries, mut all_foreign) = (Vec::new(), Vec::new());
     for (at, scene) in scenes.iter().enumerate() {
         let loaded = CpuRasterizer.load(&scene.gaussians)?;
@@ -138,10 +139,10 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         for view in &scene.queries {
             let one = attempt(view)?;
             if args.list && !one.is_within(0.25, 5.0) {
-                let told = one.found.map_or_else(
-                    |reason| reason.to_string(),
-                    |[m, deg]| format!("off by {m:.2} m, {deg:.1} degrees"),
-                );
+                let told = match &one.found {
+                    Err(reason) => reason.clone(),
+                    Ok([m, deg]) => format!("off by {m:.2} m, {deg:.1} degrees"),
+                };
                 tracing::warn!("{} {}: {told}", scene.name, view.name);
             }
             tries.push(one);
@@ -164,7 +165,7 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     let gaussians = splat::read(&files.splat, &ReadOptions { with_sh_rest: true })?;
     let views = poses::read(&files.poses, files.images.as_deref())?.views;
     let range = args.map_views.as_ref().map_or(0..views.len(), |range| range[0]..range[1].min(views.len()));
-    let is_query = |at: usize| at % HELD_OUT == HELD_OUT - 1 || !range.contains(&at);
+    let is_query = |at: usize| at % HELD_OUT == args.fold || !range.contains(&at);
     let start = Instant::now();
     let loaded = CpuRasterizer.load(&gaussians)?;
     let mapping = views.iter().enumerate().filter(|(at, _)| !is_query(*at));
@@ -204,7 +205,7 @@ fn attempt(
     let mut grey = Grey::from_rgb8(width as usize, height as usize, loaded.image.as_raw());
     let mut intrinsics = loaded.view.intrinsics;
     changed(change, &mut grey, &mut intrinsics);
-    let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: None };
+    let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: None, prior: None };
     let start = Instant::now();
     let outcome = locate(&scene.map, &photo, renderer.map(|renderer| renderer as &dyn Renderer));
     let secs = start.elapsed().as_secs_f64();
@@ -216,7 +217,8 @@ fn attempt(
             let degrees = between.to_axis_angle().1.to_degrees();
             Ok([metres, degrees.min(360.0 - degrees)])
         }
-        Outcome::Lost(reason) => Err(reason),
+        Outcome::Unsure(_) => Err("unsure".into()),
+        Outcome::Lost(reason) => Err(reason.to_string()),
     };
     Ok(Try { found, secs })
 }
@@ -277,7 +279,7 @@ impl Figures {
             lost: of_tries(&|one| one.found.is_err()),
             wrong: of_tries(&|one| one.found.is_ok() && !one.is_within(1.0, 10.0)),
             foreign_accepted: share(foreign.iter().filter(|one| one.found.is_ok()).count(), foreign.len()),
-            median_m: median(tries.iter().filter_map(|one| Some(one.found.ok()?[0])).collect()),
+            median_m: median(tries.iter().filter_map(|one| Some(one.found.as_ref().ok()?[0])).collect()),
             median_secs: median(tries.iter().map(|one| one.secs).collect()),
             bytes_per_million: (n_gaussians > 0).then(|| len_bytes as f64 * 1e6 / n_gaussians as f64),
             map_secs: scenes.iter().map(|scene| scene.map_secs).sum(),

@@ -1,0 +1,65 @@
+//! `POST /v1/locate`.
+
+use super::openapi::{check, description};
+use super::*;
+
+async fn post(service: &Service, query: &str, kind: &str, photo: Vec<u8>) -> (StatusCode, Value) {
+    let request = Request::builder()
+        .method("POST")
+        .uri(format!("/v1/locate?{query}"))
+        .header("content-type", kind)
+        .body(Body::from(photo))
+        .expect("a request");
+    let router = router(Arc::clone(&service.app));
+    let (status, headers, body) =
+        soon(async { read(router.oneshot(request).await.expect("infallible")).await }).await;
+    let api = description();
+    let replies = &api["paths"]["/v1/locate"]["post"]["responses"][status.as_str()]["content"];
+    let kind = headers["content-type"].to_str().expect("text");
+    assert_eq!(check(&replies[kind]["schema"], &body, ""), Ok(()), "{body:#}");
+    (status, body)
+}
+
+fn png(width: u32, height: u32) -> Vec<u8> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    image::RgbImage::new(width, height).write_to(&mut bytes, image::ImageFormat::Png).expect("memory");
+    bytes.into_inner()
+}
+
+#[tokio::test]
+async fn photos_are_lost_or_refused() {
+    let service = Service::with_chair();
+    let (status, body) = post(&service, "focal_px=500&gravity=0,1,0", "image/png", png(64, 48)).await;
+    assert_eq!((status, &body["state"]), (StatusCode::OK, &json!("lost")), "{body:#}");
+    assert!(body["reason"].as_str().is_some_and(|reason| reason.contains("--locate")), "{body:#}");
+    for (query, parameter) in [
+        ("", "focal_px"),
+        ("focal_px=0", "focal_px"),
+        ("focal_px=NaN", "focal_px"),
+        ("focal_px=500&centre_px=1", "centre_px"),
+        ("focal_px=500&near=1,2,3", "sigma"),
+        ("focal_px=500&near=1,2,3&sigma=0", "sigma"),
+        ("focal_px=500&sigma=1", "near"),
+        ("focal_px=500&near_lat_lon=46,8&sigma=1", "near"),
+    ] {
+        let (status, body) = post(&service, query, "image/jpeg", png(64, 48)).await;
+        assert_eq!((status, &body["parameter"]), (StatusCode::BAD_REQUEST, &json!(parameter)), "{query}");
+    }
+    let refused = post(&service, "focal_px=500", "image/png", b"hello".to_vec()).await;
+    assert_eq!(refused.0, StatusCode::BAD_REQUEST);
+    let refused = post(&service, "focal_px=500", "application/json", png(64, 48)).await;
+    assert_eq!(refused.0, StatusCode::UNSUPPORTED_MEDIA_TYPE);
+    let refused = post(&service, "focal_px=500", "image/png", vec![0; (32 << 20) + 1]).await;
+    assert_eq!(refused.0, StatusCode::PAYLOAD_TOO_LARGE);
+}
+
+/// A picture of one colour is short as a file: what it takes is refused before it is read.
+#[tokio::test]
+async fn memory_is_bounded() {
+    let settings = Settings { query_bytes: 16 << 20, ..Settings::default() };
+    let service = Service::new(Some(&chair(None)), settings);
+    let (status, body) = post(&service, "focal_px=500", "image/png", png(4000, 3000)).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body:#}");
+    let (status, _) = post(&service, "focal_px=500", "image/png", png(64, 48)).await;
+    assert_eq!(status, StatusCode::OK);
+}
