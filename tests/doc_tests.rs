@@ -73,6 +73,7 @@ fn lines_and_tables_fit_a_screen() {
     check(|_, text| {
         let mut is_layers = false;
         let mut faults = Vec::new();
+        let (mut was_row, mut next) = (false, text.lines().skip(1));
         for (line, number) in text.lines().zip(1..) {
             if line.starts_with("```") {
                 is_layers = line == "```layers";
@@ -87,6 +88,12 @@ fn lines_and_tables_fit_a_screen() {
             if is_row && n_columns > MAX_COLUMNS {
                 faults.push(format!("line {number} has {n_columns} columns"));
             }
+            // A rule follows the first row.
+            let has_rule = next.next().is_some_and(|next| next.trim_start().starts_with("|-"));
+            if is_row && !was_row && !has_rule {
+                faults.push(format!("line {number} is a row without a table"));
+            }
+            was_row = is_row;
         }
         faults
     });

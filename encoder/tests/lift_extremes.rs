@@ -216,9 +216,9 @@ fn vectors_that_are_no_numbers_are_no_evidence() {
 
 /// Returns the exact shard of a cell, and the error that is stated for its positions.
 fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (AlignedBytes, f64) {
-    let bank = TextBank::directions(DIM);
-    let metric = ScoreMetric::new(DIM, &bank);
-    let spread = metric.spread(Rows::all(&embeddings.vectors, DIM));
+    let bank = TextBank::directions(embeddings.dim);
+    let metric = ScoreMetric::new(embeddings.dim, &bank);
+    let spread = metric.spread(Rows::all(&embeddings.vectors, embeddings.dim));
     let settings = ShardSettings {
         profiles: vec![Profile::Exact],
         codebook: CodebookSettings::default(),
@@ -343,7 +343,7 @@ fn embeddings_stored_as_f16() {
 #[test]
 fn positions_keep_their_error_with_strays() {
     let random = &mut Random::new(11);
-    let n = 600;
+    let (n, dim) = (600, 8);
     for (n_strays, distance, place, scale, error) in [
         (1, 1e3, 0.0, 0.02, PositionError::OfSize),
         (20, 1e4, 0.0, 0.02, PositionError::OfSize),
@@ -371,7 +371,7 @@ fn positions_keep_their_error_with_strays() {
         for cell in &split.cells {
             let n = cell.gaussians.len();
             let embeddings =
-                CellEmbeddings { dim: DIM, vectors: vec![0.0; n * DIM], has_evidence: vec![false; n] };
+                CellEmbeddings { dim, vectors: vec![0.0; n * dim], has_evidence: vec![false; n] };
             let (bytes, stated) = exact_shard(&scene, cell, &embeddings);
             let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
             for (k, input) in shard.exact.expect("exact").input_indices.iter().enumerate() {

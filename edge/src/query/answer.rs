@@ -78,15 +78,9 @@ fn by_objects(
     request: &QueryRequest,
 ) -> Result<Vec<Answers>, ScoreError> {
     let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
-    let budget = scratch.budget();
-    let answer = |((text, question), scored)| {
-        let used_bytes = budget.used_bytes();
-        let answers = answer_objects(scene, text, question, scored, budget, request);
-        budget.check()?;
-        budget.give_back_to(used_bytes, answers.answers.len_bytes());
-        Ok(answers)
-    };
-    labels.iter().copied().zip(questions).zip(&scored).map(answer).collect()
+    each(scratch.budget(), (labels, questions), &scored, |text, question, scored, budget| {
+        answer_objects(scene, text, question, scored, budget, request)
+    })
 }
 
 /// Answers questions with Gaussians, or with clusters of them.
@@ -99,15 +93,26 @@ fn by_gaussians(
 ) -> Result<Vec<Answers>, ScoreError> {
     let searches =
         Search::batch(scratch, scene.shards, questions, request.region.clone(), request.precision)?;
-    let budget = scratch.budget();
-    let answer = |((text, question), search)| {
+    each(scratch.budget(), (labels, questions), &searches, |text, question, search, budget| {
+        answer_gaussians(scene, (text, kind), question, search, budget, request)
+    })
+}
+
+/// Answers each question from what was scored for it; of the bytes of each only those of its answers stay charged.
+fn each<S>(
+    budget: &Budget,
+    (labels, questions): (&[&str], &[Question]),
+    scored: &[S],
+    answer: impl Fn(&str, &Question, &S, &Budget) -> Answers,
+) -> Result<Vec<Answers>, ScoreError> {
+    let charged = |((text, question), scored)| {
         let used_bytes = budget.used_bytes();
-        let answers = answer_gaussians(scene, (text, kind), question, search, budget, request);
+        let answers = answer(text, question, scored, budget);
         budget.check()?;
         budget.give_back_to(used_bytes, answers.answers.len_bytes());
         Ok(answers)
     };
-    labels.iter().copied().zip(questions).zip(&searches).map(answer).collect()
+    labels.iter().copied().zip(questions).zip(scored).map(charged).collect()
 }
 
 /// Answers a question with the objects that match; no centroid is scored.
@@ -139,11 +144,10 @@ fn answer_objects(
     let found = Found::Clusters(described.collect());
     let best = objects::best(&scored.scores);
     let best = best.map(|best| (scale.shown(scored.scores[best]), objects::record(scene, best).position()));
-    let shards = scene.shards.iter().filter(|shard| region.touches(&shard.position_box()));
     let empty = empty(scene, (text, AnswerKind::Objects), scale, threshold, request);
     Answers {
         searched: Searched {
-            n_searched: shards.map(|shard| shard.n_with_evidence() as u64).sum(),
+            n_searched: n_with_evidence(scene, region),
             n_matching,
             score_error_bound: scale.error_bound(scored.error_bound),
             ..empty.searched
@@ -249,11 +253,21 @@ pub(super) fn of_related(
     let empty = empty(scene, (text, AnswerKind::Objects), scale, threshold, request);
     let n_matching = answers.iter().map(|answer| answer.n_gaussians).sum();
     Answers {
-        searched: Searched { n_matching, ..empty.searched },
+        searched: Searched {
+            n_searched: n_with_evidence(scene, &request.region),
+            n_matching,
+            ..empty.searched
+        },
         reason,
         answers: Found::Clusters(answers),
         ..empty
     }
+}
+
+/// Returns the number of Gaussians with evidence in the shards that a region touches.
+fn n_with_evidence(scene: &Scene<'_>, region: &Region) -> u64 {
+    let shards = scene.shards.iter().filter(|shard| region.touches(&shard.position_box()));
+    shards.map(|shard| shard.n_with_evidence() as u64).sum()
 }
 
 /// Returns an empty answer that describes its question and its scene.
