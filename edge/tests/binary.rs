@@ -337,8 +337,8 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
     assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
 }
 
-/// Far more queries than the service can answer: some are answered quickly, the others are refused, and memory
-/// stays.
+/// More clients than the service lets in at once: what is not refused is answered in bounded time, and memory stays.
+/// Whether any is refused depends on the machine; `http::tests` forces it.
 #[test]
 fn overload_is_turned_away_and_memory_stays() {
     const N_CLIENTS: usize = 160;
@@ -391,7 +391,7 @@ fn overload_is_turned_away_and_memory_stays() {
         early.len(),
         late.len()
     );
-    assert!(late.len() > 100 && n_refused > 0);
+    assert!(late.len() > 100);
     // A bound, not a measurement: an unbounded queue would grow for as long as the load lasts.
     assert!(p99_ms < 2000.0 && grown < 8_000_000, "{p99_ms} ms, {grown} bytes");
 }
