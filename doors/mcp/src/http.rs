@@ -13,8 +13,8 @@ use crate::Tools;
 
 /// Where the protocol is spoken.
 pub const PATH: &str = "/mcp";
-/// Longest request; the longest sensible one has 32 words.
-const MAX_BODY_BYTES: usize = 64 << 10;
+/// Longest request: a photo of 3 MB in base64.
+const MAX_BODY_BYTES: usize = 4 << 20;
 
 /// Serves until `stop` completes.
 ///

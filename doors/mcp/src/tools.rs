@@ -8,6 +8,7 @@ use slag_robot::{Robot, RobotError};
 
 use crate::changes::{Compare, Difference};
 use crate::find::{Found, Wanted};
+use crate::locate::{Places, Seen};
 use crate::place::{Asked, Description};
 use crate::stand::{Going, Stands};
 
@@ -48,6 +49,12 @@ impl Tools {
         self.blocking(move |robot| robot.goal(&going.parameters()).map(Stands::from).map_err(refused))
             .await
             .map(Json)
+    }
+
+    /// Find where the camera of a photo is on the robot's map, by landmarks; or why that cannot be told.
+    #[tool(annotations(title = "Where am I", read_only_hint = true, open_world_hint = false))]
+    async fn where_am_i(&self, Parameters(seen): Parameters<Seen>) -> Result<Json<Places>, String> {
+        self.blocking(move |robot| seen.locate(robot)).await.map(Json)
     }
 
     /// Describe what the robot's map covers: its extent, age and gaps, and how many things match each of some

@@ -6,10 +6,13 @@ WORD: something that the robot's scene has. MCP_URL: slag-mcp over HTTP, in fron
 """
 
 import asyncio
+import base64
 import json
+import struct
 import sys
 import urllib.error
 import urllib.request
+import zlib
 
 from mcp import Client, StdioServerParameters
 
@@ -19,11 +22,27 @@ def get(url):
         return json.load(reply)
 
 
+def post(url, body, media_type):
+    request = urllib.request.Request(url, body, {"content-type": media_type})
+    with urllib.request.urlopen(request, timeout=20) as reply:
+        return json.load(reply)
+
+
+def png(width, height):
+    """Returns a grey picture."""
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    rows = zlib.compress((b"\0" + b"\x80" * width) * height)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
 async def check(client, robot, word):
     assert client.server_info.name == "slag-mcp", client.server_info
     assert "world frame" in client.instructions
     tools = {tool.name: tool for tool in (await client.list_tools()).tools}
-    assert sorted(tools) == ["describe_place", "find", "what_changed", "where_to_stand"], sorted(tools)
+    assert sorted(tools) == ["describe_place", "find", "what_changed", "where_am_i", "where_to_stand"], sorted(tools)
     for tool in tools.values():
         assert tool.description and tool.annotations.read_only_hint, tool
         assert tool.output_schema["type"] == "object", tool.output_schema
@@ -92,6 +111,13 @@ async def check(client, robot, word):
     there = there.structured_content
     assert there["n_things"] == 0 and not there["is_complete"] and there["kinds"] == [], there
 
+    # The robot's own answer to the same photo is the truth.
+    photo = png(96, 64)
+    truth = post(f"{robot}/v1/locate?focal_px=80", photo, "image/png")
+    seen = {"photo_base64": base64.b64encode(photo).decode(), "focal_px": 80}
+    here = (await client.call_tool("where_am_i", seen)).structured_content
+    assert here["state"] == truth["state"] == "lost" and here["reason"] == truth["reason"], (here, truth)
+
     # Errors go to the model, which can correct its request.
     for name, asked, expected in [
         ("find", {"what": word, "limit": 0}, "expected 1 to 50"),
@@ -101,6 +127,8 @@ async def check(client, robot, word):
         ("describe_place", {"near": [0, 0, 0]}, "go together"),
         ("where_to_stand", {"what": word, "radius_m": 9.0}, "radius_m"),
         ("what_changed", {"from_generation": 10**6}, "generation"),
+        ("where_am_i", {"photo_base64": "no base64", "focal_px": 80}, "photo_base64"),
+        ("where_am_i", {**seen, "near": [0, 0, 0]}, "sigma"),
         ("what_changed", {"radius": 1.0}, "near"),
     ]:
         refused = await client.call_tool(name, asked)

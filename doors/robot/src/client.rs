@@ -9,6 +9,7 @@ use crate::changes::Changes;
 use crate::error::{MAX_TEXT_BYTES, RobotError};
 use crate::floor::Floor;
 use crate::goal::Goals;
+use crate::locate::Whereabouts;
 use crate::place::Place;
 use crate::reply::{PointAnswer, Reply};
 
@@ -84,6 +85,12 @@ impl Robot {
         self.get_with("/v1/floor", parameters)
     }
 
+    /// Returns where the camera of a JPEG or PNG is, by the parameters of `POST /v1/locate`.
+    pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<Whereabouts, RobotError> {
+        let media_type = if photo.starts_with(b"\x89PNG") { "image/png" } else { "image/jpeg" };
+        self.send("/v1/locate", parameters, media_type, photo)
+    }
+
     /// Says where the robot is, as `POST /position` takes it; a robot that follows then fetches what is around it.
     ///
     /// # Errors
@@ -107,11 +114,23 @@ impl Robot {
     }
 
     fn post<T: DeserializeOwned>(&self, path: &str, body: &Value) -> Result<T, RobotError> {
-        let mut request = self.agent.post(self.address(path)).header("content-type", "application/json");
+        self.send(path, &[], "application/json", body.to_string().as_bytes())
+    }
+
+    fn send<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        parameters: &[(&str, String)],
+        media_type: &str,
+        body: &[u8],
+    ) -> Result<T, RobotError> {
+        let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
+        let request = self.agent.post(self.address(path)).query_pairs(pairs);
+        let mut request = request.header("content-type", media_type);
         if let Some(authorization) = &self.authorization {
             request = request.header("authorization", authorization);
         }
-        self.read(path, request.send(body.to_string()))
+        self.read(path, request.send(body))
     }
 
     fn read<T: DeserializeOwned>(

@@ -6,6 +6,7 @@ mod client;
 mod error;
 mod floor;
 mod goal;
+mod locate;
 mod place;
 mod reply;
 
@@ -15,5 +16,6 @@ pub use client::Robot;
 pub use error::RobotError;
 pub use floor::{Floor, Place as FloorPlace};
 pub use goal::{Goal, GoalMiss, GoalThing, Goals};
+pub use locate::{CameraPose, Whereabouts};
 pub use place::{Box3, Cell, Place};
 pub use reply::{Answer, Geographic, Nothing, OrientedBox, PointAnswer, Reply, Results, Witness};
