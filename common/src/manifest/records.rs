@@ -93,17 +93,31 @@ pub struct ObjectRecord {
     pub len_bytes: u64,
 }
 
-/// The distribution of the scores of a bank of texts in a scene.
-///
-/// Nearly all pairs of text and Gaussian do not match, so this is the distribution of non-matches in this scene
-/// with this encoder.
+/// How a bank of texts scores in a scene, and the score from which something answers a question there.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {
     /// Mean of the scores of all pairs.
     pub score_mean: f32,
-    /// Standard deviation of the scores of all pairs, not within a text.
+    /// A third of the distance from the mean to the threshold. Few texts show no threshold: their scores' standard
+    /// deviation.
     pub score_spread: f32,
+}
+
+impl Calibration {
+    /// Spreads above the mean at which the threshold lies.
+    const SPREADS_ABOVE_MEAN: f32 = 3.0;
+
+    /// Returns the calibration with this threshold, or with the mean where that is larger.
+    pub fn with_threshold(score_mean: f32, threshold: f32) -> Self {
+        let above = (threshold - score_mean).max(0.0);
+        Self { score_mean, score_spread: above / Self::SPREADS_ABOVE_MEAN }
+    }
+
+    /// Returns the score from which something answers a question; a cosine only where the calibration is usable.
+    pub fn threshold(self) -> f32 {
+        self.score_mean + Self::SPREADS_ABOVE_MEAN * self.score_spread
+    }
 }
 
 /// A cell: a piece of space and its shards.

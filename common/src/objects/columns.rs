@@ -45,7 +45,7 @@ pub struct ObjectsHeader {
     pub photos_bytes: u32,
     /// Mean score over a bank of texts and all objects of the scene.
     pub score_mean: f32,
-    /// Standard deviation of the same scores.
+    /// A third of the distance from there to the threshold, see [`crate::manifest::Calibration`].
     pub score_spread: f32,
     /// Largest error of an object's score: the largest distance of a vector from its stored form.
     pub score_error_bound: f32,

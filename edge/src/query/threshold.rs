@@ -4,10 +4,6 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::manifest::Calibration;
 
-/// Spreads above the mean at which a scene's own threshold lies. On the labelled house with ConSE vectors
-/// (1,500 Gaussians, 1,612 texts: mean 0.002, spread 0.118) the mean F1 over its words peaks at 3 spreads,
-/// 0.355, where 1.2 % of all pairs of text and Gaussian match.
-const SPREADS_ABOVE_MEAN: f32 = 3.0;
 /// A smaller spread is unusable: all Gaussians look alike, or hardly any were scored.
 const MIN_SPREAD: f32 = 1e-3;
 
@@ -21,7 +17,7 @@ pub const RELEVANCY_THRESHOLD: f32 = 0.5;
 pub enum ThresholdSource {
     /// The request states it.
     Request,
-    /// The scene's calibration: the mean score of a text bank plus three spreads.
+    /// The scene's calibration: hardly any text of what is absent scores as high anywhere.
     Scene,
     /// The encoder's description, because the scene was not calibrated.
     Encoder,
@@ -29,12 +25,11 @@ pub enum ThresholdSource {
     Relevancy,
 }
 
-/// Returns the default cosine threshold: three spreads above the scene's mean, or the encoder's own default
-/// if the scene has no usable calibration.
+/// Returns the default cosine threshold: the scene's, or the encoder's own default if the scene has no usable
+/// calibration.
 pub fn calibrated_threshold(encoder_default: f32, scene: Option<Calibration>) -> (f32, ThresholdSource) {
-    let of_scene = |c: Calibration| c.score_mean + SPREADS_ABOVE_MEAN * c.score_spread;
-    let usable = scene.filter(|c| c.score_spread >= MIN_SPREAD && (-1.0..=1.0).contains(&of_scene(*c)));
-    usable.map_or((encoder_default, ThresholdSource::Encoder), |c| (of_scene(c), ThresholdSource::Scene))
+    let usable = scene.filter(|c| c.score_spread >= MIN_SPREAD && (-1.0..=1.0).contains(&c.threshold()));
+    usable.map_or((encoder_default, ThresholdSource::Encoder), |c| (c.threshold(), ThresholdSource::Scene))
 }
 
 #[cfg(test)]

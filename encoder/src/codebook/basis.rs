@@ -2,6 +2,7 @@
 
 use half::f16;
 
+use super::measure::conformal_bound;
 use slag_models::{TextEncoder, everyday_texts};
 
 use slag_math::axes::moments_of;
@@ -22,6 +23,8 @@ const MIN_TEXTS: usize = 8;
 const HELD_OUT_STEP: usize = 4;
 /// Fewest texts of a large bank: a quarter of them bounds 95 of 100 texts, for which 19 are needed.
 const LARGE_BANK: usize = 19 * HELD_OUT_STEP;
+/// Share of everyday words that name something in a scene.
+const EVERYDAY_PRESENT_SHARE: f64 = 0.1;
 
 /// Texts like the expected queries: `[n][dim]`, unit vectors in the space of the embeddings.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -29,20 +32,22 @@ pub struct TextBank {
     pub dim: usize,
     /// `[n][dim]`.
     pub vectors: Vec<f32>,
+    /// Share of the texts that are presumed to name something in a scene.
+    pub present_share: f64,
 }
 
 impl TextBank {
     /// Encodes a model's own vocabulary, or else everyday words; words that the model does not know are left out.
     /// Too few words are replaced by pseudo-random directions.
     pub(crate) fn of_model(encoder: &mut dyn TextEncoder) -> Self {
-        let words: Vec<String> = match encoder.vocabulary() {
-            Some(words) => words.to_vec(),
-            None => everyday_texts().map(str::to_owned).collect(),
+        let (words, present_share): (Vec<String>, f64) = match encoder.vocabulary() {
+            Some(words) => (words.to_vec(), 0.0),
+            None => (everyday_texts().map(str::to_owned).collect(), EVERYDAY_PRESENT_SHARE),
         };
         let stride = words.len().div_ceil(MAX_TEXTS).max(1);
         let dim = encoder.dim();
         let vectors = words.iter().step_by(stride).filter_map(|word| encoder.encode(word).ok());
-        let bank = Self { dim, vectors: vectors.flatten().collect() };
+        let bank = Self { dim, vectors: vectors.flatten().collect(), present_share };
         if bank.len() < MIN_TEXTS { Self::directions(bank.dim) } else { bank }
     }
 
@@ -55,7 +60,7 @@ impl TextBank {
             let length = dot(vector, vector).sqrt();
             vector.iter_mut().for_each(|v| *v /= length);
         }
-        Self { dim, vectors }
+        Self { dim, vectors, present_share: 0.0 }
     }
 
     pub fn len(&self) -> usize {
@@ -65,6 +70,13 @@ impl TextBank {
     /// Returns whether there is none.
     pub fn is_empty(&self) -> bool {
         self.vectors.is_empty()
+    }
+
+    /// Returns the score that a new text of something absent exceeds nowhere in a scene, in 95 of 100 cases; `None` for
+    /// a small bank. `best`: each text's best score there; those presumed present have the highest.
+    pub(crate) fn absent_bound(&self, best: &mut [f32]) -> Option<f32> {
+        let n_absent = (best.len() as f64 * (1.0 - self.present_share)) as usize;
+        if best.len() < LARGE_BANK { None } else { conformal_bound(best, n_absent) }
     }
 
     /// Returns whether a text is held out: the codebook is not made for it, so errors of its scores are like those

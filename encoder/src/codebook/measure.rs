@@ -6,7 +6,7 @@ use slag_common::shard::ScoreErrors;
 use super::basis::TextBank;
 use slag_math::matrix::{Panels, Rows};
 
-/// Texts in 1,000 whose scores the likely error bounds.
+/// Texts in 1,000 that a bound holds for.
 const LIKELY_TEXTS: usize = 950;
 /// Of each of these texts, scores in 1,000 that are bounded.
 const LIKELY_SCORES: usize = 990;
@@ -81,11 +81,9 @@ impl<'a> Sample<'a> {
     }
 }
 
-/// Returns a bound for a text like those held out, by split conformal prediction (Vovk, Gammerman and Shafer
-/// 2005): for 95 of 100 such texts, 99 of 100 scores err by no more.
+/// Returns a bound for a text like those held out: for 95 of 100 such texts, 99 of 100 scores err by no more.
 ///
-/// `errors`: `[n][n_texts]`, absolute. The bound is the ceil(0.95 (h + 1))-th smallest of the h held-out texts'
-/// own 99th percentiles; `None` if that is more than h.
+/// `errors`: `[n][n_texts]`, absolute. The bound is that of the held-out texts' own 99th percentiles.
 pub fn likely_error(errors: &[f32], n_texts: usize, is_held_out: impl Fn(usize) -> bool) -> Option<f32> {
     if errors.is_empty() {
         return None;
@@ -96,8 +94,15 @@ pub fn likely_error(errors: &[f32], n_texts: usize, is_held_out: impl Fn(usize) 
         *of_text.select_nth_unstable_by(rank, f32::total_cmp).1
     };
     let mut of_texts: Vec<f32> = (0..n_texts).filter(|text| is_held_out(*text)).map(percentile).collect();
-    let rank = ((of_texts.len() + 1) * LIKELY_TEXTS).div_ceil(1000);
-    (rank <= of_texts.len()).then(|| *of_texts.select_nth_unstable_by(rank - 1, f32::total_cmp).1)
+    let n = of_texts.len();
+    conformal_bound(&mut of_texts, n)
+}
+
+/// Returns a bound for a new value like the `n` smallest, in 95 of 100 cases, by split conformal prediction (Vovk,
+/// Gammerman and Shafer 2005): the ceil(0.95 (n + 1))-th smallest; `None` if that is more than n.
+pub fn conformal_bound(values: &mut [f32], n: usize) -> Option<f32> {
+    let rank = ((n + 1) * LIKELY_TEXTS).div_ceil(1000);
+    (rank <= n).then(|| *values.select_nth_unstable_by(rank - 1, f32::total_cmp).1)
 }
 
 /// Returns the standard deviation of each column of `[n][n_columns]`, averaged over the columns.

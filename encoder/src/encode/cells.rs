@@ -22,7 +22,7 @@ use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::{PendingRefinement, Refinement};
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable, SceneContributions};
 use crate::memory;
-use crate::objects::{self, Object, ObjectsReport};
+use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
 use crate::store::Extras;
@@ -38,6 +38,8 @@ pub(super) struct BuiltCells {
     pub(super) n_without_evidence: u64,
     /// The search for objects, if there was one.
     pub(super) objects: Option<ObjectsReport>,
+    /// Score from which an object answers; absent where there is none.
+    object_threshold: Option<f32>,
     pub(super) occupancy: Option<OccupancyReport>,
     pub(super) counts: Counts,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
@@ -62,12 +64,14 @@ impl BuiltCells {
         self.score_sums.iter_mut().zip(cell.score_sums).for_each(|(all, of_cell)| *all += of_cell);
     }
 
-    /// Returns how the bank of texts scores in all cells.
+    /// Returns how the bank of texts scores in all cells. Objects, where there are any, set the threshold of Gaussians
+    /// too: these answer where no object does.
     pub(super) fn calibration(&self) -> Calibration {
         let [sum, squares, n] = self.score_sums;
         let mean = sum / n.max(1.0);
         let variance = (squares / n.max(1.0) - mean * mean).max(0.0);
-        Calibration { score_mean: mean as f32, score_spread: variance.sqrt() as f32 }
+        let alone = Calibration { score_mean: mean as f32, score_spread: variance.sqrt() as f32 };
+        self.object_threshold.map_or(alone, |threshold| Calibration::with_threshold(mean as f32, threshold))
     }
 }
 
@@ -160,6 +164,7 @@ fn build(
         n_entries,
         extras,
         n_without_evidence: 0,
+        object_threshold: maker.objects.as_ref().and_then(SceneObjects::threshold),
         objects: maker.objects.map(|objects| objects.report),
         occupancy: maker.occupancy.map(|occupancy| occupancy.report),
         counts,

@@ -5,9 +5,7 @@ use std::io;
 use std::time::Instant;
 
 use slag_common::Hash32;
-use slag_common::manifest::{
-    self, Calibration, CellRecord, EncoderRecord, Manifest, ObjectRecord, TextModelRecord,
-};
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::ScoreErrors;
 use slag_models::ModelDir;
 
@@ -99,11 +97,6 @@ fn manifest(
     text_model: Option<TextModelRecord>,
 ) -> Manifest {
     let (settings, inputs, models) = (plan.settings, plan.inputs, plan.engines.models);
-    // Robots take a score as an answer from three spreads above the mean on.
-    let of_calibration = || {
-        let Calibration { score_mean, score_spread } = built.calibration();
-        (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
-    };
     Manifest {
         version: manifest::VERSION,
         scene: settings.output.scene_name.clone(),
@@ -115,7 +108,9 @@ fn manifest(
             name: models.encoder_id().name.clone(),
             id: Hash32(models.encoder_id().hash()),
             dim: models.dim() as u32,
-            default_threshold: models.threshold().unwrap_or_else(of_calibration),
+            default_threshold: models
+                .threshold()
+                .unwrap_or_else(|| built.calibration().threshold().clamp(-1.0, 1.0)),
             calibration: models.threshold().is_none().then(|| built.calibration()),
             text_model,
         },

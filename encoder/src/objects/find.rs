@@ -72,7 +72,7 @@ pub(super) fn find_among(
     let object_of: Vec<Vec<u32>> =
         cells.map(|cell| cell.gaussians.iter().map(of_gaussian).collect()).collect();
     let objects = describe(scene, table, &object_of, &masks);
-    let calibration = vectors::calibrate(&objects, score_context, table.dim());
+    let calibration = vectors::calibrate(&objects, &score_context.bank);
     let report = ObjectsReport {
         n_objects: objects.len(),
         n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),

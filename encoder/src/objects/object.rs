@@ -54,10 +54,17 @@ pub struct SceneObjects {
     pub objects: Vec<Object>,
     /// `[cell][N of the cell]`: index of each Gaussian's object, or [`NONE`].
     pub object_of: Vec<Vec<u32>>,
-    /// Mean and spread of the text bank's scores over the objects.
+    /// How the text bank scores over the objects.
     pub calibration: Calibration,
     /// Counts for the summary.
     pub report: ObjectsReport,
+}
+
+impl SceneObjects {
+    /// Returns the score from which an object answers a question, if there is one.
+    pub(crate) fn threshold(&self) -> Option<f32> {
+        (!self.objects.is_empty()).then(|| self.calibration.threshold())
+    }
 }
 
 /// Counts of objects and masks, for the summary.

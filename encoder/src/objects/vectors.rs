@@ -4,7 +4,7 @@ use slag_common::manifest::Calibration;
 use slag_common::objects::object_score;
 
 use super::object::Object;
-use crate::codebook::ScoreMetricContext;
+use crate::codebook::TextBank;
 use crate::lift::RegionTable;
 use slag_math::dot;
 
@@ -54,17 +54,56 @@ pub(super) fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec
     chosen
 }
 
-/// Returns the mean and spread of the text bank's scores over objects, as cells have them over Gaussians.
-pub(super) fn calibrate(objects: &[Object], score_context: &ScoreMetricContext, dim: usize) -> Calibration {
+/// Returns how the text bank scores over objects. The threshold is what the best object for an absent text hardly
+/// ever reaches (see [`TextBank::absent_bound`]); banks too small for that have the standard deviation of all scores.
+pub(super) fn calibrate(objects: &[Object], bank: &TextBank) -> Calibration {
     let (mut sum, mut squares, mut n) = (0.0, 0.0, 0.0f64);
+    let mut best = vec![-1.0f32; bank.len()];
     for object in objects {
-        for text in score_context.bank.vectors.chunks_exact(dim) {
-            let cosines: Vec<f32> = object.vectors.chunks_exact(dim).map(|v| dot(v, text)).collect();
-            let score = f64::from(object_score(&cosines));
+        for (text, best) in bank.vectors.chunks_exact(bank.dim).zip(&mut best) {
+            let cosines: Vec<f32> = object.vectors.chunks_exact(bank.dim).map(|v| dot(v, text)).collect();
+            let score = object_score(&cosines);
+            *best = best.max(score);
+            let score = f64::from(score);
             (sum, squares, n) = (sum + score, squares + score * score, n + 1.0);
         }
     }
     let mean = sum / n.max(1.0);
     let variance = (squares / n.max(1.0) - mean * mean).max(0.0);
-    Calibration { score_mean: mean as f32, score_spread: variance.sqrt() as f32 }
+    match bank.absent_bound(&mut best).filter(|_| !objects.is_empty()) {
+        Some(threshold) => Calibration::with_threshold(mean as f32, threshold),
+        None => Calibration { score_mean: mean as f32, score_spread: variance.sqrt() as f32 },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+    use slag_common::frames::Aabb;
+
+    /// By hand: text k scores k / 100 with one object and 0 with the other; of 76 texts the 74th bounds absent ones.
+    /// Without objects there is no threshold.
+    #[test]
+    fn the_best_object_of_an_absent_text_stays_below_the_threshold() {
+        let n = 76;
+        let object = |vectors: Vec<f32>| Object {
+            id: 0,
+            n_gaussians: 1,
+            n_masks: 1,
+            position_in_world: DVec3::ZERO,
+            box_in_world: Aabb { min: DVec3::ZERO, max: DVec3::ZERO },
+            vectors,
+            photo: String::new(),
+            photo_box_px: [0; 4],
+        };
+        let axes = (0..n).flat_map(|text| (0..n).map(move |axis| f32::from(u8::from(axis == text))));
+        let bank = TextBank { dim: n, vectors: axes.collect(), present_share: 0.0 };
+        let objects = [object(vec![0.0; n]), object((0..n).map(|k| k as f32 / 100.0).collect())];
+        let found = calibrate(&objects, &bank);
+        // The mean of 0 to 0.75 over both objects.
+        assert!((found.score_mean - 0.1875).abs() < 1e-6, "{found:?}");
+        assert!((found.threshold() - 0.73).abs() < 1e-6, "{found:?}");
+        assert_eq!(calibrate(&[], &bank), Calibration { score_mean: 0.0, score_spread: 0.0 });
+    }
 }

@@ -9,8 +9,6 @@ use slag_common::objects::{ObjectRecord, public_id};
 
 use super::shards::{Shard, combined};
 
-/// Spreads above the mean from which a score is an answer, as on robots.
-const SPREADS_ABOVE_MEAN: f32 = 3.0;
 /// Relevancy from which a question with negatives is answered, as on robots.
 const RELEVANCY_THRESHOLD: f32 = 0.5;
 
@@ -41,7 +39,7 @@ impl Things {
         let encoder = &manifest.encoder;
         match self.calibration.filter(|_| encoder.calibration.is_some()) {
             _ if has_negatives => RELEVANCY_THRESHOLD,
-            Some(of) => of.score_mean + SPREADS_ABOVE_MEAN * of.score_spread,
+            Some(calibration) => calibration.threshold(),
             None => encoder.default_threshold,
         }
     }

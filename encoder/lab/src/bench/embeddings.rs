@@ -127,7 +127,7 @@ impl Field {
             Noise::new(5, kind).add_noise(0.5, vector);
             make_unit(vector);
         }
-        TextBank { dim: self.dim, vectors }
+        TextBank { dim: self.dim, vectors, ..TextBank::default() }
     }
 }
 

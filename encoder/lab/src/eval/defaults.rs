@@ -96,6 +96,8 @@ impl fmt::Display for DefaultsReport {
             "objects that are two things",
             "things split",
             "Gaussians in objects",
+            "absent words answered",
+            "words whose best object is right; above the threshold",
         ];
         let mut table = Table::new(columns.into_iter().chain(of_things));
         for row in &self.rows {
@@ -108,6 +110,10 @@ impl fmt::Display for DefaultsReport {
                 cells.push(any.to_string());
                 cells.extend([format!("{n_merged_objects} of {n_objects}"), n_split_things.to_string()]);
                 cells.push(percent(n_in_objects[0] as u64, n_in_objects[1] as u64));
+                let ([n_silent, n_absent], [n_words, n_right, n_answered]) =
+                    (row.abstained, found.right_words);
+                cells.push(percent((n_absent - n_silent) as u64, n_absent as u64));
+                cells.push(format!("{n_right}; {n_answered} of {n_words}"));
             }
             table.row(cells);
         }

@@ -12,7 +12,7 @@ use serde::Serialize;
 use slag_encoder::cli::common::{ModelArgs, open_models};
 use slag_models::Crop;
 
-use super::judge::ABSENT;
+use super::judge::absent_words;
 use crate::generate::crops::{self, Label, Split};
 use crate::generate::grammar::{self, Noun};
 use crate::generate::paint::{Colour, Material};
@@ -96,7 +96,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
     let of_colours = encode(Colour::ALL.iter().map(|c| format!("something {}", c.word())).collect())?;
     let of_materials =
         encode(Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect())?;
-    let of_absent = encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?;
+    let of_absent = encode(absent_words().map(|thing| format!("a {thing}")).collect())?;
     let text_times = Times::measure(0, N_TIMED, |i| text.encode(&nouns[i % nouns.len()].name).map(|_| ()))?;
 
     let mut image = models.image_encoder(&session)?;
@@ -143,7 +143,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
         threshold,
         found: share(found[0], 1),
         found_others: share(found[1], nouns.len() - 1),
-        found_absent: share(found[2], ABSENT.len()),
+        found_absent: share(found[2], of_absent.len()),
         ms_per_crop: crop_times.median_ms,
         ms_per_text: text_times.median_ms,
     })

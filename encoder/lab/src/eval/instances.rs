@@ -53,12 +53,24 @@ pub(crate) struct InstanceReport {
     pub(crate) of_words: Recall,
     /// Recall by the word's n best objects, where n is the number of things with that word.
     pub(crate) best_of_words: Recall,
+    /// Words, those of them whose best object is theirs by half of its Gaussians or more, and those of them whose
+    /// best object reaches the threshold.
+    pub(crate) right_words: [usize; 3],
 }
 
 impl fmt::Display for InstanceReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { n_objects, n_in_objects, n_merged_objects, n_split_things, any, of_words, best_of_words } =
-            self;
+        let Self {
+            n_objects,
+            n_in_objects,
+            n_merged_objects,
+            n_split_things,
+            any,
+            of_words,
+            best_of_words,
+            ..
+        } = self;
+        let [n_words, n_right, n_answered] = self.right_words;
         let share = percent(n_in_objects[0] as u64, n_in_objects[1] as u64);
         writeln!(
             f,
@@ -67,6 +79,10 @@ impl fmt::Display for InstanceReport {
         writeln!(
             f,
             "  by objects above the threshold for the word: {of_words}; by the word's best objects: {best_of_words}"
+        )?;
+        writeln!(
+            f,
+            "  words whose best object is right: {n_right} of {n_words}; above the threshold: {n_answered}"
         )?;
         writeln!(
             f,
@@ -119,10 +135,16 @@ pub(super) fn report(
     // Things without Gaussians cannot be found.
     let things = truth.things.iter().map(|thing| thing.id).filter(|id| n_of_thing.contains_key(id));
     things.for_each(|thing| any.count(best_iou(thing, &|_| true)));
+    let mut right_words = [classes.len(), 0, 0];
     for ((_, ids), scores) in classes.iter().zip(scores) {
         let ids: Vec<u16> = ids.iter().copied().filter(|id| n_of_thing.contains_key(id)).collect();
         let mut order: Vec<u32> = (0..n_objects as u32).collect();
         order.sort_by(|a, b| scores[*b as usize].total_cmp(&scores[*a as usize]).then(a.cmp(b)));
+        let own = |best: u32| ids.iter().filter_map(|id| n_of_both.get(&(*id, best))).sum::<u64>();
+        if let Some(best) = order.first().filter(|best| 2 * own(**best) >= n_of_object[**best as usize]) {
+            right_words[1] += 1;
+            right_words[2] += usize::from(scores[*best as usize] >= threshold);
+        }
         order.truncate(ids.len());
         for thing in ids {
             of_words.count(best_iou(thing, &|object| scores[object as usize] >= threshold));
@@ -130,7 +152,16 @@ pub(super) fn report(
         }
     }
     let n_in_objects = [object_of.iter().filter(|object| **object != NONE).count(), object_of.len()];
-    InstanceReport { n_objects, n_in_objects, n_merged_objects, n_split_things, any, of_words, best_of_words }
+    InstanceReport {
+        n_objects,
+        n_in_objects,
+        n_merged_objects,
+        n_split_things,
+        any,
+        of_words,
+        best_of_words,
+        right_words,
+    }
 }
 
 #[cfg(test)]
@@ -167,9 +198,12 @@ mod tests {
             (report.any, report.of_words, report.best_of_words),
             (recall(2, 2, 1), recall(2, 2, 1), recall(2, 2, 1))
         );
+        // Object 0 is thing 7 alone, and half of object 2 is thing 8; a table has no Gaussians.
+        assert_eq!(report.right_words, [2, 1, 1]);
         let report = found(vec![0.4, 0.1, 0.8]);
         assert_eq!((report.of_words, report.best_of_words), (recall(2, 1, 0), recall(2, 2, 1)));
         let report = found(vec![0.1, 0.45, 0.48]);
+        assert_eq!(report.right_words, [2, 1, 0]);
         assert_eq!((report.of_words, report.best_of_words), (recall(2, 0, 0), recall(2, 1, 0)));
     }
 }

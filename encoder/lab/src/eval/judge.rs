@@ -7,7 +7,6 @@ use std::path::PathBuf;
 use anyhow::{Result, anyhow, bail};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
-use slag_common::manifest::Calibration;
 use slag_common::shard::Profile;
 use slag_encoder::query::{self, PublishedObjects};
 use slag_encoder::store::StoreReader;
@@ -23,33 +22,18 @@ const MIN_ANSWER: usize = 10;
 /// Sizes of the reported class lists, as in the ScanNet protocol; the largest categories come first.
 const SUBSETS: [usize; 3] = [19, 15, 10];
 
-/// Negative queries: categories absent from most scenes. Those that a scene does have are left out.
-pub(super) const ABSENT: [&str; 24] = [
-    "elephant",
-    "airplane",
-    "boat",
-    "piano",
-    "guitar",
-    "horse",
-    "cat",
-    "bird",
-    "fish",
-    "snake",
-    "banana",
-    "pizza",
-    "train",
-    "helicopter",
-    "bathtub",
-    "toilet",
-    "shower",
-    "umbrella",
-    "bicycle",
-    "motorcycle",
-    "tent",
-    "ladder",
-    "tractor",
-    "traffic light",
-];
+/// Negative queries: things that most scenes do not have. Those that a scene does have are left out.
+const ABSENT: &str = "elephant, airplane, boat, piano, guitar, horse, cat, bird, fish, snake, banana, pizza, train, \
+    helicopter, bathtub, toilet, shower, umbrella, bicycle, motorcycle, tent, ladder, tractor, traffic light, cow, \
+    sheep, pig, duck, bear, lion, tiger, monkey, giraffe, zebra, penguin, shark, whale, spider, butterfly, violin, \
+    drum, trumpet, ship, submarine, canoe, surfboard, skateboard, sled, kite, rocket, crown, necklace, glove, scarf, \
+    sandal, wallet, razor, comb, toothbrush, lipstick, microscope, telescope, binoculars, cannon, sword, anchor, \
+    windmill, lighthouse, pumpkin, strawberry, pineapple, carrot, mushroom, cake, hamburger, scissors";
+
+/// Returns the negative queries.
+pub(super) fn absent_words() -> impl Iterator<Item = &'static str> {
+    ABSENT.split(", ")
+}
 
 /// What is scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
@@ -162,7 +146,7 @@ pub(crate) fn judge(
     let mut asker = Asker { reader, objects: objects.as_ref(), encoder, settings, unknown: BTreeMap::new() };
     let classes = asker.classes(truth)?;
     let thresholds = Thresholds::of(reader, objects.as_ref(), settings);
-    let abstained = asker.abstained(truth, thresholds.of_gaussians)?;
+    let abstained = asker.abstained(truth, &thresholds)?;
     let things = Things::of(truth, &classes);
     let whole = things.confusion(&classes, classes.len());
     let subset = |n: usize| {
@@ -262,17 +246,18 @@ impl Asker<'_> {
         }
     }
 
-    /// Returns how many absent categories find nothing, and how many were asked.
-    fn abstained(&mut self, truth: &Truth, threshold: f32) -> Result<[usize; 2]> {
+    /// Returns how many absent categories find neither an object nor enough Gaussians, and how many were asked.
+    fn abstained(&mut self, truth: &Truth, thresholds: &Thresholds) -> Result<[usize; 2]> {
         let is_present = |word: &str| {
             let mut things = truth.things.iter().chain(&truth.background);
             things.any(|t| t.category.contains(word) || t.words.iter().any(|w| w.contains(word)))
         };
         let mut abstained = [0, 0];
-        for word in ABSENT.into_iter().filter(|word| !is_present(word)) {
-            if let Some((cosines, _)) = self.score(word)? {
-                let n = cosines.iter().filter(|c| **c >= threshold).count();
-                abstained[0] += usize::from(n < MIN_ANSWER);
+        for word in absent_words().filter(|word| !is_present(word)) {
+            if let Some((cosines, of_objects)) = self.score(word)? {
+                let n = cosines.iter().filter(|c| **c >= thresholds.of_gaussians).count();
+                let has_object = of_objects.iter().any(|score| *score >= thresholds.of_objects);
+                abstained[0] += usize::from(n < MIN_ANSWER && !has_object);
                 abstained[1] += 1;
             }
         }
@@ -291,11 +276,7 @@ impl Thresholds {
         let record = &reader.manifest().encoder;
         let of_scene = record.default_threshold;
         let of_objects = match (objects, record.calibration) {
-            // A scene's own threshold lies three spreads above the mean of the scores, here those of objects.
-            (Some(objects), Some(_)) => {
-                let Calibration { score_mean, score_spread } = objects.calibration;
-                (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
-            }
+            (Some(objects), Some(_)) => objects.calibration.threshold().clamp(-1.0, 1.0),
             _ => of_scene,
         };
         let of_gaussians = if objects.is_some() { query::mixed(of_scene, of_objects) } else { of_scene };
