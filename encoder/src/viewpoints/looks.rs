@@ -9,7 +9,7 @@ use crate::masks::RegionMap;
 use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
 
 /// Size of the drawings, pixels.
-const SIZE_PX: [u32; 2] = [80, 60];
+const SIZE_PX: [u32; 2] = [40, 30];
 /// Tangent of half the horizontal field of view, 60 degrees: that of a phone's main camera.
 const HALF_WIDTH: f64 = 0.577_350_269;
 /// Opacity below which a pixel is a hole.
@@ -21,7 +21,7 @@ const NEAR: f64 = 0.035 * WIDTH;
 /// Standard deviation on the screen from which a Gaussian is large: 24 px of a photo 640 px wide.
 const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
 /// Weight of a Gaussian that is seen, pixels of the drawing.
-const MIN_WEIGHT: f32 = 0.05;
+const MIN_WEIGHT: f32 = 0.02;
 /// Sides from which a Gaussian can be seen, around the vertical.
 const N_SIDES: usize = 8;
 /// Bytes of what a candidate shows: eight a Gaussian, of which a pixel shows few.
