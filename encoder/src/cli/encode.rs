@@ -256,12 +256,6 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let next = if json { String::new() } else { next::of_store(&settings.output.store)? };
     print(json, &summary, lines + &next)?;
     warn_of_expiry(&settings.output.store);
-    if summary.n_views_drawn > 0 {
-        let n = summary.n_views_drawn;
-        tracing::warn!(
-            "{n} views are drawings of the splat, not photos; docs/inputs.md says what photos find beyond them"
-        );
-    }
     if let (Some(path), Some(recorder)) = (&args.report, &recorder) {
         fs_err::write(path, report::of_encode(&settings.output.scene_name, &summary, recorder)?)?;
     }

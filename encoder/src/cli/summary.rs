@@ -34,7 +34,7 @@ pub(super) fn lines(
     let drawn = match summary.n_views_drawn {
         0 => String::new(),
         n => format!(
-            "drawn      {n} views are drawings of the splat, no photos: small things and signs may be missed\n"
+            "drawn      {n} views are drawings of the splat, not photos; docs/inputs.md says what they miss\n"
         ),
     };
     let skipped = match summary.skipped_views.len() {

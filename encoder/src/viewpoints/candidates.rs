@@ -4,10 +4,9 @@ use std::f64::consts::{PI, TAU};
 
 use glam::{DAffine3, DVec3};
 
-use super::looks::{look, look_along, look_at};
+use super::looks::{look_along, look_at};
 use super::plan::SceneKind;
 use super::space::{Space, VOXEL, WIDTH};
-use crate::raster::{LoadedScene, RasterError};
 
 /// Most candidates; each costs a small drawing.
 pub(super) const MOST: usize = 600;
@@ -19,50 +18,26 @@ const CLEARANCE: f64 = 0.12;
 /// Heights of cameras above the ground, in parts of the scene's width, and how far they look down, radians.
 const OUTDOOR: [(f64, f64); 3] = [(0.05, 0.1), (0.1, 0.3), (0.2, 0.6)];
 /// Rings around an object: elevation, radians, and distance in parts of the one from which it fills the image.
-const RINGS: [(f64, f64); 6] = [(-0.2, 1.0), (0.1, 1.0), (0.1, 0.6), (0.45, 1.0), (0.45, 0.6), (0.95, 1.0)];
+const RINGS: [(f64, f64); 5] = [(0.1, 1.0), (0.1, 0.6), (0.45, 1.0), (0.45, 0.6), (0.95, 1.0)];
 const N_AROUND: usize = 24;
 /// Share of the columns with ground that have, above a gap, something overhead, from which a scene is indoor. A yard
 /// has 11 %, a drone scene 23 %.
 const MIN_OVERHEAD: f64 = 0.5;
-/// Share of holes, inward from a ring, from which a scene is a single object.
-const MIN_HOLES: f32 = 0.5;
-const N_RING: usize = 12;
 
-/// Returns what the Gaussians show.
-pub(super) fn kind_of(space: &Space, loaded: &dyn LoadedScene) -> Result<SceneKind, RasterError> {
+/// Returns whether something is overhead, as in rooms.
+pub(super) fn kind_of(space: &Space) -> SceneKind {
     let ground = 0.6 * space.half.z - space.half.z;
     let gap = 0.8 * space.half.z;
-    let (mut n_ground, mut n_overhead, mut n) = (0, 0, 0);
+    let (mut n_ground, mut n_overhead) = (0, 0);
     for (x, y) in space.lattice(2.0 * VOXEL) {
         let column: Vec<f64> = space.column(x, y).collect();
-        let is_ground = column.first().is_some_and(|low| *low < ground);
-        n += 1;
-        n_ground += usize::from(is_ground);
-        n_overhead += usize::from(is_ground && column.windows(2).any(|pair| pair[1] - pair[0] > gap));
+        if column.first().is_some_and(|low| *low < ground) {
+            n_ground += 1;
+            n_overhead += u32::from(column.windows(2).any(|pair| pair[1] - pair[0] > gap));
+        }
     }
-    let overhead = f64::from(n_overhead as u32) / f64::from(n_ground.max(1) as u32);
-    let cameras = (0..N_RING).map(|i| {
-        let angle = TAU * i as f64 / N_RING as f64;
-        let eye = DVec3::new(space.half.x * angle.cos(), space.half.y * angle.sin(), 0.0) * 0.9;
-        look_at(eye, DVec3::ZERO)
-    });
-    let holes = cameras.map(|camera| {
-        let look = look(loaded, &space.scene, camera, SceneKind::Outdoor)?;
-        Ok(look.verdict.holes)
-    });
-    let holes = holes.collect::<Result<Vec<f32>, RasterError>>()?.iter().sum::<f32>() / N_RING as f32;
-    let filled = f64::from(n_ground as u32) / f64::from(n.max(1));
-    tracing::debug!(
-        "half {:?}: {overhead:.2} overhead, ground {filled:.2}, ring holes {holes:.2}",
-        space.half
-    );
-    Ok(if holes >= MIN_HOLES {
-        SceneKind::Object
-    } else if overhead >= MIN_OVERHEAD {
-        SceneKind::Indoor
-    } else {
-        SceneKind::Outdoor
-    })
+    let is_indoor = f64::from(n_overhead) >= MIN_OVERHEAD * f64::from(1.max(n_ground));
+    if is_indoor { SceneKind::Indoor } else { SceneKind::Outdoor }
 }
 
 pub(super) fn of(kind: SceneKind, space: &Space) -> Vec<DAffine3> {

@@ -1,19 +1,19 @@
 //! A small drawing of a candidate: can it be trusted, and which Gaussians does it show?
 
 use glam::{DAffine3, DMat3, DVec3};
-use slag_common::{Distortion, Gaussians, Intrinsics};
+use slag_common::{Distortion, Intrinsics};
 
 use super::plan::{SceneKind, Verdict};
-use super::space::WIDTH;
+use super::space::{Space, WIDTH};
 use crate::masks::RegionMap;
 use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
 
 /// Size of the drawings, pixels.
-const SIZE_PX: [u32; 2] = [80, 60];
+const SIZE_PX: [u32; 2] = [40, 30];
 /// Tangent of half the horizontal field of view, 60 degrees: that of a phone's main camera.
 const HALF_WIDTH: f64 = 0.577_350_269;
 /// Opacity below which a pixel is a hole.
-const MIN_COVERED: f32 = 0.5;
+const MIN_COVERED: f64 = 0.5;
 /// Difference of expected and median depth, relative to the latter, from which a pixel is hazy.
 const HAZY: f64 = 0.15;
 /// Depth below which a pixel is near.
@@ -21,7 +21,7 @@ const NEAR: f64 = 0.035 * WIDTH;
 /// Standard deviation on the screen from which a Gaussian is large: 24 px of a photo 640 px wide.
 const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
 /// Weight of a Gaussian that is seen, pixels of the drawing.
-const MIN_WEIGHT: f32 = 0.05;
+const MIN_WEIGHT: f32 = 0.02;
 /// Sides from which a Gaussian can be seen, around the vertical.
 const N_SIDES: usize = 8;
 /// Bytes of what a candidate shows: eight a Gaussian, of which a pixel shows few.
@@ -62,17 +62,10 @@ pub(super) fn pinhole(width_px: u32, height_px: u32) -> Intrinsics {
     }
 }
 
-/// A Gaussian at a pixel.
-#[derive(Clone, Copy)]
-struct Layer {
-    depth: f64,
-    weight: f64,
-}
-
 /// Draws the weight of each Gaussian at each pixel, and judges it.
 pub(super) fn look(
     loaded: &dyn LoadedScene,
-    scene: &Gaussians,
+    space: &Space,
     camera: DAffine3,
     kind: SceneKind,
 ) -> Result<Look, RasterError> {
@@ -83,15 +76,18 @@ pub(super) fn look(
     let view = RasterView { camera_from_world: camera, intrinsics };
     let weights = loaded.weights(&view, &regions, WeightKind::Blend)?;
     let eye = camera.inverse().translation;
-    let mut of_pixel: Vec<Vec<Layer>> = vec![Vec::new(); n_px as usize];
     let (mut large, mut total) = (0.0, 0.0);
     let mut seen = Vec::new();
+    // Each Gaussian with its depth, from near to far.
+    let mut layers = Vec::new();
+    // Weight of each pixel, and its weighted depth.
+    let mut sums = vec![(0.0, 0.0); n_px as usize];
     for entries in weights.entries.chunk_by(|a, b| a.gaussian == b.gaussian) {
         let gaussian = entries[0].gaussian as usize;
-        let mean = scene.means_in_world[gaussian];
+        let mean = space.scene.means_in_world[gaussian];
         let depth = camera.transform_point3(mean).z;
         let sum: f32 = entries.iter().map(|entry| entry.weight).sum();
-        let scale = f64::from(scene.scales[gaussian].into_iter().fold(0.0, f32::max));
+        let scale = f64::from(space.scene.scales[gaussian].into_iter().fold(0.0, f32::max) / space.grown);
         total += f64::from(sum);
         if scale * intrinsics.focal_x_px > LARGE_PX * depth {
             large += f64::from(sum);
@@ -100,16 +96,29 @@ pub(super) fn look(
             seen.push((entries[0].gaussian, side(eye - mean)));
         }
         for entry in entries {
-            of_pixel[entry.region as usize].push(Layer { depth, weight: entry.weight.into() });
+            let (weight, weighted) = &mut sums[entry.region as usize];
+            *weight += f64::from(entry.weight);
+            *weighted += f64::from(entry.weight) * depth;
         }
+        layers.push((depth, entries));
     }
+    layers.sort_by(|a, b| a.0.total_cmp(&b.0));
     let near = if kind == SceneKind::Object { 0.0 } else { NEAR };
     let (mut n_covered, mut n_near, mut n_hazy) = (0u32, 0u32, 0u32);
-    for layers in &mut of_pixel {
-        let Some((expected, median)) = depths(layers) else { continue };
-        n_covered += 1;
-        n_near += u32::from(median < near);
-        n_hazy += u32::from((expected - median).abs() > HAZY * median);
+    let mut nearer = vec![0.0; n_px as usize];
+    for (depth, entries) in layers {
+        for entry in entries {
+            let ((weight, weighted), nearer) =
+                (sums[entry.region as usize], &mut nearer[entry.region as usize]);
+            let is_before = *nearer < 0.5 * weight;
+            *nearer += f64::from(entry.weight);
+            // The median depth of a pixel that is no hole.
+            if weight >= MIN_COVERED && is_before && *nearer >= 0.5 * weight {
+                n_covered += 1;
+                n_near += u32::from(depth < near);
+                n_hazy += u32::from((weighted / weight - depth).abs() > HAZY * depth);
+            }
+        }
     }
     let share = |n: u32, of: u32| n as f32 / of.max(1) as f32;
     let verdict = Verdict {
@@ -122,22 +131,6 @@ pub(super) fn look(
         seen = Vec::new();
     }
     Ok(Look { camera, verdict, seen })
-}
-
-/// Returns expected and median depth of a pixel; `None` for a hole.
-fn depths(layers: &mut [Layer]) -> Option<(f64, f64)> {
-    let total: f64 = layers.iter().map(|layer| layer.weight).sum();
-    if total < f64::from(MIN_COVERED) {
-        return None;
-    }
-    layers.sort_by(|a, b| a.depth.total_cmp(&b.depth));
-    let expected = layers.iter().map(|layer| layer.weight * layer.depth).sum::<f64>() / total;
-    let mut below = 0.0;
-    let median = layers.iter().find(|layer| {
-        below += layer.weight;
-        below >= 0.5 * total
-    });
-    Some((expected, median.map_or(expected, |layer| layer.depth)))
 }
 
 /// Returns the side from which a Gaussian is seen, by the direction to the camera.

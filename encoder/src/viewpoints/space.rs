@@ -12,8 +12,6 @@ pub(super) const WIDTH: f64 = 10.0;
 pub(super) const VOXEL: f64 = WIDTH / 160.0;
 /// Voxels around the scene.
 const MARGIN: f64 = 4.0;
-/// Gaussians below this opacity occupy nothing.
-const MIN_OPACITY: f32 = 0.3;
 /// Larger ones are sky or fog, which occupy nothing.
 const MAX_SCALE: f32 = 0.1 * WIDTH as f32;
 /// Standard deviations of a Gaussian that it occupies.
@@ -23,6 +21,8 @@ const MIN_GAUSSIANS: usize = 100;
 pub(super) struct Space {
     /// In the planner's axes: z up, x along the longest horizontal side, the middle of the scene at the origin.
     pub(super) scene: Gaussians,
+    /// By how much Gaussians are enlarged.
+    pub(super) grown: f32,
     /// Half the size of the scene without strays.
     pub(super) half: DVec3,
     plan_from_world: DMat3,
@@ -33,8 +33,15 @@ pub(super) struct Space {
     occupied: Vec<bool>,
 }
 
-/// Takes every n-th usable Gaussian, enlarged so that surfaces stay closed, without colours.
-pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Result<Gaussians, ViewpointError> {
+/// Some of a scene's Gaussians, enlarged so that surfaces stay closed, without colours.
+pub(super) struct Thinned {
+    pub(super) scene: Gaussians,
+    /// By how much Gaussians are enlarged.
+    grown: f32,
+}
+
+/// Takes every n-th usable Gaussian.
+pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Result<Thinned, ViewpointError> {
     let mut thin = Gaussians::default();
     let grown = (stride as f32).sqrt();
     for i in (0..scene.len()).filter(|i| scene.is_usable(*i)).step_by(stride) {
@@ -44,59 +51,46 @@ pub(super) fn thinned(scene: &Gaussians, stride: usize) -> Result<Gaussians, Vie
         thin.opacities.push(scene.opacities[i]);
         thin.sh_dc.push([0.0; 3]);
     }
-    let n_solid = thin.opacities.iter().filter(|opacity| **opacity >= MIN_OPACITY).count();
+    let n_solid = up::solid(&thin).count();
     if n_solid < MIN_GAUSSIANS {
         return Err(ViewpointError::Empty { n: n_solid, expected: MIN_GAUSSIANS });
     }
-    Ok(thin)
+    Ok(Thinned { scene: thin, grown })
 }
 
 impl Space {
-    pub(super) fn new(thin: &Gaussians, up: DVec3) -> Self {
-        let x_axis = longest_side(thin, up);
+    /// Brings a scene into the planner's axes, and finds its occupied voxels.
+    pub(super) fn new(thin: &Thinned, up: DVec3) -> Self {
+        let Thinned { scene: world, grown } = thin;
+        let x_axis = longest_side(world, up);
         let axes = [x_axis, up.cross(x_axis), up];
-        let ranges = axes.map(|axis| up::extent(thin, axis).unwrap_or_default());
+        let ranges = axes.map(|axis| up::extent(world, axis).unwrap_or_default());
         let size = DVec3::from_array(ranges.map(|(low, high)| high - low));
         let middle = DVec3::from_array(ranges.map(|(low, high)| 0.5 * (low + high)));
         let world_from_plan = DMat3::from_cols(axes[0], axes[1], axes[2]);
+        let (plan_from_world, centre) = (world_from_plan.transpose(), world_from_plan * middle);
         let scale = size.max_element().max(f64::MIN_POSITIVE) / WIDTH;
-        Self::placed(thin, world_from_plan, world_from_plan * middle, scale, 0.5 * size / scale)
-    }
-
-    /// Brings a scene in world axes into those of the planner, and finds its occupied voxels.
-    fn placed(world: &Gaussians, world_from_plan: DMat3, centre: DVec3, scale: f64, half: DVec3) -> Self {
-        let plan_from_world = world_from_plan.transpose();
         let turn = DQuat::from_mat3(&plan_from_world);
         let turned = |[w, x, y, z]: [f32; 4]| {
             let q = turn * DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into()).normalize();
             [q.w, q.x, q.y, q.z].map(|v| v as f32)
         };
+        let placed = |at: &DVec3| plan_from_world * (*at - centre) / scale;
         let scene = Gaussians {
-            means_in_world: world
-                .means_in_world
-                .iter()
-                .map(|at| plan_from_world * (*at - centre) / scale)
-                .collect(),
+            means_in_world: world.means_in_world.iter().map(placed).collect(),
             rotations_wxyz: world.rotations_wxyz.iter().map(|rotation| turned(*rotation)).collect(),
             scales: world.scales.iter().map(|s| s.map(|s| (f64::from(s) / scale) as f32)).collect(),
             opacities: world.opacities.clone(),
             sh_dc: world.sh_dc.clone(),
             ..Gaussians::default()
         };
-        let n = [half.x, half.y, half.z].map(|h| (2.0 * (h / VOXEL + MARGIN)).ceil() as usize);
+        let half = 0.5 * size / scale;
+        let n = half.to_array().map(|h| (2.0 * (h / VOXEL + MARGIN)).ceil() as usize);
+        let (grown, occupied) = (*grown, Vec::new());
         let mut space =
-            Self { scene, half, plan_from_world, centre_in_world: centre, scale, n, occupied: Vec::new() };
+            Self { scene, grown, half, plan_from_world, centre_in_world: centre, scale, n, occupied };
         space.occupied = space.occupied();
         space
-    }
-
-    /// Returns the space with up and down exchanged.
-    pub(super) fn upside_down(&self) -> Self {
-        let turn = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-        let mut turned = Self::placed(&self.scene, turn, DVec3::ZERO, 1.0, self.half);
-        turned.plan_from_world = turn * self.plan_from_world;
-        (turned.centre_in_world, turned.scale) = (self.centre_in_world, self.scale);
-        turned
     }
 
     pub(super) fn up_in_world(&self) -> DVec3 {
@@ -114,7 +108,7 @@ impl Space {
     fn occupied(&self) -> Vec<bool> {
         let mut occupied = vec![false; self.n.iter().product()];
         let scene = &self.scene;
-        for i in (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY) {
+        for i in up::solid(scene) {
             if scene.scales[i].into_iter().any(|scale| scale > MAX_SCALE) {
                 continue;
             }
@@ -184,8 +178,7 @@ impl Space {
 fn longest_side(scene: &Gaussians, up: DVec3) -> DVec3 {
     let a = up.any_orthonormal_vector();
     let b = up.cross(a);
-    let solid =
-        || (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY).map(|i| scene.means_in_world[i]);
+    let solid = || up::solid(scene).map(|i| scene.means_in_world[i]);
     let along = |axis: DVec3| {
         let mut values: Vec<f64> = solid().map(|at| at.dot(axis)).collect();
         let median = slag_math::stats::median(&mut values).unwrap_or(0.0);
