@@ -72,11 +72,14 @@ export async function openedFile(path, run) {
   }
 }
 
+/** Longest time for a picture: without a GPU a large scene takes many seconds on a busy machine. */
+const SCREENSHOT_MS = 120_000;
+
 /** Waits until two pictures in a row are equal. */
 export async function picture(page, name) {
   let last = null;
   for (let i = 0; i < 40; i++) {
-    const next = await page.screenshot();
+    const next = await page.screenshot({ timeout: SCREENSHOT_MS });
     if (last?.equals(next)) break;
     last = next;
     await page.waitForTimeout(250);
