@@ -73,20 +73,20 @@ export async function openedFile(path, run) {
 }
 
 /** Longest time for a picture: without a GPU a large scene takes many seconds on a busy machine. */
-const SCREENSHOT_MS = 120_000;
+const PATIENT = { timeout: 120_000 };
 
 /** Waits until two pictures in a row are equal. */
 export async function picture(page, name) {
   let last = null;
   for (let i = 0; i < 40; i++) {
-    const next = await page.screenshot({ timeout: SCREENSHOT_MS });
+    const next = await page.screenshot(PATIENT);
     if (last?.equals(next)) break;
     last = next;
     await page.waitForTimeout(250);
   }
   if (PICTURES && name) {
     mkdirSync(PICTURES, { recursive: true });
-    await page.screenshot({ path: `${PICTURES}/${name}.png` });
+    await page.screenshot({ ...PATIENT, path: `${PICTURES}/${name}.png` });
   }
   return last;
 }
@@ -103,7 +103,7 @@ export async function litPixels(page, leftPx, name) {
  * or at once.
  */
 export async function pixels(page, leftPx, test, name, isStill = true) {
-  const png = (isStill ? await picture(page, name) : await page.screenshot()).toString("base64");
+  const png = (isStill ? await picture(page, name) : await page.screenshot(PATIENT)).toString("base64");
   const scratch = await browser.newPage();
   try {
     return await scratch.evaluate(async ([data, left, source]) => {
