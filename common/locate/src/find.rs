@@ -245,13 +245,17 @@ impl Search<'_> {
         let most = n(&proposals[0]);
         let enough = |one: &&Agreed| n(one) >= MIN_UNSURE_INLIERS.max((RIVAL_SHARE * most as f64) as usize);
         let candidates: Vec<&Agreed> = proposals.iter().filter(enough).take(MAX_PROPOSALS).collect();
-        let located = candidates.iter().map(|one| self.located(&self.guided(one), false));
-        let located: Vec<Result<Located, Reason>> = located.collect();
-        match located.as_slice() {
-            [] => Outcome::Lost(Reason::NoPose { inliers: most }),
-            [Err(reason)] => Outcome::Lost(*reason),
-            [Ok(one)] if most >= MIN_INLIERS => Outcome::Found(Box::new(one.clone())),
-            _ => Outcome::Unsure(located.into_iter().flatten().collect()),
+        let (mut told, mut refused) = (Vec::new(), None);
+        for one in &candidates {
+            match self.located(&self.guided(one), false) {
+                Ok(located) => told.push(located),
+                Err(reason) => refused = refused.or(Some(reason)),
+            }
+        }
+        match told.as_slice() {
+            [] => Outcome::Lost(refused.unwrap_or(Reason::NoPose { inliers: most })),
+            [one] if candidates.len() == 1 && most >= MIN_INLIERS => Outcome::Found(Box::new(one.clone())),
+            _ => Outcome::Unsure(told),
         }
     }
 

@@ -13,7 +13,7 @@ use super::settings::EncodeSettings;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
 
 /// Version of plan and drawing; another number is another plan.
-const PLAN_VERSION: u32 = 1;
+const PLAN_VERSION: u32 = 2;
 
 /// Draws the planned views of a splat beside the poses file of the settings, unless they are there.
 pub(super) fn make(
