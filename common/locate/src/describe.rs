@@ -2,7 +2,6 @@
 
 use std::f32::consts::TAU;
 
-use crate::features::Keypoint;
 use crate::grey::Grey;
 
 /// Numbers of a descriptor: 4 x 4 places, 8 directions.
@@ -21,6 +20,18 @@ const ORIENTATION_WINDOW: f32 = 1.5;
 const PLACE_WIDTH: f32 = 3.0;
 /// Largest share of one number, which bounds the effect of highlights.
 const MAX_SHARE: f32 = 0.2;
+
+/// An extremum, in an octave's pixels.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Keypoint {
+    pub(crate) x: f32,
+    pub(crate) y: f32,
+    /// The blurred picture that is nearest in scale.
+    pub(crate) layer: usize,
+    /// Blur, the octave's pixels.
+    pub(crate) sigma: f32,
+    pub(crate) contrast: f32,
+}
 
 /// Returns the gradient at a pixel: its length and its direction, 0..TAU.
 fn gradient(layer: &Grey, x: usize, y: usize) -> (f32, f32) {

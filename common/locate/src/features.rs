@@ -1,9 +1,11 @@
 //! Features of a photo: SIFT (Lowe 2004). Keypoints are extrema of differences of Gaussians, in position to a
 //! fraction of a pixel and in scale; each has an orientation, and a descriptor of the gradients around it.
 
-use crate::describe::{Descriptor, describe, orientations};
+use crate::describe::{Descriptor, Keypoint, describe, orientations};
 use crate::grey::Grey;
 
+/// Features of a photo that are matched.
+pub const MAX_FEATURES: usize = 1200;
 /// Scales an octave (Lowe 2004, 3.1).
 const SCALES: usize = 3;
 /// Blur of the first scale of an octave, its pixels (Lowe 2004, 3.3).
@@ -34,18 +36,6 @@ pub struct Feature {
     /// Contrast, 0..=1.
     pub contrast: f32,
     pub descriptor: Descriptor,
-}
-
-/// An extremum, in an octave's pixels.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Keypoint {
-    pub(crate) x: f32,
-    pub(crate) y: f32,
-    /// The blurred picture that is nearest in scale.
-    pub(crate) layer: usize,
-    /// Blur, the octave's pixels.
-    pub(crate) sigma: f32,
-    pub(crate) contrast: f32,
 }
 
 /// The pictures of an octave.

@@ -4,7 +4,7 @@ use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
 
 use crate::code::code;
-use crate::features::{Feature, features};
+use crate::features::{Feature, MAX_FEATURES, features};
 use crate::grey::Grey;
 use crate::map::Map;
 use crate::matching::Query;
@@ -12,8 +12,6 @@ use crate::pose::{Match, Pinhole, covariance};
 use crate::ransac::{Agreed, locally_refined, ransac};
 use crate::render::{Renderer, match_rendering};
 
-/// Features of a photo that are matched.
-pub const MAX_FEATURES: usize = 1200;
 /// Fewest features with which a place can be recognised.
 const MIN_FEATURES: usize = 30;
 /// Fewest inliers of a pose that no rendering verifies: twice what photos of other scenes reach.
@@ -54,7 +52,7 @@ pub struct Prior {
 }
 
 impl Photo<'_> {
-    /// Returns what is known about the photo that a pose contradicts.
+    /// Returns why a pose does not fit the photo's gravity or prior, if it does not.
     fn contradiction(&self, camera_from_world: &DAffine3) -> Option<Reason> {
         let down = camera_from_world.transform_vector3(DVec3::NEG_Z);
         if self.gravity_in_camera.is_some_and(|gravity| down.angle_between(gravity) > MAX_GRAVITY_ANGLE) {
@@ -84,7 +82,7 @@ pub struct Located {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
     Found(Box<Located>),
-    /// Poses of which none is certain, best first.
+    /// Candidate poses, best first; none is certain.
     Unsure(Vec<Located>),
     Lost(Reason),
 }
@@ -215,7 +213,7 @@ impl Search<'_> {
         locally_refined(&self.camera, pose, &matches)
     }
 
-    /// Returns the first pose at which a rendering shows what the photo does.
+    /// Returns the first proposed pose whose rendering matches the photo.
     fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Outcome {
         let mut most = 0;
         for one in proposals.iter().take(MAX_PROPOSALS) {
@@ -259,7 +257,7 @@ impl Search<'_> {
         }
     }
 
-    /// Returns the pose, unless its inliers or what is known about the photo speak against it.
+    /// Returns the pose if its inliers spread over the photo and it fits gravity and prior.
     fn located(&self, agreed: &Agreed, is_verified: bool) -> Result<Located, Reason> {
         let Agreed { camera_from_world, inliers, .. } = agreed;
         if spread(inliers) < MIN_SPREAD * self.size_px.x {

@@ -4,8 +4,7 @@ use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
 use slag_math::dot;
 
-use crate::features::{Feature, features};
-use crate::find::MAX_FEATURES;
+use crate::features::{Feature, MAX_FEATURES, features};
 use crate::grey::Grey;
 use crate::pose::Match;
 

@@ -111,8 +111,8 @@ fn too_slow(error: &axum::Error) -> Option<TooSlow> {
     None
 }
 
-/// Checks that a body is said to be of one of some media types. Forms and plain text, which a page of any origin can
-/// post without asking, are thus refused.
+/// Refuses a body whose Content-Type is none of `media_types`: also forms and plain text, which a page of any origin
+/// can post without asking.
 pub(crate) fn check_type(headers: &HeaderMap, media_types: &[&str]) -> Result<(), Problem> {
     let found = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let kind = found.and_then(|value| value.split(';').next()).unwrap_or_default().trim();

@@ -9,7 +9,7 @@ use crate::reply::Geographic;
 #[serde(tag = "state", rename_all = "lowercase")]
 pub enum Whereabouts {
     Found(CameraPose),
-    /// Poses of which none is certain, best first.
+    /// Candidate poses, best first; none is certain.
     Unsure {
         reason: String,
         candidates: Vec<CameraPose>,
