@@ -10,15 +10,22 @@ work=$(mktemp -d)
 root=${1:-$work/root}
 clean_up() {
     [ -z "$(jobs -p)" ] || kill $(jobs -p) 2>/dev/null || true
-    for mounted in proc dev root/.rustup root/.cargo/registry; do umount "$root/$mounted" 2>/dev/null || true; done
+    for mounted in proc dev root/.rustup root/.cargo/registry; do umount --lazy "$root/$mounted" 2>/dev/null || true; done
+    # What is still mounted is this machine's own, on the same file system.
+    ! grep -q " $root/" /proc/mounts || { echo "newcomer: $root has mounts left; nothing is removed" >&2; return; }
     rm -rf --one-file-system "$work"
 }
 trap clean_up EXIT
+command -v debootstrap >/dev/null || { echo "newcomer: needs debootstrap; run scripts/setup.sh packages" >&2; exit 1; }
 [ -d "$scene" ] || { echo "newcomer: there is no $scene" >&2; exit 1; }
 
 jetson/root.sh amd64 "$root" ca-certificates,curl,git
 cp /etc/resolv.conf "$root/etc/"
 cp -r /etc/apt/sources.list* /etc/apt/apt.conf.d "$root/etc/apt/"
+# Mirrors of this machine may be signed by its own authority, and named in its settings of pip and npm.
+cp -r /usr/local/share/ca-certificates "$root/usr/local/share/"
+for settings in /etc/pip.conf "$HOME/.npmrc"; do [ ! -f "$settings" ] || cp "$settings" "$root$settings"; done
+chroot "$root" update-ca-certificates >/dev/null 2>&1
 mkdir -p "$root/root/.rustup" "$root/root/.cargo/registry" "$root/root/.cargo/bin"
 mount -t proc proc "$root/proc"
 mount --bind /dev "$root/dev"
@@ -29,6 +36,7 @@ cp -a "${CARGO_HOME:-$HOME/.cargo}"/bin/. "$root/root/.cargo/bin/"
 git clone --quiet "$project" "$root/root/slag"
 mkdir "$root/root/data"
 cp -r "$scene"/point_cloud.ply "$scene"/sparse "$scene"/images "$root/root/data/"
+cp "$scene/point_cloud.ply" "$root/root/data/scene.ply"
 
 # The commands of the section, continued lines joined, without comments.
 sed -n '/^## With your own scene/,/^## Figures/p' README.md | sed -n 's/^    *//p' |
@@ -37,15 +45,18 @@ grep -q . "$work/commands" || { echo "newcomer: README has no commands" >&2; exi
 
 # Variables of this machine that name mirrors and proxies pass on.
 inside() {
-    chroot "$root" /usr/bin/env HOME=/root PATH=/root/.cargo/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
-        PIP_DISABLE_PIP_VERSION_CHECK=1 bash -euo pipefail -c "$1"
+    chroot "$root" /usr/bin/env -u PIP_FIND_LINKS HOME=/root PATH=/root/.cargo/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
+        PIP_DISABLE_PIP_VERSION_CHECK=1 bash -euo pipefail -c "$1" </dev/null
 }
 replaced=()
 before="cd /root/slag"
 while read -r command; do
     as_printed=$command
     case $command in
-    ./install.sh*) inside "cd /root/slag && $command" && before="cd /root/data" ;;
+    ./install.sh*)
+        inside "cd /root/slag && $command"
+        before="cd /root/data"
+        ;;
     export*) before="$before && $command" ;;
     *"models pull"*) replaced+=("left out, no hub is reached: $as_printed") ;;
     *qdrant*) replaced+=("left out, no Qdrant runs: $as_printed") ;;

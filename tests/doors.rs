@@ -62,3 +62,17 @@ fn cyclone_dds_asks_a_robot() {
     let printed = judge(&python, "doors/ros/tests/against_the_program.py", &args);
     assert!(printed.contains(" points, service, tf, odometry, fix, "), "{printed}");
 }
+
+/// The odometry of the robot is turned and moved against the scene; six photos that no landmark was made from tell how.
+#[test]
+fn cyclone_dds_tells_a_robot_where_it_is() {
+    let python = python_with("doors/ros/tests");
+    let room = ["--n-views", "24", "--seed", "7"];
+    let site = Site::of(&room, &["--models", "colours", "--locate"]);
+    let robot = site.robot(&["--follow", &site.store.url]);
+    let domain = (150 + std::process::id() % 40).to_string();
+    let (node, photos) = (program("slag-ros"), generated(&room).join("test"));
+    let args = [text(&node), &robot.url, text(&photos), &domain];
+    let printed = judge(&python, "doors/ros/tests/against_locating.py", &args);
+    assert!(printed.starts_with("6 photos, at most "), "{printed}");
+}

@@ -20,9 +20,14 @@ pub struct Site {
 impl Site {
     /// Serves and fetches the room.
     pub fn new() -> Self {
+        Self::of(&ROOM, &SITE)
+    }
+
+    /// Serves and fetches a generated room. `scene`: flags of `slag-lab generate scene`; `flags`: of the encode.
+    pub fn of(scene: &[&str], flags: &[&str]) -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let store = dir.path().join("store");
-        encoded_into(&store, &ROOM, &SITE);
+        encoded_into(&store, scene, flags);
         let store = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
         let site = Self { store, dir };
         let at = ["fetch", "--trust-first", "--from", &site.store.url, "--at", "3.5,2.7,0", "--cache"];

@@ -59,7 +59,7 @@ pub enum PhrasesError {
 /// Error of encoding a text or crops.
 #[derive(Debug, thiserror::Error)]
 pub enum InferenceError {
-    #[error("the text is empty; say what to look for")]
+    #[error("the text names nothing; say what to look for")]
     EmptyText,
     #[error("{text:?} is not one of the {n_known} phrases this model knows; {}", suggestion(near))]
     UnknownPhrase {

@@ -47,6 +47,7 @@ mod session_error;
 pub mod tensors;
 pub mod text;
 mod text_side;
+mod words;
 
 pub use crop::Crop;
 pub use encoder::{ImageEncoder, TextEncoder};
@@ -61,3 +62,4 @@ pub use provider::{NoProvider, Provider};
 pub use runtime::find_runtime;
 pub use session::SessionOptions;
 pub use text_side::{TextSide, TextSideError};
+pub use words::words_of;

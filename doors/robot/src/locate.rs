@@ -25,6 +25,8 @@ pub struct CameraPose {
     pub position_in_world: [f64; 3],
     /// World from camera, x forward, y left, z up (REP-103): x, y, z, w.
     pub rotation_xyzw: [f64; 4],
+    /// The same, x right, y down, z forward (axes of images).
+    pub optical_rotation_xyzw: [f64; 4],
     /// `[6][6]`: x, y, z and rotations about the world's x, y, z.
     pub covariance: Vec<f64>,
     /// The same on the earth, where the scene is geo-referenced.

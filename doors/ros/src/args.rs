@@ -60,6 +60,13 @@ pub struct Args {
     /// Where places to stand are sent to, besides the node's own topic, so that Nav2 drives there.
     #[arg(long, default_value = "none")]
     send_goals: Goals,
+    /// Namespace of a camera, such as /camera: its rectified photos (image_rect/compressed, camera_info) tell where
+    /// the robot is, if the scene was encoded with --locate.
+    #[arg(long, value_name = "NAMESPACE")]
+    camera: Option<String>,
+    /// Frame that odometry keeps: --camera publishes the scene's place in it.
+    #[arg(long, value_name = "FRAME", default_value = "odom")]
+    fixed_frame: String,
     /// Most points in the clouds of an answer.
     #[arg(long, default_value_t = 3500, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     points: u32,
@@ -128,6 +135,8 @@ impl Args {
                 sensor_height_m: self.sensor_height,
                 reach_m: self.reach,
             },
+            camera: self.camera.clone(),
+            fixed_frame: self.fixed_frame.clone(),
             goals: match self.send_goals {
                 Goals::None => GoalSink::Nowhere,
                 Goals::Topic => GoalSink::Topic,

@@ -100,6 +100,24 @@ impl Rigid {
         (self.rotation * DVec3::from_array(point) + self.translation).to_array()
     }
 
+    /// Returns the angle that this motion turns by, radians.
+    pub fn angle(self) -> f64 {
+        self.rotation.angle_between(DQuat::IDENTITY)
+    }
+
+    /// Returns a direction of the parent in the child's frame.
+    pub fn to_child(self, direction: [f64; 3]) -> [f64; 3] {
+        (self.rotation.inverse() * DVec3::from_array(direction)).to_array()
+    }
+
+    pub fn quaternion(self) -> Quaternion {
+        self.rotation.to_array().into()
+    }
+
+    pub fn pose(self) -> Pose {
+        Pose { position: self.origin().into(), orientation: self.quaternion() }
+    }
+
     /// Returns the place of the child's origin.
     pub fn origin(self) -> [f64; 3] {
         self.translation.to_array()

@@ -5,6 +5,7 @@ mod answers;
 mod args;
 mod geometry;
 mod ground;
+mod locator;
 mod messages;
 mod navigation;
 pub mod node;

@@ -29,6 +29,8 @@ messages! {
     PoseStamped { header: Header, pose: Pose }
     /// `geometry_msgs/PoseWithCovariance`. The covariance is row-major.
     PoseWithCovariance { pose: Pose, covariance: [[f64; 6]; 6] }
+    /// `geometry_msgs/PoseWithCovarianceStamped`.
+    PoseWithCovarianceStamped { header: Header, pose: PoseWithCovariance }
     /// `geometry_msgs/TransformStamped`.
     TransformStamped { header: Header, child_frame_id: String, translation: Vector3, rotation: Quaternion }
     /// `tf2_msgs/TFMessage`.
@@ -37,6 +39,11 @@ messages! {
     Odometry { header: Header, child_frame_id: String, pose: PoseWithCovariance }
     /// `sensor_msgs/NavSatFix`, as far as it is read. A negative status is no fix.
     NavSatFix { header: Header, status: i8, service: u16, latitude: f64, longitude: f64, altitude: f64 }
+    /// `sensor_msgs/CameraInfo`, as far as it is read: up to P, of rectified images.
+    CameraInfo {
+        header: Header, height: u32, width: u32, distortion_model: String, d: Vec<f64>, k: [f64; 9], r: [f64; 9],
+        p: [[f64; 4]; 3],
+    }
     /// `sensor_msgs/PointField`.
     PointField { name: String, offset: u32, datatype: u8, count: u32 }
     /// `sensor_msgs/PointCloud2`.

@@ -13,14 +13,16 @@ use ros2_client::{
 use rustdds::DomainParticipantBuilder;
 use serde::Serialize;
 use serde_json::{Value, json};
-use slag_robot::{Answer, PointAnswer, Robot, RobotError};
+use slag_robot::{Answer, CameraPose, PointAnswer, Robot, RobotError, Whereabouts};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
 use crate::answers;
+use crate::locator::{CameraFrames, Fixes, scene_from_optical};
 use crate::messages::{
-    Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix, OccupancyGrid, Odometry, PointCloud2,
-    PoseStamped, StandReply, StandRequest, Text, Transforms as TransformMessages,
+    CameraInfo, CompressedImage, Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix,
+    OccupancyGrid, Odometry, PointCloud2, PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped,
+    StandReply, StandRequest, Text, TransformStamped, Transforms as TransformMessages,
 };
 use crate::navigation::{Ended, Navigator};
 use crate::position;
@@ -37,6 +39,8 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(3);
 const SEND_TIME: Duration = Duration::from_millis(500);
 /// Time between looks whether the robot's program answers.
 const WATCH_PERIOD: Duration = Duration::from_secs(5);
+/// Least time between two photos that are located.
+const PHOTO_PERIOD: Duration = Duration::from_secs(2);
 /// Pause after a failed read, so that a broken topic does not burn the CPU.
 const READ_PAUSE: Duration = Duration::from_millis(100);
 
@@ -96,6 +100,10 @@ pub struct Settings {
     pub body: Body,
     /// Where places to stand are sent to, besides the node's own topic.
     pub goals: GoalSink,
+    /// Namespace of the camera whose photos locate the robot.
+    pub camera: Option<String>,
+    /// Frame that odometry keeps, in which the scene's place is told.
+    pub fixed_frame: String,
 }
 
 /// What all parts of the node share.
@@ -114,6 +122,17 @@ struct Shared {
     /// `/goal_pose`, if goals are sent there.
     goal_pose: Option<Publisher<PoseStamped>>,
     navigation: Option<Navigation>,
+    locating: Option<Locating>,
+}
+
+/// The robot's place by photos, if it has a camera.
+struct Locating {
+    camera: Mutex<Option<CameraInfo>>,
+    fixes: Mutex<Fixes>,
+    /// When the last photo was taken on.
+    last: Mutex<Option<Instant>>,
+    pose: Publisher<PoseWithCovarianceStamped>,
+    transforms: Publisher<TransformMessages>,
 }
 
 /// The action that drives, if goals are sent there.
@@ -188,6 +207,22 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
         })
     });
     let navigation = navigation.transpose()?;
+    let located = ("geometry_msgs", "PoseWithCovarianceStamped");
+    let locating = settings.camera.is_some().then(|| -> Result<Locating> {
+        Ok(Locating {
+            camera: Mutex::default(),
+            fixes: Mutex::default(),
+            last: Mutex::default(),
+            pose: publisher(&mut node, own("pose")?, located, &latest)?,
+            transforms: publisher(
+                &mut node,
+                Name::new("/", "tf")?,
+                ("tf2_msgs", "TFMessage"),
+                &reliable(100),
+            )?,
+        })
+    });
+    let locating = locating.transpose()?;
     let shared = Arc::new(Shared {
         detections: publisher(&mut node, own("detections")?, ("vision_msgs", "Detection3DArray"), &latest)?,
         markers: publisher(&mut node, own("markers")?, ("visualization_msgs", "MarkerArray"), &latest)?,
@@ -197,6 +232,7 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
         ground: publisher(&mut node, own("ground")?, ("nav_msgs", "OccupancyGrid"), &latest)?,
         goal_pose,
         navigation,
+        locating,
         frames: Mutex::default(),
         place: Mutex::default(),
         robot,
@@ -225,12 +261,23 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     let server = node.create_server(mapping, &own("stand")?, &kind, volatile.clone(), volatile);
     tokio::spawn(serve_stand(server.map_err(|e| anyhow!("cannot offer stand: {e}"))?, Arc::clone(&shared)));
 
-    if matches!(settings.position, PositionSource::Transforms | PositionSource::Odometry) {
+    let is_told = matches!(settings.position, PositionSource::Transforms | PositionSource::Odometry);
+    if is_told || settings.camera.is_some() {
         for (topic, qos) in [("tf", &reliable(100)), ("tf_static", &latched)] {
             let told = subscription(&mut node, Name::new("/", topic)?, ("tf2_msgs", "TFMessage"), qos)?;
             let shared = Arc::clone(&shared);
             tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_transforms(told).await));
         }
+    }
+    if let Some(camera) = &settings.camera {
+        let kind = ("sensor_msgs", "CameraInfo");
+        let told = subscription(&mut node, Name::new(camera, "camera_info")?, kind, &sensor)?;
+        let heard = Arc::clone(&shared);
+        tokio::spawn(listen(told, async move |told| heard.hear_camera(told)));
+        let name = Name::new(&format!("{camera}/image_rect"), "compressed")?;
+        let told = subscription(&mut node, name, ("sensor_msgs", "CompressedImage"), &sensor)?;
+        let heard = Arc::clone(&shared);
+        tokio::spawn(listen(told, async move |told| Arc::clone(&heard).hear_photo(told).await));
     }
     match settings.position {
         PositionSource::Odometry => {
@@ -518,6 +565,58 @@ impl Shared {
         }
     }
 
+    fn hear_camera(&self, told: CameraInfo) {
+        if let Some(locating) = &self.locating {
+            *locating.camera.lock().expect("no holder panics") = Some(told);
+        }
+    }
+
+    /// Locates a photo, and publishes where the robot is and where the scene lies in the frame of its odometry.
+    async fn hear_photo(self: Arc<Self>, photo: CompressedImage) {
+        let Some(locating) = &self.locating else { return };
+        let Some(camera) = locating.camera_of_due_photo() else { return };
+        let Settings { scene_frame, base_frame, fixed_frame, .. } = &self.settings;
+        let optical_frame = photo.header.frame_id.clone();
+        let of_camera = {
+            let frames = self.frames.lock().expect("no holder panics");
+            CameraFrames::find(&frames, fixed_frame, &optical_frame, base_frame)
+        };
+        let Some(of_camera) = of_camera else {
+            return tracing::warn!(
+                "nothing connects {optical_frame} with {fixed_frame} and {base_frame}: no photo is located"
+            );
+        };
+        let header = answers::header(scene_frame);
+        let (shared, parameters) = (Arc::clone(&self), of_camera.parameters(&camera));
+        let asked = tokio::task::spawn_blocking(move || shared.robot.locate(&parameters, &photo.data)).await;
+        let pose = match asked {
+            Ok(Ok(Whereabouts::Found(pose))) => pose,
+            Ok(Ok(Whereabouts::Unsure { reason, .. } | Whereabouts::Lost { reason })) => {
+                return tracing::info!("a photo is not located: {reason}");
+            }
+            Ok(Err(error)) => return tracing::warn!("a photo is not located: {error}"),
+            Err(_) => return,
+        };
+        let Some(scene_from_optical) = scene_from_optical(&pose) else { return };
+        let scene_from_base = scene_from_optical.after(of_camera.optical_from_base);
+        let pose = PoseWithCovariance { pose: scene_from_base.pose(), covariance: covariance(&pose) };
+        publish(&locating.pose, PoseWithCovarianceStamped { header, pose }).await;
+        let CameraFrames { fixed_from_optical, optical_from_base } = of_camera;
+        let fixed_from_scene = fixed_from_optical.after(scene_from_optical.inverse());
+        let base_in_fixed = fixed_from_optical.after(optical_from_base).origin();
+        let agreed = locating.fixes.lock().expect("no holder panics").add(fixed_from_scene, base_in_fixed);
+        if let Some(fixed_from_scene) = agreed {
+            let transform = TransformStamped {
+                header: answers::header(fixed_frame),
+                child_frame_id: scene_frame.clone(),
+                translation: fixed_from_scene.origin().into(),
+                rotation: fixed_from_scene.quaternion(),
+            };
+            self.frames.lock().expect("no holder panics").insert(transform.clone());
+            publish(&locating.transforms, TransformMessages { transforms: vec![transform] }).await;
+        }
+    }
+
     async fn moved_to(self: Arc<Self>, [x, y, z]: [f64; 3]) {
         self.place.lock().expect("no holder panics").0 = Some([x, y, z]);
         if self.is_due() {
@@ -541,6 +640,23 @@ impl Shared {
             tracing::warn!("the position is not taken: {error}");
         }
     }
+}
+
+impl Locating {
+    /// Returns the camera of a photo, if it is known and a photo is due; then counts from here.
+    fn camera_of_due_photo(&self) -> Option<CameraInfo> {
+        let camera = self.camera.lock().expect("no holder panics").clone()?;
+        let mut last = self.last.lock().expect("no holder panics");
+        let is_due = last.is_none_or(|last| last.elapsed() >= PHOTO_PERIOD);
+        is_due.then(|| *last = Some(Instant::now()))?;
+        Some(camera)
+    }
+}
+
+/// Returns the covariance of a pose in the order of ROS, which is that of the robot's program.
+fn covariance(pose: &CameraPose) -> [[f64; 6]; 6] {
+    let at = |row: usize, column: usize| pose.covariance.get(6 * row + column).copied().unwrap_or(0.0);
+    std::array::from_fn(|row| std::array::from_fn(|column| at(row, column)))
 }
 
 async fn publish<M: Serialize>(to: &Publisher<M>, message: M) {

@@ -13,6 +13,8 @@ use super::suspicion::{at_per_mille, camera_spread, scene_diagonal};
 use super::view::{CheckView, at_width, mean};
 use crate::raster::{LoadedScene, Rasterizer};
 
+/// PSNR from which a splat is drawn too well for a mistake that goes unnoticed, dB.
+pub(super) const FLAWLESS_DB: f64 = 30.0;
 /// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain
 /// colour, dB.
 pub(super) const CLEAR_GAIN_DB: f64 = 3.0;
@@ -67,6 +69,13 @@ pub(super) struct Means {
     pub(super) covered_share: f64,
 }
 
+impl Means {
+    /// Returns whether the drawings look like their photos.
+    pub(super) fn fit(&self) -> bool {
+        self.psnr_db >= self.flat_psnr_db + CLEAR_GAIN_DB
+    }
+}
+
 /// Small copies of some views, and the positions of all cameras.
 pub(super) struct Samples {
     /// Indices of the sampled views, ascending.
@@ -113,7 +122,7 @@ impl Samples {
             pairs_left: Cell::new(n_pairs.saturating_mul(1000).saturating_add(MAX_PAIRS)),
             suspected: options.suspicions.iter().filter_map(|suspicion| suspicion.mistake).collect(),
         };
-        let tried = search.run(&options.frames)?;
+        let tried = search.run(&options.frames, means.fit())?;
         let best = tried.first().filter(|best| search.explains(best));
         let mut diagnosis = Diagnosis {
             given_psnr_db: search.given_psnr_db,
@@ -164,17 +173,17 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Tries what is suspected, then common mistakes and frames, then a sweep of scales, until one explains the
-    /// photos. Returns all trials, best first; a frame of nerfstudio's defaults or a scale among the best is
-    /// refined.
-    fn run(&self, frames: &[FrameCandidate]) -> Result<Vec<Trial>, CheckError> {
+    /// Tries what is suspected and what goes unnoticed, then, where drawings and photos differ, common mistakes and
+    /// frames, then a sweep of scales, until one explains the photos. Returns all trials, best first; a frame of
+    /// nerfstudio's defaults or a scale among the best is refined.
+    fn run(&self, frames: &[FrameCandidate], fit: bool) -> Result<Vec<Trial>, CheckError> {
         let mut tried = Vec::new();
-        self.try_all(self.suspected.iter().copied(), &mut tried)?;
-        if !tried.iter().any(|trial| self.explains(trial)) {
+        self.try_all(self.suspected.iter().copied().chain(Mistake::UNNOTICED), &mut tried)?;
+        if !fit && !tried.iter().any(|trial| self.explains(trial)) {
             let frames = frames.iter().map(|frame| Mistake::Frame(*frame));
             self.try_all(Mistake::common().into_iter().chain(frames), &mut tried)?;
         }
-        if !tried.iter().any(|trial| self.explains(trial)) {
+        if !fit && !tried.iter().any(|trial| self.explains(trial)) {
             let n = (SWEEP_LIMIT.ln() / SWEEP_STEP.ln()).floor() as i32;
             let powers = (-n..=n).filter(|power| *power != 0);
             self.try_all(powers.map(|power| Mistake::SceneScale(SWEEP_STEP.powi(power))), &mut tried)?;

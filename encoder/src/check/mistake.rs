@@ -34,6 +34,10 @@ pub enum Mistake {
     Frame(FrameCandidate),
     /// The splat is mirrored along this axis, 0 to 2.
     Mirrored(usize),
+    /// The splat's rotations are x, y, z, w where the file's format has w first.
+    RotationsXyzw,
+    /// The splat's rotations turn the other way.
+    RotationsInverted,
     /// The splat has scales instead of their logarithms, or opacities instead of logits.
     Activated {
         scales: bool,
@@ -66,7 +70,10 @@ pub enum FrameCause {
 const COLMAP_AXES: [i8; 3] = [2, 1, -3];
 
 impl Mistake {
-    /// Returns the mistakes that are tried whatever the data say, beside frames.
+    /// Mistakes under which drawings still look like their photos.
+    pub(super) const UNNOTICED: [Self; 2] = [Self::RotationsXyzw, Self::RotationsInverted];
+
+    /// Returns the mistakes that are tried where drawings and photos differ, beside frames.
     pub(super) fn common() -> Vec<Self> {
         let cameras =
             [Self::OpenGlAxes, Self::WorldFromCamera, Self::WorldFromOpenGlCamera, Self::UpsideDown];
@@ -119,7 +126,7 @@ impl Mistake {
                     *pose = similarity.camera_from_target(*pose);
                 }
             }
-            Self::Mirrored(_) | Self::Activated { .. } => {}
+            _ => {}
         }
         corrected
     }
@@ -128,14 +135,16 @@ impl Mistake {
     /// splat's.
     pub(crate) fn corrected_splat(self, scene: &Gaussians) -> Option<Gaussians> {
         let mut corrected = match self {
-            Self::Mirrored(_) | Self::Activated { .. } => Gaussians {
-                means_in_world: scene.means_in_world.clone(),
-                rotations_wxyz: scene.rotations_wxyz.clone(),
-                scales: scene.scales.clone(),
-                opacities: scene.opacities.clone(),
-                sh_dc: scene.sh_dc.clone(),
-                ..Gaussians::default()
-            },
+            Self::Mirrored(_) | Self::RotationsXyzw | Self::RotationsInverted | Self::Activated { .. } => {
+                Gaussians {
+                    means_in_world: scene.means_in_world.clone(),
+                    rotations_wxyz: scene.rotations_wxyz.clone(),
+                    scales: scene.scales.clone(),
+                    opacities: scene.opacities.clone(),
+                    sh_dc: scene.sh_dc.clone(),
+                    ..Gaussians::default()
+                }
+            }
             _ => return None,
         };
         match self {
@@ -146,6 +155,10 @@ impl Mistake {
                     (0..3).filter(|at| *at != axis).for_each(|at| wxyz[at + 1] = -wxyz[at + 1]);
                 };
                 corrected.rotations_wxyz.iter_mut().for_each(mirror);
+            }
+            Self::RotationsXyzw => corrected.rotations_wxyz.iter_mut().for_each(|xyzw| xyzw.rotate_right(1)),
+            Self::RotationsInverted => {
+                corrected.rotations_wxyz.iter_mut().for_each(|wxyz| wxyz[0] = -wxyz[0])
             }
             Self::Activated { scales, opacities } => corrected.deactivate(scales, opacities),
             _ => {}
@@ -194,6 +207,13 @@ impl fmt::Display for Mistake {
                     f,
                     "splat and poses are mirror images along {axis}; export one of them with right-handed axes"
                 )
+            }
+            Self::RotationsXyzw => write!(
+                f,
+                "the splat's rotations are x, y, z, w, and its format has w first (rot_0); convert it again"
+            ),
+            Self::RotationsInverted => {
+                write!(f, "the splat's rotations are inverted, world to Gaussian; convert it again")
             }
             Self::Activated { scales, opacities } => {
                 let what = match (scales, opacities) {

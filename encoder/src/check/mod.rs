@@ -18,7 +18,7 @@ use slag_common::Gaussians;
 
 use crate::ingest::IngestError;
 use crate::raster::Rasterizer;
-use diagnosis::{CLEAR_GAIN_DB, Means, Samples};
+use diagnosis::{FLAWLESS_DB, Means, Samples};
 use view::{at_width, mean, picture, picture_name};
 
 pub use align::{AlignError, Alignment, align};
@@ -97,16 +97,16 @@ where
         notes: Vec::new(),
         diagnosis: None,
     };
-    let fits = report.mean_psnr_db >= report.mean_flat_psnr_db + CLEAR_GAIN_DB;
-    if !fits || options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some()) {
-        let means = Means {
-            psnr_db: report.mean_psnr_db,
-            flat_psnr_db: report.mean_flat_psnr_db,
-            covered_share: report.mean_covered_share,
-        };
+    let means = Means {
+        psnr_db: report.mean_psnr_db,
+        flat_psnr_db: report.mean_flat_psnr_db,
+        covered_share: report.mean_covered_share,
+    };
+    let is_suspect = options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some());
+    if means.psnr_db < FLAWLESS_DB || !means.fit() || is_suspect {
         let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;
         // Where the drawings match as they are, only a mistake that improves them counts.
-        report.diagnosis = Some(found).filter(|found| !fits || found.mistake.is_some());
+        report.diagnosis = Some(found).filter(|found| !means.fit() || found.mistake.is_some());
     }
     Ok(report)
 }

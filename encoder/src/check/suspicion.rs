@@ -8,6 +8,10 @@ use super::mistake::{FrameCandidate, FrameCause, Mistake};
 
 /// Share of the Gaussians that must look wrong: a splat may have a few of any kind.
 const MOST: f64 = 0.999;
+/// Gaussians from which shares say something.
+const MANY: usize = 1000;
+/// The opacity that 1 as a logit means.
+const ACTIVATED_OPACITY: f32 = 0.7311;
 /// Opacity below which a Gaussian is not drawn at all.
 const INVISIBLE: f32 = 1.0 / 255.0;
 /// Relative difference between the middle of a photo and its principal point that no lens has.
@@ -46,6 +50,18 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
     if let Some(mistake @ Mistake::Activated { .. }) = activated(scene, &usable) {
         say(Some(mistake), mistake.to_string());
     }
+    if usable.len() >= MANY && share(&usable, |i| scene.opacities[i] > ACTIVATED_OPACITY) > MOST {
+        say(
+            None,
+            "all Gaussians are nearly opaque: the file's opacities may be percents or bytes, not logits"
+                .into(),
+        );
+    }
+    if usable.len() >= MANY
+        && share(&usable, |i| scene.sh_dc[i].iter().all(|c| (0.0..=1.0).contains(c))) > MOST
+    {
+        say(None, "all Gaussians are pale: the file's f_dc may be colours of 0 to 1, not harmonics".into());
+    }
     if let Some((rounding, size)) = rounded(scene, &usable) {
         say(
             None,
@@ -77,8 +93,8 @@ fn share(usable: &[usize], is: impl Fn(usize) -> bool) -> f64 {
 fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
     let scale_share = |most: f32| share(usable, |i| scene.scales[i].iter().all(|s| (1.0..=most).contains(s)));
     let scales = scale_share(f32::INFINITY) > MOST && scale_share(1.5) > 0.5;
-    let opacities = share(usable, |i| (0.5..=0.7311).contains(&scene.opacities[i])) > MOST;
-    (usable.len() >= 1000 && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
+    let opacities = share(usable, |i| (0.5..=ACTIVATED_OPACITY).contains(&scene.opacities[i])) > MOST;
+    (usable.len() >= MANY && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
 }
 
 /// Returns the rounding of coordinates that were stored in 32 bits and the size of small Gaussians, where the

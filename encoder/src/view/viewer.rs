@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use glam::Vec3;
 use slag_common::{Hash32, View};
-use slag_models::{TextEncoder, everyday_words};
+use slag_models::{TextEncoder, everyday_words, words_of};
 use slag_view::{Description, Step, Word, Words};
 
 use super::error::ViewError;
@@ -134,7 +134,8 @@ impl Viewer {
     ) -> Result<T, ViewError> {
         self.with_text_encoder(|generation, OpenedText { encoder, .. }| {
             let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
-            let vectors = texts.map(|text| encoder.encode(text)).collect::<Result<Vec<_>, _>>()?;
+            let vectors =
+                texts.map(|text| encoder.encode(&words_of(text)?)).collect::<Result<Vec<_>, _>>()?;
             work(generation, &vectors)
         })
     }

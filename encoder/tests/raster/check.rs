@@ -190,6 +190,13 @@ fn planted_mistakes_are_diagnosed() {
     }
     assert_eq!(diagnosed(&mirrored, &|_| {}), Some(Mistake::Mirrored(0)));
 
+    // Both still look like their photos.
+    let mut turned = scene.clone();
+    turned.rotations_wxyz.iter_mut().for_each(|wxyz| *wxyz = [wxyz[1], wxyz[2], wxyz[3], wxyz[0]]);
+    assert_eq!(diagnosed(&turned, &|_| {}), Some(Mistake::RotationsXyzw));
+    turned.rotations_wxyz = scene.rotations_wxyz.iter().map(|[w, x, y, z]| [*w, -x, -y, -z]).collect();
+    assert_eq!(diagnosed(&turned, &|_| {}), Some(Mistake::RotationsInverted));
+
     let other_way = |view: &mut RasterView| {
         let pose = &mut view.camera_from_world;
         pose.translation += DVec3::new(0.0, 0.0, -500.0);
@@ -251,6 +258,10 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     };
     assert!(said(1e-3, scene.len()).contains("all Gaussians are transparent"));
     assert!(said(f32::NAN, scene.len() / 2 + 1).contains("cannot be drawn"));
+    assert!(said(0.99, scene.len()).contains("percents or bytes"));
+    let mut pale = scene.clone();
+    pale.sh_dc.iter_mut().flatten().for_each(|c| *c = (0.5 + 0.282_094_8 * *c).clamp(0.0, 1.0));
+    assert!(suspicions(&pale, &views(&photos))[0].text.contains("colours of 0 to 1"));
     let diagnosed = |scene: &Gaussians, photos: &[CheckView]| {
         let suspicions = suspicions(scene, &views(photos));
         assert_eq!(suspicions.len(), 1, "{suspicions:?}");
@@ -372,7 +383,7 @@ fn photos_are_loaded_one_at_a_time_and_the_scene_once() {
     let report = check(&Gaussians::default(), views, &Counted(counting), &CheckOptions::default()).unwrap();
     assert_eq!(report.views.len(), 9);
     assert!(report.diagnosis.is_some() && counting.draws.load(Ordering::Relaxed) > 100);
-    assert_eq!(counting.loads.load(Ordering::Relaxed), 1 + 3, "mirrored along three axes");
+    assert_eq!(counting.loads.load(Ordering::Relaxed), 1 + 5, "mirrored along three axes, rotations turned");
 }
 
 /// Corrections that draw a heap of Gaussians everywhere are tried until 200 million pairs were drawn.

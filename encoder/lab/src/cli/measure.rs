@@ -10,13 +10,17 @@ use slag_encoder::store::StoreReader;
 use std::fmt::Display;
 
 use crate::bench::{load, query, raster, robot, tradeoff};
-use crate::eval::{defaults, encoder, goal, judge, lerf, locate, masks, relations, run, scannet, splat_only};
+use crate::eval::{
+    all, defaults, encoder, goal, judge, lerf, locate, masks, relations, run, scannet, splat_only,
+};
 
 /// `eval`.
 #[derive(Debug, Subcommand)]
 pub(crate) enum EvalCommand {
     /// Evaluates a store of a scene with a label for every Gaussian, such as those of `generate scene`.
     Labelled(judge::LabelledArgs),
+    /// Prints the tables of `defaults` and `masks` on labelled scenes, of `relations` and `goal` on generated ones.
+    All(run::ScenesArgs),
     /// Compares the plain average with the default on labelled scenes, with true and automatic masks.
     Defaults(run::ScenesArgs),
     /// Compares drawings of planned views with as many photos on labelled scenes, with automatic masks.
@@ -47,6 +51,7 @@ pub(super) fn eval(command: &EvalCommand, progress: &dyn Progress, json: bool) -
             let truth = run::truth_of(&reader, &args.truth)?;
             show(json, &judge::judge(&reader, &truth, &mut *encoder, &args.judge)?, true)
         }
+        EvalCommand::All(args) => show(json, &all::run(args, progress)?, true),
         EvalCommand::Defaults(args) => show(json, &defaults::run(args, progress)?, true),
         EvalCommand::SplatOnly(args) => show(json, &splat_only::run(args, progress)?, true),
         EvalCommand::Masks(args) => show(json, &masks::run(args, progress)?, true),

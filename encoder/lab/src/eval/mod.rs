@@ -5,6 +5,7 @@
 //! and per word as retrieval (IoU at the threshold, average precision, area under the ROC curve). [`lerf`] and
 //! [`scannet`] follow the protocols of public data sets; [`goal`] and [`relations`] ask the robot's program.
 
+pub(crate) mod all;
 pub(crate) mod defaults;
 pub(crate) mod encoder;
 pub(crate) mod goal;

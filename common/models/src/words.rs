@@ -1,0 +1,76 @@
+//! The words of a question, before a text model sees them.
+
+use crate::InferenceError;
+
+/// Words that name nothing to look for: alone, a text model would answer them with whatever lies nearest.
+const NAMELESS: &str = "a an and are at behind beneath between biggest bring by closest farthest fifth find first for fourth \
+    from furthest go here i in is it largest littlest look me my near nearest next no not of on one or over second show \
+    smallest some take that the there these third this to under us what where where's which with your you";
+
+/// Returns the words of a text, with a space between them. Signs around words count for nothing: emoji, quotation
+/// marks, question marks, invisible characters. A text without a word that can name a thing is refused.
+pub fn words_of(text: &str) -> Result<String, InferenceError> {
+    let is_invisible = |c: &char| matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{2069}' | '\u{fe00}'..='\u{fe0f}' | '\u{feff}');
+    let visible: String = text.chars().filter(|c| !is_invisible(c)).collect();
+    // A sign within a word, as in "t-shirt", belongs to it; emoji divide words.
+    let is_between = |c: char| c.is_whitespace() || !(c.is_ascii() || c.is_alphanumeric() || is_mark(c));
+    let words = visible
+        .split(is_between)
+        .map(|word| word.trim_matches(|c: char| !(c.is_alphanumeric() || is_mark(c))));
+    let words: Vec<&str> = words.filter(|word| !word.is_empty()).collect();
+    let is_nameless =
+        |word: &&str| NAMELESS.split_whitespace().any(|nameless| word.eq_ignore_ascii_case(nameless));
+    match words.iter().all(is_nameless) {
+        true => Err(InferenceError::EmptyText),
+        false => Ok(words.join(" ")),
+    }
+}
+
+/// Returns whether a character is a combining mark, or an apostrophe of typographers, and so part of a word.
+fn is_mark(c: char) -> bool {
+    matches!(c, '\u{300}'..='\u{36f}' | '\u{2019}')
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn signs_count_for_nothing() {
+        for text in
+            ["chair", " chair ?", "\"chair\"", "🪑 chair", "ch\u{200d}air", "\u{202e}chair", "(chair).."]
+        {
+            assert_eq!(words_of(text).expect(text), "chair");
+        }
+        assert_eq!(words_of("a man’s T-shirt, size 3.5").expect("named"), "a man’s T-shirt size 3.5");
+        assert_eq!(words_of("so\u{ad}fa🪑ch\u{200b}air").expect("named"), "sofa chair");
+        assert_eq!(words_of("чашка на столе").expect("named"), "чашка на столе");
+    }
+
+    #[test]
+    fn a_text_that_names_nothing_is_refused() {
+        for text in [
+            "",
+            "?",
+            "%",
+            "..",
+            "!!!",
+            "\"",
+            "🪑🪑",
+            "\u{200b}",
+            "the",
+            "An ?",
+            "a the",
+            "of",
+            "is",
+            "Where is the",
+            "find",
+            "go to",
+            "the largest",
+            "second",
+            "on",
+        ] {
+            assert!(matches!(words_of(text), Err(InferenceError::EmptyText)), "{text}");
+        }
+    }
+}

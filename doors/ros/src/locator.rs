@@ -1,0 +1,107 @@
+//! Where the scene lies in a frame that odometry keeps, from single photos.
+
+use std::collections::VecDeque;
+
+use slag_robot::CameraPose;
+
+use crate::geometry::Rigid;
+use crate::messages::CameraInfo;
+use crate::transforms::Transforms;
+
+/// Photos that are remembered.
+const N_KEPT: usize = 7;
+/// Photos that must agree on where the robot is, this one among them.
+const MIN_AGREEING: usize = 2;
+/// How far apart two photos that agree may see the robot, world units and radians.
+const MAX_APART: f64 = 0.5;
+const MAX_TURNED: f64 = 0.087;
+
+/// The camera of a photo in the frames of a robot.
+#[derive(Clone, Copy, Debug)]
+pub struct CameraFrames {
+    pub fixed_from_optical: Rigid,
+    pub optical_from_base: Rigid,
+}
+
+impl CameraFrames {
+    /// Returns them, if the tree of frames connects them.
+    pub fn find(frames: &Transforms, fixed: &str, optical: &str, base: &str) -> Option<Self> {
+        let fixed_from_optical = frames.target_from(fixed, optical)?;
+        Some(Self { fixed_from_optical, optical_from_base: frames.target_from(optical, base)? })
+    }
+
+    /// Returns the parameters of `POST /v1/locate`: odometry keeps z up, so the direction of gravity is known.
+    pub fn parameters(&self, camera: &CameraInfo) -> Vec<(&'static str, String)> {
+        let [x, y, z] = self.fixed_from_optical.to_child([0.0, 0.0, -1.0]);
+        vec![
+            ("focal_px", camera.p[0][0].to_string()),
+            ("centre_px", format!("{},{}", camera.p[0][2], camera.p[1][2])),
+            ("gravity", format!("{x},{y},{z}")),
+        ]
+    }
+}
+
+/// Returns the motion that a pose states; `None` if it is none.
+pub fn scene_from_optical(pose: &CameraPose) -> Option<Rigid> {
+    Rigid::new(pose.position_in_world.into(), pose.optical_rotation_xyzw.into())
+}
+
+/// What the last photos said of the scene's place in the fixed frame.
+#[derive(Debug, Default)]
+pub struct Fixes(VecDeque<Rigid>);
+
+impl Fixes {
+    /// Takes what a photo says, and returns the newest of those that most others agree with; `None` while none has
+    /// another. One wrong photo thus moves nothing, and a robot that was carried is followed once two photos agree on
+    /// the new place and the old ones are forgotten. `base_in_fixed`: where the robot is.
+    pub fn add(&mut self, fixed_from_scene: Rigid, base_in_fixed: [f64; 3]) -> Option<Rigid> {
+        self.0.truncate(N_KEPT - 1);
+        self.0.push_front(fixed_from_scene);
+        let n_agreeing = |one: &Rigid| self.0.iter().filter(|of| agree(*one, **of, base_in_fixed)).count();
+        // Of equal ones the last, so from the oldest to the newest.
+        let (n, best) = self.0.iter().rev().map(|one| (n_agreeing(one), *one)).max_by_key(|(n, _)| *n)?;
+        (n >= MIN_AGREEING).then_some(best)
+    }
+}
+
+/// Returns whether two motions see the robot at the same place of the scene.
+fn agree(a: Rigid, b: Rigid, base_in_fixed: [f64; 3]) -> bool {
+    let [p, q] = [a, b].map(|of| of.inverse().apply(base_in_fixed));
+    let apart = p.iter().zip(q).map(|(p, q)| (p - q) * (p - q)).sum::<f64>().sqrt();
+    apart <= MAX_APART && a.inverse().after(b).angle() <= MAX_TURNED
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Quaternion;
+
+    fn at(x: f64, yaw: f64) -> Rigid {
+        let (sin, cos) = (yaw / 2.0).sin_cos();
+        Rigid::new([x, 0.0, 0.0].into(), Quaternion { x: 0.0, y: 0.0, z: sin, w: cos }).expect("a motion")
+    }
+
+    /// By hand: the photos at 0.0 and 0.1 agree; the one 5 m away does not, nor one that is turned.
+    #[test]
+    fn one_wrong_photo_moves_nothing() {
+        let mut fixes = Fixes::default();
+        assert!(fixes.add(at(0.0, 0.0), [1.0, 0.0, 0.0]).is_none());
+        for (x, yaw, expected) in [(5.0, 0.0, None), (0.1, 0.0, Some(0.1)), (5.1, 0.5, Some(0.1))] {
+            let found = fixes.add(at(x, yaw), [1.0, 0.0, 0.0]).map(|found| found.origin()[0]);
+            assert_eq!(found, expected, "{x} {yaw}");
+        }
+        // Carried to another place: followed when most of the remembered photos say so.
+        let moved: Vec<f64> = (0..7)
+            .filter_map(|_| fixes.add(at(9.0, 0.0), [1.0, 0.0, 0.0]))
+            .map(|of| of.origin()[0])
+            .collect();
+        assert_eq!(moved, [0.1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0]);
+    }
+
+    /// Seen 100 m from the scene's origin, a turn of 2 degrees is 3.5 m: such photos do not agree.
+    #[test]
+    fn turns_count_where_the_robot_is() {
+        assert!(agree(at(0.0, 0.0), at(0.0, 0.035), [1.0, 0.0, 0.0]));
+        assert!(!agree(at(0.0, 0.0), at(0.0, 0.035), [100.0, 0.0, 0.0]));
+    }
+}
