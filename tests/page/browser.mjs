@@ -91,10 +91,19 @@ export async function picture(page, name) {
   return last;
 }
 
+/** Switches something that is drawn on or off: `boxes`, `grid`, `cells`, `photos` or `changes`. */
+export async function layer(page, name, isShown) {
+  const open = (isOpen) => page.evaluate((value) => { document.getElementById("layers").open = value; }, isOpen);
+  await open(true);
+  await page.locator(`#show-${name}`).setChecked(isShown);
+  await open(false);
+}
+
 /** Pixels of strong colour beside the panel; the scene itself is grey. */
 export async function litPixels(page, leftPx, name) {
-  await page.uncheck("#show-boxes");
-  await page.uncheck("#show-grid");
+  await layer(page, "boxes", false);
+  await layer(page, "grid", false);
+  await page.evaluate(() => { document.getElementById("hud").hidden = true; });
   return pixels(page, leftPx, (r, g, b) => r > 90 && r - Math.min(g, b) > 45, name);
 }
 
@@ -115,7 +124,8 @@ export async function pixels(page, leftPx, test, name, isStill = true) {
       const found = [];
       for (let y = 0; y < height; y++) {
         for (let x = left; x < width; x++) {
-          if (test(...rgba.subarray(4 * (y * width + x), 4 * (y * width + x) + 3))) found.push([x, y]);
+          const at = 4 * (y * width + x);
+          if (test(rgba[at], rgba[at + 1], rgba[at + 2])) found.push([x, y]);
         }
       }
       return found;

@@ -3,7 +3,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { axe, closeBrowser, openBrowser, picture } from "./browser.mjs";
+import { axe, closeBrowser, layer, openBrowser, picture } from "./browser.mjs";
 import { answered, CAMERA, cameraOf, dot, drawn, HEIGHT, isInside, litPixels, minus, opened, PANEL_PX, POSITION, project, TARGET, WIDTH } from "./scene.mjs";
 import { THINGS } from "./service.mjs";
 
@@ -38,7 +38,7 @@ test("typing asks after a pause, the slider unlights, a click shows the thing, a
   assert.ok(before > 2000 && after === 0, `${before} lit, then ${after}`);
   assert.match(page.url(), /threshold=0\.98/);
   const [x, y] = project([1.2, 0.8, 0.5]);
-  await page.check("#show-boxes");
+  await layer(page, "boxes", true);
   await page.mouse.click(x, y);
   await page.locator("#details").waitFor();
   assert.match(await page.locator("#details").innerText(), /1\.20, 0\.80, 0\.50 m/);
@@ -58,9 +58,9 @@ test("negatives go to the service", () => opened(async (page, service) => {
 test("a phrase lights its thing and tells what it is related to", () => opened(async (page) => {
   await drawn(page);
   await answered(page, "ball on the floor");
-  await page.locator("#answers button").click();
+  await page.locator("#answers .card").click();
   await page.locator("#details").getByText("holds to 0.93").waitFor();
-  assert.match(await page.locator("#details").innerText(), /ball[^]*48\.1000000, 11\.5000000[^]*To: floor/);
+  assert.match(await page.locator("#answers li").innerText(), /ball[^]*48\.1000000, 11\.5000000[^]*To: floor/);
   await page.evaluate((fragment) => { location.hash = fragment; location.reload(); }, `q=ball on the floor&camera=${CAMERA}`);
   await drawn(page);
   await answered(page, "ball on the floor");
@@ -71,7 +71,7 @@ test("a phrase lights its thing and tells what it is related to", () => opened(a
 
 test("a missing cell is told, and drawn once it is there", () => opened(async (page, service) => {
   await page.getByText("1 of 3 cells missing").waitFor();
-  await page.check("#show-cells");
+  await layer(page, "cells", true);
   await picture(page, "cells");
   assert.ok(!service.behaviour.requests.some((path) => path.startsWith("/v1/view/cells/2")));
   service.behaviour.missing = [];
@@ -102,7 +102,7 @@ test("keys reach the question and move the camera", () => opened(async (page) =>
   assert.notEqual(await page.evaluate(() => getComputedStyle(document.activeElement).outlineStyle), "none");
   await page.keyboard.press("Enter");
   await page.locator("#details").getByText("Score").waitFor();
-  assert.equal(await page.evaluate(() => document.activeElement.getAttribute("aria-pressed")), "true");
+  assert.equal(await page.evaluate(() => document.activeElement.getAttribute("aria-expanded")), "true");
 }, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
 
 test("a service without a scene says so, and the page opens when it has one", () => opened(async (page, service) => {

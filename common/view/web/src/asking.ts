@@ -114,8 +114,8 @@ export class Asking {
     if (!first) return say("");
     const n = this.answers.length;
     const isGroups = n > 0 && this.answers.every(({ id }) => !id);
-    const places = n === 1 ? "1 place" : `${n} places`;
-    say(n === 0 ? (first.reply.none ?? "Nothing found.") : isGroups ? `${places} that match; none is marked as an object.` : `${n} found`);
+    const groups = n === 1 ? "1 place matches, which is not marked as an object." : `${n} places match, none marked as an object.`;
+    say(n === 0 ? (first.reply.none ?? "Nothing found.") : isGroups ? groups : `${n} found`);
   }
 
   choose(index: number | null): void {

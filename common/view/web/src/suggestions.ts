@@ -69,6 +69,7 @@ export class Combobox {
   private active = -1;
   /** Whether suggestions are shown as soon as there are some. */
   private isWanted = false;
+  private isPointerDown = false;
 
   /** `source` suggests lines for a text; `onChoose` is called when the box has a suggestion, `onOpen` when the list opens or closes. */
   constructor(private readonly input: HTMLInputElement, private readonly list: HTMLElement,
@@ -76,7 +77,13 @@ export class Combobox {
     input.addEventListener("focus", () => this.open());
     input.addEventListener("click", () => this.open());
     input.addEventListener("input", () => this.open());
-    input.addEventListener("blur", () => this.close());
+    // What is clicked must not move before the click arrives.
+    document.addEventListener("pointerdown", () => (this.isPointerDown = true), true);
+    document.addEventListener("pointerup", () => (this.isPointerDown = false), true);
+    input.addEventListener("blur", () => {
+      if (!this.isPointerDown) return this.close();
+      document.addEventListener("pointerup", () => setTimeout(() => this.close()), { once: true });
+    });
     input.addEventListener("keydown", (event) => this.key(event));
     // The focus must not leave the box before the click arrives.
     list.addEventListener("pointerdown", (event) => event.preventDefault());
