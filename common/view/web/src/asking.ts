@@ -115,7 +115,7 @@ export class Asking {
     const n = this.answers.length;
     const isGroups = n > 0 && this.answers.every(({ id }) => !id);
     const groups = n === 1 ? "1 place matches, which is not marked as an object." : `${n} places match, none marked as an object.`;
-    say(n === 0 ? (first.reply.none ?? "Nothing found.") : isGroups ? groups : `${n} found`);
+    say(n === 0 ? `Not found. ${first.reply.none ?? ""}` : isGroups ? groups : `${n} found`);
   }
 
   choose(index: number | null): void {

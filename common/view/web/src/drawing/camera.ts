@@ -4,6 +4,8 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 export const FIELD_OF_VIEW_DEG = 55;
+/** Sines of the angles from which a thing is framed. */
+const [LEAST_RISE, MOST_RISE] = [0.35, 0.95];
 const GLIDE_MS = 700;
 const KEYS = ["KeyW", "KeyS", "KeyA", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
 
@@ -114,12 +116,13 @@ export class Camera {
     return radiusM / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360) / Math.min(this.aspect, 1);
   }
 
-  /** Looks at a sphere from the side on which the camera is, a little from above. */
+  /** Looks at a sphere from the side and the height at which the camera is, a little from above at least. */
   frame(centre: THREE.Vector3, radiusM: number): [THREE.Vector3, THREE.Vector3] {
     const away = this.camera.position.clone().sub(centre);
+    const height = Math.min(Math.max(away.normalize().dot(this.up), LEAST_RISE), MOST_RISE);
     away.addScaledVector(this.up, -away.dot(this.up));
     if (away.lengthSq() < 1e-6) away.set(1, 0, 0);
-    away.normalize().addScaledVector(this.up, 0.4).normalize();
+    away.setLength(Math.sqrt(1 - height ** 2)).addScaledVector(this.up, height);
     return [centre.clone().addScaledVector(away, this.distanceOf(radiusM)), centre];
   }
 

@@ -10,6 +10,7 @@ import { Frames } from "./frames";
 import { Hud } from "./hud";
 import { boxOf, type Change, Marks, seenBy } from "./marks";
 import { type Extent, extentOf, openingPose, pointsOfCells } from "./opening";
+import { lightAlong } from "./pick";
 import { Places } from "./places";
 import { PALETTES } from "./ramp";
 
@@ -19,10 +20,10 @@ const NEAR_PX = 14;
 const BACKGROUNDS: Record<Theme, number> = { dark: 0x14181d, light: 0xeceff2, contrast: 0x000000 };
 /** Points by which the extent is measured. */
 const N_POINTS = 20_000;
-/** What is nearer than this share of the way hides a thing; haze near it does not. */
-const HIDDEN_SHARE = 0.9;
+/** Share of the light by which a photo sees a thing, through haze. */
+const LEAST_LIGHT = 0.3;
 /** Photos that are tried for one that nothing hides. */
-const MOST_RAYS = 4;
+const MOST_RAYS = 6;
 /** An answer takes so many of its radii of the picture's half height. */
 const ROOM_AROUND = 2.2;
 
@@ -179,9 +180,9 @@ export class Drawing {
       .sort((a, b) => b.seen!.share - a.seen!.share).slice(0, MOST_RAYS);
     for (const { photo, seen } of found) {
       const away = new THREE.Vector3(...centre).sub(new THREE.Vector3(...photo.position_m));
-      const distance = away.length();
-      const hit = this.cells.pick(photo.position_m, away.normalize().toArray() as Vector, 1 / photo.focal_px);
-      if (hit && hit.distanceM > HIDDEN_SHARE * distance - Math.hypot(...size)) return { photo: photo.name, box_px: seen!.boxPx };
+      const untilM = away.length() - Math.hypot(...size) / 2;
+      const light = lightAlong(this.cells.all(), photo.position_m, away.normalize().toArray() as Vector, untilM);
+      if (light > LEAST_LIGHT) return { photo: photo.name, box_px: seen!.boxPx };
     }
     return null;
   }

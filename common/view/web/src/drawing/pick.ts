@@ -5,8 +5,8 @@ import type { Vector } from "../network";
 import type { CellGaussians } from "../messages";
 
 const HALVES = Float32Array.from({ length: 65536 }, (_, half) => THREE.DataUtils.fromHalfFloat(half));
-/** Mean standard deviation by the sum of the three axes' bytes, metres (`readCell` has the bytes). */
-const SIGMAS = Float32Array.from({ length: 766 }, (_, sum) => Math.exp(((sum / 3 - 1) * 21) / 254 - 12));
+/** Standard deviation of an axis by its byte, metres (`readCell` has the bytes). */
+const SIGMAS = Float32Array.from({ length: 256 }, (_, byte) => (byte === 0 ? 0 : Math.exp(((byte - 1) * 21) / 254 - 12)));
 /** Less opaque ones are not what is seen. */
 const LEAST_OPACITY = 90;
 /** A Gaussian counts as hit within so many pixels of the ray at most, and one at least. */
@@ -18,6 +18,31 @@ export function centreOf({ packed, originM }: CellGaussians, i: number, out: Vec
   out[0] = originM[0] + HALVES[xy & 0xffff];
   out[1] = originM[1] + HALVES[xy >>> 16];
   out[2] = originM[2] + HALVES[packed[4 * i + 2] & 0xffff];
+}
+
+/** Standard deviation along the axis that is neither the shortest nor the longest: the radius of a disk. */
+function sigmaOf(packed: Uint32Array, i: number): number {
+  const word = packed[4 * i + 3];
+  const [a, b, c] = [word & 255, (word >> 8) & 255, (word >> 16) & 255];
+  return SIGMAS[a + b + c - Math.min(a, b, c) - Math.max(a, b, c)];
+}
+
+/** Share of the light that reaches a place from a point of a ray; Gaussians count as balls. */
+export function lightAlong(cells: Iterable<[number, CellGaussians]>, from: Vector, along: Vector, untilM: number): number {
+  const centre = new Float64Array(3);
+  let light = 1;
+  for (const [, gaussians] of cells) {
+    for (let i = 0; i < gaussians.n; i++) {
+      centreOf(gaussians, i, centre);
+      const [x, y, z] = [centre[0] - from[0], centre[1] - from[1], centre[2] - from[2]];
+      const t = x * along[0] + y * along[1] + z * along[2];
+      if (t <= 0 || t > untilM) continue;
+      const variance = sigmaOf(gaussians.packed, i) ** 2;
+      const squared = x * x + y * y + z * z - t * t;
+      if (squared < 9 * variance) light *= 1 - ((gaussians.packed[4 * i] >>> 24) / 255) * Math.exp((-0.5 * squared) / variance);
+    }
+  }
+  return light;
 }
 
 export interface Hit {
@@ -41,9 +66,7 @@ export function pick(cells: Iterable<[number, CellGaussians]>, from: Vector, alo
       const [x, y, z] = [centre[0] - from[0], centre[1] - from[1], centre[2] - from[2]];
       const t = x * along[0] + y * along[1] + z * along[2];
       if (t <= 0 || t >= nearest) continue;
-      const word = packed[4 * i + 3];
-      const sigma = SIGMAS[(word & 255) + ((word >> 8) & 255) + ((word >> 16) & 255)];
-      const reach = Math.min(Math.max(sigma, t * pxRad), t * pxRad * MOST_PX);
+      const reach = Math.min(Math.max(sigmaOf(packed, i), t * pxRad), t * pxRad * MOST_PX);
       if (x * x + y * y + z * z - t * t > reach * reach) continue;
       nearest = t;
       best = { point: [centre[0], centre[1], centre[2]], cell, index: i, distanceM: t };
