@@ -144,7 +144,7 @@ try {
     await page.keyboard.up("ArrowLeft");
     result.turning = { frames_a_second_at_first: rounded(turn.first), at_last: rounded(turn.last), gaussians_at_last: turn.gaussians, sort_ms: spread(turn.sorts) };
     result.script_memory_mb = rounded((await page.evaluate(() => performance.memory?.usedJSHeapSize ?? 0)) / 1e6);
-  }, { origin: service.url });
+  }, { isLookedAt: true, origin: service.url });
 
   if (out !== "none") {
     await opened(service.url, async (page) => {
@@ -154,7 +154,7 @@ try {
       await picture(page, null);
       mkdirSync(dirname(out), { recursive: true });
       await page.screenshot({ path: out });
-    }, { fragment: `${questions[0] ? `q=${encodeURIComponent(questions[0])}` : ""}${camera === "whole" ? "" : `&camera=${camera}`}` });
+    }, { isLookedAt: true, fragment: `${questions[0] ? `q=${encodeURIComponent(questions[0])}` : ""}${camera === "whole" ? "" : `&camera=${camera}`}` });
   }
 } finally {
   await closeBrowser();

@@ -37,7 +37,7 @@ test("a thing's places to stand are drawn on the ground with their directions, a
   await page.mouse.click(u, v);
   await page.locator("#places button[aria-pressed=true]").filter({ hasText: "-0.20, 0.90" }).waitFor();
   assert.deepEqual(await cameraOf(page), [GOALS[1].sensor_in_world, [1.2, 0.8, 0.5]]);
-}, { behaviour: { goal: "reached" }, fragment: `q=chair&camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { goal: "reached" }, fragment: `q=chair&camera=${CAMERA}` }));
 
 for (const [goal, said] of [["unreachable", "None: unreachable."], ["not-visible", "None: not visible."], ["no-occupancy", "encode it with --occupancy"]]) {
   test(`a plain message where there is no place to stand: ${goal}`, () => opened(async (page) => {
@@ -128,4 +128,4 @@ test("a link shows the same questions, threshold and camera to others", () => op
   for (const [colour, n] of [["(r, g, b) => r > 90 && r - Math.min(g, b) > 45", 2000], ["(r, g, b) => b > 90 && b - r > 45", 2000]]) {
     assert.ok((await pixels(other, PANEL_PX, colour)).length > n, colour);
   }
-}, { fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, fragment: `camera=${CAMERA}` }));

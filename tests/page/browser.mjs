@@ -34,10 +34,11 @@ export const closeBrowser = () => browser?.close();
 
 /**
  * Opens the page of a service, or "about:blank" of one with this origin; fails at errors in the console and
- * requests to others, but for those expected.
+ * requests to others, but for those expected. `isLookedAt`: the picture is looked at; else it has a sixteenth of the pixels, which
+ * take their time without a GPU.
  */
-export async function opened(url, run, { fragment = "", options = {}, expected = null, origin = url } = {}) {
-  const context = await browser.newContext({ viewport: SIZE, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
+export async function opened(url, run, { fragment = "", options = {}, expected = null, origin = url, isLookedAt = false } = {}) {
+  const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: isLookedAt || PICTURES ? 1 : 0.25, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
   const page = await context.newPage();
   const wrong = [];
   page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
@@ -91,13 +92,11 @@ export async function picture(page, name) {
   return last;
 }
 
-/** Switches something that is drawn on or off: `boxes`, `grid`, `cells`, `photos` or `changes`. */
-export async function layer(page, name, isShown) {
-  const open = (isOpen) => page.evaluate((value) => { document.getElementById("layers").open = value; }, isOpen);
-  await open(true);
-  await page.locator(`#show-${name}`).setChecked(isShown);
-  await open(false);
-}
+/**
+ * Switches something that is drawn on or off: `boxes`, `grid`, `cells`, `photos` or `changes`. Without a pointer, which would wait
+ * for a picture.
+ */
+export const layer = (page, name, isShown) => page.locator(`#show-${name}`).evaluate((box, wanted) => box.checked === wanted || box.click(), isShown);
 
 /** Pixels of strong colour beside the panel; the scene itself is grey. */
 export async function litPixels(page, leftPx, name) {

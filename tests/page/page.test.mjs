@@ -23,7 +23,7 @@ for (const name of ["chair", "ball"]) {
     const recall = lit.filter((pixel) => isInside(thing, pixel, 0)).length / truePixels;
     console.log(`${name}: ${lit.length} lit, precision ${precision.toFixed(3)}, recall ${recall.toFixed(3)}`);
     assert.ok(truePixels > 2000 && precision > 0.98 && recall > 0.85);
-  }, { fragment: `q=${name}&camera=${CAMERA}` }));
+  }, { isLookedAt: true, fragment: `q=${name}&camera=${CAMERA}` }));
 }
 
 test("typing asks after a pause, the slider unlights, a click shows the thing, and the address keeps it", () => opened(async (page) => {
@@ -44,7 +44,7 @@ test("typing asks after a pause, the slider unlights, a click shows the thing, a
   assert.match(await page.locator("#details").innerText(), /1\.20, 0\.80, 0\.50 m/);
   await page.fill("#question", "unicorn");
   await page.getByText("nothing found").waitFor();
-}, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
 
 test("negatives go to the service", () => opened(async (page, service) => {
   await drawn(page);
@@ -67,7 +67,7 @@ test("a phrase lights its thing and tells what it is related to", () => opened(a
   const lit = await litPixels(page);
   const ball = THINGS.find(({ name }) => name === "ball");
   assert.ok(lit.length > 5000 && lit.every((pixel) => isInside(ball, pixel, 8)));
-}, { behaviour: { goal: "unreachable" }, fragment: `q=ball on the floor&camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { goal: "unreachable" }, fragment: `q=ball on the floor&camera=${CAMERA}` }));
 
 test("a missing cell is told, and drawn once it is there", () => opened(async (page, service) => {
   await page.getByText("1 of 3 cells missing").waitFor();

@@ -40,7 +40,7 @@ test("what appeared, went and moved is listed and boxed in the colour of its kin
   }
   await layer(page, "changes", false);
   assert.ok(await page.locator("#changes").isHidden());
-}, { behaviour: { program: "slag-encoder", generation: 2, changes: CHANGES }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { program: "slag-encoder", generation: 2, changes: CHANGES }, fragment: `camera=${CAMERA}` }));
 
 /** A thing as a robot describes it. */
 const onRobot = ({ id, position_in_world, box_in_world: { min, max } }) => ({ id, position_in_world, box_min_in_world: min, box_max_in_world: max });
@@ -91,7 +91,7 @@ test("a camera without its picture can be clicked and stood in", () => opened(as
   // Its rotation turns z, forward, to -y.
   assert.deepEqual(camera.slice(0, 3), PHOTO.position_m);
   assert.ok(Math.abs(camera[3] - 1.5) < 0.01 && camera[4] < 1.5 - 0.4 && Math.abs(camera[5] - 1.2) < 0.01, String(camera));
-}, { behaviour: { photos: [PHOTO] }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { photos: [PHOTO] }, fragment: `camera=${CAMERA}` }));
 
 test("missing and earlier cells are told and outlined, and the robot is where it says", () => opened(async (page, service) => {
   await page.getByText("1 of 3 cells missing · 1 of an earlier generation").waitFor({ timeout: 30000 });
@@ -112,7 +112,7 @@ test("missing and earlier cells are told and outlined, and the robot is where it
   service.behaviour.tell("following", {});
   await page.waitForFunction(() => performance.getEntriesByType("resource").filter(({ name }) => name.endsWith("/v1/view")).length > 1);
   assert.ok(await isDrawnAt(ROBOT, [2, 1, 1]) && !(await isDrawnAt(ROBOT, [1, 2, 1])));
-}, { behaviour: { missing: [2], stale: [1], position: [1, 2, 0] }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { missing: [2], stale: [1], position: [1, 2, 0] }, fragment: `camera=${CAMERA}` }));
 
 test("a geo-referenced scene has east, north and up, latitude and longitude, and an arrow to the north", () => opened(async (page) => {
   await drawn(page);
@@ -123,7 +123,7 @@ test("a geo-referenced scene has east, north and up, latitude and longitude, and
   assert.ok(red.some(([x, y]) => Math.hypot(x + 0.5 - u, y + 0.5 - v) < 3));
   await page.locator("#answers .card").click();
   assert.match(await page.locator("#details").innerText(), /East, north, up\s+1\.20, 0\.80, 0\.50 m[^]*48\.1000000, 11\.5000000/);
-}, { behaviour: { geographic: true, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { geographic: true, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
 
 test("fingers choose and turn", () => opened(async (page) => {
   await drawn(page);

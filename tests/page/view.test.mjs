@@ -32,7 +32,7 @@ for (const [name, options] of [["wide", { viewport: { width: 960, height: 540 } 
     console.log(`${name}: ${(100 * share).toFixed(0)} % of the screen`);
     // Far strays do not move it away.
     assert.ok(share > 0.5, String(share));
-  }, { behaviour: { things: [...THINGS, { name: "stray", min: [300, 300, 90], max: [302, 302, 92], n: [2, 2, 2] }], position: null, program: "slag-encoder" }, options }));
+  }, { isLookedAt: true, behaviour: { things: [...THINGS, { name: "stray", min: [300, 300, 90], max: [302, 302, 92], n: [2, 2, 2] }], position: null, program: "slag-encoder" }, options }));
 
   test(`the chosen answer is never behind the panel: ${name}`, () => opened(async (page) => {
     await drawn(page);
@@ -53,7 +53,7 @@ for (const [name, options] of [["wide", { viewport: { width: 960, height: 540 } 
       assert.ok(free.length > 1500 && Math.hypot(mean[0] - middle[0], mean[1] - middle[1]) < 60, `${thing}: ${free.length} lit around ${mean}, not ${middle}`);
       await layer(page, "boxes", true);
     }
-  }, { behaviour: { goal: "unreachable" }, options }));
+  }, { isLookedAt: true, behaviour: { goal: "unreachable" }, options }));
 }
 
 test("cards have the photo's crop, whereabouts, size and how sure; the chosen one shows the photo with its box first", () => opened(async (page) => {
@@ -97,7 +97,7 @@ test("what no object answers, groups of what is lit do; what nothing answers lig
   await page.fill("#question", "ball");
   await page.getByText("too busy").waitFor();
   assert.deepEqual([(await litPixels(page)).length, await page.locator("#answers .card").count()], [0, 0]);
-}, { fragment: `q=seat&camera=${CAMERA}`, expected: /503/ }));
+}, { isLookedAt: true, fragment: `q=seat&camera=${CAMERA}`, expected: /503/ }));
 
 /** Luminance of a colour (WCAG 2.2). */
 const luminance = (colour) => colour.map((v) => v / 255).map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)).reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
@@ -122,7 +122,7 @@ test("lit and unlit differ by 3 to 1 in lightness in every theme, and for eyes t
     await devtools.send("Emulation.setEmulatedVisionDeficiency", { type: "none" });
     await page.click("#theme");
   }
-}, { fragment: `q=chair&camera=${CAMERA}` }));
+}, { isLookedAt: true, fragment: `q=chair&camera=${CAMERA}` }));
 
 /** Mean colours inside of things' outlines, away from their edges. */
 async function meanColours(page, png, things) {

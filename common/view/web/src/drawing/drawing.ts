@@ -24,6 +24,8 @@ const N_POINTS = 20_000;
 const LEAST_LIGHT = 0.3;
 /** Photos that are tried for one that nothing hides. */
 const MOST_RAYS = 6;
+/** Gaussians that are looked at for that. */
+const MOST_ON_A_RAY = 150_000;
 /** An answer takes so many of its radii of the picture's half height. */
 const ROOM_AROUND = 2.2;
 
@@ -181,7 +183,7 @@ export class Drawing {
     for (const { photo, seen } of found) {
       const away = new THREE.Vector3(...centre).sub(new THREE.Vector3(...photo.position_m));
       const untilM = away.length() - Math.hypot(...size) / 2;
-      const light = lightAlong(this.cells.all(), photo.position_m, away.normalize().toArray() as Vector, untilM);
+      const light = lightAlong(this.cells.all(), photo.position_m, away.normalize().toArray() as Vector, untilM, Math.ceil(this.cells.nDrawn / MOST_ON_A_RAY));
       if (light > LEAST_LIGHT) return { photo: photo.name, box_px: seen!.boxPx };
     }
     return null;

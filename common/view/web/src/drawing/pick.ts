@@ -27,12 +27,12 @@ function sigmaOf(packed: Uint32Array, i: number): number {
   return SIGMAS[a + b + c - Math.min(a, b, c) - Math.max(a, b, c)];
 }
 
-/** Share of the light that reaches a place from a point of a ray; Gaussians count as balls. */
-export function lightAlong(cells: Iterable<[number, CellGaussians]>, from: Vector, along: Vector, untilM: number): number {
+/** Share of the light that reaches a place from a point of a ray, by every `stride`-th Gaussian; they count as balls. */
+export function lightAlong(cells: Iterable<[number, CellGaussians]>, from: Vector, along: Vector, untilM: number, stride: number): number {
   const centre = new Float64Array(3);
   let light = 1;
   for (const [, gaussians] of cells) {
-    for (let i = 0; i < gaussians.n; i++) {
+    for (let i = 0; i < gaussians.n; i += stride) {
       centreOf(gaussians, i, centre);
       const [x, y, z] = [centre[0] - from[0], centre[1] - from[1], centre[2] - from[2]];
       const t = x * along[0] + y * along[1] + z * along[2];
@@ -42,7 +42,7 @@ export function lightAlong(cells: Iterable<[number, CellGaussians]>, from: Vecto
       if (squared < 9 * variance) light *= 1 - ((gaussians.packed[4 * i] >>> 24) / 255) * Math.exp((-0.5 * squared) / variance);
     }
   }
-  return light;
+  return light ** stride;
 }
 
 export interface Hit {
