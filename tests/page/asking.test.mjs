@@ -75,7 +75,7 @@ test("keys choose a suggestion, and screen readers are told which", () => opened
   await page.keyboard.press("Escape");
   assert.deepEqual([await options.count(), await box.inputValue()], [0, "chair -ba"]);
   await box.fill("");
-  assert.deepEqual((await options.allInnerTexts())[0], "wallbefore");
+  assert.ok((await options.allInnerTexts()).includes("wallbefore"));
 }));
 
 test("a click chooses a suggestion, and a second question has its own", () => opened(async (page, service) => {

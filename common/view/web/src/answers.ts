@@ -6,7 +6,7 @@ import type { Answer, Vector } from "./network";
 export type Strength = "strong" | "likely" | "weak";
 
 /** Shares of the threshold by which a score is above it. */
-const [LIKELY_FROM, STRONG_FROM] = [0.1, 0.35];
+const [LIKELY_FROM, STRONG_FROM] = [0.15, 0.3];
 /** Of their boxes. */
 export const OPACITY: Record<Strength, number> = { strong: 1, likely: 0.75, weak: 0.4 };
 const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];

@@ -26,8 +26,8 @@ const LEAST_LIGHT = 0.3;
 const MOST_RAYS = 6;
 /** Gaussians that are looked at for that. */
 const MOST_ON_A_RAY = 150_000;
-/** An answer takes so many of its radii of the picture's half height. */
-const ROOM_AROUND = 2.2;
+/** The picture's half height has so many radii of an answer: as its photo shows it, and otherwise. */
+const [ROOM_IN_PHOTO, ROOM_AROUND] = [2.2, 3];
 
 interface Label {
   text: string;
@@ -141,7 +141,7 @@ export class Drawing {
     if (!photo) return this.flyTo(new THREE.Vector3(...centre), new THREE.Vector3(...size));
     const target = this.local(centre);
     const away = this.local(photo.position_m).sub(target);
-    const distance = Math.min(away.length(), Math.max(this.camera.distanceOf((Math.hypot(...size) / 2) * ROOM_AROUND), 1));
+    const distance = Math.min(away.length(), Math.max(this.camera.distanceOf((Math.hypot(...size) / 2) * ROOM_IN_PHOTO), 1));
     this.camera.flyTo(target.clone().addScaledVector(away.normalize(), distance), target);
     this.redraw();
   }
