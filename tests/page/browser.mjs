@@ -22,7 +22,7 @@ const SIZE = { width: 1100, height: 640 };
  */
 export const launch = () => chromium.launch({
   executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  args: ["--no-sandbox", ...(process.env.CHROMIUM_GPU ?? "--use-angle=swiftshader --enable-unsafe-swiftshader --disable-gpu-compositing").split(" ")],
+  args: ["--no-sandbox", ...(process.env.CHROMIUM_GPU ?? "--use-angle=swiftshader --enable-unsafe-swiftshader").split(" ")],
 });
 
 let browser;

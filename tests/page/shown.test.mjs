@@ -159,4 +159,4 @@ test("of a large scene a part is drawn at first, then all, and fewer again where
   await page.keyboard.up("ArrowLeft");
   // Not even the nearest cell, the floor, fits into the budget in full.
   assert.deepEqual(steps().slice(6).sort(), [[0, 2], [1, 2], [2, 2]]);
-}, { behaviour: { things: LARGE }, options: { viewport: { width: 400, height: 240 } }, fragment: `camera=${CAMERA}` }));
+}, { behaviour: { things: LARGE }, isLookedAt: true, options: { viewport: { width: 720, height: 320 } }, fragment: `camera=${CAMERA}` }));
