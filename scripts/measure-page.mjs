@@ -94,7 +94,7 @@ try {
       const cells = performance.getEntriesByType("resource").filter(({ name }) => name.includes("/v1/view/cells/"));
       return {
         renderer: gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER),
-        facts: document.getElementById("facts").innerText,
+        facts: document.getElementById("amount").textContent,
         first_picture_on_screen_ms: Math.round(window.watched.firstPictureMs),
         first_cell_ms: Number(firstPictureMs), whole_scene_ms: Number(wholePictureMs), all_fetched_ms: Math.round(performance.now()),
         drawn_gaussians: Number(gaussians), n_cells_fetched: cells.length, bytes_of_cells: cells.reduce((sum, { encodedBodySize }) => sum + encodedBodySize, 0),

@@ -31,7 +31,6 @@ export const panel = {
   details: element("details"),
   blend: element<HTMLImageElement>("blend"),
   threshold: element<HTMLInputElement>("threshold"),
-  layers: element<HTMLDetailsElement>("layers"),
   showBoxes: element<HTMLInputElement>("show-boxes"),
   showGrid: element<HTMLInputElement>("show-grid"),
   showCells: element<HTMLInputElement>("show-cells"),
