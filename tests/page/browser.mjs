@@ -92,6 +92,9 @@ export async function picture(page, name) {
   return last;
 }
 
+/** Takes a picture for people to look at, if one is wanted. */
+export const keepPicture = async (page, name) => PICTURES && picture(page, name);
+
 /**
  * Switches something that is drawn on or off: `boxes`, `grid`, `cells`, `photos` or `changes`. Without a pointer, which would wait
  * for a picture.

@@ -3,7 +3,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { axe, closeBrowser, layer, openBrowser, picture } from "./browser.mjs";
+import { axe, closeBrowser, keepPicture, layer, openBrowser } from "./browser.mjs";
 import { answered, CAMERA, cameraOf, dot, drawn, HEIGHT, isInside, litPixels, minus, opened, PANEL_PX, POSITION, project, TARGET, WIDTH } from "./scene.mjs";
 import { THINGS } from "./service.mjs";
 
@@ -14,7 +14,7 @@ for (const name of ["chair", "ball"]) {
   test(`pixels that "${name}" lights are those of the truth`, () => opened(async (page) => {
     await drawn(page);
     await answered(page, name);
-    await picture(page, `${name}-answered`);
+    await keepPicture(page, `${name}-answered`);
     const lit = await litPixels(page, `${name}-lit`);
     const thing = THINGS.find((entry) => entry.name === name);
     let truePixels = 0;
@@ -72,7 +72,7 @@ test("a phrase lights its thing and tells what it is related to", () => opened(a
 test("a missing cell is told, and drawn once it is there", () => opened(async (page, service) => {
   await page.getByText("1 of 3 cells missing").waitFor();
   await layer(page, "cells", true);
-  await picture(page, "cells");
+  await keepPicture(page, "cells");
   assert.ok(!service.behaviour.requests.some((path) => path.startsWith("/v1/view/cells/2")));
   service.behaviour.missing = [];
   await drawn(page);
@@ -132,7 +132,7 @@ for (const [name, options] of [["dark", {}], ["light", { colorScheme: "light" }]
   test(`axe finds nothing: ${name}`, () => opened(async (page) => {
     await drawn(page);
     await answered(page, "chair");
-    await picture(page, name);
+    await keepPicture(page, name);
     assert.ok(await page.evaluate(() => document.documentElement.scrollWidth <= innerWidth));
     const found = await page.evaluate(`(() => { ${axe}; return axe.run(); })()`);
     assert.deepEqual(found.violations.map(({ id, nodes }) => `${id}: ${nodes[0].html}`), []);

@@ -5,7 +5,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { closeBrowser, layer, litPixels, openBrowser, opened as openedAt, picture } from "./browser.mjs";
+import { closeBrowser, keepPicture, layer, litPixels, openBrowser, opened as openedAt } from "./browser.mjs";
 import { makeRoom, readGrey16, run, serve } from "./programs.mjs";
 
 /** Small: without a GPU, every pixel of a picture takes its time. */
@@ -77,7 +77,7 @@ for (const [name, service] of [["slag-edge", () => robot], ["slag-encoder", () =
     return opened(service().url, async (page) => {
       await drawn(page);
       await answered(page, THING);
-      await picture(page, `${name}-answered`);
+      await keepPicture(page, `${name}-answered`);
       const { nTrue, precision, recall } = judge(await litPixels(page, PANEL_PX, `${name}-lit`), isThing);
       console.log(`${name}: ${nTrue} pixels of ${THING}, precision ${precision.toFixed(3)}, recall ${recall.toFixed(3)}`);
       assert.ok(nTrue > 1000 && precision > 0.8 && recall > 0.6);
@@ -150,7 +150,7 @@ test("slag-encoder view: the photo has the answer's box, and a second question i
       await page.getByRole("button", { name: "Stand here" }).click();
       await page.locator("#blend-share").fill("60");
       await page.waitForFunction(() => !document.getElementById("blend").hidden && document.getElementById("blend").naturalWidth > 0);
-      await picture(page, "photo-blended");
+      await keepPicture(page, "photo-blended");
     }, { fragment: `q=${THING}&and=wall` });
   } finally {
     await viewer.stop();
