@@ -94,7 +94,7 @@ try {
       const cells = performance.getEntriesByType("resource").filter(({ name }) => name.includes("/v1/view/cells/"));
       return {
         renderer: gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER),
-        facts: document.getElementById("facts").innerText,
+        facts: document.getElementById("amount").textContent,
         first_picture_on_screen_ms: Math.round(window.watched.firstPictureMs),
         first_cell_ms: Number(firstPictureMs), whole_scene_ms: Number(wholePictureMs), all_fetched_ms: Math.round(performance.now()),
         drawn_gaussians: Number(gaussians), n_cells_fetched: cells.length, bytes_of_cells: cells.reduce((sum, { encodedBodySize }) => sum + encodedBodySize, 0),
@@ -144,7 +144,7 @@ try {
     await page.keyboard.up("ArrowLeft");
     result.turning = { frames_a_second_at_first: rounded(turn.first), at_last: rounded(turn.last), gaussians_at_last: turn.gaussians, sort_ms: spread(turn.sorts) };
     result.script_memory_mb = rounded((await page.evaluate(() => performance.memory?.usedJSHeapSize ?? 0)) / 1e6);
-  }, { origin: service.url });
+  }, { isLookedAt: true, origin: service.url });
 
   if (out !== "none") {
     await opened(service.url, async (page) => {
@@ -154,7 +154,7 @@ try {
       await picture(page, null);
       mkdirSync(dirname(out), { recursive: true });
       await page.screenshot({ path: out });
-    }, { fragment: `${questions[0] ? `q=${encodeURIComponent(questions[0])}` : ""}${camera === "whole" ? "" : `&camera=${camera}`}` });
+    }, { isLookedAt: true, fragment: `${questions[0] ? `q=${encodeURIComponent(questions[0])}` : ""}${camera === "whole" ? "" : `&camera=${camera}`}` });
   }
 } finally {
   await closeBrowser();

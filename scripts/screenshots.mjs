@@ -39,7 +39,7 @@ try {
     await picture(page, null);
     mkdirSync(dirname(out), { recursive: true });
     await page.screenshot({ path: out });
-  }, { fragment: `q=${encodeURIComponent(question)}&camera=${camera}` });
+  }, { isLookedAt: true, fragment: `q=${encodeURIComponent(question)}&camera=${camera}` });
 } finally {
   await closeBrowser();
   await viewer.stop();

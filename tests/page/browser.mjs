@@ -34,10 +34,11 @@ export const closeBrowser = () => browser?.close();
 
 /**
  * Opens the page of a service, or "about:blank" of one with this origin; fails at errors in the console and
- * requests to others, but for those expected.
+ * requests to others, but for those expected. `isLookedAt`: the picture is looked at; else it has a sixteenth of the pixels, which
+ * take their time without a GPU.
  */
-export async function opened(url, run, { fragment = "", options = {}, expected = null, origin = url } = {}) {
-  const context = await browser.newContext({ viewport: SIZE, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
+export async function opened(url, run, { fragment = "", options = {}, expected = null, origin = url, isLookedAt = false } = {}) {
+  const context = await browser.newContext({ viewport: SIZE, deviceScaleFactor: isLookedAt || PICTURES ? 1 : 0.25, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
   const page = await context.newPage();
   const wrong = [];
   page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
@@ -91,10 +92,20 @@ export async function picture(page, name) {
   return last;
 }
 
+/** Takes a picture for people to look at, if one is wanted. */
+export const keepPicture = async (page, name) => PICTURES && picture(page, name);
+
+/**
+ * Switches something that is drawn on or off: `boxes`, `grid`, `cells`, `photos` or `changes`. Without a pointer, which would wait
+ * for a picture.
+ */
+export const layer = (page, name, isShown) => page.locator(`#show-${name}`).evaluate((box, wanted) => box.checked === wanted || box.click(), isShown);
+
 /** Pixels of strong colour beside the panel; the scene itself is grey. */
 export async function litPixels(page, leftPx, name) {
-  await page.uncheck("#show-boxes");
-  await page.uncheck("#show-grid");
+  await layer(page, "boxes", false);
+  await layer(page, "grid", false);
+  await page.evaluate(() => { document.getElementById("hud").hidden = true; });
   return pixels(page, leftPx, (r, g, b) => r > 90 && r - Math.min(g, b) > 45, name);
 }
 
@@ -115,7 +126,8 @@ export async function pixels(page, leftPx, test, name, isStill = true) {
       const found = [];
       for (let y = 0; y < height; y++) {
         for (let x = left; x < width; x++) {
-          if (test(...rgba.subarray(4 * (y * width + x), 4 * (y * width + x) + 3))) found.push([x, y]);
+          const at = 4 * (y * width + x);
+          if (test(rgba[at], rgba[at + 1], rgba[at + 2])) found.push([x, y]);
         }
       }
       return found;

@@ -3,7 +3,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { axe, closeBrowser, openBrowser, picture } from "./browser.mjs";
+import { axe, closeBrowser, keepPicture, layer, openBrowser } from "./browser.mjs";
 import { answered, CAMERA, cameraOf, dot, drawn, HEIGHT, isInside, litPixels, minus, opened, PANEL_PX, POSITION, project, TARGET, WIDTH } from "./scene.mjs";
 import { THINGS } from "./service.mjs";
 
@@ -14,7 +14,7 @@ for (const name of ["chair", "ball"]) {
   test(`pixels that "${name}" lights are those of the truth`, () => opened(async (page) => {
     await drawn(page);
     await answered(page, name);
-    await picture(page, `${name}-answered`);
+    await keepPicture(page, `${name}-answered`);
     const lit = await litPixels(page, `${name}-lit`);
     const thing = THINGS.find((entry) => entry.name === name);
     let truePixels = 0;
@@ -23,7 +23,7 @@ for (const name of ["chair", "ball"]) {
     const recall = lit.filter((pixel) => isInside(thing, pixel, 0)).length / truePixels;
     console.log(`${name}: ${lit.length} lit, precision ${precision.toFixed(3)}, recall ${recall.toFixed(3)}`);
     assert.ok(truePixels > 2000 && precision > 0.98 && recall > 0.85);
-  }, { fragment: `q=${name}&camera=${CAMERA}` }));
+  }, { isLookedAt: true, fragment: `q=${name}&camera=${CAMERA}` }));
 }
 
 test("typing asks after a pause, the slider unlights, a click shows the thing, and the address keeps it", () => opened(async (page) => {
@@ -38,13 +38,13 @@ test("typing asks after a pause, the slider unlights, a click shows the thing, a
   assert.ok(before > 2000 && after === 0, `${before} lit, then ${after}`);
   assert.match(page.url(), /threshold=0\.98/);
   const [x, y] = project([1.2, 0.8, 0.5]);
-  await page.check("#show-boxes");
+  await layer(page, "boxes", true);
   await page.mouse.click(x, y);
   await page.locator("#details").waitFor();
   assert.match(await page.locator("#details").innerText(), /1\.20, 0\.80, 0\.50 m/);
   await page.fill("#question", "unicorn");
   await page.getByText("nothing found").waitFor();
-}, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
 
 test("negatives go to the service", () => opened(async (page, service) => {
   await drawn(page);
@@ -58,21 +58,21 @@ test("negatives go to the service", () => opened(async (page, service) => {
 test("a phrase lights its thing and tells what it is related to", () => opened(async (page) => {
   await drawn(page);
   await answered(page, "ball on the floor");
-  await page.locator("#answers button").click();
+  await page.locator("#answers .card").click();
   await page.locator("#details").getByText("holds to 0.93").waitFor();
-  assert.match(await page.locator("#details").innerText(), /ball[^]*48\.1000000, 11\.5000000[^]*To: floor/);
+  assert.match(await page.locator("#answers li").innerText(), /ball[^]*48\.1000000, 11\.5000000[^]*To: floor/);
   await page.evaluate((fragment) => { location.hash = fragment; location.reload(); }, `q=ball on the floor&camera=${CAMERA}`);
   await drawn(page);
   await answered(page, "ball on the floor");
   const lit = await litPixels(page);
   const ball = THINGS.find(({ name }) => name === "ball");
   assert.ok(lit.length > 5000 && lit.every((pixel) => isInside(ball, pixel, 8)));
-}, { behaviour: { goal: "unreachable" }, fragment: `q=ball on the floor&camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { goal: "unreachable" }, fragment: `q=ball on the floor&camera=${CAMERA}` }));
 
 test("a missing cell is told, and drawn once it is there", () => opened(async (page, service) => {
   await page.getByText("1 of 3 cells missing").waitFor();
-  await page.check("#show-cells");
-  await picture(page, "cells");
+  await layer(page, "cells", true);
+  await keepPicture(page, "cells");
   assert.ok(!service.behaviour.requests.some((path) => path.startsWith("/v1/view/cells/2")));
   service.behaviour.missing = [];
   await drawn(page);
@@ -102,7 +102,7 @@ test("keys reach the question and move the camera", () => opened(async (page) =>
   assert.notEqual(await page.evaluate(() => getComputedStyle(document.activeElement).outlineStyle), "none");
   await page.keyboard.press("Enter");
   await page.locator("#details").getByText("Score").waitFor();
-  assert.equal(await page.evaluate(() => document.activeElement.getAttribute("aria-pressed")), "true");
+  assert.equal(await page.evaluate(() => document.activeElement.getAttribute("aria-expanded")), "true");
 }, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
 
 test("a service without a scene says so, and the page opens when it has one", () => opened(async (page, service) => {
@@ -132,7 +132,7 @@ for (const [name, options] of [["dark", {}], ["light", { colorScheme: "light" }]
   test(`axe finds nothing: ${name}`, () => opened(async (page) => {
     await drawn(page);
     await answered(page, "chair");
-    await picture(page, name);
+    await keepPicture(page, name);
     assert.ok(await page.evaluate(() => document.documentElement.scrollWidth <= innerWidth));
     const found = await page.evaluate(`(() => { ${axe}; return axe.run(); })()`);
     assert.deepEqual(found.violations.map(({ id, nodes }) => `${id}: ${nodes[0].html}`), []);

@@ -5,14 +5,17 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { closeBrowser, litPixels, openBrowser, opened, picture } from "./browser.mjs";
+import { closeBrowser, keepPicture, layer, litPixels, openBrowser, opened as openedAt } from "./browser.mjs";
 import { makeRoom, readGrey16, run, serve } from "./programs.mjs";
 
-const [WIDTH, HEIGHT] = [1100, 640];
+/** Small: without a GPU, every pixel of a picture takes its time. */
+const [WIDTH, HEIGHT] = [700, 360];
 const PANEL_PX = 360;
 const FIELD_OF_VIEW_DEG = 55;
 /** A photo of the test set, and a thing in it that the embedded models know. */
 const [VIEW, THING] = [Number(process.env.SLAG_PAGE_VIEW ?? 3), process.env.SLAG_PAGE_THING ?? "armchair"];
+
+const opened = (url, run, how = {}) => openedAt(url, run, { ...how, options: { viewport: { width: WIDTH, height: HEIGHT } } });
 
 let room, store, robot;
 before(async () => {
@@ -44,7 +47,7 @@ function truth() {
   const ids = instances.filter(({ category }) => category === THING).map(({ id }) => id);
   const focal = HEIGHT / 2 / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
   const isThing = (x, y) => {
-    const u = Math.round(((x - WIDTH / 2) / focal) * poses.fl_x + poses.cx);
+    const u = Math.round(((x - (PANEL_PX + WIDTH) / 2) / focal) * poses.fl_x + poses.cx);
     const v = Math.round(((y - HEIGHT / 2) / focal) * poses.fl_y + poses.cy);
     return u >= 0 && v >= 0 && u < mask.width && v < mask.height ? ids.includes(mask.at(u, v)) : null;
   };
@@ -74,22 +77,22 @@ for (const [name, service] of [["slag-edge", () => robot], ["slag-encoder", () =
     return opened(service().url, async (page) => {
       await drawn(page);
       await answered(page, THING);
-      await picture(page, `${name}-answered`);
+      await keepPicture(page, `${name}-answered`);
       const { nTrue, precision, recall } = judge(await litPixels(page, PANEL_PX, `${name}-lit`), isThing);
       console.log(`${name}: ${nTrue} pixels of ${THING}, precision ${precision.toFixed(3)}, recall ${recall.toFixed(3)}`);
-      assert.ok(nTrue > 2000 && precision > 0.8 && recall > 0.6);
-    }, { fragment: `q=${THING}&camera=${camera}` });
+      assert.ok(nTrue > 1000 && precision > 0.8 && recall > 0.6);
+    }, { isLookedAt: true, fragment: `q=${THING}&camera=${camera}` });
   });
 }
 
 test("slag-edge: a click on an answer shows its place and photo, and what is absent is told", () => opened(robot.url, async (page) => {
   await drawn(page);
   await answered(page, THING);
-  await page.locator("#answers button").first().click();
+  await page.locator("#answers .card").first().click();
   await page.locator("#details").getByText("Best photo").waitFor();
   await page.fill("#question", "an elephant");
   await answered(page, "an elephant");
-  assert.equal(await page.locator("#answers button").count(), 0);
+  assert.equal(await page.locator("#answers .card").count(), 0);
   assert.match(await page.locator("#message").innerText(), /\w/);
 }, { fragment: `q=${THING}` }));
 
@@ -98,7 +101,7 @@ test("slag-edge: places to stand are those of the robot's own route", () => open
   await answered(page, THING);
   const [{ answers: [{ id }] }] = (await (await fetch(`${robot.url}/v1/query?text=${THING}`)).json()).results;
   const reply = await (await fetch(`${robot.url}/v1/goal?id=${id}`)).json();
-  await page.locator("#answers button").first().click();
+  await page.locator("#answers .card").first().click();
   await page.locator("#places").waitFor();
   const shown = await page.locator("#places button").allInnerTexts();
   assert.deepEqual(shown.map((text) => text.split(" m ")[0]), reply.goals.map(({ position_in_world: [x, y] }) => `${x.toFixed(2)}, ${y.toFixed(2)}`));
@@ -113,9 +116,9 @@ test("slag-edge: suggested words have as many things as they are answered with",
   await options.first().waitFor();
   const suggested = await options.allInnerTexts();
   assert.ok(suggested.length > 2, String(suggested));
-  for (const [word, note] of suggested.map((text) => text.split("\n"))) {
+  for (const [word, note] of await options.evaluateAll((all) => all.map((option) => [...option.children].map((part) => part.textContent)))) {
     const [{ answers }] = (await (await fetch(`${robot.url}/v1/query?limit=1000&text=${encodeURIComponent(word)}`)).json()).results;
-    assert.equal(note, `${answers.length} on board`, word);
+    assert.equal(note, String(answers.length), word);
   }
 }));
 
@@ -131,7 +134,7 @@ test("slag-edge: cameras are where the poses say, without pictures", () => opene
     for (const k of [0, 1, 2]) assert.ok(Math.abs(position_m[k] - matrix[k][3]) < 1e-4 && Math.abs(forward[k] + matrix[k][2]) < 1e-4, `${name}: ${position_m}, ${forward}`);
     assert.equal(has_picture, false);
   }
-  assert.ok(await page.locator("#show-photos").isVisible());
+  assert.ok(await page.locator("#photos-label").evaluate((label) => !label.hidden));
 }));
 
 test("slag-encoder view: the photo has the answer's box, and a second question is beside the first", async () => {
@@ -141,13 +144,13 @@ test("slag-encoder view: the photo has the answer's box, and a second question i
     await opened(viewer.url, async (page) => {
       await drawn(page);
       await answered(page, `${THING} | wall`);
-      assert.ok(await page.locator("#photos-label").isVisible());
-      await page.locator("#answers button").first().click();
+      assert.ok(await page.locator("#photos-label").evaluate((label) => !label.hidden));
+      await page.locator("#answers .card").first().click();
       await page.locator("#details figure rect").waitFor();
       await page.getByRole("button", { name: "Stand here" }).click();
       await page.locator("#blend-share").fill("60");
       await page.waitForFunction(() => !document.getElementById("blend").hidden && document.getElementById("blend").naturalWidth > 0);
-      await picture(page, "photo-blended");
+      await keepPicture(page, "photo-blended");
     }, { fragment: `q=${THING}&and=wall` });
   } finally {
     await viewer.stop();
@@ -184,12 +187,12 @@ test("another generation is told while the page is open, and a robot that goes a
   assert.ok(appeared.length + went.length + moved.length > 0);
   await opened(store.url, async (of) => {
     await drawn(of);
-    await of.check("#show-changes");
+    await layer(of, "changes", true);
     await of.locator("#changes").getByText(`${appeared.length} appeared, ${went.length} went, ${moved.length} moved, ${n_same + n_stayed} stayed`).waitFor();
     assert.equal(await of.locator("#changes button").count(), appeared.length + went.length + moved.length);
   });
   const ofRobot = await (await fetch(`${robot.url}/v1/changes`)).json();
-  await page.check("#show-changes");
+  await layer(page, "changes", true);
   const kinds = ["appeared", "went", "moved"];
   await page.locator("#changes").getByText(kinds.map((kind) => `${ofRobot[kind].length} ${kind}`).join(", ")).waitFor();
   const at = robot.url;

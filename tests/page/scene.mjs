@@ -37,24 +37,31 @@ export const dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
 const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
 const unit = (v) => v.map((x) => x / Math.hypot(...v));
 
-/** Pixel of a world point, computed apart from the page. */
+/** Pixel of a world point, computed apart from the page: the camera looks at the middle of what the panel leaves free. */
 export function project(point, from = POSITION, to = TARGET) {
   const forward = unit(minus(to, from));
   const right = unit(cross(forward, [0, 0, 1]));
   const ray = minus(point, from);
   const focal = HEIGHT / 2 / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
   const depth = dot(ray, forward);
-  return [WIDTH / 2 + (focal * dot(ray, right)) / depth, HEIGHT / 2 - (focal * dot(ray, cross(right, forward))) / depth];
+  return [(PANEL_PX + WIDTH) / 2 + (focal * dot(ray, right)) / depth, HEIGHT / 2 - (focal * dot(ray, cross(right, forward))) / depth];
+}
+
+const outlines = new Map();
+
+/** Directions, and how far the projected corners of a box reach along each. */
+function outlineOf(thing) {
+  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => project(thing.min.map((low, k) => ((i >> k) & 1 ? thing.max[k] : low))));
+  return Array.from({ length: 72 }, (_, i) => {
+    const [dx, dy] = [Math.cos((i * Math.PI) / 36), Math.sin((i * Math.PI) / 36)];
+    return [dx, dy, Math.max(...corners.map(([cx, cy]) => cx * dx + cy * dy))];
+  });
 }
 
 /** The true mask: pixels inside the hull of a box's projected corners, which `grownPx` moves outward. */
 export function isInside(thing, [x, y], grownPx) {
-  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => project(thing.min.map((low, k) => ((i >> k) & 1 ? thing.max[k] : low))));
+  if (!outlines.has(thing)) outlines.set(thing, outlineOf(thing));
   // Inside the hull if no direction separates the point from all corners.
-  for (let i = 0; i < 72; i++) {
-    const [dx, dy] = [Math.cos((i * Math.PI) / 36), Math.sin((i * Math.PI) / 36)];
-    if (x * dx + y * dy > Math.max(...corners.map(([cx, cy]) => cx * dx + cy * dy)) + grownPx) return false;
-  }
-  return true;
+  return outlines.get(thing).every(([dx, dy, reach]) => x * dx + y * dy <= reach + grownPx);
 }
 

@@ -21,6 +21,7 @@ export const GOALS = [
   { position_in_world: [-0.2, 0.9, 0], yaw_rad: -0.1, sensor_in_world: [-0.2, 0.9, 0.4], clearance_m: 0.52, visible_share: 0.44, path_m: 5.5 },
 ];
 
+/** "seat" lights what "chair" does, and finds no object. */
 const WORDS = [["chair", 1], ["ball", 1], ["wall", 0], ["armchair", 0], ["red wall", 0]].map(([word, n_things]) => ({ word, n_things }));
 
 /** What the robot's routes take of what the page may send; they refuse the rest. */
@@ -32,7 +33,12 @@ const PARAMETERS = {
   "/v1/goal": ["id", "radius_m"],
   "/v1/view/words": [],
   "/v1/changes": [],
+  "/v1/map": [],
+  "/v1/objects": ["near", "radius", "limit"],
 };
+
+/** A picture whose left half is red and whose right half is blue. */
+const PICTURE = '<svg xmlns="http://www.w3.org/2000/svg" width="640" height="480"><rect width="320" height="480" fill="#f00"/><rect x="320" width="320" height="480" fill="#00f"/></svg>';
 
 function half(value) {
   if (value === 0) return 0;
@@ -86,7 +92,7 @@ function scoresMessage(things, text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], photos: [], ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -109,8 +115,12 @@ export async function startService(behaviour = {}) {
     if (foreign) return json(response, 400, { detail: `unknown parameter ${foreign}` });
     const cell = url.pathname.match(/^\/v1\/view\/cells\/(\d+)$/);
     if (cell) return response.writeHead(200).end(cellMessage(behaviour.things[Number(cell[1])], Number(url.searchParams.get("step") ?? 1)));
-    if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(behaviour.things, url.searchParams.get("text"), behaviour.generation));
+    if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(behaviour.things, url.searchParams.get("text").replace("seat", "chair"), behaviour.generation));
     if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: behaviour.words, complete: behaviour.hasAllWords });
+    if (url.pathname === "/v1/map") return json(response, 200, { age_secs: behaviour.ageSecs, is_expired: false });
+    if (url.pathname.startsWith("/v1/view/photos/")) return response.writeHead(200, { "content-type": "image/svg+xml" }).end(PICTURE);
+    if (url.pathname === "/v1/objects") return json(response, 200, { objects: THINGS.map(({ min, max }, i) => ({ id: `o${i}`, position_in_world: min.map((low, k) => (low + max[k]) / 2), box_min_in_world: min, box_max_in_world: max })) });
+    if (behaviour.fails && /query|scores/.test(url.pathname)) return json(response, 503, { detail: "too busy" });
     if (url.pathname === "/v1/changes") return behaviour.changes ? json(response, 200, behaviour.changes) : json(response, 409, { detail: "the store has one generation alone" });
     if (url.pathname === "/v1/goal") {
       if (behaviour.goal === "no-occupancy") return json(response, 409, { detail: "the scene does not say which places are free; encode it with --occupancy" });
@@ -125,6 +135,7 @@ export async function startService(behaviour = {}) {
       const answers = thing ? [{
         ...(support ? { degree: 0.93, related_to: [{ thing: support, position_in_world: [0, 0, 0], score: 0.7 }] } : {}),
         geographic: { latitude_deg: 48.1, longitude_deg: 11.5, height_m: 520 },
+        ...(behaviour.evidence ? { evidence: behaviour.evidence } : {}),
         id: "o1", score: 0.86, n_gaussians: 1536, position_in_world: thing.min.map((low, i) => (low + thing.max[i]) / 2),
         box_min_in_world: thing.min, box_max_in_world: thing.max,
       }] : [];

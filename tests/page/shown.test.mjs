@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { closeBrowser, openBrowser, pixels } from "./browser.mjs";
+import { closeBrowser, layer, openBrowser, pixels } from "./browser.mjs";
 import { answered, CAMERA, cameraOf, drawn, opened, PANEL_PX, project } from "./scene.mjs";
 import { THINGS } from "./service.mjs";
 
@@ -23,8 +23,8 @@ const CHANGES = {
 
 test("what appeared, went and moved is listed and boxed in the colour of its kind", () => opened(async (page) => {
   await drawn(page);
-  await page.uncheck("#show-grid");
-  await page.check("#show-changes");
+  await layer(page, "grid", false);
+  await layer(page, "changes", true);
   await page.locator("#changes").getByText("1 appeared, 1 went, 1 moved, 4 stayed").waitFor();
   assert.deepEqual(await page.locator("#changes button").allInnerTexts(), [
     "Appeared: 1.20, 0.80, 0.50 m", "Went: -1.50, -1.00, 0.50 m", "Moved by 1.12 m: 1.00, 2.50, 0.40 m",
@@ -38,9 +38,9 @@ test("what appeared, went and moved is listed and boxed in the colour of its kin
       assert.ok(found.some(([x, y]) => Math.hypot(x + 0.5 - u, y + 0.5 - v) < 3), `${kind}: no line ends at ${u}, ${v}`);
     }
   }
-  await page.uncheck("#show-changes");
+  await layer(page, "changes", false);
   assert.ok(await page.locator("#changes").isHidden());
-}, { behaviour: { program: "slag-encoder", generation: 2, changes: CHANGES }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { program: "slag-encoder", generation: 2, changes: CHANGES }, fragment: `camera=${CAMERA}` }));
 
 /** A thing as a robot describes it. */
 const onRobot = ({ id, position_in_world, box_in_world: { min, max } }) => ({ id, position_in_world, box_min_in_world: min, box_max_in_world: max });
@@ -51,18 +51,18 @@ const OF_ROBOT = {
 
 test("a robot's changes are listed, and its reason where it has none", () => opened(async (page, service) => {
   await drawn(page);
-  await page.check("#show-changes");
+  await layer(page, "changes", true);
   await page.locator("#changes").getByText("Generation 4 to 7").waitFor();
   assert.deepEqual(await page.locator("#changes button").allInnerTexts(), ["Appeared: 1.20, 0.80, 0.50 m", "Moved by 1.12 m: 1.00, 2.50, 0.40 m"]);
   service.behaviour.changes = { ...OF_ROBOT, from: null, none: { kind: "no-earlier-generation", detail: "the robot has had one generation" } };
-  await page.uncheck("#show-changes");
-  await page.check("#show-changes");
+  await layer(page, "changes", false);
+  await layer(page, "changes", true);
   await page.locator("#changes").getByText("the robot has had one generation").waitFor();
 }, { behaviour: { generation: 7, changes: OF_ROBOT } }));
 
 test("without a generation before, the service's words say so", () => opened(async (page) => {
   await drawn(page);
-  await page.check("#show-changes");
+  await layer(page, "changes", true);
   await page.locator("#changes").getByText("one generation alone").waitFor();
 }, { behaviour: { program: "slag-encoder", generation: 2 }, expected: /409/ }));
 
@@ -72,11 +72,11 @@ const PHOTO = { name: "roof/12.jpg", position_m: [1.5, 1.5, 1.2], rotation_xyzw:
 
 test("a camera without its picture can be clicked and stood in", () => opened(async (page) => {
   await drawn(page);
-  await page.uncheck("#show-grid");
-  await page.check("#show-photos");
-  // A frustum as long as a fortieth of the scene's radius: its forward z is -y of the world, its down y is z.
+  await layer(page, "grid", false);
+  await layer(page, "photos", true);
+  // Edges of a frustum, a fiftieth of the scene's radius along: its forward z is -y of the world, its down y is z.
   const green = await pixels(page, PANEL_PX, isColour([0x6f, 0xbf, 0x8b]));
-  const length = Math.hypot(8, 8, 1.1) / 2 / 40;
+  const length = Math.hypot(8, 8, 1.1) / 2 / 60;
   for (const [x, y] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
     const offset = [(x * PHOTO.width_px) / 2 / PHOTO.focal_px, -1, (y * PHOTO.height_px) / 2 / PHOTO.focal_px];
     const [u, v] = project(PHOTO.position_m.map((value, i) => value + length * offset[i]));
@@ -91,12 +91,12 @@ test("a camera without its picture can be clicked and stood in", () => opened(as
   // Its rotation turns z, forward, to -y.
   assert.deepEqual(camera.slice(0, 3), PHOTO.position_m);
   assert.ok(Math.abs(camera[3] - 1.5) < 0.01 && camera[4] < 1.5 - 0.4 && Math.abs(camera[5] - 1.2) < 0.01, String(camera));
-}, { behaviour: { photos: [PHOTO] }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { photos: [PHOTO] }, fragment: `camera=${CAMERA}` }));
 
 test("missing and earlier cells are told and outlined, and the robot is where it says", () => opened(async (page, service) => {
   await page.getByText("1 of 3 cells missing · 1 of an earlier generation").waitFor({ timeout: 30000 });
-  await page.uncheck("#show-grid");
-  await page.check("#show-cells");
+  await layer(page, "grid", false);
+  await layer(page, "cells", true);
   // A corner of a box, or the foot of the robot's post, is drawn in its colour.
   const isDrawnAt = async (colour, point) => {
     const [u, v] = project(point);
@@ -112,7 +112,7 @@ test("missing and earlier cells are told and outlined, and the robot is where it
   service.behaviour.tell("following", {});
   await page.waitForFunction(() => performance.getEntriesByType("resource").filter(({ name }) => name.endsWith("/v1/view")).length > 1);
   assert.ok(await isDrawnAt(ROBOT, [2, 1, 1]) && !(await isDrawnAt(ROBOT, [1, 2, 1])));
-}, { behaviour: { missing: [2], stale: [1], position: [1, 2, 0] }, fragment: `camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { missing: [2], stale: [1], position: [1, 2, 0] }, fragment: `camera=${CAMERA}` }));
 
 test("a geo-referenced scene has east, north and up, latitude and longitude, and an arrow to the north", () => opened(async (page) => {
   await drawn(page);
@@ -121,9 +121,9 @@ test("a geo-referenced scene has east, north and up, latitude and longitude, and
   // The arrow leaves the middle of the ground along y; beyond the floor it is seen.
   const [u, v] = project([0, 5.5, -0.1]);
   assert.ok(red.some(([x, y]) => Math.hypot(x + 0.5 - u, y + 0.5 - v) < 3));
-  await page.locator("#answers button").click();
+  await page.locator("#answers .card").click();
   assert.match(await page.locator("#details").innerText(), /East, north, up\s+1\.20, 0\.80, 0\.50 m[^]*48\.1000000, 11\.5000000/);
-}, { behaviour: { geographic: true, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
+}, { isLookedAt: true, behaviour: { geographic: true, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
 
 test("fingers choose and turn", () => opened(async (page) => {
   await drawn(page);
@@ -150,12 +150,13 @@ test("of a large scene a part is drawn at first, then all, and fewer again where
   const [first, second] = [steps().slice(0, 3), steps().slice(3)];
   for (const asked of [first, second]) assert.deepEqual(asked.map(([cell]) => cell).sort(), [0, 1, 2]);
   assert.deepEqual([first, second].map((asked) => [...new Set(asked.map(([, step]) => step))]), [[4], [1]]);
-  assert.match(await page.locator("#facts").innerText(), /^493,264 of 493,264 Gaussians/);
+  const amount = page.locator("#amount");
+  assert.match(await amount.textContent(), /^493,264 of 493,264 Gaussians/);
   // A software GPU draws so many less than 25 times a second.
   await page.locator("#canvas").focus();
   await page.keyboard.down("ArrowLeft");
-  await page.locator("#facts").getByText("246,632 of 493,264").waitFor({ timeout: 120000 });
+  await page.waitForFunction(() => document.getElementById("amount").textContent.startsWith("246,632 of 493,264"), null, { timeout: 120000 });
   await page.keyboard.up("ArrowLeft");
   // Not even the nearest cell, the floor, fits into the budget in full.
   assert.deepEqual(steps().slice(6).sort(), [[0, 2], [1, 2], [2, 2]]);
-}, { behaviour: { things: LARGE }, fragment: `camera=${CAMERA}` }));
+}, { behaviour: { things: LARGE }, isLookedAt: true, options: { viewport: { width: 720, height: 320 } }, fragment: `camera=${CAMERA}` }));

@@ -1,44 +1,38 @@
-// Ties the three modules together: state.ts (what a link holds), network.ts (what is asked), drawing/ (what is
-// seen).
+// Ties the modules together: state.ts (what a link holds), network.ts (what is asked), drawing/ (what is seen),
+// asking.ts (questions), pointing.ts (pointer and keys).
 
 import "./style.css";
+import type { Viewpoint } from "./answers";
+import { Asking } from "./asking";
 import { ChangesPanel } from "./changes";
 import { Drawing } from "./drawing/drawing";
-import type { Scores } from "./messages";
-import { type Answer, type Answers, type Description, describe, fetchAnswers, fetchPhoto, fetchScores, fetchWords, follow, NotFound, parseQuestion, setToken, Unauthorized, type Word } from "./network";
-import { askToken, panel, say, showAnswers, showDetails, showFacts, showLegend, showPhoto, showSecond } from "./panel";
+import { type Description, describe, fetchWords, follow, NotFound, setToken, Unauthorized, type Word } from "./network";
+import { askToken, covered, panel, say, showBeside, showFacts } from "./panel";
+import { forgetPictures } from "./photos";
 import { PlacesToStand } from "./places";
-import { readHistory, readState, remember, writeState } from "./state";
+import { Pointing } from "./pointing";
+import { Robot } from "./robot";
+import { readHistory, readState, writeState } from "./state";
 import { Streaming } from "./streaming";
-import { Combobox, suggest } from "./suggestions";
+import { Combobox, showChips, suggest } from "./suggestions";
+import { followTheme, themeNow } from "./theme";
 
 const PAUSE_IN_TYPING_MS = 150;
 const LOOK_EVERY_MS = 4000;
-/** Where things were found, Gaussians are lit from this share of the range of scores, or a lower threshold. */
-const SHARE_OF_RANGE = 0.75;
 
 const state = readState();
+const robot = new Robot();
 let description: Description;
 let drawing: Drawing;
 let streaming: Streaming;
-let places: PlacesToStand;
+let asking: Asking;
 let changes: ChangesPanel;
-let scores: Scores | null = null;
-/** Of the second question, and its level of threshold. */
-let second: { scores: Scores; threshold: number } | null = null;
-let answers: Answer[] = [];
-/** What the answers are. */
-let thing = "";
-let asking = new AbortController();
 let typing = 0;
 let looking = 0;
-let photoOpened = 0;
 /** Of the generation that is drawn, and whether they are all. */
 let words: Word[] = [];
 let hasAllWords = false;
 const comboboxes: Combobox[] = [];
-
-const levelOf = (score: number, range: Scores) => Math.min(255, Math.max(1, Math.round(((score - range.min) / (range.max - range.min || 1)) * 255)));
 
 /** Runs a request again after the token was given. */
 async function withToken<T>(request: () => Promise<T>): Promise<T> {
@@ -52,112 +46,49 @@ async function withToken<T>(request: () => Promise<T>): Promise<T> {
   }
 }
 
-function colour(level: number): void {
-  drawing.cells.colour(scores && { scores, threshold: level }, second);
-  showLegend(scores, level);
-  drawing.redraw();
-}
-
-function choose(index: number | null): void {
-  showAnswers(thing, answers, index, choose);
-  drawing.showAnswers(thing, answers, index);
-  const answer = index === null ? null : answers[index];
-  showDetails(thing, answer, description.geographic);
-  void places.ask(answer, description);
-  if (!answer) return;
-  drawing.flyToAnswer(answer);
-  const photo = description.views.findIndex(({ name }) => name === answer.evidence?.photo);
-  if (photo >= 0) void openPhoto(photo, answer.evidence?.box_px ?? null);
-}
-
-/** Shows a photo with a box in it. */
-async function openPhoto(index: number, boxPx: number[] | null): Promise<void> {
-  const photo = description.views[index];
-  const opened = ++photoOpened;
-  try {
-    const picture = photo.has_picture ? URL.createObjectURL(await fetchPhoto(index)) : null;
-    if (opened !== photoOpened) return;
-    leavePhoto();
-    if (picture) panel.blend.src = picture;
-    showPhoto(photo, picture, boxPx, () => drawing.standAt(photo), (share) => {
-      drawing.standAt(photo);
-      panel.blend.hidden = share === 0;
-      // Opacity as a property: the page's policy allows no style attributes in HTML.
-      panel.blend.style.opacity = String(share);
-    });
-  } catch (error) {
-    report(error);
-  }
-}
-
-function leavePhoto(): void {
-  panel.blend.hidden = true;
-  const share = document.querySelector<HTMLInputElement>("#blend-share");
-  if (share) share.value = "0";
-}
-
-/** Asks one line of words; nothing for an empty one. */
-async function fetchBoth(line: string, signal: AbortSignal): Promise<[Scores, Answers] | null> {
-  const question = parseQuestion(line);
-  if (!question.text) return null;
-  const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal)]);
-  // The scores of "mug on the table" are those of mugs.
-  return [reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal), reply];
-}
-
-/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. */
-function levelFrom(found: Scores, { threshold, answers }: Pick<Answers, "threshold" | "answers">): number {
-  const high = found.min + SHARE_OF_RANGE * (found.max - found.min);
-  return levelOf(answers.length > 0 ? Math.min(threshold ?? high, high) : (threshold ?? high), found);
-}
-
-async function ask(): Promise<void> {
-  const start = performance.now();
-  asking.abort();
-  asking = new AbortController();
-  const { signal } = asking;
-  writeState(state);
-  try {
-    const [first, beside] = await Promise.all([fetchBoth(state.question, signal), fetchBoth(state.second, signal)]);
-    if (signal.aborted) return;
-    // Scores of another generation would light the wrong Gaussians; the next poll brings both.
-    if ([first, beside].some((found) => found && found[0].generation !== description.generation % 2 ** 32)) return void lookSoon();
-    scores = first?.[0] ?? null;
-    thing = first?.[1].thing ?? "";
-    answers = first?.[1].answers ?? [];
-    second = beside && { scores: beside[0], threshold: levelFrom(beside[0], beside[1]) };
-    showSecond(beside && `${beside[1].thing}: ${beside[1].answers.length} found`);
-    if (first && state.threshold !== null) colour(levelOf(state.threshold, first[0]));
-    else colour(first ? levelFrom(...first) : 0);
-    choose(null);
-    drawing.onceDrawn(() => performance.measure("answered", { start }));
-    say(first ? (answers.length > 0 ? `${answers.length} found` : (first[1].none ?? "Nothing found")) : "");
-    if (first) remember(state.question);
-    document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
-  } catch (error) {
-    if (!signal.aborted) report(error);
-  }
-}
-
 function report(error: unknown): void {
   if (error instanceof Unauthorized) {
-    void withToken(describe).then(ask);
+    void withToken(describe).then(() => asking.ask());
     return;
   }
   say(error instanceof Error ? error.message : String(error), true);
 }
 
+/** Distances are from the robot, or where none is from the camera. */
+function viewpoint(): Viewpoint {
+  const { position_m, geographic } = description;
+  if (position_m) return { at: position_m, from: "the robot", headingRad: robot.headingRad, isGeographic: geographic };
+  const { position, target } = drawing.pose();
+  return { at: position, from: "here", headingRad: Math.atan2(target[1] - position[1], target[0] - position[0]), isGeographic: geographic };
+}
+
+function showRobot(isOffline = false): void {
+  robot.see(description);
+  drawing.showRobot(description, robot.headingRad);
+  void robot.show(description, isOffline);
+}
+
 function open(): void {
-  drawing = new Drawing(panel.canvas, panel.labels, description, leavePhoto, (share) => streaming.isComplete && streaming.lower(share));
-  places = new PlacesToStand(drawing);
+  drawing = new Drawing(panel.canvas, panel.labels, description, () => asking.leavePhoto(), (share) => streaming.isComplete && streaming.lower(share), covered);
+  const places = new PlacesToStand(drawing);
+  asking = new Asking(state, drawing, places, () => description, viewpoint, lookSoon, report);
   changes = new ChangesPanel(drawing, panel.changes);
+  new Pointing(drawing, asking, places, () => description);
   panel.form.hidden = !description.can_ask;
   if (state.camera) drawing.placeAt(state.camera);
-  drawing.showRobot(description);
+  drawing.setTheme(themeNow());
+  showRobot();
   stream();
   panel.question.value = state.question;
   panel.second.value = state.second;
-  if (description.can_ask && (state.question || state.second)) void ask();
+  showBeside(state.second !== "");
+  if (description.can_ask && (state.question || state.second)) void askOnceDrawn();
+}
+
+/** Groups are made of what is drawn. */
+async function askOnceDrawn(): Promise<void> {
+  await streaming.whole;
+  await asking.ask();
 }
 
 /** Learns which words find something; without them, only the history is suggested. */
@@ -167,18 +98,37 @@ async function learnWords(): Promise<void> {
   // Models that take any text count a few words a request.
   hasAllWords = learnt?.complete ?? true;
   for (const combobox of comboboxes) combobox.refresh();
+  showChips(panel.chips, words, (word) => {
+    panel.question.value = word;
+    read();
+  });
+  hideChips(false);
+}
+
+/** Chips make room for suggestions and for answers. */
+function hideChips(isSuggesting: boolean): void {
+  panel.chips.hidden = isSuggesting || panel.question.value.trim() !== "" || panel.chips.childElementCount === 0;
 }
 
 function stream(): void {
   void learnWords();
+  const isOpening = !state.camera && document.documentElement.dataset.gaussians === undefined;
+  const facts = () => {
+    const { min, max } = drawing.extent.box;
+    showFacts(description, drawing.cells.nDrawn, drawing.stepM, [max.x - min.x, max.y - min.y, max.z - min.z]);
+  };
   streaming = new Streaming(description, drawing, () => {
     document.documentElement.dataset.firstPictureMs ??= performance.now().toFixed(0);
-    if (streaming.isWhole) document.documentElement.dataset.wholePictureMs ??= performance.now().toFixed(0);
     document.documentElement.toggleAttribute("data-complete", streaming.isComplete);
     document.documentElement.dataset.gaussians = String(drawing.cells.nDrawn);
-    showFacts(description, drawing.cells.nDrawn, drawing.stepM);
+    facts();
   }, report);
-  showFacts(description, 0, drawing.stepM);
+  void streaming.whole.then(() => {
+    document.documentElement.dataset.wholePictureMs ??= performance.now().toFixed(0);
+    drawing.measureExtent(isOpening);
+    facts();
+  });
+  facts();
   streaming.update();
 }
 
@@ -193,14 +143,15 @@ async function look(): Promise<void> {
     const wasOffline = document.documentElement.dataset.offline !== undefined;
     delete document.documentElement.dataset.offline;
     description = seen;
-    drawing.showRobot(seen);
+    showRobot();
     if (isOther) {
       streaming.stop();
       drawing.cells.clear();
       drawing.marks.showCells(seen.cells);
+      if (isOtherGeneration) forgetPictures();
       stream();
       if (panel.showChanges.checked) void changes.show();
-      if (description.can_ask && (state.question || state.second)) await ask();
+      if (description.can_ask && (state.question || state.second)) await askOnceDrawn();
       say(isOtherGeneration ? `The service has generation ${seen.generation} now.` : "Other cells are on board now.");
     } else {
       streaming.update();
@@ -209,6 +160,7 @@ async function look(): Promise<void> {
     }
   } catch (error) {
     document.documentElement.dataset.offline = "";
+    showRobot(true);
     report(error);
   }
   state.camera = drawing.pose();
@@ -235,31 +187,33 @@ async function hearEvents(): Promise<void> {
   setTimeout(() => void hearEvents(), 5 * LOOK_EVERY_MS);
 }
 
-function listen(): void {
-  const read = () => {
-    clearTimeout(typing);
-    if (panel.question.value.trim() !== state.question) state.threshold = null;
-    [state.question, state.second] = [panel.question.value.trim(), panel.second.value.trim()];
-    void ask();
-  };
+/** Asks what stands in the boxes. */
+function read(): void {
+  clearTimeout(typing);
+  if (panel.question.value.trim() !== state.question) state.threshold = null;
+  [state.question, state.second] = [panel.question.value.trim(), panel.second.value.trim()];
+  hideChips(false);
+  void asking.ask();
+}
+
+function listenToForm(): void {
   panel.form.addEventListener("submit", (event) => {
     event.preventDefault();
     read();
   });
   for (const [box, list] of [[panel.question, panel.questionSuggestions], [panel.second, panel.secondSuggestions]] as const) {
-    comboboxes.push(new Combobox(box, list, (line) => suggest(line, readHistory(), words), read));
+    comboboxes.push(new Combobox(box, list, (line) => suggest(line, readHistory(), words), read, hideChips));
     box.addEventListener("input", () => {
       clearTimeout(typing);
       typing = window.setTimeout(read, PAUSE_IN_TYPING_MS);
     });
   }
-  panel.threshold.addEventListener("input", () => {
-    if (!scores) return;
-    const level = Number(panel.threshold.value);
-    state.threshold = scores.min + (level / 255) * (scores.max - scores.min);
-    colour(level);
-    writeState(state);
-  });
+  panel.more.addEventListener("click", () => showBeside(panel.beside.hidden));
+  panel.threshold.addEventListener("input", () => asking.light(Number(panel.threshold.value)));
+}
+
+function listen(): void {
+  listenToForm();
   const toggle = (box: HTMLInputElement, group: () => { visible: boolean }) => box.addEventListener("change", () => {
     group().visible = box.checked;
     drawing.redraw();
@@ -276,19 +230,8 @@ function listen(): void {
     const copied = navigator.clipboard?.writeText(location.href) ?? Promise.reject(new Error("no clipboard"));
     copied.then(() => say("The link is copied."), () => say("The browser does not let this page copy; take the link from the address bar."));
   });
-  panel.whole.addEventListener("click", () => drawing.showWhole());
-  panel.canvas.addEventListener("click", (event) => {
-    if (places.chooseAt(event.offsetX, event.offsetY)) return;
-    const index = drawing.answerAt(event.offsetX, event.offsetY);
-    if (index !== null) return choose(index);
-    const photo = drawing.photoAt(description.views, event.offsetX, event.offsetY);
-    if (photo !== null) void openPhoto(photo, null).then(() => drawing.standAt(description.views[photo]));
-  });
-  document.addEventListener("keydown", (event) => {
-    if (event.key !== "/" || event.target instanceof HTMLInputElement) return;
-    event.preventDefault();
-    panel.question.focus();
-  });
+  panel.sheet.addEventListener("click", () => panel.sheet.setAttribute("aria-expanded", String(panel.aside.classList.toggle("large"))));
+  new ResizeObserver(() => drawing.resize()).observe(panel.aside);
 }
 
 async function start(): Promise<void> {
@@ -310,4 +253,5 @@ async function start(): Promise<void> {
   if (description.program === "slag-edge") void hearEvents();
 }
 
+followTheme((theme) => drawing?.setTheme(theme));
 void start();

@@ -104,6 +104,8 @@ export interface Answers {
   answers: Answer[];
   threshold: number | null;
   none: string | null;
+  /** Whether they answer words alone: groups of Gaussians may stand in for objects. */
+  isPlain: boolean;
 }
 
 export interface Question {
@@ -163,6 +165,21 @@ export async function fetchChanges(): Promise<Changes> {
     appeared: reply.appeared.map(thing), went: reply.went.map(thing),
     moved: reply.moved.map(({ from, to }: { from: Parameters<typeof thing>[0]; to: Parameters<typeof thing>[0] }) => ({ from: thing(from), to: thing(to) })),
   };
+}
+
+/** How old a robot's scene is. */
+export async function fetchMap(): Promise<{ age_secs: number; is_expired: boolean }> {
+  return (await get("/v1/map")).json();
+}
+
+/** The smallest object on a robot whose box holds a point, or nearly. */
+export async function fetchObjectAt(point: Vector): Promise<Answer | null> {
+  const parameters = new URLSearchParams({ near: point.join(","), radius: "5", limit: "100" });
+  const { objects } = (await (await get(`/v1/objects?${parameters}`)).json()) as { objects: Answer[] };
+  const NEAR_M = 0.05;
+  const holds = (object: Answer) => point.every((v, i) => v >= object.box_min_in_world[i] - NEAR_M && v <= object.box_max_in_world[i] + NEAR_M);
+  const volume = (object: Answer) => object.box_max_in_world.reduce((product, v, i) => product * (v - object.box_min_in_world[i]), 1);
+  return objects.filter(holds).sort((a, b) => volume(a) - volume(b))[0] ?? null;
 }
 
 /** Words to ask for, those of most things first; `complete`: whether all are counted. */
@@ -225,6 +242,7 @@ export async function fetchAnswers(question: Question, signal: AbortSignal): Pro
       answers: result.answers,
       threshold: result.threshold ?? result.parts?.[0]?.threshold ?? null,
       none: result.none?.detail ?? null,
+      isPlain: !result.understood,
     };
   } catch (error) {
     if (!(error instanceof NotFound)) throw error;
@@ -232,5 +250,5 @@ export async function fetchAnswers(question: Question, signal: AbortSignal): Pro
   const short = new URLSearchParams({ text: question.text, limit: String(MAX_ANSWERS) });
   if (question.negatives.length > 0) short.set("negatives", question.negatives.join(","));
   const reply = await (await get(`/query?${short}`, signal)).json();
-  return { thing: question.text, answers: reply.answers ?? [], threshold: reply.threshold ?? null, none: reply.none?.detail ?? null };
+  return { thing: question.text, answers: reply.answers ?? [], threshold: reply.threshold ?? null, none: reply.none?.detail ?? null, isPlain: true };
 }

@@ -1,7 +1,9 @@
 // The panel's elements, and what is written in them.
 
-import { rampColour } from "./drawing/ramp";
-import type { Answer, Description, Goal, Photo } from "./network";
+import { lengthText } from "./answers";
+import { PALETTES, rampColour } from "./drawing/ramp";
+import type { Description, Vector } from "./network";
+import { themeNow } from "./theme";
 
 function element<T extends HTMLElement>(id: string): T {
   const found = document.getElementById(id);
@@ -10,13 +12,23 @@ function element<T extends HTMLElement>(id: string): T {
 }
 
 export const panel = {
+  aside: element("panel"),
+  sheet: element<HTMLButtonElement>("sheet"),
   canvas: element<HTMLCanvasElement>("canvas"),
   labels: element("labels"),
+  hover: element("hover"),
+  badge: element("badge"),
+  robot: element("robot"),
   form: element<HTMLFormElement>("ask"),
   question: element<HTMLInputElement>("question"),
   second: element<HTMLInputElement>("second"),
+  more: element<HTMLButtonElement>("more"),
+  beside: element("beside"),
+  chips: element("chips"),
   questionSuggestions: element("question-suggestions"),
   secondSuggestions: element("second-suggestions"),
+  answers: element("answers"),
+  details: element("details"),
   blend: element<HTMLImageElement>("blend"),
   threshold: element<HTMLInputElement>("threshold"),
   showBoxes: element<HTMLInputElement>("show-boxes"),
@@ -26,6 +38,10 @@ export const panel = {
   showChanges: element<HTMLInputElement>("show-changes"),
   changes: element("changes"),
   copyLink: element<HTMLButtonElement>("copy-link"),
+  measure: element<HTMLButtonElement>("measure"),
+  theme: element<HTMLButtonElement>("theme"),
+  help: element<HTMLButtonElement>("help"),
+  keys: element<HTMLDialogElement>("keys"),
   whole: element<HTMLButtonElement>("whole"),
 };
 
@@ -36,18 +52,26 @@ export function say(text: string, isError = false): void {
   element("message").classList.toggle("error", isError);
 }
 
-export function showFacts(description: Description, nDrawn: number, stepM: number): void {
-  const missing = description.cells.filter((cell) => cell.state === "missing").length;
-  const stale = description.cells.filter((cell) => cell.state === "stale").length;
+/** Pixels of the scene that the panel covers: at the left, or on phones at the bottom. */
+export function covered(): [number, number] {
+  const { right, top, width } = panel.aside.getBoundingClientRect();
+  return width > innerWidth * 0.7 ? [0, Math.max(innerHeight - top, 0)] : [right, 0];
+}
+
+/** `size`: of the scene without its strays. */
+export function showFacts(description: Description, nDrawn: number, stepM: number, size: Vector): void {
+  const { cells, metric, n_gaussians } = description;
+  const missing = cells.filter((cell) => cell.state === "missing").length;
+  const stale = cells.filter((cell) => cell.state === "stale").length;
   document.title = `${description.scene} · SLAG`;
   element("scene").textContent = description.scene;
   element("facts").textContent = [
-    `${count.format(nDrawn)} of ${count.format(description.n_gaussians)} Gaussians`,
-    `generation ${description.generation}`,
-    missing > 0 ? `${missing} of ${description.cells.length} cells missing` : "",
+    nDrawn === 0 ? "opening…" : `${lengthText(size[0], metric)} × ${lengthText(size[1], metric)}`,
+    description.views.length > 0 ? `${description.views.length} photos` : "",
+    missing > 0 ? `${missing} of ${cells.length} cells missing` : "",
     stale > 0 ? `${stale} of an earlier generation` : "",
-    `grid ${stepM} ${description.metric ? "m" : "units"}`,
   ].filter(Boolean).join(" · ");
+  element("amount").textContent = `${count.format(nDrawn)} of ${count.format(n_gaussians)} Gaussians, generation ${description.generation}, grid ${stepM} ${metric ? "m" : "units"}`;
   element("photos-label").hidden = description.views.length === 0;
   element("changes-label").hidden = description.generation < 2;
 }
@@ -55,15 +79,13 @@ export function showFacts(description: Description, nDrawn: number, stepM: numbe
 export function showLegend(range: { min: number; max: number } | null, level: number): void {
   element("legend").hidden = range === null;
   if (!range) return;
-  const score = (l: number) => (range.min + (l / 255) * (range.max - range.min)).toFixed(2);
+  const score = (range.min + (level / 255) * (range.max - range.min)).toFixed(2);
   panel.threshold.value = String(level);
-  panel.threshold.setAttribute("aria-valuetext", score(level));
-  element("threshold-value").textContent = score(level);
-  element("lowest").textContent = score(0);
-  element("highest").textContent = score(255);
+  panel.threshold.setAttribute("aria-valuetext", score);
+  element("threshold-value").textContent = score;
   const context = element<HTMLCanvasElement>("ramp").getContext("2d");
   for (let l = 0; context && l < 256; l++) {
-    const [r, g, b] = l >= level ? rampColour((l - level) / Math.max(255 - level, 1)) : [120, 126, 133];
+    const [r, g, b] = l >= level ? rampColour((l - level) / Math.max(255 - level, 1), PALETTES[themeNow()].warm) : [120, 126, 133];
     context.fillStyle = `rgb(${r} ${g} ${b})`;
     context.fillRect(l, 0, 1, 1);
   }
@@ -74,138 +96,11 @@ export function showSecond(text: string | null): void {
   element("second-legend").textContent = text ?? "";
 }
 
-export function showAnswers(name: string, answers: Answer[], chosen: number | null, onChoose: (index: number) => void): void {
-  const focused = document.activeElement?.closest("#answers li");
-  const focusedIndex = focused ? [...element("answers").children].indexOf(focused) : -1;
-  element("answers").replaceChildren(...answers.map((answer, index) => {
-    const button = document.createElement("button");
-    button.type = "button";
-    button.setAttribute("aria-pressed", String(index === chosen));
-    const title = document.createElement("span");
-    title.textContent = `${index + 1}. ${name}`;
-    const score = document.createElement("span");
-    score.className = "score";
-    score.textContent = answer.score.toFixed(2);
-    const place = document.createElement("small");
-    const gaussians = answer.n_gaussians === undefined ? "" : ` · ${count.format(answer.n_gaussians)} Gaussians`;
-    place.textContent = `${answer.position_in_world.map((v) => v.toFixed(2)).join(", ")} m${gaussians}`;
-    button.append(title, score, place);
-    button.addEventListener("click", () => onChoose(index));
-    const item = document.createElement("li");
-    item.append(button);
-    return item;
-  }));
-  if (focusedIndex >= 0) element("answers").children[focusedIndex]?.querySelector("button")?.focus();
-}
-
-export function showDetails(name: string, answer: Answer | null, isGeographic: boolean): void {
-  const section = element("details");
-  section.hidden = answer === null;
-  if (!answer) return;
-  const metres = (v: number[]) => `${v.map((x) => x.toFixed(2)).join(", ")} m`;
-  const size = answer.oriented_box?.size ?? answer.box_max_in_world.map((v, i) => v - answer.box_min_in_world[i]);
-  const rows: [string, string][] = [
-    [isGeographic ? "East, north, up" : "World", metres(answer.position_in_world)],
-    ["Size", metres(size)],
-    ["Score", answer.score.toFixed(3)],
-  ];
-  if (answer.geographic) {
-    const { latitude_deg, longitude_deg, height_m } = answer.geographic;
-    rows.push(["Lat, lon", `${latitude_deg.toFixed(7)}, ${longitude_deg.toFixed(7)}`], ["Height", `${height_m.toFixed(2)} m`]);
-  }
-  if (answer.degree !== undefined) rows.push(["Relation", `holds to ${answer.degree.toFixed(2)}`]);
-  for (const other of answer.related_to ?? []) rows.push([`To: ${other.thing}`, metres(other.position_in_world)]);
-  if (answer.evidence) rows.push(["Best photo", answer.evidence.photo]);
-  if (answer.id) rows.push(["Id", answer.id]);
-  const heading = document.createElement("h2");
-  heading.textContent = name;
-  const list = document.createElement("dl");
-  for (const [term, text] of rows) {
-    const [dt, dd] = [document.createElement("dt"), document.createElement("dd")];
-    dt.textContent = term;
-    dd.textContent = text;
-    list.append(dt, dd);
-  }
-  section.replaceChildren(heading, list);
-}
-
-/** Lists places to stand in the details, or says why there is none. */
-export function showPlaces(goals: Goal[], none: string | null, chosen: number | null, onChoose: (index: number) => void): void {
-  const places = document.createElement("div");
-  places.id = "places";
-  const heading = document.createElement("h3");
-  heading.textContent = "Places to stand";
-  places.append(heading);
-  const list = document.createElement("ol");
-  list.append(...goals.map((goal, index) => {
-    const button = document.createElement("button");
-    button.type = "button";
-    button.setAttribute("aria-pressed", String(index === chosen));
-    const [x, y] = goal.position_in_world.map((v) => v.toFixed(2));
-    button.textContent = `${x}, ${y} m · sees ${Math.round(goal.visible_share * 100)} % · clear by ${goal.clearance_m.toFixed(2)} m · way ${goal.path_m.toFixed(1)} m`;
-    button.addEventListener("click", () => onChoose(index));
-    const item = document.createElement("li");
-    item.append(button);
-    return item;
-  }));
-  if (goals.length > 0) places.append(list);
-  if (none) {
-    const reason = document.createElement("p");
-    reason.textContent = none;
-    places.append(reason);
-  }
-  const section = element("details");
-  const before = section.querySelector("#places");
-  const focused = [...(before?.querySelectorAll("button") ?? [])].indexOf(document.activeElement as HTMLButtonElement);
-  if (before) before.replaceWith(places);
-  else section.append(places);
-  if (focused >= 0) places.querySelectorAll("button")[focused]?.focus();
-}
-
-const SVG = "http://www.w3.org/2000/svg";
-
-/**
- * Shows a photo in the details: the picture, where there is one, with a box in it, and a button that goes
- * there.
- */
-export function showPhoto(photo: Photo, picture: string | null, boxPx: number[] | null, onGo: () => void, onBlend: (share: number) => void): void {
-  const figure = document.createElement("figure");
-  if (picture) {
-    const svg = document.createElementNS(SVG, "svg");
-    svg.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
-    svg.setAttribute("role", "img");
-    svg.setAttribute("aria-label", `Photo ${photo.name}`);
-    const image = document.createElementNS(SVG, "image");
-    const put = (to: Element, values: Record<string, number | string>) => Object.entries(values).forEach(([name, value]) => to.setAttribute(name, String(value)));
-    put(image, { href: picture, width: photo.width_px, height: photo.height_px });
-    svg.append(image);
-    if (boxPx) {
-      const box = document.createElementNS(SVG, "rect");
-      put(box, { x: boxPx[0], y: boxPx[1], width: boxPx[2] - boxPx[0], height: boxPx[3] - boxPx[1] });
-      svg.append(box);
-    }
-    figure.append(svg);
-  }
-  const caption = document.createElement("figcaption");
-  const name = document.createElement("span");
-  name.textContent = photo.name;
-  const go = document.createElement("button");
-  go.type = "button";
-  go.textContent = "Stand here";
-  go.addEventListener("click", onGo);
-  caption.append(name, go);
-  if (picture) {
-    const blend = document.createElement("input");
-    Object.assign(blend, { type: "range", min: "0", max: "100", value: "0", id: "blend-share" });
-    blend.setAttribute("aria-label", "Photo over the scene");
-    blend.addEventListener("input", () => onBlend(Number(blend.value) / 100));
-    caption.append(blend);
-  }
-  figure.append(caption);
-  const section = element("details");
-  section.querySelector("figure")?.remove();
-  section.hidden = false;
-  section.append(figure);
+/** Shows or hides what stands behind "+". */
+export function showBeside(isShown: boolean): void {
+  panel.beside.hidden = !isShown;
+  panel.more.setAttribute("aria-expanded", String(isShown));
+  panel.more.textContent = isShown ? "−" : "+";
 }
 
 /** Asks for the service's token. */

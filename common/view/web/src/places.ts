@@ -1,12 +1,10 @@
-// Places to stand near the chosen thing: asked of the robot, drawn as poses on the ground, listed in the details.
+// Places to stand near the chosen thing: asked of the robot, drawn as poses on the ground, listed with the answer.
 
+import { showPlaces } from "./cards";
 import type { Drawing } from "./drawing/drawing";
+import { ROBOT_RADIUS_M } from "./drawing/marks";
 import { type Answer, type Description, type Goals, fetchGoals } from "./network";
-import { showPlaces } from "./panel";
 
-/** Radius of the robot that is asked for, metres: `/v1/goal`'s own default. */
-const ROBOT_RADIUS_M = 0.3;
-const ONLY_ROBOTS = "Only a robot's page (slag-edge) knows where a robot can stand.";
 const NO_OBJECT = "Places are known for objects; this answer is a group of Gaussians.";
 
 export class PlacesToStand {
@@ -23,8 +21,8 @@ export class PlacesToStand {
     const { signal } = this.asking;
     this.found = this.chosen = null;
     this.draw();
-    if (!answer) return;
-    if (description.program !== "slag-edge") return showPlaces([], ONLY_ROBOTS, null, () => {});
+    // Only a robot knows where it can stand.
+    if (!answer || description.program !== "slag-edge") return;
     if (!answer.id) return showPlaces([], NO_OBJECT, null, () => {});
     try {
       const found = await fetchGoals(answer.id, ROBOT_RADIUS_M, signal);

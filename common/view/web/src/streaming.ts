@@ -40,6 +40,9 @@ export class Streaming {
   private budget = MAX_GAUSSIANS;
   private isStopped = false;
   private isLoaded = false;
+  private onWhole = () => {};
+  /** Once all cells are drawn, if with few Gaussians. */
+  readonly whole = new Promise<void>((resolve) => (this.onWhole = resolve));
 
   constructor(private readonly description: Description, private readonly drawing: Drawing,
     private readonly onCell: () => void, private readonly onError: (error: unknown) => void) {
@@ -68,6 +71,7 @@ export class Streaming {
       Math.hypot(...at.map((v, i) => Math.max(min[i] - v, 0, v - max[i])));
     this.cells.sort((a, b) => distance(a.box_m) - distance(b.box_m) || a.cell - b.cell);
     const first = this.cells.filter(({ cell }) => this.drawing.cells.stepOf(cell) === null);
+    if (first.length === 0) this.onWhole();
     const steps = chooseSteps(this.cells.map(({ n_gaussians }) => n_gaussians), this.budget);
     const rest = this.cells.map(({ cell }, i): [number, number] => [cell, steps[i]]).filter(([cell, step]) => this.drawing.cells.stepOf(cell) !== step);
     this.isLoaded = rest.length === 0;
@@ -81,11 +85,6 @@ export class Streaming {
   /** Whether all cells are drawn, with as many Gaussians as the budget allows. */
   get isComplete(): boolean {
     return this.isLoaded;
-  }
-
-  /** Whether all cells are drawn, if with few Gaussians. */
-  get isWhole(): boolean {
-    return this.cells.every(({ cell }) => this.drawing.cells.stepOf(cell) !== null);
   }
 
   private async load(cell: number, step: number): Promise<void> {

@@ -5,6 +5,7 @@
 import type { Word } from "./network";
 
 const MAX_SUGGESTIONS = 8;
+const MAX_CHIPS = 12;
 /** While nothing is typed, so many of the last questions stand before the things on board. */
 const MAX_HISTORY_AT_FIRST = 4;
 
@@ -24,7 +25,7 @@ export function suggest(line: string, history: string[], words: Word[]): Suggest
     if (!isKnown && found.length < MAX_SUGGESTIONS) found.push(suggestion);
   };
   const before = history.filter((entry) => entry.toLowerCase().includes(typed.trimEnd()));
-  for (const entry of typed ? before : before.slice(0, MAX_HISTORY_AT_FIRST)) add({ line: entry, note: "asked before" });
+  for (const entry of typed ? before : before.slice(0, MAX_HISTORY_AT_FIRST)) add({ line: entry, note: "before" });
   // `chair -wa` goes on with the negative "wall"; words of the model may hold spaces, so two typed words may
   // begin one.
   const [, start, last] = line.match(/^(.*\s-?|-?)(\S*)$/s) ?? ["", "", line];
@@ -46,7 +47,21 @@ export function suggest(line: string, history: string[], words: Word[]): Suggest
 }
 
 function noteOf(nThings: number): string {
-  return nThings === 0 ? "a word of the model" : `${nThings} on board`;
+  return nThings === 0 ? "" : String(nThings);
+}
+
+/** Chips of what is on board, each with its number. */
+export function showChips(chips: HTMLElement, words: Word[], onChoose: (word: string) => void): void {
+  chips.replaceChildren(...words.filter(({ n_things }) => n_things > 0).slice(0, MAX_CHIPS).map(({ word, n_things }) => {
+    const chip = document.createElement("button");
+    chip.type = "button";
+    chip.textContent = word;
+    const number = document.createElement("small");
+    number.textContent = String(n_things);
+    chip.append(number);
+    chip.addEventListener("click", () => onChoose(word));
+    return chip;
+  }));
 }
 
 export class Combobox {
@@ -54,14 +69,21 @@ export class Combobox {
   private active = -1;
   /** Whether suggestions are shown as soon as there are some. */
   private isWanted = false;
+  private isPointerDown = false;
 
-  /** `source` suggests lines for a text; `onChoose` is called when the box has a suggestion. */
+  /** `source` suggests lines for a text; `onChoose` is called when the box has a suggestion, `onOpen` when the list opens or closes. */
   constructor(private readonly input: HTMLInputElement, private readonly list: HTMLElement,
-    private readonly source: (line: string) => Suggestion[], private readonly onChoose: () => void) {
+    private readonly source: (line: string) => Suggestion[], private readonly onChoose: () => void, private readonly onOpen: (isOpen: boolean) => void) {
     input.addEventListener("focus", () => this.open());
     input.addEventListener("click", () => this.open());
     input.addEventListener("input", () => this.open());
-    input.addEventListener("blur", () => this.close());
+    // What is clicked must not move before the click arrives.
+    document.addEventListener("pointerdown", () => (this.isPointerDown = true), true);
+    document.addEventListener("pointerup", () => (this.isPointerDown = false), true);
+    input.addEventListener("blur", () => {
+      if (!this.isPointerDown) return this.close();
+      document.addEventListener("pointerup", () => setTimeout(() => this.close()), { once: true });
+    });
     input.addEventListener("keydown", (event) => this.key(event));
     // The focus must not leave the box before the click arrives.
     list.addEventListener("pointerdown", (event) => event.preventDefault());
@@ -106,6 +128,7 @@ export class Combobox {
   private mark(): void {
     const isOpen = this.suggestions.length > 0;
     this.list.hidden = !isOpen;
+    this.onOpen(isOpen);
     this.input.setAttribute("aria-expanded", String(isOpen));
     [...this.list.children].forEach((option, index) => option.setAttribute("aria-selected", String(index === this.active)));
     const option = this.list.children[this.active];

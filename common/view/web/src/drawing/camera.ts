@@ -4,6 +4,8 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 export const FIELD_OF_VIEW_DEG = 55;
+/** Sines of the angles from which a thing is framed. */
+const [LEAST_RISE, MOST_RISE] = [0.35, 0.95];
 const GLIDE_MS = 700;
 const KEYS = ["KeyW", "KeyS", "KeyA", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
 
@@ -21,6 +23,11 @@ export class Camera {
   private lastMs = 0;
   private isAtPhoto = false;
   private isDragged = false;
+  /** Vertical angle of the part of the picture that nothing covers. */
+  private fieldOfViewDeg = FIELD_OF_VIEW_DEG;
+  private size: [number, number] = [1, 1];
+  /** What covers the picture at its left and at its bottom, pixels. */
+  private covered: [number, number] = [0, 0];
 
   /** `onLeave` is called when the camera leaves a photo's pose. */
   constructor(canvas: HTMLCanvasElement, private readonly up: THREE.Vector3, onMove: () => void, private readonly onLeave: () => void) {
@@ -30,7 +37,7 @@ export class Camera {
     this.controls.addEventListener("start", () => {
       this.glide = null;
       this.leavePhoto();
-      this.isDragged = true;
+      this.isDragged = this.wasMoved = true;
     });
     this.controls.addEventListener("end", () => (this.isDragged = false));
     canvas.addEventListener("keydown", (event) => {
@@ -39,10 +46,34 @@ export class Camera {
       this.glide = null;
       this.leavePhoto();
       this.pressed.add(event.code);
+      this.wasMoved = true;
       onMove();
     });
     canvas.addEventListener("keyup", (event) => this.pressed.delete(event.code));
     canvas.addEventListener("blur", () => this.pressed.clear());
+  }
+
+  /** The middle of what is not covered is what the camera looks at. */
+  resize(size: [number, number], covered: [number, number]): void {
+    [this.size, this.covered] = [size, covered];
+    this.project();
+  }
+
+  private project(): void {
+    const [width, height] = this.size;
+    const [left, bottom] = this.covered;
+    this.camera.fov = (Math.atan(height / 2 / this.focalPx) * 360) / Math.PI;
+    this.camera.aspect = width / height;
+    this.camera.setViewOffset(width, height, -left / 2, bottom / 2, width, height);
+  }
+
+  get focalPx(): number {
+    return (this.size[1] - this.covered[1]) / 2 / Math.tan((this.fieldOfViewDeg * Math.PI) / 360);
+  }
+
+  /** Breadth by height of what is not covered. */
+  get aspect(): number {
+    return (this.size[0] - this.covered[0]) / Math.max(this.size[1] - this.covered[1], 1);
   }
 
   place(position: THREE.Vector3, target: THREE.Vector3): void {
@@ -60,33 +91,39 @@ export class Camera {
     this.place(position, new THREE.Vector3(0, 0, -distance).applyQuaternion(rotation).add(position));
     // The controls keep the horizon level; a photo need not be.
     this.camera.quaternion.copy(rotation);
-    this.camera.fov = fieldOfViewDeg;
-    this.camera.updateProjectionMatrix();
+    this.fieldOfViewDeg = fieldOfViewDeg;
+    this.project();
     this.isAtPhoto = true;
   }
 
   private leavePhoto(): void {
     if (!this.isAtPhoto) return;
     this.isAtPhoto = false;
-    this.camera.fov = FIELD_OF_VIEW_DEG;
-    this.camera.updateProjectionMatrix();
+    this.fieldOfViewDeg = FIELD_OF_VIEW_DEG;
+    this.project();
     this.onLeave();
   }
 
   flyTo(position: THREE.Vector3, target: THREE.Vector3): void {
     this.leavePhoto();
+    this.wasMoved = true;
     if (matchMedia("(prefers-reduced-motion: reduce)").matches) return this.place(position, target);
     this.glide = { startMs: performance.now(), from: [this.camera.position.clone(), this.controls.target.clone()], to: [position, target] };
   }
 
-  /** Looks at a sphere from the side on which the camera is, a little from above. */
-  frame(centre: THREE.Vector3, radiusM: number, from?: THREE.Vector3): [THREE.Vector3, THREE.Vector3] {
-    const away = (from ?? this.camera.position.clone().sub(centre)).clone();
+  /** Distance from which a sphere fills what is not covered. */
+  distanceOf(radiusM: number): number {
+    return radiusM / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360) / Math.min(this.aspect, 1);
+  }
+
+  /** Looks at a sphere from the side and the height at which the camera is, a little from above at least. */
+  frame(centre: THREE.Vector3, radiusM: number): [THREE.Vector3, THREE.Vector3] {
+    const away = this.camera.position.clone().sub(centre);
+    const height = Math.min(Math.max(away.normalize().dot(this.up), LEAST_RISE), MOST_RISE);
     away.addScaledVector(this.up, -away.dot(this.up));
     if (away.lengthSq() < 1e-6) away.set(1, 0, 0);
-    away.normalize().addScaledVector(this.up, 0.6).normalize();
-    const distance = radiusM / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
-    return [centre.clone().addScaledVector(away, distance), centre];
+    away.setLength(Math.sqrt(1 - height ** 2)).addScaledVector(this.up, height);
+    return [centre.clone().addScaledVector(away, this.distanceOf(radiusM)), centre];
   }
 
   /** Moves on; true while it is under way. */
@@ -103,6 +140,9 @@ export class Camera {
     if (this.pressed.size > 0) this.moveByKeys(seconds);
     return this.isUnderWay;
   }
+
+  /** Whether a person moved it since it was placed. */
+  wasMoved = false;
 
   private get isUnderWay(): boolean {
     return this.glide !== null || this.pressed.size > 0;

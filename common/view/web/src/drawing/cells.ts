@@ -3,7 +3,9 @@
 import { PackedSplats, RgbaArray, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import type { CellGaussians, Scores } from "../messages";
-import { type Lit, colourByScore } from "./ramp";
+import type { Vector } from "../network";
+import { centreOf, type Hit, pick } from "./pick";
+import { type Lit, colourByScore, type Palette } from "./ramp";
 
 /** A question's scores, and the level from which they are lit. */
 export interface Question {
@@ -20,6 +22,7 @@ interface Drawn {
 export class Cells {
   private readonly drawn = new Map<number, Drawn>();
   private questions: [Question | null, Question | null] = [null, null];
+  private palette: Palette | null = null;
 
   /** `box` holds the scene; where a cell has no colours, heights in it give shades. */
   constructor(private readonly parent: THREE.Object3D, private readonly box: THREE.Box3, private readonly up: THREE.Vector3) {}
@@ -58,6 +61,40 @@ export class Cells {
     for (const cell of [...this.drawn.keys()]) this.remove(cell);
   }
 
+  /** Centres of at most so many Gaussians of all that are drawn, in world metres. */
+  points(most: number): Float64Array {
+    const stride = Math.max(1, Math.ceil(this.nDrawn / most));
+    const points: number[] = [];
+    const centre: Vector = [0, 0, 0];
+    for (const { gaussians } of this.drawn.values()) {
+      for (let i = 0; i < gaussians.n; i += stride) {
+        centreOf(gaussians, i, centre);
+        points.push(...centre);
+      }
+    }
+    return Float64Array.from(points);
+  }
+
+  /** All that are drawn, by cell. */
+  *all(): Generator<[number, CellGaussians]> {
+    for (const [cell, { gaussians }] of this.drawn) yield [cell, gaussians];
+  }
+
+  /** The Gaussian under a ray, and its score in the first question. */
+  pick(from: Vector, along: Vector, pxRad: number): (Hit & { score: number | null }) | null {
+    const hit = pick(this.all(), from, along, pxRad);
+    if (!hit) return null;
+    const scores = this.questions[0]?.scores;
+    const level = scores?.byCell.get(hit.cell)?.[hit.index * (this.stepOf(hit.cell) ?? 1)];
+    return { ...hit, score: scores && level ? scores.min + (level / 255) * (scores.max - scores.min) : null };
+  }
+
+  /** Colours again, in another palette. */
+  paint(palette: Palette): void {
+    this.palette = palette;
+    this.colour(...this.questions);
+  }
+
   /** Colours by one question or two; by none, the scene has its own colours again. */
   colour(first: Question | null, second: Question | null): void {
     this.questions = [first, second];
@@ -93,8 +130,8 @@ export class Cells {
     };
     drawn.rgba ??= new RgbaArray({ array: new Uint8Array(gaussians.packed.length), count: gaussians.n });
     const array = drawn.rgba.array;
-    if (!array) return;
-    colourByScore(array, gaussians, lit(this.questions[0]), lit(this.questions[1]));
+    if (!array || !this.palette) return;
+    colourByScore(array, gaussians, lit(this.questions[0]), lit(this.questions[1]), this.palette);
     drawn.rgba.needsUpdate = true;
     if (mesh.splatRgba === null) {
       mesh.splatRgba = drawn.rgba;

@@ -3,15 +3,37 @@
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import type { Answer, Description, Goal, Photo, Vector } from "../network";
-import { Camera } from "./camera";
+import type { Theme } from "../theme";
+import { Camera, FIELD_OF_VIEW_DEG } from "./camera";
 import { Cells } from "./cells";
-import { boxOf, type Change, Marks } from "./marks";
 import { Frames } from "./frames";
+import { Hud } from "./hud";
+import { boxOf, type Change, Marks, seenBy } from "./marks";
+import { type Extent, extentOf, openingPose, pointsOfCells } from "./opening";
+import { lightAlong } from "./pick";
 import { Places } from "./places";
+import { PALETTES } from "./ramp";
 
-const MAX_LABELS = 8;
+const MAX_LABELS = 9;
 /** Largest distance between a click and the mark it means. */
 const NEAR_PX = 14;
+const BACKGROUNDS: Record<Theme, number> = { dark: 0x14181d, light: 0xeceff2, contrast: 0x000000 };
+/** Points by which the extent is measured. */
+const N_POINTS = 20_000;
+/** Share of the light by which a photo sees a thing, through haze. */
+const LEAST_LIGHT = 0.3;
+/** Photos that are tried for one that nothing hides. */
+const MOST_RAYS = 6;
+/** Gaussians that are looked at for that. */
+const MOST_ON_A_RAY = 150_000;
+/** The picture's half height has so many radii of an answer: as its photo shows it, and otherwise. */
+const [ROOM_IN_PHOTO, ROOM_AROUND] = [2.2, 3];
+
+interface Label {
+  text: string;
+  at: Vector;
+  kind: string;
+}
 
 export class Drawing {
   readonly camera: Camera;
@@ -20,6 +42,7 @@ export class Drawing {
   readonly places: Places;
   /** Side of a square of the grid. */
   stepM = 1;
+  extent: Extent;
   private readonly renderer: THREE.WebGLRenderer;
   private readonly scene = new THREE.Scene();
   /**
@@ -27,40 +50,37 @@ export class Drawing {
    * floats.
    */
   private readonly world = new THREE.Group();
-  private readonly box = new THREE.Box3();
   private readonly up: THREE.Vector3;
-  private readonly isDark = matchMedia("(prefers-color-scheme: dark)");
-  private answers: Answer[] = [];
+  private readonly hud: Hud;
+  private theme: Theme = "dark";
+  private readonly labelled = { answers: [] as Label[], robot: [] as Label[], measured: [] as Label[] };
+  private shown: [Answer[], number[], number | null] = [[], [], null];
+  private robotSeen = "";
   private isDirty = true;
   private readonly frames: Frames;
   private waiting: (() => void)[] = [];
 
-  /** `onSlow` is told which share of the Gaussians would be drawn fast enough. */
-  constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, description: Description, onLeavePhoto: () => void, onSlow: (share: number) => void) {
+  /** `onSlow` is told which share of the Gaussians would be drawn fast enough; `covered` what lies over the picture. */
+  constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, private readonly description: Description,
+    onLeavePhoto: () => void, onSlow: (share: number) => void, private readonly covered: () => [number, number]) {
     this.frames = new Frames(onSlow);
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.up = new THREE.Vector3(...description.up).normalize();
-    for (const cell of description.cells) this.box.union(new THREE.Box3(new THREE.Vector3(...cell.box_m.min), new THREE.Vector3(...cell.box_m.max)));
-    if (this.box.isEmpty()) this.box.set(new THREE.Vector3(-1, -1, -1), new THREE.Vector3(1, 1, 1));
-    this.world.position.copy(this.box.getCenter(new THREE.Vector3())).negate();
+    const somewhere = { box: new THREE.Box3(new THREE.Vector3(-1, -1, -1), new THREE.Vector3(1, 1, 1)), groundM: 0 };
+    this.extent = extentOf(pointsOfCells(description.cells), this.up) ?? somewhere;
+    this.world.position.copy(this.extent.box.getCenter(new THREE.Vector3())).negate();
     this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.redraw() }), this.world);
-    this.cells = new Cells(this.world, this.box, this.up);
+    this.cells = new Cells(this.world, this.extent.box, this.up);
     this.marks = new Marks(this.world);
     this.places = new Places(this.world);
+    this.hud = new Hud(this.up, description.metric, description.geographic);
     this.camera = new Camera(canvas, this.up, () => this.redraw(), onLeavePhoto);
-    const themed = () => {
-      this.scene.background = new THREE.Color(this.isDark.matches ? 0x14181d : 0xeceff2);
-      this.stepM = this.marks.showGround(this.box, this.up, description.geographic, this.isDark.matches);
-      this.redraw();
-    };
-    themed();
-    this.isDark.addEventListener("change", themed);
     this.marks.showCells(description.cells);
     this.marks.showPhotos(description.views, this.radiusM / 40);
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
-    this.showWhole(true);
+    this.showOpening(true);
     this.renderer.setAnimationLoop((nowMs) => this.step(nowMs));
   }
 
@@ -74,33 +94,56 @@ export class Drawing {
     this.redraw();
   }
 
-  stop(): void {
-    this.renderer.setAnimationLoop(null);
-    this.cells.clear();
-    this.renderer.dispose();
+  setTheme(theme: Theme): void {
+    this.theme = theme;
+    this.scene.background = new THREE.Color(BACKGROUNDS[theme]);
+    this.cells.paint(PALETTES[theme]);
+    this.showGround();
+    this.marks.showAnswers(...this.shown, theme);
+    this.redraw();
   }
 
-  showWhole(atOnce = false): void {
-    const pose = this.camera.frame(new THREE.Vector3(), this.radiusM * 0.75, new THREE.Vector3(-0.5, -1, 0));
+  private showGround(): void {
+    this.stepM = this.marks.showGround(this.extent, this.up, this.description.geographic, this.theme);
+  }
+
+  /** Measures the scene again by the Gaussians that are drawn, and looks from there unless a person moved on. */
+  measureExtent(isOpening: boolean): void {
+    this.extent = extentOf(this.cells.points(N_POINTS), this.up) ?? this.extent;
+    this.showGround();
+    if (isOpening && !this.camera.wasMoved) this.showOpening(true);
+    this.redraw();
+  }
+
+  showOpening(atOnce = false): void {
+    const points = this.cells.nDrawn > 0 ? this.cells.points(N_POINTS) : pointsOfCells(this.description.cells);
+    const halfTan = Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
+    const { position, target } = openingPose(this.description, points, this.extent, this.up, this.camera.aspect, halfTan);
+    const pose = [position, target].map((point) => point.add(this.world.position)) as [THREE.Vector3, THREE.Vector3];
     if (atOnce) this.camera.place(...pose);
     else this.camera.flyTo(...pose);
     this.redraw();
   }
 
-  showAnswers(name: string, answers: Answer[], chosen: number | null): void {
-    this.answers = answers;
-    this.marks.showAnswers(answers, chosen);
-    this.labels.replaceChildren(...answers.slice(0, MAX_LABELS).map((answer) => {
-      const label = document.createElement("span");
-      label.textContent = `${name} ${answer.score.toFixed(2)}`;
-      return label;
-    }));
-    this.redraw();
+  /** `opacities`: of their boxes. */
+  showAnswers(name: string, answers: Answer[], opacities: number[], chosen: number | null): void {
+    this.shown = [answers, opacities, chosen];
+    this.marks.showAnswers(answers, opacities, chosen, this.theme);
+    const over = (answer: Answer) => new THREE.Vector3(...boxOf(answer).centre).addScaledVector(this.up, boxOf(answer).size[2] / 2).toArray() as Vector;
+    this.labelled.answers = answers.slice(0, MAX_LABELS).map((answer, i) => ({ text: i === chosen ? name : String(i + 1), at: over(answer), kind: i === chosen ? "chosen" : "answer" }))
+      .filter((_, i) => chosen === null || i === chosen);
+    this.writeLabels();
   }
 
-  flyToAnswer(answer: Answer): void {
-    const box = boxOf(answer);
-    this.flyTo(new THREE.Vector3(...box.centre), new THREE.Vector3(...box.size));
+  /** Looks at an answer as its best photo does, from nearby; without that from where the camera is. */
+  flyToAnswer(answer: Answer, photo: Photo | null): void {
+    const { centre, size } = boxOf(answer);
+    if (!photo) return this.flyTo(new THREE.Vector3(...centre), new THREE.Vector3(...size));
+    const target = this.local(centre);
+    const away = this.local(photo.position_m).sub(target);
+    const distance = Math.min(away.length(), Math.max(this.camera.distanceOf((Math.hypot(...size) / 2) * ROOM_IN_PHOTO), 1));
+    this.camera.flyTo(target.clone().addScaledVector(away.normalize(), distance), target);
+    this.redraw();
   }
 
   flyToBox({ min, max }: { min: Vector; max: Vector }): void {
@@ -113,24 +156,58 @@ export class Drawing {
     this.redraw();
   }
 
-  /** Index of the answer under a point of the canvas. */
-  answerAt(xPx: number, yPx: number): number | null {
+  private rayAt(xPx: number, yPx: number): THREE.Raycaster {
     const caster = new THREE.Raycaster();
     caster.setFromCamera(new THREE.Vector2((xPx / this.canvas.clientWidth) * 2 - 1, 1 - (yPx / this.canvas.clientHeight) * 2), this.camera.camera);
-    const hit = caster.intersectObjects(this.marks.boxes.children.filter((child) => child instanceof THREE.Mesh))[0];
+    return caster;
+  }
+
+  /** Index of the answer under a point of the canvas. */
+  answerAt(xPx: number, yPx: number): number | null {
+    const hit = this.rayAt(xPx, yPx).intersectObjects(this.marks.boxes.children.filter((child) => child.userData.index !== undefined))[0];
     return hit ? (hit.object.userData.index as number) : null;
+  }
+
+  /** What is seen at a point of the canvas: where it is, its height over the ground, its score. */
+  surfaceAt(xPx: number, yPx: number): { point: Vector; heightM: number; score: number | null } | null {
+    const { origin, direction } = this.rayAt(xPx, yPx).ray;
+    const hit = this.cells.pick(origin.clone().sub(this.world.position).toArray() as Vector, direction.toArray() as Vector, 1 / this.camera.focalPx);
+    return hit && { point: hit.point, heightM: this.up.dot(new THREE.Vector3(...hit.point)) - this.extent.groundM, score: hit.score };
+  }
+
+  /** The photo that shows an answer largest with nothing in between, and where in it. */
+  photoOf(answer: Answer, photos: Photo[]): { photo: string; box_px: [number, number, number, number] } | null {
+    const { centre, size } = boxOf(answer);
+    const found = photos.map((photo) => ({ photo, seen: seenBy(photo, answer) })).filter(({ seen }) => seen !== null)
+      .sort((a, b) => b.seen!.share - a.seen!.share).slice(0, MOST_RAYS);
+    for (const { photo, seen } of found) {
+      const away = new THREE.Vector3(...centre).sub(new THREE.Vector3(...photo.position_m));
+      const untilM = away.length() - Math.hypot(...size) / 2;
+      const light = lightAlong(this.cells.all(), photo.position_m, away.normalize().toArray() as Vector, untilM, Math.ceil(this.cells.nDrawn / MOST_ON_A_RAY));
+      if (light > LEAST_LIGHT) return { photo: photo.name, box_px: seen!.boxPx };
+    }
+    return null;
+  }
+
+  get coveredPx(): [number, number] {
+    return this.covered();
+  }
+
+  showMeasured(points: Vector[], text: string): void {
+    this.marks.showMeasured(points);
+    const middle = points.length === 2 ? (points[0].map((v, i) => (v + points[1][i]) / 2) as Vector) : points[0];
+    this.labelled.measured = middle ? [{ text, at: middle, kind: "measured" }] : [];
+    this.writeLabels();
   }
 
   /** Takes a photo's camera, so that the picture laid over the canvas fits. */
   standAt(photo: Photo): void {
     const flipped = new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(1, 0, 0), Math.PI);
     const rotation = new THREE.Quaternion(...photo.rotation_xyzw).multiply(flipped);
-    const aspect = this.canvas.clientWidth / Math.max(this.canvas.clientHeight, 1);
-    // A canvas narrower than the photo shows all of its width.
-    const halfHeight = Math.max(photo.height_px, photo.width_px / aspect) / 2;
+    // What is free and narrower than the photo shows all of its width.
+    const halfHeight = Math.max(photo.height_px, photo.width_px / this.camera.aspect) / 2;
     const fieldOfViewDeg = (Math.atan(halfHeight / photo.focal_px) * 360) / Math.PI;
-    const position = new THREE.Vector3(...photo.position_m).add(this.world.position);
-    this.camera.standAt(position, rotation, fieldOfViewDeg, Math.max(this.radiusM * 0.2, 0.5));
+    this.camera.standAt(this.local(photo.position_m), rotation, fieldOfViewDeg, Math.max(this.radiusM * 0.2, 0.5));
     this.redraw();
   }
 
@@ -147,14 +224,19 @@ export class Drawing {
 
   /** Looks as a robot at a place does, at the thing. */
   lookFrom(goal: Goal, thing: Vector): void {
-    const local = (point: Vector) => new THREE.Vector3(...point).add(this.world.position);
-    this.camera.flyTo(local(goal.sensor_in_world), local(thing));
+    this.camera.flyTo(this.local(goal.sensor_in_world), this.local(thing));
     this.redraw();
   }
 
-  showRobot(description: Description): void {
-    this.marks.showRobot(description, this.up);
-    this.redraw();
+  showRobot(description: Description, headingRad: number | null): void {
+    // Every poll says where it is; a picture is drawn again only if that is news.
+    const seen = JSON.stringify([description.position_m, description.fetched, headingRad]);
+    if (seen === this.robotSeen) return;
+    this.robotSeen = seen;
+    this.marks.showRobot(description, headingRad, this.up);
+    const { position_m } = description;
+    this.labelled.robot = position_m ? [{ text: "Robot", at: new THREE.Vector3(...position_m).add(this.up).toArray() as Vector, kind: "robot" }] : [];
+    this.writeLabels();
   }
 
   pose(): { position: Vector; target: Vector } {
@@ -163,36 +245,45 @@ export class Drawing {
   }
 
   placeAt(pose: { position: Vector; target: Vector }): void {
-    const local = (point: Vector) => new THREE.Vector3(...point).add(this.world.position);
-    this.camera.place(local(pose.position), local(pose.target));
+    this.camera.place(this.local(pose.position), this.local(pose.target));
+    this.camera.wasMoved = true;
     this.redraw();
+  }
+
+  private local(point: Vector): THREE.Vector3 {
+    return new THREE.Vector3(...point).add(this.world.position);
+  }
+
+  /** Pixel of a point of the world; null behind the camera. */
+  private pixelOf(point: Vector): [number, number] | null {
+    const { x, y, z } = this.local(point).project(this.camera.camera);
+    return Math.abs(z) > 1 ? null : [((x + 1) / 2) * this.canvas.clientWidth, ((1 - y) / 2) * this.canvas.clientHeight];
   }
 
   /** Index of the point of the world that is drawn within a few pixels of a point of the canvas. */
   private nearest(points: Vector[], xPx: number, yPx: number): number | null {
     const distances = points.map((place) => {
-      const point = new THREE.Vector3(...place).add(this.world.position).project(this.camera.camera);
-      const [x, y] = [((point.x + 1) / 2) * this.canvas.clientWidth, ((1 - point.y) / 2) * this.canvas.clientHeight];
-      return Math.abs(point.z) > 1 ? Infinity : Math.hypot(x - xPx, y - yPx);
+      const at = this.pixelOf(place);
+      return at ? Math.hypot(at[0] - xPx, at[1] - yPx) : Infinity;
     });
     const nearest = distances.indexOf(Math.min(...distances));
     return nearest >= 0 && distances[nearest] < NEAR_PX ? nearest : null;
   }
 
   private flyTo(centre: THREE.Vector3, size: THREE.Vector3): void {
-    this.camera.flyTo(...this.camera.frame(centre.add(this.world.position), Math.max(size.length() * 1.5, 0.5)));
+    this.camera.flyTo(...this.camera.frame(centre.add(this.world.position), Math.max((size.length() / 2) * ROOM_AROUND, 0.3)));
     this.redraw();
   }
 
   private get radiusM(): number {
-    return this.box.getSize(new THREE.Vector3()).length() / 2;
+    return this.extent.box.getSize(new THREE.Vector3()).length() / 2;
   }
 
-  private resize(): void {
+  resize(): void {
     const { clientWidth, clientHeight } = this.canvas;
-    this.renderer.setSize(clientWidth, clientHeight, false);
-    this.camera.camera.aspect = clientWidth / Math.max(clientHeight, 1);
-    this.camera.camera.updateProjectionMatrix();
+    const size = this.renderer.getSize(new THREE.Vector2());
+    if (size.x !== clientWidth || size.y !== clientHeight) this.renderer.setSize(clientWidth, clientHeight, false);
+    this.camera.resize([clientWidth, Math.max(clientHeight, 1)], this.covered());
     this.redraw();
   }
 
@@ -203,22 +294,37 @@ export class Drawing {
     this.isDirty = false;
     this.renderer.render(this.scene, this.camera.camera);
     this.placeLabels();
+    const forward = this.camera.controls.target.clone().sub(this.camera.camera.position);
+    this.hud.show(forward, forward.length() / this.camera.focalPx);
     for (const then of this.waiting.splice(0)) then();
   }
 
-  /** Puts labels above their boxes; one that would cover a better answer's is left out. */
+  private get labelsNow(): Label[] {
+    return [...this.labelled.measured, ...this.labelled.answers, ...this.labelled.robot];
+  }
+
+  private writeLabels(): void {
+    this.labels.replaceChildren(...this.labelsNow.map(({ text, kind }) => {
+      const label = document.createElement("span");
+      label.textContent = text;
+      label.className = kind;
+      return label;
+    }));
+    this.redraw();
+  }
+
+  /** Puts labels over their points; one that would cover an earlier one is left out. */
   private placeLabels(): void {
-    const taken: [number, number][] = [];
-    [...this.labels.children].forEach((label, i) => {
-      const answer = this.answers[i];
-      if (!answer || !(label instanceof HTMLElement)) return;
-      const box = boxOf(answer);
-      const point = new THREE.Vector3(...box.centre).addScaledVector(this.up, box.size[2] / 2).add(this.world.position).project(this.camera.camera);
-      const [xPx, yPx] = [((point.x + 1) / 2) * this.canvas.clientWidth, ((1 - point.y) / 2) * this.canvas.clientHeight - 24];
-      const isCovering = taken.some(([x, y]) => Math.abs(x - xPx) < label.offsetWidth + 4 && Math.abs(y - yPx) < 24);
-      label.style.visibility = point.z > 1 || isCovering || !this.marks.boxes.visible ? "hidden" : "visible";
+    const taken: [number, number, number][] = [];
+    this.labelsNow.forEach(({ at, kind }, i) => {
+      const label = this.labels.children[i] as HTMLElement;
+      const pixel = this.pixelOf(at);
+      const isHidden = (kind === "answer" || kind === "chosen") && !this.marks.boxes.visible;
+      const [xPx, yPx] = pixel ? [pixel[0] - label.offsetWidth / 2, pixel[1] - 24] : [0, 0];
+      const isCovering = taken.some(([x, y, width]) => x < xPx + label.offsetWidth + 4 && xPx < x + width + 4 && Math.abs(y - yPx) < 24);
+      label.style.visibility = !pixel || isCovering || isHidden ? "hidden" : "visible";
       label.style.transform = `translate(${xPx}px, ${yPx}px)`;
-      if (!isCovering) taken.push([xPx, yPx]);
+      if (pixel && !isCovering) taken.push([xPx, yPx, label.offsetWidth]);
     });
   }
 }

@@ -1,0 +1,170 @@
+// Questions and what comes of them: the scene lit, the answers' cards and boxes, one of them chosen.
+
+import { OPACITY, strengthOf, type Viewpoint } from "./answers";
+import { type Asked, openCard, photoOf, showCards, showPhoto } from "./cards";
+import { clustersOf } from "./clusters";
+import type { Drawing } from "./drawing/drawing";
+import type { Scores } from "./messages";
+import { type Answer, type Answers, type Description, fetchAnswers, fetchScores, parseQuestion } from "./network";
+import { panel, say, showLegend, showSecond } from "./panel";
+import type { PlacesToStand } from "./places";
+import { remember, type State, writeState } from "./state";
+
+/** Where things were found, Gaussians are lit from this share of the range of scores, or a lower threshold. */
+const SHARE_OF_RANGE = 0.75;
+
+const levelOf = (score: number, range: Scores) => Math.min(255, Math.max(1, Math.round(((score - range.min) / (range.max - range.min || 1)) * 255)));
+
+interface Found {
+  scores: Scores;
+  reply: Answers;
+}
+
+/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. */
+function levelFrom({ scores, reply: { threshold, answers } }: Found): number {
+  const high = scores.min + SHARE_OF_RANGE * (scores.max - scores.min);
+  return levelOf(answers.some(({ id }) => id) ? Math.min(threshold ?? high, high) : (threshold ?? high), scores);
+}
+
+export class Asking {
+  private scores: Scores | null = null;
+  /** Of the second question, and its level of threshold. */
+  private second: { scores: Scores; threshold: number } | null = null;
+  private answers: Answer[] = [];
+  private asked: Asked | null = null;
+  private chosen: number | null = null;
+  private controller = new AbortController();
+  private photoOpened = 0;
+
+  /** `viewpoint` is from where distances are said now; `onOther` is called when the service has another generation. */
+  constructor(private readonly state: State, private readonly drawing: Drawing, private readonly places: PlacesToStand,
+    private readonly description: () => Description, private readonly viewpoint: () => Viewpoint, private readonly onOther: () => void, private readonly report: (error: unknown) => void) {}
+
+  colour(level: number): void {
+    this.drawing.cells.colour(this.scores && { scores: this.scores, threshold: level }, this.second);
+    showLegend(this.scores, level);
+    this.drawing.redraw();
+  }
+
+  /** Lights from a level on, as the slider says. */
+  light(level: number): void {
+    if (!this.scores) return;
+    this.state.threshold = this.scores.min + (level / 255) * (this.scores.max - this.scores.min);
+    this.colour(level);
+    writeState(this.state);
+  }
+
+  /** Asks one line of words; nothing for an empty one. */
+  private async fetchBoth(line: string, signal: AbortSignal): Promise<Found | null> {
+    const question = parseQuestion(line);
+    if (!question.text) return null;
+    const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal)]);
+    // The scores of "mug on the table" are those of mugs.
+    const scores = reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal);
+    if (reply.answers.length === 0 && reply.isPlain && reply.threshold !== null) {
+      const diagonalM = this.drawing.extent.box.min.distanceTo(this.drawing.extent.box.max);
+      reply.answers = clustersOf(this.drawing.cells.all(), scores, reply.threshold, diagonalM);
+      for (const answer of reply.answers) answer.evidence = this.photoBySight(answer);
+    }
+    return { scores, reply };
+  }
+
+  /** A photo that sees a group, the one that shows it largest. */
+  private photoBySight(answer: Answer): Answer["evidence"] {
+    return this.drawing.photoOf(answer, this.description().views) ?? undefined;
+  }
+
+  async ask(): Promise<void> {
+    const { state } = this;
+    const start = performance.now();
+    this.controller.abort();
+    this.controller = new AbortController();
+    const { signal } = this.controller;
+    writeState(state);
+    try {
+      const [first, beside] = await Promise.all([this.fetchBoth(state.question, signal), this.fetchBoth(state.second, signal)]);
+      if (signal.aborted) return;
+      // Scores of another generation would light the wrong Gaussians; the next poll brings both.
+      if ([first, beside].some((found) => found && found.scores.generation !== this.description().generation % 2 ** 32)) return this.onOther();
+      this.show(first, beside);
+      this.drawing.onceDrawn(() => performance.measure("answered", { start }));
+      if (first) remember(state.question);
+      document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
+    } catch (error) {
+      if (signal.aborted) return;
+      this.show(null, null);
+      this.report(error);
+    }
+  }
+
+  /** Lights only what was found: nothing is lit beside the words "not found". */
+  private show(first: Found | null, beside: Found | null): void {
+    const lit = (found: Found | null) => (found && found.reply.answers.length > 0 ? found : null);
+    this.scores = lit(first)?.scores ?? null;
+    const second = lit(beside);
+    this.second = second && { scores: second.scores, threshold: levelFrom(second) };
+    showSecond(beside && `${beside.reply.thing}: ${beside.reply.answers.length || "not"} found`);
+    const { threshold } = this.state;
+    this.colour(first && this.scores ? (threshold === null ? levelFrom(first) : levelOf(threshold, first.scores)) : 0);
+    this.answers = first?.reply.answers ?? [];
+    this.asked = first && { thing: first.reply.thing, threshold: first.reply.threshold, viewpoint: this.viewpoint(), description: this.description() };
+    if (this.asked) showCards(this.answers, this.asked, (index) => this.choose(index === this.chosen ? null : index));
+    else panel.answers.replaceChildren();
+    this.choose(null);
+    if (!first) return say("");
+    const n = this.answers.length;
+    const isGroups = n > 0 && this.answers.every(({ id }) => !id);
+    const groups = n === 1 ? "1 place matches, which is not marked as an object." : `${n} places match, none marked as an object.`;
+    say(n === 0 ? `Not found. ${first.reply.none ?? ""}` : isGroups ? groups : `${n} found`);
+  }
+
+  choose(index: number | null): void {
+    const { asked } = this;
+    this.chosen = index !== null && index < this.answers.length ? index : null;
+    const opacities = this.answers.map((answer) => OPACITY[strengthOf(answer, asked?.threshold ?? null)]);
+    this.drawing.showAnswers(asked?.thing ?? "", this.answers, opacities, this.chosen);
+    const answer = this.chosen === null ? null : this.answers[this.chosen];
+    this.leavePhoto();
+    this.photoOpened++;
+    if (asked) openCard(this.answers, this.chosen, asked);
+    else panel.details.hidden = true;
+    void this.places.ask(answer, this.description());
+    if (!answer) return;
+    const photo = photoOf(answer, this.description());
+    this.drawing.flyToAnswer(answer, this.description().views[photo] ?? null);
+    if (photo >= 0) void this.openPhoto(photo, answer.evidence?.box_px ?? null);
+  }
+
+  /** Shows one object that was clicked, as if it had been asked for. */
+  showObject(object: Answer): void {
+    this.answers = [{ ...object, score: object.score ?? 0 }];
+    this.asked = { thing: "This object", threshold: null, viewpoint: this.viewpoint(), description: this.description() };
+    showCards(this.answers, this.asked, (index) => this.choose(index === this.chosen ? null : index));
+    say("");
+    this.choose(0);
+  }
+
+  /** Shows a photo with a box in it. */
+  async openPhoto(index: number, boxPx: number[] | null): Promise<void> {
+    const photo = this.description().views[index];
+    const opened = ++this.photoOpened;
+    try {
+      await showPhoto(index, photo, boxPx, () => this.drawing.standAt(photo), (share) => {
+        if (opened !== this.photoOpened) return;
+        this.drawing.standAt(photo);
+        panel.blend.hidden = share === 0;
+        // Properties: the page's policy allows no style attributes in HTML.
+        const [left, bottom] = this.drawing.coveredPx;
+        Object.assign(panel.blend.style, { opacity: String(share), left: `${left}px`, top: "0", width: `${innerWidth - left}px`, height: `${innerHeight - bottom}px` });
+      });
+    } catch (error) {
+      this.report(error);
+    }
+  }
+
+  leavePhoto(): void {
+    panel.blend.hidden = true;
+    const share = document.querySelector<HTMLInputElement>("#blend-share");
+    if (share) share.value = "0";
+  }
+}

@@ -1,0 +1,154 @@
+// Answers as cards; the chosen one opens in place: its photo, its position to copy, places to stand.
+
+import { copies, metres, sizeText, strengthOf, whereabouts, type Viewpoint } from "./answers";
+import type { Answer, Description, Goal, Photo } from "./network";
+import { panel } from "./panel";
+import { crop, photoWithBox } from "./photos";
+
+/** What all cards of one question share. */
+export interface Asked {
+  /** What the answers are. */
+  thing: string;
+  threshold: number | null;
+  viewpoint: Viewpoint;
+  description: Description;
+}
+
+function make<K extends keyof HTMLElementTagNameMap>(tag: K, text = "", className = ""): HTMLElementTagNameMap[K] {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+function button(text: string, onClick: () => void): HTMLButtonElement {
+  const made = make("button", text);
+  made.type = "button";
+  made.addEventListener("click", onClick);
+  return made;
+}
+
+/** The photo that shows an answer best, by its index in the description. */
+export function photoOf(answer: Answer, { views }: Description): number {
+  return views.findIndex(({ name }) => name === answer.evidence?.photo);
+}
+
+export function showCards(answers: Answer[], asked: Asked, onChoose: (index: number) => void): void {
+  panel.aside.append(panel.details);
+  panel.answers.replaceChildren(...answers.map((answer, index) => {
+    const card = button("", () => onChoose(index));
+    card.className = "card";
+    card.setAttribute("aria-expanded", "false");
+    const number = make("span", String(index + 1), "crop none");
+    const text = make("span");
+    const { metric } = asked.description;
+    text.append(make("b", asked.thing), make("small", whereabouts(answer.position_in_world, asked.viewpoint, metric)), make("small", sizeText(answer, metric)));
+    const strength = strengthOf(answer, asked.threshold);
+    card.append(number, text, make("span", strength, `strength ${strength}`));
+    const item = make("li");
+    item.append(card);
+    const photo = photoOf(answer, asked.description);
+    const view = asked.description.views[photo];
+    if (view?.has_picture && answer.evidence) crop(photo, view, answer.evidence.box_px).then((cut) => number.replaceWith(cut), () => {});
+    return item;
+  }));
+}
+
+/** Opens a card, or none. */
+export function openCard(answers: Answer[], chosen: number | null, asked: Asked): void {
+  [...panel.answers.children].forEach((item, index) => {
+    item.classList.toggle("chosen", index === chosen);
+    item.querySelector(".card")?.setAttribute("aria-expanded", String(index === chosen));
+  });
+  const answer = chosen === null ? null : answers[chosen];
+  panel.details.hidden = !answer;
+  panel.details.replaceChildren();
+  if (!answer || chosen === null) return void panel.aside.append(panel.details);
+  const item = panel.answers.children[chosen];
+  item.append(panel.details);
+  panel.details.append(facts(answer, asked), copying(answer, asked.thing));
+  item.scrollIntoView({ block: "nearest" });
+}
+
+function facts(answer: Answer, { description, threshold }: Asked): HTMLDListElement {
+  const rows: [string, string][] = [[description.geographic ? "East, north, up" : "Position", metres(answer.position_in_world)]];
+  if (answer.geographic) {
+    const { latitude_deg, longitude_deg, height_m } = answer.geographic;
+    rows.push(["Lat, lon", `${latitude_deg.toFixed(7)}, ${longitude_deg.toFixed(7)}`], ["Height", `${height_m.toFixed(2)} m`]);
+  }
+  rows.push(["Score", `${answer.score.toFixed(2)}${threshold === null ? "" : `, found from ${threshold.toFixed(2)}`}`]);
+  if (!answer.id) rows.push(["Kind", "a group of points, not a marked object"]);
+  if (answer.degree !== undefined) rows.push(["Relation", `holds to ${answer.degree.toFixed(2)}`]);
+  for (const other of answer.related_to ?? []) rows.push([`To: ${other.thing}`, metres(other.position_in_world)]);
+  if (answer.evidence) rows.push(["Best photo", answer.evidence.photo]);
+  if (answer.id) rows.push(["Id", answer.id]);
+  const list = make("dl");
+  for (const [term, text] of rows) list.append(make("dt", term), make("dd", text));
+  return list;
+}
+
+/** Buttons that copy; without a clipboard, which browsers give over HTTPS and on this machine only, the text is shown. */
+function copying(answer: Answer, question: string): HTMLElement {
+  const row = make("div", "Copy", "copies");
+  const show = (text: string) => {
+    row.querySelector("textarea")?.remove();
+    const shown = make("textarea", text);
+    shown.readOnly = true;
+    shown.setAttribute("aria-label", "To copy");
+    row.append(shown);
+    shown.select();
+  };
+  for (const [name, text] of Object.entries(copies(answer, question))) {
+    const copy = button(name, () => {
+      (navigator.clipboard?.writeText(text) ?? Promise.reject(new Error("no clipboard"))).then(() => {
+        copy.textContent = "Copied";
+        setTimeout(() => (copy.textContent = name), 1500);
+      }, () => show(text));
+    });
+    row.append(copy);
+  }
+  return row;
+}
+
+/** Shows a photo first of the details, with a box, a button that goes there, and a slider that lays it over the scene. */
+export async function showPhoto(index: number, photo: Photo, boxPx: number[] | null, onGo: () => void, onBlend: (share: number) => void): Promise<void> {
+  const figure = make("figure");
+  const caption = make("figcaption");
+  caption.append(make("span", photo.name), button("Stand here", onGo));
+  figure.append(caption);
+  panel.details.querySelector("figure")?.remove();
+  panel.details.hidden = false;
+  panel.details.prepend(figure);
+  if (!photo.has_picture) return;
+  const { svg, url } = await photoWithBox(index, photo, boxPx);
+  panel.blend.src = url;
+  figure.prepend(svg);
+  const blend = make("input");
+  Object.assign(blend, { type: "range", min: "0", max: "100", value: "0", id: "blend-share" });
+  blend.setAttribute("aria-label", "Photo over the scene");
+  blend.addEventListener("input", () => onBlend(Number(blend.value) / 100));
+  caption.append(blend);
+}
+
+/** Lists places to stand in the details, or says why there is none. */
+export function showPlaces(goals: Goal[], none: string | null, chosen: number | null, onChoose: (index: number) => void): void {
+  const places = make("div");
+  places.id = "places";
+  places.append(make("h3", "Places to stand"));
+  const list = make("ol");
+  list.append(...goals.map((goal, index) => {
+    const [x, y] = goal.position_in_world.map((v) => v.toFixed(2));
+    const place = button(`${x}, ${y} m · sees ${Math.round(goal.visible_share * 100)} % · clear by ${goal.clearance_m.toFixed(2)} m · way ${goal.path_m.toFixed(1)} m`, () => onChoose(index));
+    place.setAttribute("aria-pressed", String(index === chosen));
+    const item = make("li");
+    item.append(place);
+    return item;
+  }));
+  if (goals.length > 0) places.append(list);
+  if (none) places.append(make("p", none));
+  const before = panel.details.querySelector("#places");
+  const focused = [...(before?.querySelectorAll("button") ?? [])].indexOf(document.activeElement as HTMLButtonElement);
+  if (before) before.replaceWith(places);
+  else panel.details.append(places);
+  if (focused >= 0) places.querySelectorAll("button")[focused]?.focus();
+}

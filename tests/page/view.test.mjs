@@ -1,0 +1,175 @@
+// What a person sees at first, and of a chosen answer: the scene fills the screen, nothing covers what was chosen, lit
+// and unlit differ for every eye.
+
+import assert from "node:assert/strict";
+import { after, before, test } from "node:test";
+import { closeBrowser, layer, openBrowser, pixels } from "./browser.mjs";
+import { answered, CAMERA, cameraOf, drawn, isInside, litPixels, opened, PANEL_PX, project, WIDTH } from "./scene.mjs";
+import { THINGS } from "./service.mjs";
+
+before(openBrowser);
+after(closeBrowser);
+
+const CHAIR = THINGS.find(({ name }) => name === "chair");
+/** Looks from the west at the chair, a little downward. */
+const PHOTO = { name: "west/1.jpg", position_m: [-2.5, 0.8, 1.5], rotation_xyzw: [-0.561451, 0.561451, -0.429852, 0.429852], width_px: 640, height_px: 480, focal_px: 500, has_picture: true };
+const EVIDENCE = { photo: PHOTO.name, box_px: [400, 200, 500, 300] };
+const PHONE = { viewport: { width: 390, height: 844 }, hasTouch: true };
+
+/** Shares of the screen that show the scene: it is grey, and the ground around it is bluish. */
+async function coverage(page, { width, height }) {
+  await layer(page, "grid", false);
+  const found = await pixels(page, 0, (r, g, b) => Math.abs(r - g) < 4 && Math.abs(g - b) < 4 && r > 60);
+  const panel = await page.locator("#panel").boundingBox();
+  const isPanel = ([x, y]) => x >= panel.x && x < panel.x + panel.width && y >= panel.y && y < panel.y + panel.height;
+  return found.filter((pixel) => !isPanel(pixel)).length / (width * height);
+}
+
+for (const [name, options] of [["wide", { viewport: { width: 960, height: 540 } }], ["phone", PHONE]]) {
+  test(`the opening view shows the scene over at least half of the screen: ${name}`, () => opened(async (page) => {
+    await page.waitForFunction(() => document.documentElement.dataset.wholePictureMs !== undefined);
+    const share = await coverage(page, options.viewport);
+    console.log(`${name}: ${(100 * share).toFixed(0)} % of the screen`);
+    // Far strays do not move it away.
+    assert.ok(share > 0.5, String(share));
+  }, { isLookedAt: true, behaviour: { things: [...THINGS, { name: "stray", min: [300, 300, 90], max: [302, 302, 92], n: [2, 2, 2] }], position: null, program: "slag-encoder" }, options }));
+
+  test(`the chosen answer is never behind the panel: ${name}`, () => opened(async (page) => {
+    await drawn(page);
+    for (const thing of ["chair", "ball"]) {
+      await page.fill("#question", thing);
+      await answered(page, thing);
+      await page.locator("#answers .card").click();
+      await page.locator("#details").waitFor();
+      await page.locator("#labels .chosen").waitFor();
+      await layer(page, "boxes", false);
+      const lit = await pixels(page, 0, "(r, g, b) => r > 90 && r - Math.min(g, b) > 45");
+      const panel = await page.locator("#panel").boundingBox();
+      const isFree = ([x, y]) => options.hasTouch ? y < panel.y : x > panel.x + panel.width;
+      const free = lit.filter(isFree);
+      const { width, height } = options.viewport;
+      const middle = options.hasTouch ? [width / 2, panel.y / 2] : [(panel.x + panel.width + width) / 2, height / 2];
+      const mean = [0, 1].map((axis) => free.reduce((sum, pixel) => sum + pixel[axis], 0) / free.length);
+      assert.ok(free.length > 1500 && Math.hypot(mean[0] - middle[0], mean[1] - middle[1]) < 60, `${thing}: ${free.length} lit around ${mean}, not ${middle}`);
+      await layer(page, "boxes", true);
+    }
+  }, { isLookedAt: true, behaviour: { goal: "unreachable" }, options }));
+}
+
+test("cards have the photo's crop, whereabouts, size and how sure; the chosen one shows the photo with its box first", () => opened(async (page) => {
+  await drawn(page);
+  await answered(page, "chair");
+  const card = page.locator("#answers .card");
+  await card.locator("svg.crop").waitFor();
+  const [x, y, width, height] = (await card.locator("svg.crop").getAttribute("viewBox")).split(" ").map(Number);
+  const [left, top, right, bottom] = EVIDENCE.box_px;
+  assert.ok(x <= left && y <= top && x + width >= right && y + height >= bottom && width < 200, `${x} ${y} ${width} ${height}`);
+  assert.match(await card.innerText(), /chair\s+4\.8 m from the robot\s+1\.4 × 0\.6 × 1\.0 m\s+strong/);
+  await card.click();
+  await page.locator("#details figure rect").waitFor();
+  assert.equal(await page.locator("#answers li #details > :first-child").evaluate((first) => first.tagName), "FIGURE");
+  const box = await page.locator("#details rect").evaluate((rect) => ["x", "y", "width", "height"].map((name) => Number(rect.getAttribute(name))));
+  assert.deepEqual(box, [400, 200, 100, 100]);
+  // It looks from where the photo was taken, not farther away than that.
+  const [from, to] = await cameraOf(page);
+  const along = [0, 1, 2].map((k) => (from[k] - to[k]) / Math.hypot(...from.map((v, i) => v - to[i])));
+  const toPhoto = PHOTO.position_m.map((v, k) => v - to[k]);
+  assert.ok(along.reduce((sum, v, k) => sum + (v * toPhoto[k]) / Math.hypot(...toPhoto), 0) > 0.999, `${from}, ${to}`);
+  await page.getByRole("button", { name: "ROS" }).click();
+  await page.locator(".copies").getByText(/Copied/).or(page.locator(".copies textarea")).first().waitFor();
+  await page.keyboard.press("Escape");
+  assert.ok(await page.locator("#details").isHidden());
+}, { behaviour: { photos: [PHOTO], evidence: EVIDENCE, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
+
+test("what no object answers, groups of what is lit do; what nothing answers lights nothing, nor does a failure", () => opened(async (page, service) => {
+  await drawn(page);
+  await answered(page, "seat");
+  await page.getByText("1 place matches, which is not marked as an object.").waitFor();
+  assert.match(await page.locator("#answers .card").innerText(), /seat[^]*1\.\d × 0\.\d × 0\.9 m/);
+  assert.ok((await litPixels(page)).filter((pixel) => isInside(CHAIR, pixel, 8)).length > 2000);
+  await page.fill("#question", "unicorn");
+  await answered(page, "unicorn");
+  assert.equal((await litPixels(page)).length, 0);
+  assert.ok(await page.locator("#legend").isHidden());
+  await page.fill("#question", "chair");
+  await answered(page, "chair");
+  service.behaviour.fails = true;
+  await page.fill("#question", "ball");
+  await page.getByText("too busy").waitFor();
+  assert.deepEqual([(await litPixels(page)).length, await page.locator("#answers .card").count()], [0, 0]);
+}, { isLookedAt: true, fragment: `q=seat&camera=${CAMERA}`, expected: /503/ }));
+
+/** Luminance of a colour (WCAG 2.2). */
+const luminance = (colour) => colour.map((v) => v / 255).map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)).reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+
+test("lit and unlit differ by 3 to 1 in lightness in every theme, and for eyes that see no red, green or blue", () => opened(async (page) => {
+  await drawn(page);
+  await answered(page, "chair");
+  await layer(page, "boxes", false);
+  await layer(page, "grid", false);
+  const devtools = await page.context().newCDPSession(page);
+  const FLOOR = { name: "floor", min: [2, -3, -0.1], max: [3.5, -1.5, 0] };
+  for (const theme of ["dark", "light", "contrast"]) {
+    assert.equal(await page.evaluate(() => document.documentElement.dataset.theme), theme);
+    for (const type of ["none", "protanopia", "deuteranopia", "tritanopia"]) {
+      await devtools.send("Emulation.setEmulatedVisionDeficiency", { type });
+      const colours = await page.screenshot().then((png) => meanColours(page, png.toString("base64"), [CHAIR, FLOOR]));
+      const [lit, unlit] = colours.map(luminance);
+      const ratio = (Math.max(lit, unlit) + 0.05) / (Math.min(lit, unlit) + 0.05);
+      console.log(`${theme}, ${type}: ${ratio.toFixed(1)} to 1`);
+      assert.ok(ratio > 3, `${theme}, ${type}: ${ratio}`);
+    }
+    await devtools.send("Emulation.setEmulatedVisionDeficiency", { type: "none" });
+    await page.click("#theme");
+  }
+}, { isLookedAt: true, fragment: `q=chair&camera=${CAMERA}` }));
+
+/** Mean colours inside of things' outlines, away from their edges. */
+async function meanColours(page, png, things) {
+  const inside = things.map((thing) => {
+    const found = [];
+    for (let x = PANEL_PX; x < WIDTH; x += 3) for (let y = 0; y < 640; y += 3) if (isInside(thing, [x, y], -12)) found.push([x, y]);
+    return found;
+  });
+  return page.evaluate(async ([data, all]) => {
+    const image = await createImageBitmap(new Blob([Uint8Array.from(atob(data), (c) => c.charCodeAt(0))]));
+    const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
+    context.drawImage(image, 0, 0);
+    const { data: rgba, width } = context.getImageData(0, 0, image.width, image.height);
+    return all.map((points) => [0, 1, 2].map((k) => points.reduce((sum, [x, y]) => sum + rgba[4 * (y * width + x) + k], 0) / points.length));
+  }, [png, inside]);
+}
+
+test("keys: the list of them, measuring, hovering, and the opening view again", () => opened(async (page) => {
+  await drawn(page);
+  await page.keyboard.press("?");
+  await page.locator("#keys").getByText("opening view").waitFor();
+  await page.keyboard.press("Escape");
+  await page.keyboard.press("m");
+  // Two places on the floor, 2 m apart.
+  const at = (point) => page.mouse.click(...project(point));
+  await at([-1, 2, 0]);
+  await page.getByText("Click the second point.").waitFor();
+  await at([-3, 2, 0]);
+  const said = await page.locator("#message").innerText();
+  assert.ok(Math.abs(Number.parseFloat(said) - 2) < 0.2, said);
+  await page.keyboard.press("m");
+  await page.mouse.move(...project([1.2, 0.5, 0.7]));
+  await page.locator("#hover").waitFor();
+  assert.match(await page.locator("#hover").innerText(), /\d cm above ground$/);
+  const [before] = await cameraOf(page);
+  await page.locator("#canvas").focus();
+  await page.keyboard.press("r");
+  await page.waitForTimeout(300);
+  assert.notDeepEqual((await cameraOf(page))[0], before);
+}, { fragment: `camera=${CAMERA}` }));
+
+test("the robot is named, with its age and heading; a lost service has a badge; a click asks for what is under it", () => opened(async (page, service) => {
+  await drawn(page);
+  await page.locator("#labels .robot").getByText("Robot").waitFor();
+  await page.getByText("Robot, the green mark · scene 2 h old · 80 cm around it on board").waitFor();
+  await page.mouse.click(...project([-1.5, -1.5, 0.5]));
+  await page.locator("#details").getByText("-1.50, -1.00, 0.50 m").waitFor();
+  service.behaviour.isGone = true;
+  await page.locator("#badge").getByText("offline").waitFor({ timeout: 15000 });
+}, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}`, expected: /ERR_/ }));
