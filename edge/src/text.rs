@@ -118,7 +118,7 @@ impl TextService {
         &self.info
     }
 
-    /// Returns the phrases or words that it accepts; none if it accepts any text.
+    /// Returns the words that things can be called by; none if everyday nouns do.
     pub fn vocabulary(&self) -> &[String] {
         &self.vocabulary
     }
@@ -134,15 +134,20 @@ impl TextService {
         if let Some(vector) = self.cache().get(&key) {
             return Ok(vector);
         }
+        let vector: Arc<[f32]> = self.run(key.clone())?.into();
+        self.cache().put(key, Arc::clone(&vector));
+        Ok(vector)
+    }
+
+    /// Returns a text's vector as [`Self::encode`] does, without the cache and signs included.
+    pub(crate) fn run(&self, text: String) -> Result<Vec<f32>, TextError> {
         let (reply, answer) = sync_channel(1);
         let jobs = self.jobs.as_ref().ok_or(TextError::Stopped)?;
-        jobs.try_send(Job { text: key.clone(), reply }).map_err(|e| match e {
+        jobs.try_send(Job { text, reply }).map_err(|e| match e {
             TrySendError::Full(_) => TextError::Busy,
             TrySendError::Disconnected(_) => TextError::Stopped,
         })?;
-        let vector: Arc<[f32]> = answer.recv().map_err(|_| TextError::Stopped)??.into();
-        self.cache().put(key, Arc::clone(&vector));
-        Ok(vector)
+        Ok(answer.recv().map_err(|_| TextError::Stopped)??)
     }
 
     fn cache(&self) -> std::sync::MutexGuard<'_, Cache> {

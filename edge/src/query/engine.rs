@@ -1,7 +1,7 @@
 //! Query engine: a cache, a text model, and the questions asked of them. Shared by the HTTP service and the
 //! command line.
 
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use slag_common::Hash32;
@@ -11,6 +11,7 @@ use slag_common::shard::ShardView;
 use slag_models::{InferenceError, SessionOptions};
 
 use super::carried;
+use super::names::{Names, Words};
 use super::relations;
 use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
@@ -70,6 +71,8 @@ impl QueryError {
 struct Loaded {
     text: Arc<TextService>,
     snapshot: Option<Arc<Snapshot>>,
+    /// The names of its things, once they were asked for.
+    names: Arc<OnceLock<Names>>,
     /// State of `current` at the last attempt to load it.
     tried: Option<Stat>,
     failed_at: Option<Instant>,
@@ -79,7 +82,8 @@ struct Loaded {
 /// not take the vectors of one model to the scene of another.
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
-    text: Arc<TextService>,
+    pub(super) text: Arc<TextService>,
+    pub(super) names: Arc<OnceLock<Names>>,
 }
 
 impl OnBoard {
@@ -100,11 +104,6 @@ impl OnBoard {
     /// Returns whether the text model runs.
     pub(crate) fn text_is_alive(&self) -> bool {
         self.text.is_alive()
-    }
-
-    /// Returns the words that the text model knows; none if it takes any text.
-    pub(super) fn vocabulary(&self) -> &[String] {
-        self.text.vocabulary()
     }
 
     /// Returns the vector of a text.
@@ -135,6 +134,8 @@ pub struct Engine {
     /// Options to open the text models with that scenes carry; absent if the text model is given.
     carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
+    /// Vectors of the words that things are named by.
+    pub(super) words: Mutex<Option<Arc<Words>>>,
     /// Buffers of finished answers, one for each answer computed at a time.
     idle: Mutex<Vec<Scratch>>,
 }
@@ -142,8 +143,15 @@ pub struct Engine {
 impl Engine {
     /// Makes an engine of a text model without loading a scene yet.
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
-        let loaded = Loaded { text: Arc::new(text), snapshot: None, tried: None, failed_at: None };
-        Self { cache, carried: None, loaded: RwLock::new(loaded), idle: Mutex::default() }
+        let (text, names) = (Arc::new(text), Arc::default());
+        let loaded = Loaded { text, snapshot: None, names, tried: None, failed_at: None };
+        Self {
+            cache,
+            carried: None,
+            loaded: RwLock::new(loaded),
+            words: Mutex::default(),
+            idle: Mutex::default(),
+        }
     }
 
     /// Makes an engine that takes the text model of each scene which carries one, and that of `otherwise` before.
@@ -203,7 +211,8 @@ impl Engine {
             Ok(snapshot) => {
                 let (tried, failed_at) = (snapshot.current_stat, snapshot.may_recover.then(Instant::now));
                 let snapshot = Some(Arc::new(snapshot));
-                let before = std::mem::replace(&mut *loaded, Loaded { text, snapshot, tried, failed_at });
+                let fresh = Loaded { text, snapshot, names: Arc::default(), tried, failed_at };
+                let before = std::mem::replace(&mut *loaded, fresh);
                 // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
                 drop(before);
@@ -228,7 +237,7 @@ impl Engine {
     pub fn on_board(&self) -> Result<OnBoard, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
-        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text) })
+        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), names: Arc::clone(&loaded.names) })
     }
 
     /// Runs work on a generation, with buffers of earlier answers.
@@ -272,7 +281,8 @@ mod tests {
         let snapshot = Snapshot::open(&EdgeCache::open(dir.path())).expect("opens");
         let info = EncoderInfo { id, ..Axes::info(2) };
         let text = TextService::start(info, Box::new(Axes::new(2))).expect("a thread");
-        Loaded { text: Arc::new(text), snapshot: Some(Arc::new(snapshot)), tried: None, failed_at: None }
+        let (text, snapshot) = (Arc::new(text), Some(Arc::new(snapshot)));
+        Loaded { text, snapshot, names: Arc::default(), tried: None, failed_at: None }
     }
 
     /// While generations of two encoders replace each other, no question takes the text model of one to the scene
