@@ -12,6 +12,7 @@ use slag_models::{InferenceError, SessionOptions};
 
 use super::carried;
 use super::names::{Names, Words};
+use super::oriented::OrientedBox;
 use super::relations;
 use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
@@ -71,8 +72,8 @@ impl QueryError {
 struct Loaded {
     text: Arc<TextService>,
     snapshot: Option<Arc<Snapshot>>,
-    /// The names of its things, once they were asked for.
-    names: Arc<OnceLock<Names>>,
+    /// What is known of its things since it was asked for.
+    listed: Arc<Listed>,
     /// State of `current` at the last attempt to load it.
     tried: Option<Stat>,
     failed_at: Option<Instant>,
@@ -83,7 +84,14 @@ struct Loaded {
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
     pub(super) text: Arc<TextService>,
-    pub(super) names: Arc<OnceLock<Names>>,
+    pub(super) listed: Arc<Listed>,
+}
+
+/// The names of a generation's things, and their boxes along axes of their own, in the order of the index.
+#[derive(Default)]
+pub(super) struct Listed {
+    pub(super) names: OnceLock<Names>,
+    pub(super) boxes: OnceLock<Vec<OnceLock<OrientedBox>>>,
 }
 
 impl OnBoard {
@@ -143,8 +151,8 @@ pub struct Engine {
 impl Engine {
     /// Makes an engine of a text model without loading a scene yet.
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
-        let (text, names) = (Arc::new(text), Arc::default());
-        let loaded = Loaded { text, snapshot: None, names, tried: None, failed_at: None };
+        let (text, listed) = (Arc::new(text), Arc::default());
+        let loaded = Loaded { text, snapshot: None, listed, tried: None, failed_at: None };
         Self {
             cache,
             carried: None,
@@ -211,7 +219,7 @@ impl Engine {
             Ok(snapshot) => {
                 let (tried, failed_at) = (snapshot.current_stat, snapshot.may_recover.then(Instant::now));
                 let snapshot = Some(Arc::new(snapshot));
-                let fresh = Loaded { text, snapshot, names: Arc::default(), tried, failed_at };
+                let fresh = Loaded { text, snapshot, listed: Arc::default(), tried, failed_at };
                 let before = std::mem::replace(&mut *loaded, fresh);
                 // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
@@ -237,7 +245,7 @@ impl Engine {
     pub fn on_board(&self) -> Result<OnBoard, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
-        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), names: Arc::clone(&loaded.names) })
+        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), listed: Arc::clone(&loaded.listed) })
     }
 
     /// Runs work on a generation, with buffers of earlier answers.
@@ -282,7 +290,7 @@ mod tests {
         let info = EncoderInfo { id, ..Axes::info(2) };
         let text = TextService::start(info, Box::new(Axes::new(2))).expect("a thread");
         let (text, snapshot) = (Arc::new(text), Some(Arc::new(snapshot)));
-        Loaded { text, snapshot, names: Arc::default(), tried: None, failed_at: None }
+        Loaded { text, snapshot, listed: Arc::default(), tried: None, failed_at: None }
     }
 
     /// While generations of two encoders replace each other, no question takes the text model of one to the scene

@@ -1,6 +1,7 @@
 //! The things on board, and the area that they lie in.
 
 use std::cmp::Reverse;
+use std::sync::OnceLock;
 use std::time::Duration;
 
 use glam::DVec3;
@@ -130,7 +131,10 @@ impl Engine {
         let names = self.names(on_board, wait, budget)?;
         let snapshot = &on_board.snapshot;
         budget.take(limit.min(snapshot.objects.len()) * size_of::<ObjectOnBoard>());
-        let page = self.on_scene(snapshot, budget, |_, scene| page(scene, names, filter, limit, budget));
+        let unmeasured = || (0..snapshot.objects.len()).map(|_| OnceLock::new()).collect();
+        let boxes: &[OnceLock<OrientedBox>] = on_board.listed.boxes.get_or_init(unmeasured);
+        let page =
+            self.on_scene(snapshot, budget, |_, scene| page(scene, (names, boxes), filter, limit, budget));
         budget.check().map_err(ScoreError::from)?;
         Ok(page?)
     }
@@ -145,7 +149,7 @@ impl Engine {
     ) -> Result<Option<ObjectOnBoard>, QueryError> {
         let found = self.on_scene(snapshot, budget, |_, scene| {
             let object = number_of(scene, id)?;
-            take_points(scene, object, budget).then(|| describe(scene, names, object))
+            take_points(scene, object, budget).then(|| describe(scene, names, object, &OnceLock::new()))
         });
         budget.check().map_err(ScoreError::from)?;
         Ok(found)
@@ -210,7 +214,7 @@ fn number_of(scene: &Scene<'_>, id: u64) -> Option<usize> {
 
 fn page(
     scene: &Scene<'_>,
-    names: Option<&Names>,
+    (names, boxes): (Option<&Names>, &[OnceLock<OrientedBox>]),
     filter: &ObjectFilter,
     limit: usize,
     budget: &Budget,
@@ -232,10 +236,11 @@ fn page(
             at.ok_or_else(refused)? + 1
         }
     };
-    // Positions are needed for one at a time.
+    // Positions are needed for one at a time, and once.
     let described = |at: &usize| {
-        let used_bytes = budget.used_bytes();
-        let described = take_points(scene, *at, budget).then(|| describe(scene, names, *at));
+        let (used_bytes, measured) = (budget.used_bytes(), &boxes[*at]);
+        let may_go_on = measured.get().is_some() || take_points(scene, *at, budget);
+        let described = may_go_on.then(|| describe(scene, names, *at, measured));
         budget.give_back_to(used_bytes, 0);
         described
     };
@@ -277,7 +282,13 @@ fn sort(scene: &Scene<'_>, names: Option<&Names>, order: ObjectOrder, all: &mut 
     }
 }
 
-fn describe(scene: &Scene<'_>, names: Option<&Names>, object: usize) -> ObjectOnBoard {
+/// Describes an object. `measured`: its box along axes of its own, if that was measured before.
+fn describe(
+    scene: &Scene<'_>,
+    names: Option<&Names>,
+    object: usize,
+    measured: &OnceLock<OrientedBox>,
+) -> ObjectOnBoard {
     let (record, everywhere) = (objects::record(scene, object), Region::default());
     let n_gaussians = objects::count_in(scene, object, &everywhere);
     let found = FoundObject { object, record, score: 0.0, n_gaussians, cut: None };
@@ -291,7 +302,8 @@ fn describe(scene: &Scene<'_>, names: Option<&Names>, object: usize) -> ObjectOn
         geographic: scene.manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
         box_min_in_world: min,
         box_max_in_world: max,
-        oriented_box: objects::oriented_box(scene, &found, &everywhere, alignment(scene.manifest)),
+        oriented_box: *measured
+            .get_or_init(|| objects::oriented_box(scene, &found, &everywhere, alignment(scene.manifest))),
         n_gaussians,
         n_gaussians_in_scene: u64::from(record.n_gaussians),
         evidence: Evidence { photo: objects::photo(scene, object).to_owned(), box_px: record.photo_box_px },

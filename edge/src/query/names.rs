@@ -135,7 +135,7 @@ impl Engine {
         wait: Duration,
         budget: &Budget,
     ) -> Result<Option<&'a Names>, QueryError> {
-        if let Some(names) = on_board.names.get() {
+        if let Some(names) = on_board.listed.names.get() {
             return Ok(Some(names));
         }
         if on_board.check().is_err() {
@@ -146,7 +146,7 @@ impl Engine {
         let made = self.on_scene(&on_board.snapshot, budget, |_, scene| Names::new(words, scene, budget));
         budget.give_back_to(used_bytes, 0);
         let made = made?;
-        Ok(Some(on_board.names.get_or_init(|| made)))
+        Ok(Some(on_board.listed.names.get_or_init(|| made)))
     }
 
     /// Begins to encode the words that things are named by.

@@ -71,9 +71,9 @@ fn ids(result: &Value) -> Vec<String> {
     answers.iter().map(|answer| answer["id"].as_str().expect("an id").to_owned()).collect()
 }
 
-pub(super) const MUG_ON_TABLE: &str = "o0000000000000001";
-pub(super) const MUG_ON_FLOOR: &str = "o0000000000000002";
-pub(super) const TABLE: &str = "o0000000000000003";
+const MUG_ON_TABLE: &str = "o0000000000000001";
+const MUG_ON_FLOOR: &str = "o0000000000000002";
+const TABLE: &str = "o0000000000000003";
 
 #[tokio::test]
 async fn get_and_post_answer_in_one_shape() {
