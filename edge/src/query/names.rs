@@ -9,15 +9,12 @@ use serde::Serialize;
 use slag_common::Hash32;
 use slag_models::names::{Confidence, Naming, Spread, words_of};
 
-use super::engine::{Engine, OnBoard, QueryError};
 use super::scene::Scene;
 use crate::score::{Budget, Question, ScoreError, score_objects};
 use crate::store::EdgeCache;
 use crate::store::words::{self, WordVector};
 use crate::text::{TextError, TextService};
 
-/// Longest wait of a request for the words to be encoded.
-pub(crate) const NAMES_WAIT: Duration = Duration::from_millis(500);
 /// Words that are scored at a time: bounds the scores in memory.
 const WORDS_TOGETHER: usize = 16;
 /// One of so many words tells how all score.
@@ -59,7 +56,7 @@ impl Names {
     }
 
     /// Scores all words over all objects.
-    fn new(words: Arc<[WordVector]>, scene: &Scene<'_>, budget: &Budget) -> Result<Self, ScoreError> {
+    pub fn new(words: Arc<[WordVector]>, scene: &Scene<'_>, budget: &Budget) -> Result<Self, ScoreError> {
         let n_objects = scene.index.len();
         let scores_bytes = WORDS_TOGETHER * size_of::<f32>();
         budget.take(n_objects * (size_of::<Naming>() + size_of::<Vec<(u32, f32)>>() + scores_bytes));
@@ -104,8 +101,27 @@ enum State {
 }
 
 impl Words {
+    /// Begins to encode the words of a text model, on a thread of their own.
+    pub fn begin(cache: &EdgeCache, text: &Arc<TextService>) -> Arc<Self> {
+        let (state, is_over) = (Mutex::new(State::Encoding), Condvar::new());
+        let words = Arc::new(Self { encoder_id: text.info().id, state, is_over });
+        let (cache, text, encoding) = (cache.clone(), Arc::clone(text), Arc::clone(&words));
+        let encode = move || encoding.become_ready(encode(&cache, &text));
+        if let Err(error) = std::thread::Builder::new().name("words".into()).spawn(encode) {
+            tracing::warn!("the words that things are named by cannot be encoded: {error}");
+            words.become_ready(None);
+        }
+        words
+    }
+
+    /// Returns whether these are, or will be, the words of an encoder.
+    pub fn are_of(&self, encoder_id: Hash32) -> bool {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        self.encoder_id == encoder_id && !matches!(*state, State::Failed)
+    }
+
     /// Waits for the words; `None` if they take longer.
-    fn wait(&self, longest: Duration) -> Option<Arc<[WordVector]>> {
+    pub fn wait(&self, longest: Duration) -> Option<Arc<[WordVector]>> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let waiting = |state: &mut State| matches!(state, State::Encoding);
         let waited = self.is_over.wait_timeout_while(state, longest, waiting);
@@ -115,65 +131,10 @@ impl Words {
         }
     }
 
-    fn has_failed(&self) -> bool {
-        matches!(*self.state.lock().unwrap_or_else(PoisonError::into_inner), State::Failed)
-    }
-
     fn become_ready(&self, words: Option<Vec<WordVector>>) {
         let state = words.map_or(State::Failed, |words| State::Ready(words.into()));
         *self.state.lock().unwrap_or_else(PoisonError::into_inner) = state;
         self.is_over.notify_all();
-    }
-}
-
-impl Engine {
-    /// Returns the names of the things on board, for whose words it waits at most `wait`; `None` if the text model
-    /// still encodes them then, has stopped, or is not the scene's.
-    pub(crate) fn names<'a>(
-        &self,
-        on_board: &'a OnBoard,
-        wait: Duration,
-        budget: &Budget,
-    ) -> Result<Option<&'a Names>, QueryError> {
-        if let Some(names) = on_board.listed.names.get() {
-            return Ok(Some(names));
-        }
-        if on_board.check().is_err() {
-            return Ok(None);
-        }
-        let Some(words) = self.words(&on_board.text).wait(wait) else { return Ok(None) };
-        let used_bytes = budget.used_bytes();
-        let made = self.on_scene(&on_board.snapshot, budget, |_, scene| Names::new(words, scene, budget));
-        budget.give_back_to(used_bytes, 0);
-        let made = made?;
-        Ok(Some(on_board.listed.names.get_or_init(|| made)))
-    }
-
-    /// Begins to encode the words that things are named by.
-    pub(crate) fn begin_names(&self) {
-        if let Ok(on_board) = self.on_board()
-            && on_board.check().is_ok()
-        {
-            self.words(&on_board.text);
-        }
-    }
-
-    /// Returns the words of a text model, which are encoded on a thread of their own at first.
-    fn words(&self, text: &Arc<TextService>) -> Arc<Words> {
-        let encoder_id = text.info().id;
-        let mut kept = self.words.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(words) = kept.as_ref().filter(|of| of.encoder_id == encoder_id && !of.has_failed()) {
-            return Arc::clone(words);
-        }
-        let (state, is_over) = (Mutex::new(State::Encoding), Condvar::new());
-        let words = Arc::new(Words { encoder_id, state, is_over });
-        let (cache, text, encoding) = (self.cache().clone(), Arc::clone(text), Arc::clone(&words));
-        let encode = move || encoding.become_ready(encode(&cache, &text));
-        if let Err(error) = std::thread::Builder::new().name("words".into()).spawn(encode) {
-            tracing::warn!("the words that things are named by cannot be encoded: {error}");
-            words.become_ready(None);
-        }
-        Arc::clone(kept.insert(words))
     }
 }
 
@@ -204,51 +165,4 @@ fn encode(cache: &EdgeCache, text: &TextService) -> Option<Vec<WordVector>> {
         tracing::warn!("the words that things are named by are encoded again next time: {error}");
     }
     Some(known)
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::atomic::Ordering;
-
-    use slag_common::manifest::Calibration;
-
-    use super::*;
-    use crate::testing::{Gate, Member, TestObject, TestShard, axes_service, open_gate, write_cache};
-
-    /// While the text model answers a question there are no names; then each word was encoded once, for all asked.
-    #[test]
-    fn names_come_once_the_words_are_encoded() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let members = (0..9).map(|i| Member { steps: [i, 0, 0], embedding: vec![0.0, 1.0, 0.0] }).collect();
-        let object = TestObject {
-            id: 4,
-            vectors: vec![0.0, 1.0, 0.0],
-            runs: std::iter::once(0..9).collect(),
-            n_gaussians: 9,
-        };
-        let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-        let shard = TestShard::new(vec![members]).build(false).with_objects(&[object], calibration);
-        write_cache(dir.path(), &[shard], 1);
-        let gate = Gate::default();
-        let (text, n_encoded) = axes_service(3, Arc::clone(&gate));
-        let engine = Engine::new(EdgeCache::open(dir.path()), text);
-        engine.reload().expect("a scene");
-        let on_board = engine.on_board().expect("a scene");
-        let budget = Budget::default();
-        std::thread::scope(|threads| {
-            threads.spawn(|| on_board.text.run("wait".to_owned()).expect("answers"));
-            while n_encoded.load(Ordering::SeqCst) == 0 {
-                std::thread::yield_now();
-            }
-            let early = engine.names(&on_board, Duration::from_millis(20), &budget).expect("no error");
-            open_gate(&gate);
-            assert!(early.is_none());
-        });
-        for _ in 0..2 {
-            let names = engine.names(&on_board, Duration::from_secs(20), &budget).expect("no error");
-            let names = names.expect("the words are encoded");
-            assert_eq!((names.len(), names.describe(0)[0].name.as_str()), (1, "1"));
-        }
-        assert_eq!(n_encoded.load(Ordering::SeqCst), 1 + 3);
-    }
 }

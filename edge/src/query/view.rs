@@ -9,7 +9,7 @@ use slag_view::{
 
 use super::engine::{Engine, QueryError};
 use super::map::MapStatus;
-use super::names::NAMES_WAIT;
+use super::naming::NAMES_WAIT;
 use super::request::{Negatives, QueryRequest};
 use crate::score::{Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy};
 use crate::store::Snapshot;
