@@ -8,6 +8,7 @@ mod failure;
 mod fetch;
 mod follow;
 mod goal;
+mod list;
 mod locate;
 mod models;
 mod network;
@@ -32,6 +33,7 @@ pub use failure::Exit;
 use failure::Failure;
 use fetch::FetchArgs;
 use goal::GoalArgs;
+use list::ListArgs;
 use locate::LocateArgs;
 use models::ModelsArgs;
 use query::QueryArgs;
@@ -65,6 +67,8 @@ enum Command {
     Serve(ServeArgs),
     /// Answer one question from the shards on board.
     Query(QueryArgs),
+    /// List the things on board and what they are called.
+    List(ListArgs),
     /// Find places to stand near a thing: reached, clear, and in sight of it.
     Goal(GoalArgs),
     /// Find the camera of a photo by the landmarks on board.
@@ -116,6 +120,7 @@ impl Cli {
             Command::Fetch(args) => (args.json, fetch::run(args, self.quiet)),
             Command::Serve(args) => (false, serve::run(args)),
             Command::Query(args) => (args.json, query::run(args)),
+            Command::List(args) => (args.json, list::run(args)),
             Command::Goal(args) => (args.json, goal::run(args)),
             Command::Locate(args) => (args.json, locate::run(args)),
             Command::Changes(args) => (args.json, changes::run(args)),
@@ -142,7 +147,7 @@ impl Cli {
 
 #[cfg(test)]
 mod tests {
-    use crate::query::{AnswerKind, Negatives};
+    use crate::query::{AnswerKind, ListFormat, Negatives, ObjectOrder};
     use crate::score::Precision;
     use glam::DVec3;
     use slag_common::frames::Aabb;
@@ -183,6 +188,11 @@ mod tests {
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         let Command::Goal(goal) = command("slag-edge goal chair --near 1,-2,0") else { panic!("goal") };
         assert_eq!((goal.radius_m, goal.limit), (0.3, 3));
+        let Command::List(list) = command("slag-edge list --near 1,-2,0 --radius 3 --sort area --format csv")
+        else {
+            panic!("list")
+        };
+        assert_eq!((list.sort, list.format), (ObjectOrder::Area, Some(ListFormat::Csv)));
         command("slag-edge query chair --encoder clip --provider tensorrt,cuda,cpu --model-threads 2");
         command("slag-edge locate a.jpg --focal-px 554.3 --gravity 0,1,0 --cache c --json");
     }
@@ -200,6 +210,10 @@ mod tests {
             "slag-edge query chair --box 1,2,3",
             "slag-edge query chair --negatives ,",
             "slag-edge goal",
+            "slag-edge list --near 1,2,3",
+            "slag-edge list --radius 3",
+            "slag-edge list --sort size",
+            "slag-edge list --format csv --json",
             "slag-edge locate a.jpg",
             "slag-edge locate a.jpg --focal-px 0",
             "slag-edge changes --from first",

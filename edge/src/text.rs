@@ -12,7 +12,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_models::{InferenceError, ModelDir, ModelError, SessionOptions, TextEncoder, words_of};
+use slag_models::{InferenceError, ModelDir, ModelError, SessionOptions, TextEncoder, words_to_find};
 
 /// Longest query text; every text model here truncates far below.
 pub const MAX_TEXT_BYTES: usize = 512;
@@ -116,7 +116,7 @@ impl TextService {
         &self.info
     }
 
-    /// Returns the phrases or words that it accepts; none if it accepts any text.
+    /// Returns the words that things can be called by; none if everyday nouns do.
     pub fn vocabulary(&self) -> &[String] {
         &self.vocabulary
     }
@@ -128,19 +128,24 @@ impl TextService {
 
     /// Returns a text's vector, `[dim]`, unit length. Blocks while other texts are encoded.
     pub fn encode(&self, text: &str) -> Result<Arc<[f32]>, TextError> {
-        let key = words_of(text)?;
+        let key = words_to_find(text)?;
         if let Some(vector) = self.cache().get(&key) {
             return Ok(vector);
         }
+        let vector: Arc<[f32]> = self.run(key.clone())?.into();
+        self.cache().put(key, Arc::clone(&vector));
+        Ok(vector)
+    }
+
+    /// Returns a text's vector as [`Self::encode`] does, without the cache and signs included.
+    pub(crate) fn run(&self, text: String) -> Result<Vec<f32>, TextError> {
         let (reply, answer) = sync_channel(1);
         let jobs = self.jobs.as_ref().ok_or(TextError::Stopped)?;
-        jobs.try_send(Job { text: key.clone(), reply }).map_err(|e| match e {
+        jobs.try_send(Job { text, reply }).map_err(|e| match e {
             TrySendError::Full(_) => TextError::Busy,
             TrySendError::Disconnected(_) => TextError::Stopped,
         })?;
-        let vector: Arc<[f32]> = answer.recv().map_err(|_| TextError::Stopped)??.into();
-        self.cache().put(key, Arc::clone(&vector));
-        Ok(vector)
+        Ok(answer.recv().map_err(|_| TextError::Stopped)??)
     }
 
     fn cache(&self) -> std::sync::MutexGuard<'_, Cache> {

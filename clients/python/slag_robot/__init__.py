@@ -169,7 +169,7 @@ class Robot:
             offset = reply.results[0].next_offset
 
     def objects(self, near: Optional[Sequence[float]] = None, **parameters: Any) -> Iterator[dict[str, Any]]:
-        """Yields the things on board, page by page: near, radius, min_size, limit as `GET /v1/objects` takes
+        """Yields the things on board, page by page: near, radius, sort, min_size, limit as `GET /v1/objects` takes
         them."""
         while True:
             page = self._send("/v1/objects?" + urllib.parse.urlencode(_pairs(near, parameters)))

@@ -8,6 +8,8 @@
 //! cube root of k: hue and chroma / L are invariant and decide between hues. Lightness matters only for names
 //! that depend on it (white, grey, black; orange, brown; red, pink), relative to the crop's own highlights.
 
+use std::sync::LazyLock;
+
 use slag_math::stats::{Rank, quantile};
 
 use crate::crop::Crop;
@@ -83,6 +85,11 @@ const SYNONYMS: [(&str, &str); 24] = [
 const STOP_WORDS: &str = "a an the and or of with in is are that this some any all thing things object objects item items \
     coloured colored photo something anything everything one ones find where there";
 
+/// Returns the words of colours and shapes.
+fn known() -> Vec<String> {
+    COLOURS.iter().chain(&SHAPES).map(|&word| word.to_owned()).collect()
+}
+
 /// The stand-in; both an image and a text encoder.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ColourShape;
@@ -94,6 +101,11 @@ impl TextEncoder for ColourShape {
 
     fn dim(&self) -> usize {
         DIM
+    }
+
+    fn vocabulary(&self) -> Option<&[String]> {
+        static WORDS: LazyLock<Vec<String>> = LazyLock::new(known);
+        Some(&WORDS)
     }
 
     fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
@@ -120,8 +132,7 @@ impl TextEncoder for ColourShape {
         }
         // All colours together cancel out, as if the text had only stop words.
         if !unknown.is_empty() || !normalise(&mut vector) {
-            let known = COLOURS.iter().chain(&SHAPES).map(|&word| word.to_owned()).collect();
-            return Err(InferenceError::UnknownWords { unknown, known });
+            return Err(InferenceError::UnknownWords { unknown, known: known() });
         }
         Ok(vector)
     }

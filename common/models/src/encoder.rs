@@ -45,7 +45,7 @@ pub trait TextEncoder: Send {
     /// Encodes `text`: `[dim]`, a unit vector, centred if the description asks for it.
     fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError>;
 
-    /// Returns the phrases or words that it accepts; `None` if it accepts any text.
+    /// Returns the words that things can be called by, if it knows some and not others; `None` if everyday nouns do.
     fn vocabulary(&self) -> Option<&[String]> {
         None
     }

@@ -12,6 +12,8 @@ mod embedded {
     pub const IMAGE: &[u8] = include_bytes!("../embedded/image.onnx");
     pub const TEXT: &[u8] = include_bytes!("../embedded/text.onnx");
     pub const TOKENIZER: &[u8] = include_bytes!("../embedded/tokenizer.json");
+    /// The nouns that the models learnt, one a line.
+    pub const NOUNS: &str = include_str!("../embedded/nouns.txt");
 }
 
 use crate::{
@@ -215,7 +217,9 @@ impl ModelDir {
             TextDescription::Onnx(text) => {
                 let model = files.open(&text.file, embedded::TEXT)?;
                 let tokenizer = files.open(&text.tokenizer, embedded::TOKENIZER)?;
-                Box::new(OnnxTextEncoder::open(name, dim, [&model, &tokenizer], text, centre, options)?)
+                let encoder = OnnxTextEncoder::open(name, dim, [&model, &tokenizer], text, centre, options)?;
+                let is_embedded = matches!(files, Files::Embedded);
+                Box::new(encoder.with_vocabulary(is_embedded.then(|| embedded::NOUNS.lines())))
             }
             TextDescription::Phrases(text) => {
                 let (phrases, vectors) = (files.on_disk(&text.file)?, files.on_disk(&text.vectors)?);

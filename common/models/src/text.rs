@@ -97,6 +97,8 @@ pub struct OnnxTextEncoder {
     is_i32: bool,
     /// Subtracted from the unit vector, `[dim]`.
     centre: Option<Vec<f32>>,
+    /// The words of a model that knows some and not others.
+    vocabulary: Option<Vec<String>>,
 }
 
 impl OnnxTextEncoder {
@@ -132,7 +134,8 @@ impl OnnxTextEncoder {
             .expect_output(description.output.as_deref(), TensorElementType::Float32, &[1, dim as i64])?
             .name;
         let (name, description) = (name.to_owned(), description.clone());
-        let mut encoder = Self { name, dim, model, tokens, description, output, is_i32, centre };
+        let mut encoder =
+            Self { name, dim, model, tokens, description, output, is_i32, centre, vocabulary: None };
         let largest = encoder.tokens.largest_id();
         let end = encoder.description.end_token_id.unwrap_or(0);
         match encoder.run(&[largest, end]) {
@@ -143,6 +146,11 @@ impl OnnxTextEncoder {
             }
             Err(cause) => Err(cause.into()),
         }
+    }
+
+    /// Says which words the model knows; of one without, that it knows them all.
+    pub(crate) fn with_vocabulary<'a>(self, words: Option<impl Iterator<Item = &'a str>>) -> Self {
+        Self { vocabulary: words.map(|words| words.map(str::to_owned).collect()), ..self }
     }
 
     /// Runs the model on token ids; returns its vector, `[dim]`.
@@ -187,6 +195,10 @@ impl TextEncoder for OnnxTextEncoder {
         } else {
             Err(InferenceError::NoDirection { model: self.name.clone(), index: 0 })
         }
+    }
+
+    fn vocabulary(&self) -> Option<&[String]> {
+        self.vocabulary.as_deref()
     }
 
     fn placement(&self) -> Option<&Placement> {

@@ -9,7 +9,7 @@ const NAMELESS: &str = "a an and are at behind beneath between biggest bring by 
 
 /// Returns the words of a text, with a space between them. Signs around words count for nothing: emoji, quotation
 /// marks, question marks, invisible characters. A text without a word that can name a thing is refused.
-pub fn words_of(text: &str) -> Result<String, InferenceError> {
+pub fn words_to_find(text: &str) -> Result<String, InferenceError> {
     let is_invisible = |c: &char| matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{2069}' | '\u{fe00}'..='\u{fe0f}' | '\u{feff}');
     let visible: String = text.chars().filter(|c| !is_invisible(c)).collect();
     // A sign within a word, as in "t-shirt", belongs to it; emoji divide words.
@@ -40,11 +40,11 @@ mod tests {
         for text in
             ["chair", " chair ?", "\"chair\"", "🪑 chair", "ch\u{200d}air", "\u{202e}chair", "(chair).."]
         {
-            assert_eq!(words_of(text).expect(text), "chair");
+            assert_eq!(words_to_find(text).expect(text), "chair");
         }
-        assert_eq!(words_of("a man’s T-shirt, size 3.5").expect("named"), "a man’s T-shirt size 3.5");
-        assert_eq!(words_of("so\u{ad}fa🪑ch\u{200b}air").expect("named"), "sofa chair");
-        assert_eq!(words_of("чашка на столе").expect("named"), "чашка на столе");
+        assert_eq!(words_to_find("a man’s T-shirt, size 3.5").expect("named"), "a man’s T-shirt size 3.5");
+        assert_eq!(words_to_find("so\u{ad}fa🪑ch\u{200b}air").expect("named"), "sofa chair");
+        assert_eq!(words_to_find("чашка на столе").expect("named"), "чашка на столе");
     }
 
     #[test]
@@ -70,7 +70,7 @@ mod tests {
             "second",
             "on",
         ] {
-            assert!(matches!(words_of(text), Err(InferenceError::EmptyText)), "{text}");
+            assert!(matches!(words_to_find(text), Err(InferenceError::EmptyText)), "{text}");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! `GET /v1/view`: what there is to draw.
 
-use std::time::{Duration, Instant};
+use std::collections::BTreeMap;
 
 use glam::{DVec3, Vec3};
 use schemars::JsonSchema;
@@ -125,39 +125,36 @@ impl Photo {
 pub struct Words {
     /// The generation whose things are counted.
     pub generation: u64,
-    /// Those of most things first: the words that the text model knows, or of one that takes any text everyday
-    /// words that find something.
+    /// The names of things, the likeliest first; then the other words of a model that knows some and not others.
     pub words: Vec<Word>,
-    /// Whether all are counted; if not, the next request goes on.
+    /// Whether things have their names; if not, ask again in a second.
     pub complete: bool,
 }
 
 impl Words {
-    /// Most words that are counted: lists of phrases for people are shorter.
-    pub const MAX: usize = 2048;
-    /// Time after which a request encodes no further everyday word: questions wait meanwhile.
-    const ENCODING: Duration = Duration::from_millis(500);
-
-    /// Encodes words as long as there is time for it. Returns what `encode` made of them, and whether all were
-    /// encoded.
-    pub fn encode<'a, V, E>(
-        words: impl IntoIterator<Item = &'a str>,
-        mut encode: impl FnMut(&'a str) -> Result<V, E>,
-    ) -> Result<(Vec<V>, bool), E> {
-        let (started, mut encoded) = (Instant::now(), Vec::new());
-        for word in words {
-            if started.elapsed() > Self::ENCODING {
-                return Ok((encoded, false));
-            }
-            encoded.push(encode(word)?);
+    /// Counts things by their best names, each with its confidence; adds the other words of a `vocabulary`. Names
+    /// are ordered by the number of things to expect: the sum of their confidences.
+    pub fn new<'a>(
+        generation: u64,
+        best: impl IntoIterator<Item = (&'a str, f32)>,
+        vocabulary: &[String],
+    ) -> Self {
+        let mut counts: BTreeMap<&str, (f32, usize)> = BTreeMap::new();
+        for (name, confidence) in best {
+            let (expected, n_things) = counts.entry(name).or_default();
+            (*expected, *n_things) = (*expected + confidence, *n_things + 1);
         }
-        Ok((encoded, true))
+        let others = vocabulary.iter().filter(|word| !counts.contains_key(word.as_str()));
+        let others = others.map(|word| Word { word: word.clone(), n_things: 0 });
+        let mut named: Vec<(&str, (f32, usize))> = counts.iter().map(|(name, of)| (*name, *of)).collect();
+        named.sort_by(|a, b| b.1.0.total_cmp(&a.1.0));
+        let named = named.into_iter().map(|(name, (_, n_things))| Word { word: name.to_owned(), n_things });
+        Self { generation, words: named.chain(others).collect(), complete: true }
     }
 
-    /// Orders words by their things; equal ones stay in the model's order.
-    pub fn new(generation: u64, mut words: Vec<Word>, complete: bool) -> Self {
-        words.sort_by_key(|word| std::cmp::Reverse(word.n_things));
-        Self { generation, words, complete }
+    /// Returns the reply while the words are encoded.
+    pub fn pending(generation: u64) -> Self {
+        Self { generation, words: Vec::new(), complete: false }
     }
 }
 
@@ -166,7 +163,7 @@ impl Words {
 pub struct Word {
     /// The word, or phrase.
     pub word: String,
-    /// Things that are found by it.
+    /// Things whose best name it is.
     pub n_things: usize,
 }
 
@@ -185,19 +182,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_are_encoded_while_there_is_time() {
-        let of = |pause: Duration| {
-            Words::encode(["mug", "chair", "lamp"], |word| {
-                std::thread::sleep(pause);
-                Ok::<_, ()>(word.len())
-            })
-        };
-        assert_eq!(of(Duration::ZERO), Ok((vec![3, 5, 4], true)));
-        // What has begun is finished.
-        assert_eq!(of(Words::ENCODING), Ok((vec![3], false)));
-        assert_eq!(
-            Words::encode(["mug", "chair"], |word| if word == "mug" { Ok(()) } else { Err(word) }),
-            Err("chair")
-        );
+    fn likely_names_come_first_and_words_of_no_thing_last() {
+        let best = [("mug", 0.4), ("crib", 0.1), ("chair", 0.9), ("crib", 0.2), ("crib", 0.05)];
+        let vocabulary = ["lamp", "mug", "sofa"].map(str::to_owned);
+        let words = Words::new(7, best, &vocabulary);
+        let found: Vec<(&str, usize)> = words.words.iter().map(|of| (&*of.word, of.n_things)).collect();
+        assert_eq!(found, [("chair", 1), ("mug", 1), ("crib", 3), ("lamp", 0), ("sofa", 0)]);
+        assert!(words.complete && words.generation == 7 && !Words::pending(7).complete);
     }
 }

@@ -9,7 +9,7 @@ use slag_robot::Changes;
 #[serde(deny_unknown_fields)]
 pub struct Compare {
     /// Kinds of things that may have changed, such as ["chair", "box"]: each changed thing names the one that it
-    /// is most like. The map has no names of its own.
+    /// is most like.
     #[serde(default)]
     #[schemars(length(max = 32))]
     pub words: Vec<String>,

@@ -6,6 +6,7 @@ mod args;
 mod changes;
 mod find;
 pub mod http;
+mod list;
 mod locate;
 mod place;
 mod stand;

@@ -15,8 +15,7 @@ const SECS_PER_HOUR: f64 = 3600.0;
 #[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Asked {
-    /// Kinds of things to count, such as ["chair", "table", "door"]. The map has no list of names: it can only say
-    /// how many things match given words.
+    /// Kinds of things to count, such as ["chair", "table", "door"]: how many things match each.
     #[serde(default)]
     #[schemars(length(max = 32))]
     pub words: Vec<String>,

@@ -8,14 +8,16 @@ use slag_robot::{Robot, RobotError};
 
 use crate::changes::{Compare, Difference};
 use crate::find::{Found, Wanted};
+use crate::list::{Listed, Listing};
 use crate::locate::{Places, Seen};
 use crate::place::{Asked, Description};
 use crate::stand::{Going, Stands};
 
 const INSTRUCTIONS: &str = "Answers where things are on the robot's map of its surroundings. All positions are in the \
     map's world frame and belong to the generation that the answer names. The map is a record of the past: things may \
-    have moved since. Ask describe_place first if you do not know how large the map is; ask find for each thing, and where_to_stand before \
-    going to one.";
+    have moved since. Ask describe_place first if you do not know how large the map is, and list if you do not know what \
+    is there; ask find for each thing, and where_to_stand before going to one. Names in a list are guesses with their \
+    chances.";
 
 /// The tools over a robot.
 #[derive(Clone, Debug)]
@@ -38,6 +40,16 @@ impl Tools {
         let request = wanted.request()?;
         let refused = |error: RobotError| error.to_string();
         self.blocking(move |robot| Found::new(robot.ask(&request).map_err(refused)?)).await.map(Json)
+    }
+
+    /// List the things on the robot's map with what they are probably called, the largest first or by name.
+    #[tool(annotations(title = "What is here", read_only_hint = true, open_world_hint = false))]
+    async fn list(&self, Parameters(listing): Parameters<Listing>) -> Result<Json<Listed>, String> {
+        let parameters = listing.parameters()?;
+        let refused = |error: RobotError| error.to_string();
+        self.blocking(move |robot| robot.objects(&parameters).map(Listed::from).map_err(refused))
+            .await
+            .map(Json)
     }
 
     /// Find where the robot can stand near a thing: places that it reaches, has room at, and sees the thing from,

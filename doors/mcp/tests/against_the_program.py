@@ -42,7 +42,7 @@ async def check(client, robot, word):
     assert client.server_info.name == "slag-mcp", client.server_info
     assert "world frame" in client.instructions
     tools = {tool.name: tool for tool in (await client.list_tools()).tools}
-    assert sorted(tools) == ["describe_place", "find", "what_changed", "where_am_i", "where_to_stand"], sorted(tools)
+    assert sorted(tools) == ["describe_place", "find", "list", "what_changed", "where_am_i", "where_to_stand"], sorted(tools)
     for tool in tools.values():
         assert tool.description and tool.annotations.read_only_hint, tool
         assert tool.output_schema["type"] == "object", tool.output_schema
@@ -101,6 +101,19 @@ async def check(client, robot, word):
     beyond = beyond.structured_content
     assert beyond["appeared"] == beyond["went"] == beyond["moved"] == [], beyond
 
+    # The robot's own list is the oracle, page by page.
+    truth = get(f"{robot}/v1/objects?sort=area")
+    listed, after = [], None
+    while after is not None or not listed:
+        page = (await client.call_tool("list", {"limit": 2, **({"after": after} if after else {})})).structured_content
+        assert page["n_things"] == truth["n_objects"] and page["named"] and page["things"], page
+        listed, after = listed + page["things"], page.get("next_after")
+    told = [(one["id"], one["names"], one["position_in_world"]) for one in listed]
+    assert told == [(one["id"], one["names"], one["position_in_world"]) for one in truth["objects"]], (told, truth)
+    assert any(one["names"][0]["name"] == word for one in listed), (word, listed)
+    nothing = (await client.call_tool("list", {"near": away, "radius": 1.0})).structured_content
+    assert nothing["n_things"] == 0 and nothing["things"] == [], nothing
+
     place = get(f"{robot}/v1/map")
     here = (await client.call_tool("describe_place", {"words": [word]})).structured_content
     assert here["n_things"] == place["n_objects"] and here["scene"] == place["scene"], here
@@ -125,6 +138,9 @@ async def check(client, robot, word):
         ("find", {"what": ""}, "text"),
         ("find", {"what": word, "near": [0, 0, 0], "radius": -1.0}, "radius"),
         ("describe_place", {"near": [0, 0, 0]}, "go together"),
+        ("list", {"radius": 1.0}, "go together"),
+        ("list", {"limit": 1000}, "expected 1 to 200"),
+        ("list", {"after": "3"}, "after"),
         ("where_to_stand", {"what": word, "radius_m": 9.0}, "radius_m"),
         ("what_changed", {"from_generation": 10**6}, "generation"),
         ("where_am_i", {"photo_base64": "no base64", "focal_px": 80}, "photo_base64"),

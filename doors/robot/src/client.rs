@@ -10,7 +10,7 @@ use crate::error::{MAX_TEXT_BYTES, RobotError};
 use crate::floor::Floor;
 use crate::goal::Goals;
 use crate::locate::Whereabouts;
-use crate::place::Place;
+use crate::place::{OnBoard, Place};
 use crate::reply::{PointAnswer, Reply};
 
 /// Longest reply that is read: ten thousand answers are 10 MB.
@@ -62,12 +62,18 @@ impl Robot {
         self.get("/v1/map")
     }
 
+    /// Returns things on board, by the parameters of `GET /v1/objects`.
+    pub fn objects(&self, parameters: &[(&str, String)]) -> Result<OnBoard, RobotError> {
+        self.get_with("/v1/objects", parameters)
+    }
+
     /// Returns the number of things on board, or of those in a ball.
     pub fn n_objects(&self, ball: Option<([f64; 3], f64)>) -> Result<u64, RobotError> {
-        let filter = ball.map(|([x, y, z], radius)| format!("&near={x},{y},{z}&radius={radius}"));
-        let path = format!("/v1/objects?limit=1{}", filter.unwrap_or_default());
-        let page: Value = self.get(&path)?;
-        page["n_objects"].as_u64().ok_or_else(|| self.foreign(&path, "n_objects is no number"))
+        let mut parameters = vec![("limit", "1".to_owned())];
+        if let Some(([x, y, z], radius)) = ball {
+            parameters.extend([("near", format!("{x},{y},{z}")), ("radius", radius.to_string())]);
+        }
+        Ok(self.objects(&parameters)?.n_objects)
     }
 
     /// Returns places to stand, by the parameters of `GET /v1/goal`.

@@ -17,5 +17,5 @@ pub use error::RobotError;
 pub use floor::{Floor, Place as FloorPlace};
 pub use goal::{Goal, GoalMiss, GoalThing, Goals};
 pub use locate::{CameraPose, Whereabouts};
-pub use place::{Box3, Cell, Place};
+pub use place::{Box3, Cell, Name, OnBoard, OnBoardThing, Place};
 pub use reply::{Answer, Geographic, Nothing, OrientedBox, PointAnswer, Reply, Results, Witness};

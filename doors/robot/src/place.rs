@@ -1,4 +1,4 @@
-//! The reply to `/v1/map`.
+//! The replies to `/v1/map` and `/v1/objects`.
 
 use serde::Deserialize;
 
@@ -37,6 +37,45 @@ pub struct Cell {
     /// Whether the robot wanted it and could not fetch it; of missing cells only.
     #[serde(default)]
     pub is_wanted: bool,
+}
+
+/// Things on board.
+#[derive(Clone, Debug, Deserialize)]
+pub struct OnBoard {
+    pub scene: String,
+    /// The published state on board.
+    pub generation: u64,
+    /// `m`, or `world` for scenes whose scale is unknown.
+    pub unit: String,
+    /// Whether the things have names.
+    pub named: bool,
+    /// Things that were asked for, over all pages.
+    pub n_objects: u64,
+    /// `after` of the next page, if there is one.
+    pub next_after: Option<String>,
+    /// Those of this page.
+    pub objects: Vec<OnBoardThing>,
+}
+
+/// A thing on board.
+#[derive(Clone, Debug, Deserialize)]
+pub struct OnBoardThing {
+    /// Stable within a generation.
+    pub id: String,
+    /// What it is called, best first.
+    pub names: Vec<Name>,
+    /// Its middle.
+    pub position_in_world: [f64; 3],
+    #[serde(flatten)]
+    pub bounds: Box3,
+}
+
+/// A name of a thing.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Name {
+    pub name: String,
+    /// The chance that it is right.
+    pub confidence: f32,
 }
 
 /// A box along the axes.

@@ -111,6 +111,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     {
         tracing::warn!("{error}");
     }
+    engine.begin_names();
     let query_timeout = Duration::from_secs(args.max_query_secs);
     let settings = Settings { access, ..Settings::with_budget(args.max_query_bytes, query_timeout) };
     let (drain, blocking_threads) =

@@ -102,7 +102,7 @@ fn things(
 ) -> Result<Result<Things, String>, GoalError> {
     let text = match &request.target {
         GoalTarget::Object(id) => {
-            let Some(object) = engine.object(snapshot, *id, budget)? else {
+            let Some(object) = engine.object(snapshot, None, *id, budget)? else {
                 let generation = snapshot.manifest.generation;
                 return Ok(Err(format!("generation {generation} has no object {} on board", public_id(*id))));
             };

@@ -6,8 +6,8 @@ use serde::Deserialize;
 
 use super::forms::{self, BoxText, LatLonPolygonText, LatLonText, NegativesText, PolygonText, XyzText};
 use crate::query::{
-    AnswerKind, Area, AreaBall, AreaBox, Ask, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Format, MAX_GAUSSIANS,
-    MAX_NEGATIVES, MAX_TEXTS, Negatives, Point, RequestError, Words,
+    AnswerKind, Ask, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Format, MAX_GAUSSIANS, MAX_NEGATIVES, MAX_TEXTS,
+    Negatives, RequestError, Words,
 };
 use crate::score::{MAX_COORDINATE, Precision};
 
@@ -108,31 +108,19 @@ impl AskParams {
         let near = forms::point(self.near, self.near_lat_lon)?;
         let ball = match (self.radius, near) {
             (None, _) => None,
-            (Some(radius), Some(centre)) => Some(AreaBall { centre, radius }),
+            (Some(radius), Some(centre)) => Some((centre, radius)),
             (Some(radius), None) => {
                 let expected = format!("where the asker is, because radius is {radius}");
                 return Err(RequestError::new("near", "nothing", expected));
             }
         };
-        let bounds = self.bounds.map(|BoxText(bounds)| {
-            let [from, to] = [bounds.min, bounds.max].map(|corner| Point::World(corner.to_array()));
-            AreaBox { from, to }
-        });
-        let polygon = match (self.polygon, self.polygon_lat_lon) {
-            (Some(_), Some(_)) => {
-                let error = RequestError::new("polygon_lat_lon", "polygon as well", "one of the two");
-                return Err(error);
-            }
-            (world, geographic) => {
-                world.map(|PolygonText(corners)| corners).or(geographic.map(|of| of.0)).unwrap_or_default()
-            }
-        };
+        let region = forms::area(ball, self.bounds, self.polygon, self.polygon_lat_lon)?;
         Ok(Ask {
             texts: self.text,
             relations: Some(self.relations == Switch::On),
             negatives: self.negative.into(),
             kind: self.kind,
-            region: Area { ball, bounds, polygon },
+            region,
             near,
             heading_rad: self.heading_rad,
             min_score: self.min_score,

@@ -6,7 +6,8 @@ use serde::de::{Deserialize, Deserializer, Error};
 use slag_common::frames::Aabb;
 
 use crate::query::{
-    Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, object_id, parse_box, parse_point,
+    Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, object_id, parse_box,
+    parse_point,
 };
 use crate::score::MAX_CORNERS;
 
@@ -103,6 +104,30 @@ pub fn point(near: Option<XyzText>, near_lat_lon: Option<LatLonText>) -> Result<
         (Some(_), Some(_)) => Err(RequestError::new("near_lat_lon", "near as well", "one of the two")),
         (world, geographic) => Ok(world.or(geographic)),
     }
+}
+
+/// Returns the area of a ball, a box and a polygon, each of which may be absent.
+///
+/// # Errors
+/// The polygon is given in two ways.
+pub fn area(
+    ball: Option<(Point, f64)>,
+    bounds: Option<BoxText>,
+    polygon: Option<PolygonText>,
+    polygon_lat_lon: Option<LatLonPolygonText>,
+) -> Result<Area, RequestError> {
+    let corner = |corner: DVec3| Point::World(corner.to_array());
+    let polygon = match (polygon, polygon_lat_lon) {
+        (Some(_), Some(_)) => {
+            return Err(RequestError::new("polygon_lat_lon", "polygon as well", "one of the two"));
+        }
+        (world, geographic) => world.map(|of| of.0).or(geographic.map(|of| of.0)).unwrap_or_default(),
+    };
+    Ok(Area {
+        ball: ball.map(|(centre, radius)| AreaBall { centre, radius }),
+        bounds: bounds.map(|BoxText(of)| AreaBox { from: corner(of.min), to: corner(of.max) }),
+        polygon,
+    })
 }
 
 /// Returns the ball of a point and a radius, both of which may be absent.

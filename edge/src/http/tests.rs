@@ -28,6 +28,7 @@ mod answers;
 mod attacks;
 mod changes;
 mod goal;
+mod list;
 mod locate;
 mod openapi;
 mod ply;

@@ -1,7 +1,7 @@
 //! Query engine: a cache, a text model, and the questions asked of them. Shared by the HTTP service and the
 //! command line.
 
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use slag_common::Hash32;
@@ -11,6 +11,8 @@ use slag_common::shard::ShardView;
 use slag_models::{InferenceError, SessionOptions};
 
 use super::carried;
+use super::names::{Names, Words};
+use super::oriented::OrientedBox;
 use super::relations;
 use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
@@ -70,6 +72,8 @@ impl QueryError {
 struct Loaded {
     text: Arc<TextService>,
     snapshot: Option<Arc<Snapshot>>,
+    /// What is known of its things since it was asked for.
+    listed: Arc<Listed>,
     /// State of `current` at the last attempt to load it.
     tried: Option<Stat>,
     failed_at: Option<Instant>,
@@ -79,7 +83,15 @@ struct Loaded {
 /// not take the vectors of one model to the scene of another.
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
-    text: Arc<TextService>,
+    pub(super) text: Arc<TextService>,
+    pub(super) listed: Arc<Listed>,
+}
+
+/// The names of a generation's things, and their boxes along axes of their own, in the order of the index.
+#[derive(Default)]
+pub(super) struct Listed {
+    pub(super) names: OnceLock<Names>,
+    pub(super) boxes: OnceLock<Vec<OnceLock<OrientedBox>>>,
 }
 
 impl OnBoard {
@@ -100,11 +112,6 @@ impl OnBoard {
     /// Returns whether the text model runs.
     pub(crate) fn text_is_alive(&self) -> bool {
         self.text.is_alive()
-    }
-
-    /// Returns the words that the text model knows; none if it takes any text.
-    pub(super) fn vocabulary(&self) -> &[String] {
-        self.text.vocabulary()
     }
 
     /// Returns the vector of a text.
@@ -135,6 +142,8 @@ pub struct Engine {
     /// Options to open the text models with that scenes carry; absent if the text model is given.
     carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
+    /// Vectors of the words that things are named by.
+    pub(super) words: Mutex<Option<Arc<Words>>>,
     /// Buffers of finished answers, one for each answer computed at a time.
     idle: Mutex<Vec<Scratch>>,
 }
@@ -142,8 +151,15 @@ pub struct Engine {
 impl Engine {
     /// Makes an engine of a text model without loading a scene yet.
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
-        let loaded = Loaded { text: Arc::new(text), snapshot: None, tried: None, failed_at: None };
-        Self { cache, carried: None, loaded: RwLock::new(loaded), idle: Mutex::default() }
+        let (text, listed) = (Arc::new(text), Arc::default());
+        let loaded = Loaded { text, snapshot: None, listed, tried: None, failed_at: None };
+        Self {
+            cache,
+            carried: None,
+            loaded: RwLock::new(loaded),
+            words: Mutex::default(),
+            idle: Mutex::default(),
+        }
     }
 
     /// Makes an engine that takes the text model of each scene which carries one, and that of `otherwise` before.
@@ -203,7 +219,8 @@ impl Engine {
             Ok(snapshot) => {
                 let (tried, failed_at) = (snapshot.current_stat, snapshot.may_recover.then(Instant::now));
                 let snapshot = Some(Arc::new(snapshot));
-                let before = std::mem::replace(&mut *loaded, Loaded { text, snapshot, tried, failed_at });
+                let fresh = Loaded { text, snapshot, listed: Arc::default(), tried, failed_at };
+                let before = std::mem::replace(&mut *loaded, fresh);
                 // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
                 drop(before);
@@ -228,7 +245,7 @@ impl Engine {
     pub fn on_board(&self) -> Result<OnBoard, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let snapshot = loaded.snapshot.clone().ok_or(QueryError::NoScene)?;
-        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text) })
+        Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), listed: Arc::clone(&loaded.listed) })
     }
 
     /// Runs work on a generation, with buffers of earlier answers.
@@ -272,7 +289,8 @@ mod tests {
         let snapshot = Snapshot::open(&EdgeCache::open(dir.path())).expect("opens");
         let info = EncoderInfo { id, ..Axes::info(2) };
         let text = TextService::start(info, Box::new(Axes::new(2))).expect("a thread");
-        Loaded { text: Arc::new(text), snapshot: Some(Arc::new(snapshot)), tried: None, failed_at: None }
+        let (text, snapshot) = (Arc::new(text), Some(Arc::new(snapshot)));
+        Loaded { text, snapshot, listed: Arc::default(), tried: None, failed_at: None }
     }
 
     /// While generations of two encoders replace each other, no question takes the text model of one to the scene

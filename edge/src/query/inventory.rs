@@ -1,19 +1,25 @@
 //! The things on board, and the area that they lie in.
 
 use std::cmp::Reverse;
+use std::sync::OnceLock;
+use std::time::Duration;
 
 use glam::DVec3;
 use schemars::JsonSchema;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use slag_common::frames::{Aabb, Geographic};
+use slag_common::objects::public_id;
+use slag_models::names::MAX_NAMES;
 
 use super::answers::Evidence;
 use super::cluster::{Grouping, cluster};
-use super::engine::{Engine, QueryError};
+use super::engine::{Engine, OnBoard, QueryError};
 use super::extent::Extent;
 use super::frame::{FRAME, UNITS, unit};
+use super::names::{Name, Names};
 use super::objects::{self, FoundObject};
 use super::oriented::OrientedBox;
+use super::request::RequestError;
 use super::scene::{Scene, alignment, default_voxel};
 use crate::score::{Budget, Region, Run, ScoreError};
 use crate::store::Snapshot;
@@ -21,14 +27,28 @@ use crate::store::Snapshot;
 /// The form of an object's id.
 pub const OBJECT_ID: &str = "^o[0-9a-f]{16}$";
 
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// Order of the objects.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum ObjectOrder {
+    /// By id.
+    #[default]
+    Id,
+    /// By the best name, the surest first; those without names last.
+    Name,
+    /// By the area of the largest face of the box, the largest first.
+    Area,
+}
+
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct ObjectFilter {
-    /// Only those with larger ids.
+    /// Only those after the object with this id.
     pub after: Option<u64>,
-    /// Only those with their position within this distance of a point.
-    pub ball: Option<(DVec3, f64)>,
+    /// Only those with their position there.
+    pub region: Region,
     /// Least length of the longest edge of the box.
     pub min_size: f64,
+    pub order: ObjectOrder,
 }
 
 /// An object on board.
@@ -37,6 +57,9 @@ pub struct ObjectFilter {
 pub struct ObjectOnBoard {
     /// Its id: `o` and 16 hex digits.
     pub id: String,
+    /// What it is called, best first; see the page's `named`.
+    #[schemars(length(max = MAX_NAMES))]
+    pub names: Vec<Name>,
     /// Frame of every position.
     #[schemars(extend("enum" = [FRAME]))]
     pub frame: &'static str,
@@ -77,11 +100,14 @@ pub struct ObjectPage {
     /// Unit of every position and length: `m`, or `world` if the scene is not metric.
     #[schemars(extend("enum" = UNITS))]
     pub unit: &'static str,
+    /// Whether the objects have names: not while the text model encodes the words (ask again in a second), nor if it
+    /// is another than the scene's.
+    pub named: bool,
     /// Objects that pass the filter, over all pages.
     pub n_objects: usize,
     /// `after` of the next page; null if there is none.
     pub next_after: Option<String>,
-    /// The objects, by id.
+    /// The objects, in the order asked for.
     pub objects: Vec<ObjectOnBoard>,
 }
 
@@ -93,29 +119,37 @@ pub fn object_id(text: &str) -> Option<u64> {
 }
 
 impl Engine {
-    /// Returns the objects of a generation that pass a filter, by id, at most `limit`.
+    /// Returns the objects on board that pass a filter, at most `limit`; waits at most `wait` for their names.
     pub fn objects(
         &self,
-        snapshot: &Snapshot,
+        on_board: &OnBoard,
         filter: &ObjectFilter,
         limit: usize,
+        wait: Duration,
         budget: &Budget,
     ) -> Result<ObjectPage, QueryError> {
+        let names = self.names(on_board, wait, budget)?;
+        let snapshot = &on_board.snapshot;
         budget.take(limit.min(snapshot.objects.len()) * size_of::<ObjectOnBoard>());
-        let page = self.on_scene(snapshot, budget, |_, scene| page(scene, filter, limit, budget));
+        let unmeasured = || (0..snapshot.objects.len()).map(|_| OnceLock::new()).collect();
+        let boxes: &[OnceLock<OrientedBox>] = on_board.listed.boxes.get_or_init(unmeasured);
+        let page =
+            self.on_scene(snapshot, budget, |_, scene| page(scene, (names, boxes), filter, limit, budget));
         budget.check().map_err(ScoreError::from)?;
-        Ok(page)
+        Ok(page?)
     }
 
+    /// Returns an object of a generation, with those of `names` that it has.
     pub fn object(
         &self,
         snapshot: &Snapshot,
+        names: Option<&Names>,
         id: u64,
         budget: &Budget,
     ) -> Result<Option<ObjectOnBoard>, QueryError> {
         let found = self.on_scene(snapshot, budget, |_, scene| {
             let object = number_of(scene, id)?;
-            take_points(scene, object, budget).then(|| describe(scene, object))
+            take_points(scene, object, budget).then(|| describe(scene, names, object, &OnceLock::new()))
         });
         budget.check().map_err(ScoreError::from)?;
         Ok(found)
@@ -178,50 +212,98 @@ fn number_of(scene: &Scene<'_>, id: u64) -> Option<usize> {
     (low < scene.index.len() && objects::record(scene, low).id == id).then_some(low)
 }
 
-fn page(scene: &Scene<'_>, filter: &ObjectFilter, limit: usize, budget: &Budget) -> ObjectPage {
+fn page(
+    scene: &Scene<'_>,
+    (names, boxes): (Option<&Names>, &[OnceLock<OrientedBox>]),
+    filter: &ObjectFilter,
+    limit: usize,
+    budget: &Budget,
+) -> Result<ObjectPage, RequestError> {
     let passes = |object: &usize| {
         let record = objects::record(scene, *object);
-        filter.ball.is_none_or(|(centre, radius)| record.position().distance(centre) <= radius)
-            && record.bounds().size().max_element() >= filter.min_size
+        filter.region.contains(record.position()) && record.bounds().size().max_element() >= filter.min_size
     };
-    let all: Vec<usize> = (0..scene.index.len()).filter(passes).collect();
-    let is_after = |object: &usize| filter.after.is_none_or(|id| objects::record(scene, *object).id > id);
-    let mut rest = all.iter().copied().filter(is_after);
-    // Positions are needed for one at a time.
-    let described = |at: usize| {
-        let used_bytes = budget.used_bytes();
-        let described = take_points(scene, at, budget).then(|| describe(scene, at));
+    let mut all: Vec<usize> = (0..scene.index.len()).filter(passes).collect();
+    sort(scene, names, filter.order, &mut all);
+    let id = |object: &usize| objects::record(scene, *object).id;
+    let first = match filter.after {
+        None => 0,
+        Some(after) if filter.order == ObjectOrder::Id => all.partition_point(|object| id(object) <= after),
+        Some(after) => {
+            let at = all.iter().position(|object| id(object) == after);
+            let refused =
+                || RequestError::new("after", &public_id(after), "next_after of a page of the same objects");
+            at.ok_or_else(refused)? + 1
+        }
+    };
+    // Positions are needed for one at a time, and once.
+    let described = |at: &usize| {
+        let (used_bytes, measured) = (budget.used_bytes(), &boxes[*at]);
+        let may_go_on = measured.get().is_some() || take_points(scene, *at, budget);
+        let described = may_go_on.then(|| describe(scene, names, *at, measured));
         budget.give_back_to(used_bytes, 0);
         described
     };
-    let objects: Vec<ObjectOnBoard> = rest.by_ref().take(limit).map_while(described).collect();
-    let next_after = rest.next().and_then(|_| objects.last()).map(|last| last.id.clone());
+    let end = first.saturating_add(limit).min(all.len());
+    let objects: Vec<ObjectOnBoard> = all[first..end].iter().map_while(described).collect();
+    let is_last = end == all.len();
+    let next_after = objects.last().filter(|_| !is_last).map(|last| last.id.clone());
     let manifest = scene.manifest;
-    ObjectPage {
+    Ok(ObjectPage {
         scene: manifest.scene.clone(),
         generation: manifest.generation,
         frame: FRAME,
         unit: unit(manifest),
+        named: names.is_some(),
         n_objects: all.len(),
         next_after,
         objects,
+    })
+}
+
+/// Sorts objects that are in order of their ids.
+fn sort(scene: &Scene<'_>, names: Option<&Names>, order: ObjectOrder, all: &mut [usize]) {
+    match (order, names) {
+        (ObjectOrder::Id, _) | (ObjectOrder::Name, None) => {}
+        (ObjectOrder::Name, Some(names)) => {
+            let best = |object: &usize| names.of(*object).next();
+            all.sort_by(|a, b| match (best(a), best(b)) {
+                (Some(a), Some(b)) => a.0.cmp(b.0).then(b.1.total_cmp(&a.1)),
+                (a, b) => a.is_none().cmp(&b.is_none()),
+            });
+        }
+        (ObjectOrder::Area, _) => {
+            let area = |object: &usize| {
+                let [x, y, z] = objects::record(scene, *object).bounds().size().to_array();
+                (x * y).max(x * z).max(y * z)
+            };
+            all.sort_by(|a, b| area(b).total_cmp(&area(a)));
+        }
     }
 }
 
-fn describe(scene: &Scene<'_>, object: usize) -> ObjectOnBoard {
+/// Describes an object. `measured`: its box along axes of its own, if that was measured before.
+fn describe(
+    scene: &Scene<'_>,
+    names: Option<&Names>,
+    object: usize,
+    measured: &OnceLock<OrientedBox>,
+) -> ObjectOnBoard {
     let (record, everywhere) = (objects::record(scene, object), Region::default());
     let n_gaussians = objects::count_in(scene, object, &everywhere);
     let found = FoundObject { object, record, score: 0.0, n_gaussians, cut: None };
     let Extent { position_in_world, box_in_world: Aabb { min, max } } = found.extent();
     ObjectOnBoard {
         id: found.public_id(),
+        names: names.map(|names| names.describe(object)).unwrap_or_default(),
         frame: FRAME,
         generation: scene.manifest.generation,
         position_in_world,
         geographic: scene.manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
         box_min_in_world: min,
         box_max_in_world: max,
-        oriented_box: objects::oriented_box(scene, &found, &everywhere, alignment(scene.manifest)),
+        oriented_box: *measured
+            .get_or_init(|| objects::oriented_box(scene, &found, &everywhere, alignment(scene.manifest))),
         n_gaussians,
         n_gaussians_in_scene: u64::from(record.n_gaussians),
         evidence: Evidence { photo: objects::photo(scene, object).to_owned(), box_px: record.photo_box_px },

@@ -1,34 +1,23 @@
 //! What the page needs to draw the Gaussians on board, and to colour them by a question.
 
-use std::sync::Arc;
-
 use glam::{DVec3, Vec3};
 use slag_common::shard::ShardView;
-use slag_models::everyday_words;
 use slag_view::{
-    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, Photo, ScoresMessage, Step, Word,
+    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, Photo, ScoresMessage, Step,
     Words, cell_message,
 };
 
-use super::engine::{Engine, OnBoard, QueryError};
+use super::engine::{Engine, QueryError};
 use super::map::MapStatus;
-use super::objects;
+use super::naming::NAMES_WAIT;
 use super::request::{Negatives, QueryRequest};
-use super::threshold::calibrated_threshold;
-use crate::score::{
-    Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy, score_objects,
-};
+use crate::score::{Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy};
 use crate::store::Snapshot;
-use crate::text::TextError;
 
 /// Below every cosine, and below every difference of two cosines.
 const BELOW_ALL: f32 = -4.0;
 /// The program's name in a description.
 const PROGRAM: &str = "slag-edge";
-/// Words that are scored at a time: bounds the scores in memory.
-const WORDS_TOGETHER: usize = 64;
-
-type WordVector = (String, Arc<[f32]>);
 
 impl Engine {
     /// Describes the scene on board. `robot_in_world`: where the robot is, if that is known.
@@ -102,42 +91,17 @@ impl Engine {
         Ok(Some(cell_message(&positions, shard.appearance(), step)))
     }
 
-    /// Returns the words that the text model knows, each with the number of objects on board that it finds; of a
-    /// model that takes any text, everyday words that find something.
+    /// Returns what the things on board are called, each name with the number of things whose best one it is; then
+    /// the other words of a model that knows some and not others.
     pub(crate) fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
-        let snapshot = &on_board.snapshot;
-        let vocabulary = on_board.vocabulary();
-        let takes_any = vocabulary.is_empty();
-        let (known, is_complete) = match takes_any {
-            true => everyday_vectors(&on_board)?,
-            false => {
-                let vector = |word: &String| Ok((word.clone(), on_board.encode(word)?));
-                let known = vocabulary.iter().take(Words::MAX).map(vector);
-                (known.collect::<Result<Vec<_>, QueryError>>()?, true)
-            }
+        let generation = on_board.snapshot.manifest.generation;
+        let Some(names) = self.names(&on_board, NAMES_WAIT, budget)? else {
+            return Ok(Words::pending(generation));
         };
-        let mut words = Vec::new();
-        for known in known.chunks(WORDS_TOGETHER) {
-            let question =
-                |(_, vector): &WordVector| Question { vector: Arc::clone(vector), negatives: Vec::new() };
-            let questions: Vec<Question> = known.iter().map(question).collect();
-            budget.take(questions.len() * snapshot.objects.len() * size_of::<f32>());
-            budget.check().map_err(ScoreError::from)?;
-            let scored = self.on_scene(snapshot, budget, |_, scene| {
-                let encoder = &scene.manifest.encoder;
-                let calibration = encoder.calibration.and(objects::calibration(scene.objects));
-                let (threshold, _) = calibrated_threshold(encoder.default_threshold, calibration);
-                let scored = score_objects(scene.shards, scene.objects, scene.index, &questions)?;
-                let count = |scores: &[f32]| scores.iter().filter(|score| **score >= threshold).count();
-                Ok::<_, ScoreError>(scored.iter().map(|of_word| count(&of_word.scores)).collect::<Vec<_>>())
-            })?;
-            let counted = known.iter().zip(scored);
-            let counted = counted.map(|((word, _), n_things)| Word { word: word.clone(), n_things });
-            words.extend(counted.filter(|word| !takes_any || word.n_things > 0));
-        }
-        Ok(Words::new(snapshot.manifest.generation, words, is_complete))
+        let best = (0..names.len()).filter_map(|object| names.of(object).next());
+        Ok(Words::new(generation, best, on_board.text.vocabulary()))
     }
 
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.
@@ -160,17 +124,6 @@ impl Engine {
         });
         Ok(message?)
     }
-}
-
-/// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a
-/// while for each, and encodes some more at the next request.
-fn everyday_vectors(on_board: &OnBoard) -> Result<(Vec<WordVector>, bool), QueryError> {
-    let (vectors, is_complete) = Words::encode(everyday_words(), |word| match on_board.encode(word) {
-        Ok(vector) => Ok(Some((word.to_owned(), vector))),
-        Err(QueryError::Text(TextError::Encode(_))) => Ok(None),
-        Err(error) => Err(error),
-    })?;
-    Ok((vectors.into_iter().flatten().collect(), is_complete))
 }
 
 fn scores_message(

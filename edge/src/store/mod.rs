@@ -8,6 +8,7 @@
 //! | `staging/` | partial downloads | fetch |
 //! | `damaged/HASH` | marks of shards that were found damaged | readers: added; fetch: removed |
 //! | `history/GENERATION` | the objects of earlier generations; may be lost | fetch: replaced whole, removed |
+//! | `words/ENCODER` | vectors of the words that things are named by; may be lost | `serve`, `list`: replaced whole |
 //! | `trust/` | accepted metadata and scene, in two copies | fetch |
 //! | `usage.json` | when each shard was needed last; may be lost | fetch: replaced whole |
 //! | `lock` | locked by the one fetch | |
@@ -26,6 +27,7 @@ pub mod objects;
 mod scrubber;
 mod shard;
 mod snapshot;
+pub mod words;
 
 pub use bad_cell::{BadCell, CellFault, OldShard, can_stand_in, cell_of};
 pub use cache::{Current, CurrentCell, EdgeCache};

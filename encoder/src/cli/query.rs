@@ -8,7 +8,7 @@ use serde_json::json;
 use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
 use slag_common::{Gaussians, npy};
-use slag_models::words_of;
+use slag_models::words_to_find;
 
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
 use crate::query::{self, Hit};
@@ -59,7 +59,7 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
         return Err(anyhow!("--threshold is {threshold}, expected a cosine, -1 to 1"));
     }
     let mut encoder = text_encoder_of(&reader, &args.models)?;
-    let vector = encoder.encode(&words_of(&args.text)?)?;
+    let vector = encoder.encode(&words_to_find(&args.text)?)?;
     let scores = match args.profile {
         Some(profile) => query::scores_of_shards(&reader, &vector, profile)?,
         None => query::scores(&reader, &vector)?,

@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 use serde_json::{Value, json};
 use slag_common::manifest::{Calibration, Manifest};
 use slag_common::objects::{ObjectRecord, public_id};
+use slag_models::names::{Confidence, Naming, Spread};
 
 use super::shards::{Shard, combined};
 
@@ -46,15 +47,29 @@ impl Things {
         }
     }
 
-    /// Returns the number of things that a word finds.
-    pub(super) fn count(&self, manifest: &Manifest, word: &[f32]) -> usize {
-        let threshold = self.threshold(manifest, false);
-        let of_shard = |(shard, here): &(Shard, Vec<usize>)| {
-            let Some(objects) = shard.layout.objects(&shard.bytes) else { return 0 };
-            let scores = shard.layout.view(&shard.bytes).object_scores(&objects, word);
-            here.iter().filter(|at| scores[**at] >= threshold).count()
+    /// Returns the best name of each thing with its confidence. `words`: with their vectors.
+    pub(super) fn best_names<'a>(
+        &self,
+        manifest: &Manifest,
+        words: &[(&'a str, &[f32])],
+    ) -> Vec<(&'a str, f32)> {
+        let mut of_things: Vec<Vec<f32>> = Vec::new();
+        for (shard, here) in &self.shards {
+            let Some(objects) = shard.layout.objects(&shard.bytes) else { continue };
+            let view = shard.layout.view(&shard.bytes);
+            let of_words: Vec<Vec<f32>> =
+                words.iter().map(|(_, vector)| view.object_scores(&objects, vector)).collect();
+            of_things.extend(here.iter().map(|at| of_words.iter().map(|scores| scores[*at]).collect()));
+        }
+        let mut spread = Spread::default();
+        of_things.iter().for_each(|scores| spread.add(scores));
+        let confidence = Confidence::new(&manifest.encoder.name, spread);
+        let best = |scores: &Vec<f32>| {
+            let mut naming = Naming::default();
+            (0..).zip(scores).for_each(|(word, score)| naming.add(word, *score, &confidence));
+            naming.names(&confidence).next()
         };
-        self.shards.iter().map(of_shard).sum()
+        of_things.iter().filter_map(best).map(|(word, of)| (words[word as usize].0, of)).collect()
     }
 
     /// Answers a question, the first of `vectors`, against its negatives.

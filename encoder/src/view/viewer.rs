@@ -1,13 +1,14 @@
 //! Answers the page from what is shown.
 
-use std::convert::Infallible;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use glam::Vec3;
 use slag_common::{Hash32, View};
-use slag_models::{TextEncoder, everyday_words, words_of};
-use slag_view::{Description, Step, Word, Words};
+use slag_models::names::words_of;
+use slag_models::{TextEncoder, words_to_find};
+use slag_view::{Description, Step, Words};
 
 use super::error::ViewError;
 use super::generation::Generation;
@@ -15,6 +16,9 @@ use super::photos;
 use super::splat::Splat;
 use crate::diff::{self, Diff};
 use crate::store::StoreReader;
+
+/// Time after which a request encodes no further word: questions wait meanwhile.
+const ENCODING: Duration = Duration::from_millis(500);
 
 /// Opens the text encoder of a store; the error says what to do.
 pub(crate) type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
@@ -34,19 +38,28 @@ pub(crate) struct Viewed {
 struct OpenedText {
     id: Hash32,
     encoder: Box<dyn TextEncoder>,
-    /// Vectors of everyday words, as far as they were needed; `None` of one that it does not know.
-    everyday: Vec<Option<Vec<f32>>>,
+    /// The words that things are named by, and their vectors as far as they were needed; `None` of one that the model
+    /// does not know.
+    words: Vec<String>,
+    vectors: Vec<Option<Vec<f32>>>,
 }
 
 impl OpenedText {
-    /// Encodes some more everyday words. Returns those that it knows, and whether these are all.
-    fn everyday_words(&mut self) -> (Vec<(&'static str, &[f32])>, bool) {
-        let rest = everyday_words().skip(self.everyday.len());
-        let Ok((vectors, is_complete)) =
-            Words::encode(rest, |word| Ok::<_, Infallible>(self.encoder.encode(word).ok()));
-        self.everyday.extend(vectors);
-        let known = everyday_words().zip(&self.everyday);
-        (known.filter_map(|(word, vector)| Some((word, vector.as_deref()?))).collect(), is_complete)
+    /// Encodes some more words; returns whether all are encoded.
+    fn encode_words(&mut self) -> bool {
+        let started = Instant::now();
+        while let Some(word) = self.words.get(self.vectors.len()) {
+            if started.elapsed() > ENCODING {
+                return false;
+            }
+            self.vectors.push(self.encoder.encode(word).ok());
+        }
+        true
+    }
+
+    /// Returns the words that the model knows.
+    fn known(&self) -> impl Iterator<Item = (&str, &[f32])> {
+        self.words.iter().zip(&self.vectors).filter_map(|(word, vector)| Some((&**word, vector.as_deref()?)))
     }
 }
 
@@ -135,30 +148,21 @@ impl Viewer {
         self.with_text_encoder(|generation, OpenedText { encoder, .. }| {
             let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
             let vectors =
-                texts.map(|text| encoder.encode(&words_of(text)?)).collect::<Result<Vec<_>, _>>()?;
+                texts.map(|text| encoder.encode(&words_to_find(text)?)).collect::<Result<Vec<_>, _>>()?;
             work(generation, &vectors)
         })
     }
 
-    /// Returns the words that the current generation's text model knows, each with the number of things that it
-    /// finds; of a model that takes any text, everyday words that find something.
+    /// Returns what the things of the current generation are called, as the robot does.
     pub(super) fn words(&self) -> Result<Words, ViewError> {
         self.with_text_encoder(|generation, opened| {
             let manifest = generation.reader.manifest();
-            let count = |word: &str, vector: &[f32]| {
-                let n_things = generation.things.count(manifest, vector);
-                Word { word: word.to_owned(), n_things }
-            };
-            let Some(known) = opened.encoder.vocabulary() else {
-                let (known, is_complete) = opened.everyday_words();
-                let words = known.into_iter().map(|(word, vector)| count(word, vector));
-                let words = words.filter(|word| word.n_things > 0).collect();
-                return Ok(Words::new(manifest.generation, words, is_complete));
-            };
-            let known = known[..known.len().min(Words::MAX)].to_vec();
-            let encoded = |word: &String| Ok(count(word, &opened.encoder.encode(word)?));
-            let words = known.iter().map(encoded).collect::<Result<_, ViewError>>()?;
-            Ok(Words::new(manifest.generation, words, true))
+            if !opened.encode_words() {
+                return Ok(Words::pending(manifest.generation));
+            }
+            let known: Vec<(&str, &[f32])> = opened.known().collect();
+            let best = generation.things.best_names(manifest, &known);
+            Ok(Words::new(manifest.generation, best, opened.encoder.vocabulary().unwrap_or_default()))
         })
     }
 
@@ -172,7 +176,8 @@ impl Viewer {
         let mut opened = locked(&self.text);
         if opened.as_ref().is_none_or(|opened| opened.id != encoder_id) {
             let encoder = (self.shown.open_text)(&generation.reader).map_err(ViewError::Models)?;
-            *opened = Some(OpenedText { id: encoder_id, encoder, everyday: Vec::new() });
+            let words = words_of(encoder.vocabulary());
+            *opened = Some(OpenedText { id: encoder_id, encoder, words, vectors: Vec::new() });
         }
         let Some(opened) = opened.as_mut() else { return Err(ViewError::NoStore) };
         work(&generation, opened)

@@ -218,6 +218,8 @@ async fn every_answer_is_as_described() {
         ("/v1/query", "text=0&limit=0"),
         ("/v1/objects", "limit=1"),
         ("/v1/objects", "limit=x"),
+        ("/v1/objects", "sort=name&box=-9,-9,-9,9,9,9"),
+        ("/v1/objects", "format=geojson"),
         ("/v1/map", ""),
         ("/v1/changes", "text=0&text=1"),
         ("/v1/changes", "from=9"),

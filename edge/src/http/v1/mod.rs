@@ -40,7 +40,7 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .errors(&SCENE)
         .errors(&TEXTS)
         .errors(&[TIME_BUDGET])
-        .get("/v1/objects", "all things on board, by id, in pages", objects::list)
+        .get("/v1/objects", "all things on board and what they are called, in pages", objects::list)
         .errors(&SCENE)
         .errors(&[BUDGET])
         .get("/v1/objects/{id}", "one thing on board", objects::one)

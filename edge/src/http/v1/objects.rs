@@ -4,16 +4,21 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::{Path, State};
-use axum::http::StatusCode;
-use schemars::JsonSchema;
+use axum::http::{StatusCode, header};
+use schemars::{JsonSchema, SchemaGenerator};
 use serde::Deserialize;
+use slag_common::manifest::Manifest;
 use slag_service::params::Params;
 use slag_service::problem::Problem;
+use slag_service::replies::{As, Binary, Described, Reply};
 
 use crate::http::app::App;
-use crate::http::forms::{self, ObjectIdText, XyzText};
+use crate::http::forms::{self, BoxText, LatLonPolygonText, LatLonText, ObjectIdText, PolygonText, XyzText};
 use crate::http::problem::query_problem;
-use crate::query::{ObjectFilter, ObjectOnBoard, ObjectPage, RequestError, object_id};
+use crate::query::{
+    Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOnBoard, ObjectOrder, ObjectPage, RequestError,
+    object_id,
+};
 use crate::score::MAX_COORDINATE;
 
 /// Objects in a page unless the request says otherwise.
@@ -28,19 +33,40 @@ pub struct ListParams {
     #[serde(default = "default_page")]
     #[schemars(range(min = 1, max = MAX_PAGE), example = 100)]
     limit: usize,
-    /// The id that the page begins after: next_after of the page before.
+    /// The id that the page begins after: next_after of the page before, asked for in the same way.
     #[schemars(example = &"o0123456789abcdef")]
     after: Option<ObjectIdText>,
+    /// Order of the objects: id, name (the best one), or area (of the box's largest face, the largest first).
+    #[serde(default)]
+    #[schemars(example = &"id")]
+    sort: ObjectOrder,
     /// With radius: only objects with their position within this distance.
     #[schemars(example = &"2,1.5,0")]
     near: Option<XyzText>,
+    /// The same on the earth, WGS 84: lat,lon or lat,lon,height.
+    #[schemars(example = &"46.8,-92.1")]
+    near_lat_lon: Option<LatLonText>,
     /// With near, world units.
     #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
     radius: Option<f64>,
+    /// Only between two opposite corners.
+    #[serde(rename = "box")]
+    #[schemars(example = &"0,0,0,4,3,2")]
+    bounds: Option<BoxText>,
+    /// Only inside this outline of 3 to 256 corners, seen from above.
+    #[schemars(example = &"0,0,4,0,4,3")]
+    polygon: Option<PolygonText>,
+    /// The same on the earth.
+    #[schemars(example = &"46.8,-92.1,46.8,-92,46.9,-92")]
+    polygon_lat_lon: Option<LatLonPolygonText>,
     /// Least length of the box's longest edge, world units.
     #[serde(default)]
     #[schemars(range(min = 0), example = 0.5)]
     min_size: f64,
+    /// json, csv (a line for each object), or geojson (a point for each, of scenes with a place on the earth).
+    #[serde(default)]
+    #[schemars(example = &"json")]
+    format: ListFormat,
 }
 
 fn default_page() -> usize {
@@ -48,7 +74,15 @@ fn default_page() -> usize {
 }
 
 impl ListParams {
-    fn filter(self) -> Result<ObjectFilter, RequestError> {
+    /// Returns the area asked for.
+    fn area(&mut self) -> Result<Area, RequestError> {
+        let near = forms::point(self.near.take(), self.near_lat_lon.take())?;
+        let ball = forms::ball(near, self.radius)?;
+        forms::area(ball, self.bounds.take(), self.polygon.take(), self.polygon_lat_lon.take())
+    }
+
+    /// Returns which objects of a generation are asked for.
+    fn filter(mut self, manifest: &Manifest) -> Result<ObjectFilter, RequestError> {
         let refuse =
             |parameter, found: String, expected: String| Err(RequestError::new(parameter, &found, expected));
         if !(1..=MAX_PAGE).contains(&self.limit) {
@@ -57,10 +91,12 @@ impl ListParams {
         if !(self.min_size >= 0.0 && self.min_size.is_finite()) {
             return refuse("min_size", self.min_size.to_string(), "0 or more".into());
         }
+        self.format.check(manifest)?;
         Ok(ObjectFilter {
+            region: self.area()?.in_world(manifest)?,
             after: self.after.map(|ObjectIdText(id)| id),
-            ball: forms::ball(self.near.map(|XyzText(near)| near), self.radius)?,
             min_size: self.min_size,
+            order: self.sort,
         })
     }
 }
@@ -68,14 +104,30 @@ impl ListParams {
 pub async fn list(
     State(app): State<Arc<App>>,
     Params(params): Params<ListParams>,
-) -> Result<Json<ObjectPage>, Problem> {
-    let limit = params.limit;
-    let filter = params.filter()?;
-    app.within_limits(None, move |app, budget| {
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        app.engine.objects(&snapshot, &filter, limit, budget).map(Json).map_err(query_problem)
-    })
-    .await
+) -> Result<As<ListFormats>, Problem> {
+    let (limit, format) = (params.limit, params.format);
+    let listing = app.within_limits(None, move |app, budget| {
+        let on_board = app.engine.on_board().map_err(query_problem)?;
+        let filter = params.filter(&on_board.snapshot.manifest)?;
+        let page =
+            app.engine.objects(&on_board, &filter, limit, NAMES_WAIT, budget).map_err(query_problem)?;
+        format.write(&page).map_err(Problem::internal)
+    });
+    Ok(As::new(([(header::CONTENT_TYPE, format.media_type())], listing.await?)))
+}
+
+/// A list of objects in any format.
+pub struct ListFormats;
+
+impl Described for ListFormats {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        let content = vec![
+            (ListFormat::Json.media_type(), schemas.subschema_for::<ObjectPage>()),
+            (ListFormat::Csv.media_type(), schemas.subschema_for::<String>()),
+            (ListFormat::Geojson.media_type(), Binary::schema()),
+        ];
+        vec![Reply { content, ..Reply::ok("", Binary::schema()) }]
+    }
 }
 
 pub async fn one(
@@ -85,8 +137,10 @@ pub async fn one(
     let refused = || RequestError::new("id", &id, "o and 16 hex digits");
     let wanted = object_id(&id).ok_or_else(refused)?;
     app.within_limits(None, move |app, budget| {
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let found = app.engine.object(&snapshot, wanted, budget).map_err(query_problem)?;
+        let on_board = app.engine.on_board().map_err(query_problem)?;
+        let snapshot = &on_board.snapshot;
+        let names = app.engine.names(&on_board, NAMES_WAIT, budget).map_err(query_problem)?;
+        let found = app.engine.object(snapshot, names, wanted, budget).map_err(query_problem)?;
         let Some(object) = found else {
             let detail = format!(
                 "generation {} has no object {id} on board; GET /v1/objects lists those it has",

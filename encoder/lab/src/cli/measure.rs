@@ -11,7 +11,7 @@ use std::fmt::Display;
 
 use crate::bench::{load, query, raster, robot, tradeoff};
 use crate::eval::{
-    all, defaults, encoder, goal, judge, lerf, locate, masks, relations, run, scannet, splat_only,
+    all, defaults, encoder, goal, judge, lerf, locate, masks, names, relations, run, scannet, splat_only,
 };
 
 /// `eval`.
@@ -27,6 +27,8 @@ pub(crate) enum EvalCommand {
     SplatOnly(run::ScenesArgs),
     /// Judges segmenters without words: by labelled photos, by coverage, and by agreement between views.
     Masks(masks::MasksArgs),
+    /// Judges the names of objects and their confidences by labels.
+    Names(names::NamesArgs),
     /// Evaluates a store on LangSplat's labels of LERF scenes (LERF-OVS).
     Lerf(lerf::LerfArgs),
     /// Evaluates stores on ScanNet's labelled meshes with OpenGaussian's protocol.
@@ -55,6 +57,7 @@ pub(super) fn eval(command: &EvalCommand, progress: &dyn Progress, json: bool) -
         EvalCommand::Defaults(args) => show(json, &defaults::run(args, progress)?, true),
         EvalCommand::SplatOnly(args) => show(json, &splat_only::run(args, progress)?, true),
         EvalCommand::Masks(args) => show(json, &masks::run(args, progress)?, true),
+        EvalCommand::Names(args) => show(json, &names::run(args)?, true),
         EvalCommand::Lerf(args) => {
             let report = lerf::run(args)?;
             show(json, &report, report.is_complete())

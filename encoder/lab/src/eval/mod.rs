@@ -15,6 +15,7 @@ pub(crate) mod lerf;
 pub(crate) mod locate;
 pub(crate) mod masks;
 mod metrics;
+pub(crate) mod names;
 #[cfg(test)]
 mod public_tests;
 pub(crate) mod relations;

@@ -1,0 +1,168 @@
+//! What the things on board are called. The words are encoded once a text model, beside questions, and scored once a
+//! generation; requests then only read.
+
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use schemars::JsonSchema;
+use serde::Serialize;
+use slag_common::Hash32;
+use slag_models::names::{Confidence, Naming, Spread, words_of};
+
+use super::scene::Scene;
+use crate::score::{Budget, Question, ScoreError, score_objects};
+use crate::store::EdgeCache;
+use crate::store::words::{self, WordVector};
+use crate::text::{TextError, TextService};
+
+/// Words that are scored at a time: bounds the scores in memory.
+const WORDS_TOGETHER: usize = 16;
+/// One of so many words tells how all score.
+const MEASURED: usize = 4;
+/// Pause after a text model turned a word away.
+const BUSY_PAUSE: Duration = Duration::from_millis(100);
+/// Words that took less are not kept on disk.
+const WORTH_KEEPING: Duration = Duration::from_secs(2);
+
+/// A name of a thing.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+pub struct Name {
+    /// The word.
+    pub name: String,
+    /// The chance that it is right, as measured on labelled scenes; a thing may have several right names.
+    pub confidence: f32,
+}
+
+/// The names of a generation's things.
+pub struct Names {
+    words: Arc<[WordVector]>,
+    /// By object, in the order of the index: words and their confidences, best first.
+    of_object: Vec<Vec<(u32, f32)>>,
+}
+
+impl Names {
+    /// Returns the words of an object with their confidences, best first.
+    pub fn of(&self, object: usize) -> impl ExactSizeIterator<Item = (&str, f32)> {
+        self.of_object[object].iter().map(|(word, confidence)| (&*self.words[*word as usize].0, *confidence))
+    }
+
+    pub fn describe(&self, object: usize) -> Vec<Name> {
+        self.of(object).map(|(name, confidence)| Name { name: name.to_owned(), confidence }).collect()
+    }
+
+    /// Returns the number of objects.
+    pub fn len(&self) -> usize {
+        self.of_object.len()
+    }
+
+    /// Scores all words over all objects.
+    pub fn new(words: Arc<[WordVector]>, scene: &Scene<'_>, budget: &Budget) -> Result<Self, ScoreError> {
+        let n_objects = scene.index.len();
+        let scores_bytes = WORDS_TOGETHER * size_of::<f32>();
+        budget.take(n_objects * (size_of::<Naming>() + size_of::<Vec<(u32, f32)>>() + scores_bytes));
+        let mut of_object = vec![Naming::default(); n_objects];
+        let together = || (0..).step_by(WORDS_TOGETHER).zip(words.chunks(WORDS_TOGETHER));
+        let scores = |together: &[WordVector]| {
+            budget.check()?;
+            let question =
+                |(_, vector): &WordVector| Question { vector: Arc::clone(vector), negatives: Vec::new() };
+            let questions: Vec<Question> = together.iter().map(question).collect();
+            score_objects(scene.shards, scene.objects, scene.index, &questions)
+        };
+        let mut spread = Spread::default();
+        for (_, words) in together().step_by(MEASURED) {
+            scores(words)?.iter().for_each(|scored| spread.add(&scored.scores));
+        }
+        let confidence = Confidence::new(&scene.manifest.encoder.name, spread);
+        for (first, words) in together() {
+            for (word, scored) in (first..).zip(&scores(words)?) {
+                let scores = of_object.iter_mut().zip(&scored.scores);
+                scores.for_each(|(naming, score)| naming.add(word, *score, &confidence));
+            }
+        }
+        let of_object = of_object.iter().map(|naming| naming.names(&confidence).collect()).collect();
+        Ok(Self { words, of_object })
+    }
+}
+
+/// The words that things are named by, while they are encoded and after.
+pub struct Words {
+    encoder_id: Hash32,
+    state: Mutex<State>,
+    is_over: Condvar,
+}
+
+#[derive(Clone)]
+enum State {
+    Encoding,
+    Ready(Arc<[WordVector]>),
+    /// The text model stopped.
+    Failed,
+}
+
+impl Words {
+    /// Begins to encode the words of a text model, on a thread of their own.
+    pub fn begin(cache: &EdgeCache, text: &Arc<TextService>) -> Arc<Self> {
+        let (state, is_over) = (Mutex::new(State::Encoding), Condvar::new());
+        let words = Arc::new(Self { encoder_id: text.info().id, state, is_over });
+        let (cache, text, encoding) = (cache.clone(), Arc::clone(text), Arc::clone(&words));
+        let encode = move || encoding.become_ready(encode(&cache, &text));
+        if let Err(error) = std::thread::Builder::new().name("words".into()).spawn(encode) {
+            tracing::warn!("the words that things are named by cannot be encoded: {error}");
+            words.become_ready(None);
+        }
+        words
+    }
+
+    /// Returns whether these are, or will be, the words of an encoder.
+    pub fn are_of(&self, encoder_id: Hash32) -> bool {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        self.encoder_id == encoder_id && !matches!(*state, State::Failed)
+    }
+
+    /// Waits for the words; `None` if they take longer.
+    pub fn wait(&self, longest: Duration) -> Option<Arc<[WordVector]>> {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let waiting = |state: &mut State| matches!(state, State::Encoding);
+        let waited = self.is_over.wait_timeout_while(state, longest, waiting);
+        match &*waited.unwrap_or_else(PoisonError::into_inner).0 {
+            State::Ready(words) => Some(Arc::clone(words)),
+            State::Encoding | State::Failed => None,
+        }
+    }
+
+    fn become_ready(&self, words: Option<Vec<WordVector>>) {
+        let state = words.map_or(State::Failed, |words| State::Ready(words.into()));
+        *self.state.lock().unwrap_or_else(PoisonError::into_inner) = state;
+        self.is_over.notify_all();
+    }
+}
+
+/// Encodes the words that a text model knows, or reads what was kept of them.
+fn encode(cache: &EdgeCache, text: &TextService) -> Option<Vec<WordVector>> {
+    let vocabulary = Some(text.vocabulary()).filter(|words| !words.is_empty());
+    let (asked, info) = (words_of(vocabulary), text.info());
+    if let Some(kept) = words::read(cache, info.id, info.dim as usize, &asked) {
+        return Some(kept);
+    }
+    let (started, mut known) = (Instant::now(), Vec::new());
+    for word in &asked {
+        let vector = loop {
+            match text.run(word.clone()) {
+                Err(TextError::Busy) => std::thread::sleep(BUSY_PAUSE),
+                other => break other,
+            }
+        };
+        match vector {
+            Ok(vector) => known.push((word.clone(), vector.into())),
+            Err(TextError::Encode(_)) => {}
+            Err(_) => return None,
+        }
+    }
+    if started.elapsed() >= WORTH_KEEPING
+        && let Err(error) = words::write(cache, info.id, &asked, &known)
+    {
+        tracing::warn!("the words that things are named by are encoded again next time: {error}");
+    }
+    Some(known)
+}
