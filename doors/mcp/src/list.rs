@@ -67,7 +67,7 @@ pub struct Name {
     /// The word.
     pub name: String,
     /// The chance that it is right.
-    pub confidence: f32,
+    pub confidence: f64,
 }
 
 impl Listing {

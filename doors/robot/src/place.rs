@@ -75,7 +75,7 @@ pub struct OnBoardThing {
 pub struct Name {
     pub name: String,
     /// The chance that it is right.
-    pub confidence: f32,
+    pub confidence: f64,
 }
 
 /// A box along the axes.

@@ -26,7 +26,7 @@ const LEAST_SHOWN: f32 = 0.01;
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-edge list\n\
     \x20 slag-edge list --near 12.5,-3,0 --radius 10 --sort area\n\
-    \x20 slag-edge list --format csv > things.csv\n";
+    \x20 slag-edge list --format csv\n";
 
 #[derive(Debug, Args)]
 #[command(before_help = EXAMPLES)]

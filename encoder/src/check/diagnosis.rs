@@ -18,7 +18,7 @@ pub(super) const FLAWLESS_DB: f64 = 30.0;
 /// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain
 /// colour, dB.
 pub(super) const CLEAR_GAIN_DB: f64 = 3.0;
-/// Gain that counts where the data themselves suggest a mistake, dB.
+/// Gain that counts where the data themselves suggest a mistake, or where nothing but the mistake can cause it, dB.
 const SUSPECTED_GAIN_DB: f64 = 0.5;
 /// Factor between neighbouring scales of the sweep, and the largest scale; the smallest is its inverse.
 const SWEEP_STEP: f64 = 1.06;
@@ -223,7 +223,9 @@ impl Search<'_> {
     /// Returns whether a correction is clearly better than the inputs as given, and its drawings fit by
     /// themselves: one that merely turns black into some colour gains, too.
     fn explains(&self, trial: &Trial) -> bool {
-        let gain_db = if self.suspected.contains(&trial.mistake) { SUSPECTED_GAIN_DB } else { CLEAR_GAIN_DB };
+        let is_likely =
+            self.suspected.contains(&trial.mistake) || Mistake::UNNOTICED.contains(&trial.mistake);
+        let gain_db = if is_likely { SUSPECTED_GAIN_DB } else { CLEAR_GAIN_DB };
         trial.psnr_db > (self.given_psnr_db + gain_db).max(self.flat_psnr_db + CLEAR_GAIN_DB)
     }
 

@@ -139,8 +139,8 @@ fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
 /// there is no other way to look at it.
 fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
     let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
-    let n_past = n_with(looked, kind, Some(Fault::Holes));
-    n_past > 0 && 2 * n_past >= looked.len() && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
+    2 * n_with(looked, kind, Some(Fault::Holes)) > looked.len()
+        && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
 }
 
 /// Returns how many views fail for which reason.
