@@ -165,5 +165,5 @@ fn examples_of_help_parse() {
             }
         }
     }
-    assert_eq!(n_examples, 42);
+    assert_eq!(n_examples, 45);
 }

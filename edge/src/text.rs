@@ -97,7 +97,7 @@ impl TextService {
         reopen: Option<Reopen>,
     ) -> io::Result<Self> {
         let (jobs, waiting) = sync_channel(MAX_WAITING);
-        let vocabulary = encoder.vocabulary().unwrap_or_default().to_vec();
+        let vocabulary = encoder.nouns().unwrap_or_default().to_vec();
         let is_alive = Arc::new(AtomicBool::new(true));
         let told = Arc::clone(&is_alive);
         let run = move || run(encoder, reopen, &waiting, &told);

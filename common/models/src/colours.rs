@@ -103,7 +103,7 @@ impl TextEncoder for ColourShape {
         DIM
     }
 
-    fn vocabulary(&self) -> Option<&[String]> {
+    fn nouns(&self) -> Option<&[String]> {
         static WORDS: LazyLock<Vec<String>> = LazyLock::new(known);
         Some(&WORDS)
     }

@@ -45,9 +45,14 @@ pub trait TextEncoder: Send {
     /// Encodes `text`: `[dim]`, a unit vector, centred if the description asks for it.
     fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError>;
 
-    /// Returns the words that things can be called by, if it knows some and not others; `None` if everyday nouns do.
+    /// Returns the phrases or words that it accepts; `None` if it accepts any text.
     fn vocabulary(&self) -> Option<&[String]> {
         None
+    }
+
+    /// Returns the words that things can be called by, if it knows some and not others; `None` if everyday nouns do.
+    fn nouns(&self) -> Option<&[String]> {
+        self.vocabulary()
     }
 
     /// Returns the device that ONNX Runtime runs the model on; `None` without ONNX Runtime.

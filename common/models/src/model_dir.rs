@@ -219,7 +219,7 @@ impl ModelDir {
                 let tokenizer = files.open(&text.tokenizer, embedded::TOKENIZER)?;
                 let encoder = OnnxTextEncoder::open(name, dim, [&model, &tokenizer], text, centre, options)?;
                 let is_embedded = matches!(files, Files::Embedded);
-                Box::new(encoder.with_vocabulary(is_embedded.then(|| embedded::NOUNS.lines())))
+                Box::new(encoder.with_nouns(is_embedded.then(|| embedded::NOUNS.lines())))
             }
             TextDescription::Phrases(text) => {
                 let (phrases, vectors) = (files.on_disk(&text.file)?, files.on_disk(&text.vectors)?);

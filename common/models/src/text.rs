@@ -98,7 +98,7 @@ pub struct OnnxTextEncoder {
     /// Subtracted from the unit vector, `[dim]`.
     centre: Option<Vec<f32>>,
     /// The words of a model that knows some and not others.
-    vocabulary: Option<Vec<String>>,
+    nouns: Option<Vec<String>>,
 }
 
 impl OnnxTextEncoder {
@@ -134,8 +134,7 @@ impl OnnxTextEncoder {
             .expect_output(description.output.as_deref(), TensorElementType::Float32, &[1, dim as i64])?
             .name;
         let (name, description) = (name.to_owned(), description.clone());
-        let mut encoder =
-            Self { name, dim, model, tokens, description, output, is_i32, centre, vocabulary: None };
+        let mut encoder = Self { name, dim, model, tokens, description, output, is_i32, centre, nouns: None };
         let largest = encoder.tokens.largest_id();
         let end = encoder.description.end_token_id.unwrap_or(0);
         match encoder.run(&[largest, end]) {
@@ -149,8 +148,8 @@ impl OnnxTextEncoder {
     }
 
     /// Says which words the model knows; of one without, that it knows them all.
-    pub(crate) fn with_vocabulary<'a>(self, words: Option<impl Iterator<Item = &'a str>>) -> Self {
-        Self { vocabulary: words.map(|words| words.map(str::to_owned).collect()), ..self }
+    pub(crate) fn with_nouns<'a>(self, words: Option<impl Iterator<Item = &'a str>>) -> Self {
+        Self { nouns: words.map(|words| words.map(str::to_owned).collect()), ..self }
     }
 
     /// Runs the model on token ids; returns its vector, `[dim]`.
@@ -197,8 +196,8 @@ impl TextEncoder for OnnxTextEncoder {
         }
     }
 
-    fn vocabulary(&self) -> Option<&[String]> {
-        self.vocabulary.as_deref()
+    fn nouns(&self) -> Option<&[String]> {
+        self.nouns.as_deref()
     }
 
     fn placement(&self) -> Option<&Placement> {

@@ -127,7 +127,7 @@ pub fn variable(name: &str) -> Option<OsString> {
     std::env::var_os(name)
 }
 
-fn parse_radius(text: &str) -> Result<f64, String> {
+pub(super) fn parse_radius(text: &str) -> Result<f64, String> {
     let radius = text.parse::<f64>().ok().filter(|radius| *radius >= 0.0 && radius.is_finite());
     radius.ok_or_else(|| "expected world units, 0 or more".to_owned())
 }

@@ -9,7 +9,7 @@ use serde::de::value::{Error, StrDeserializer};
 use serde::de::{DeserializeOwned, IntoDeserializer};
 use slag_common::frames::Aabb;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
 use crate::query::{
@@ -35,13 +35,13 @@ pub struct ListArgs {
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true, requires = "radius")]
     pub near: Option<DVec3>,
     /// The radius, world units.
-    #[arg(long, requires = "near")]
+    #[arg(long, requires = "near", value_parser = parse_radius, allow_negative_numbers = true)]
     pub radius: Option<f64>,
     /// List only within the box between two corners, world frame.
     #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]
     pub bounds: Option<Aabb>,
     /// Least length of a thing's longest edge, world units.
-    #[arg(long, default_value_t = 0.0)]
+    #[arg(long, default_value_t = 0.0, value_parser = parse_radius, allow_negative_numbers = true)]
     pub min_size: f64,
     /// Order: name, area (the largest face first) or id.
     #[arg(long, value_name = "ORDER", default_value = "name", value_parser = named::<ObjectOrder>)]

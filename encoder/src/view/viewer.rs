@@ -162,7 +162,7 @@ impl Viewer {
             }
             let known: Vec<(&str, &[f32])> = opened.known().collect();
             let best = generation.things.best_names(manifest, &known);
-            Ok(Words::new(manifest.generation, best, opened.encoder.vocabulary().unwrap_or_default()))
+            Ok(Words::new(manifest.generation, best, opened.encoder.nouns().unwrap_or_default()))
         })
     }
 
@@ -176,7 +176,7 @@ impl Viewer {
         let mut opened = locked(&self.text);
         if opened.as_ref().is_none_or(|opened| opened.id != encoder_id) {
             let encoder = (self.shown.open_text)(&generation.reader).map_err(ViewError::Models)?;
-            let words = words_of(encoder.vocabulary());
+            let words = words_of(encoder.nouns());
             *opened = Some(OpenedText { id: encoder_id, encoder, words, vectors: Vec::new() });
         }
         let Some(opened) = opened.as_mut() else { return Err(ViewError::NoStore) };

@@ -44,7 +44,7 @@ export function clustersOf(cells: Iterable<[number, CellGaussians]>, scores: Sco
     let sum = 0;
     const open: [string, Voxel][] = [[start, voxel]];
     for (let next = open.pop(); next; next = open.pop()) {
-      points.push(...next[1].points);
+      for (const point of next[1].points) points.push(point);
       sum += next[1].sum;
       const at = next[0].split(",").map(Number);
       for (let i = 0; i < 27; i++) {

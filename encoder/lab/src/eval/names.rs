@@ -106,7 +106,7 @@ fn judge(reader: &StoreReader, truth: &Truth, models: &ModelArgs) -> Result<Vec<
     let objects = PublishedObjects::read(reader)?;
     let mut encoder = text_encoder_of(reader, models)?;
     let (mut words, mut scores) = (Vec::new(), Vec::new());
-    for word in words_of(encoder.vocabulary()) {
+    for word in words_of(encoder.nouns()) {
         if let Ok(vector) = encoder.encode(&word) {
             scores.push(objects.scores(&vector));
             words.push(word);
