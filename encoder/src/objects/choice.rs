@@ -104,19 +104,24 @@ fn views_of(sightings: &Sightings, superpoint: usize, sizes: Sizes<'_>) -> NodeV
     sightings.of(superpoint).filter(|of_view| of_view.n > 0).map(of_view).collect()
 }
 
+/// Of this many views that judge an object one must show it whole: a park that one of 80 photos outlines is none.
+const JUDGES_PER_WHOLE: usize = 20;
+
 /// Returns the worth of a node of `n` Gaussians as an object; 0 if it is none.
 fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     // A view that outlines nothing of the node says nothing of it.
     let is_judge =
         |view: &&NodeView| !view.masks.is_empty() && u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS;
     let judges = views.values().filter(is_judge);
-    let (mut sum, mut weights, mut is_whole) = (0.0, 0.0, false);
+    let (mut sum, mut weights, mut n_whole, mut n_judges) = (0.0, 0.0, 0_usize, 0_usize);
     for view in judges {
         let uncut = f64::from(view.uncut.max(LEAST_UNCUT));
         let weight = uncut * uncut;
         (sum, weights) = (sum + weight * view.agreement, weights + weight);
-        is_whole |= view.agreement > SAME_IOU && view.uncut >= WHOLE;
+        n_judges += 1;
+        n_whole += usize::from(view.agreement > SAME_IOU && view.uncut >= WHOLE);
     }
+    let is_whole = n_whole > 0 && JUDGES_PER_WHOLE * n_whole >= n_judges;
     if n < min_gaussians || !is_whole || sum < MIN_CONSENSUS * weights {
         return 0.0;
     }

@@ -33,6 +33,13 @@ const WEIGHT_STEPS: f32 = 200.0;
 const MIN_SURROUNDED: u32 = 8;
 /// Smallest mask, pixels of the working image: a JPEG block, the size of its artefacts.
 const MIN_AREA_PX: u32 = 64;
+/// Scale of observation of small things, finer than all levels: only its compact components are masks.
+const COMPACT_SCALE: f32 = 100.0;
+/// A compact component fills this share of its box, is at most this share of the photo, and touches no edge of it.
+const MIN_FILL: f32 = 0.65;
+const MAX_COMPACT_SHARE: f32 = 0.03;
+/// Boundaries along its outline that suffice for a compact component.
+const COMPACT_SUPPORT: f32 = 0.3;
 /// The neighbours to which a pixel has an edge; the other four have an edge to the pixel.
 const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (-1, 1), (0, 1), (1, 1)];
 
@@ -185,38 +192,50 @@ impl Segmenter for GraphSegmenter {
         let edges = raster.edges_by_weight(&self.settings, boundaries.as_deref());
         let n_pixels = raster.lab.len();
         let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(MIN_AREA_PX);
+        let n_levels = self.settings.scales.len();
+        let compact_scale = boundaries.as_ref().map(|_| COMPACT_SCALE);
         let levels: Vec<Labels> = self
             .settings
             .scales
             .iter()
+            .copied()
+            .chain(compact_scale)
             .map(|scale| raster.components(&edges, scale * WEIGHT_STEPS, min_area_px))
             .collect();
 
         let mut masks = Vec::new();
+        let finest = n_levels.checked_sub(1).and_then(|level| levels.get(level));
         // The finest component of each pixel that no mask covers.
-        let mut rest = levels.last().map_or(Vec::new(), |finest| finest.of_pixel.clone());
+        let mut rest = finest.map_or(Vec::new(), |finest| finest.of_pixel.clone());
         for (level, labels) in levels.iter().enumerate() {
             let repeats = labels.repeats_of(&levels[..level], self.settings.max_overlap_iou);
             let n_components = labels.area_px.len();
             let support = boundaries.as_deref().map(|boundaries| {
                 support::of_outlines(&labels.of_pixel, raster.width_px as usize, n_components, boundaries)
             });
-            let is_confirmed =
-                |label: usize| support.as_ref().is_none_or(|of| of[label] >= self.settings.min_support);
-            let is_kept =
-                |label: usize| labels.area_px[label] >= min_area_px && !repeats[label] && is_confirmed(label);
-            let is_kept: Vec<bool> = (0..n_components).map(is_kept).collect();
+            let is_confirmed = |label: usize, mask: &Mask| {
+                support.as_ref().is_none_or(|of| {
+                    (level < n_levels && of[label] >= self.settings.min_support)
+                        || (of[label] >= COMPACT_SUPPORT && raster.is_compact(mask))
+                })
+            };
+            let all = masks_of_labels(&labels.of_pixel, raster.width_px, n_components, u64::MAX);
+            let mut is_kept = vec![false; n_components];
+            for (label, mask) in all.unwrap_or_default() {
+                let of = label as usize;
+                is_kept[of] = labels.area_px[of] >= min_area_px && !repeats[of] && is_confirmed(of, &mask);
+                if is_kept[of] {
+                    masks.push(Mask { level: level.min(n_levels.saturating_sub(1)) as u8, ..mask });
+                }
+            }
             let covered = labels.of_pixel.iter().map(|label| is_kept.get(*label as usize) == Some(&true));
             rest.iter_mut()
                 .zip(covered)
                 .filter(|(_, covered)| *covered)
                 .for_each(|(rest, _)| *rest = NO_REGION);
-            let all = masks_of_labels(&labels.of_pixel, raster.width_px, n_components, u64::MAX);
-            let kept = all.unwrap_or_default().into_iter().filter(|(label, _)| is_kept[*label as usize]);
-            masks.extend(kept.map(|(_, mask)| Mask { level: level as u8, ..mask }));
         }
         if boundaries.is_some() {
-            let n_components = levels.last().map_or(0, |finest| finest.area_px.len());
+            let n_components = finest.map_or(0, |finest| finest.area_px.len());
             let fillers = masks_of_labels(&rest, raster.width_px, n_components, u64::MAX).unwrap_or_default();
             let fillers = fillers.into_iter().filter(|(_, mask)| mask.area_px >= min_area_px);
             masks.extend(fillers.map(|(_, mask)| Mask { level: Mask::FILLER, ..mask }));
@@ -361,6 +380,14 @@ impl Raster {
             *slot += 1;
         }
         sorted
+    }
+
+    /// Returns whether a mask has the shape of a thing rather than of what remains between things.
+    fn is_compact(&self, mask: &Mask) -> bool {
+        let BoxPx { x0, y0, x1, y1 } = mask.box_px;
+        let (area, n_box) = (mask.area_px as f32, (x1 - x0) as f32 * (y1 - y0) as f32);
+        let is_inside = x0 > 0 && y0 > 0 && x1 < self.width_px && y1 < self.height_px;
+        is_inside && area >= MIN_FILL * n_box && area <= MAX_COMPACT_SHARE * self.lab.len() as f32
     }
 
     /// Joins pixels over ascending edges while the edge is no larger than both components' largest
