@@ -97,7 +97,6 @@ test("keys reach the question and move the camera", () => opened(async (page) =>
   assert.ok(dot(moved, forward) > 0.99 * Math.hypot(...moved) * Math.hypot(...forward), `moved by ${moved}`);
   // Without a pointer: from the question to the first answer and its details.
   await page.locator("#question").focus();
-  await page.keyboard.press("Escape");
   for (let i = 0; i < 12 && !(await page.evaluate(() => document.activeElement?.closest("#answers"))); i++) await page.keyboard.press("Tab");
   assert.notEqual(await page.evaluate(() => getComputedStyle(document.activeElement).outlineStyle), "none");
   await page.keyboard.press("Enter");
