@@ -1,15 +1,17 @@
-// Pictures of the page for README and docs: a labelled photo's pose, a question in the box, the scene lit.
-// usage: node scripts/screenshots.mjs OUT.png SCENE_DIR POSES CAMERA QUESTION [flags of `slag-encoder encode`]
+// Pictures of the page in six states, on a desk and on a phone, to be looked at; README and docs show some of them.
+// usage: node scripts/screenshots.mjs OUT_DIR SCENE_DIR POSES QUESTION SECOND [flags of `slag-encoder encode`]
 //   after `scripts/setup.sh page` and a build with the page. SCENE_DIR has the splat and POSES; `generate` makes a room and a
-//   yard instead. CAMERA: the number of a photo of transforms.json, or X,Y,Z,X,Y,Z: where it is and what it looks at.
+//   yard instead, whose POSES are transforms.json.
 
-import { mkdirSync, mkdtempSync, readdirSync, readFileSync, rmSync } from "node:fs";
+import { mkdirSync, mkdtempSync, readdirSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
-import { dirname, join } from "node:path";
+import { join } from "node:path";
 import { closeBrowser, openBrowser, opened, picture } from "../tests/page/browser.mjs";
 import { run, serve } from "../tests/page/programs.mjs";
 
-const [out, scene, posesName, cameraIn, question, ...flags] = process.argv.slice(2);
+const [out, scene, posesName, question, second, ...flags] = process.argv.slice(2);
+const WIDTHS = { desk: { width: 1280, height: 800 }, phone: { width: 390, height: 844 } };
+const WAIT = { timeout: 300000 };
 const folder = mkdtempSync(join(tmpdir(), "slag-screenshots-"));
 let dir = scene;
 if (scene === "generate") {
@@ -17,29 +19,56 @@ if (scene === "generate") {
   run("slag-lab", ["generate", "scene", "--kind", "room,yard", "--seed", "7", "--n-views", "48", "--out", dir, "--quiet"]);
 }
 
-/** A step behind a photo, where more is in sight. OpenGL's cameras look against z. */
-function photoCamera(number) {
-  const matrix = JSON.parse(readFileSync(poses, "utf8")).frames[number].transform_matrix.slice(0, 3);
-  const along = (metres) => matrix.map((row) => (row[3] - metres * row[2]).toFixed(3));
-  return [...along(-0.3), ...along(2)].join(",");
+const asked = (page, line) => page.waitForFunction((q) => document.documentElement.dataset.answered === q, line, WAIT);
+async function ask(page, line) {
+  await page.locator("#question").fill(line);
+  await asked(page, line);
 }
+
+/** Each goes on from the state before. */
+const STATES = {
+  opening: () => {},
+  typing: async (page) => {
+    await page.locator("#question").focus();
+    await page.keyboard.type(question.slice(0, 2));
+  },
+  answers: async (page) => {
+    await ask(page, question);
+    await page.locator("#question").blur();
+  },
+  chosen: async (page) => {
+    await page.locator("#answers .card").first().click();
+    await page.locator("#details figure svg").waitFor(WAIT).catch(() => {});
+  },
+  compared: async (page) => {
+    await page.locator("#more").click();
+    await page.locator("#second").fill(second);
+    await asked(page, `${question} | ${second}`);
+  },
+  nothing: async (page) => {
+    await page.locator("#second").fill("");
+    await ask(page, "submarine");
+  },
+};
 
 const splat = join(dir, readdirSync(dir).find((name) => name.endsWith(".ply")));
 const poses = join(dir, posesName);
 const store = join(folder, "store");
 run("slag-encoder", ["encode", "--scene", splat, "--views", poses, "--metric", "--store", store, "--quiet", ...flags]);
 const viewer = await serve("slag-encoder", ["view", "--store", store, "--scene", splat, "--views", poses, "--listen", "127.0.0.1:0", "--no-open"]);
+mkdirSync(out, { recursive: true });
 await openBrowser();
 try {
-  const camera = cameraIn.includes(",") ? cameraIn : photoCamera(Number(cameraIn));
-  await opened(viewer.url, async (page) => {
-    const wait = { timeout: 300000 };
-    await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined, null, wait);
-    await page.waitForFunction((q) => document.documentElement.dataset.answered === q, question, wait);
-    await picture(page, null);
-    mkdirSync(dirname(out), { recursive: true });
-    await page.screenshot({ path: out });
-  }, { isLookedAt: true, fragment: `q=${encodeURIComponent(question)}&camera=${camera}` });
+  for (const [name, viewport] of Object.entries(WIDTHS)) {
+    await opened(viewer.url, async (page) => {
+      await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined, null, WAIT);
+      for (const [state, reach] of Object.entries(STATES)) {
+        await reach(page);
+        await picture(page, null);
+        await page.screenshot({ path: join(out, `${state}-${name}.png`) });
+      }
+    }, { isLookedAt: true, options: { viewport }, expected: /40[04]|422/ });
+  }
 } finally {
   await closeBrowser();
   await viewer.stop();

@@ -119,7 +119,12 @@ export async function startService(behaviour = {}) {
     if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: behaviour.words, complete: behaviour.hasAllWords });
     if (url.pathname === "/v1/map") return json(response, 200, { age_secs: behaviour.ageSecs, is_expired: false });
     if (url.pathname.startsWith("/v1/view/photos/")) return response.writeHead(200, { "content-type": "image/svg+xml" }).end(PICTURE);
-    if (url.pathname === "/v1/objects") return json(response, 200, { objects: THINGS.map(({ min, max }, i) => ({ id: `o${i}`, position_in_world: min.map((low, k) => (low + max[k]) / 2), box_min_in_world: min, box_max_in_world: max })) });
+    if (url.pathname === "/v1/locate") {
+      behaviour.focalPx = Number(url.searchParams.get("focal_px"));
+      request.resume();
+      return request.on("end", () => json(response, 200, behaviour.located));
+    }
+    if (url.pathname === "/v1/objects") return json(response, 200, { objects: THINGS.map(({ name, min, max }, i) => ({ id: `o${i}`, names: [{ name, confidence: 0.814 }], position_in_world: min.map((low, k) => (low + max[k]) / 2), box_min_in_world: min, box_max_in_world: max })) });
     if (behaviour.fails && /query|scores/.test(url.pathname)) return json(response, 503, { detail: "too busy" });
     if (url.pathname === "/v1/changes") return behaviour.changes ? json(response, 200, behaviour.changes) : json(response, 409, { detail: "the store has one generation alone" });
     if (url.pathname === "/v1/goal") {

@@ -4,7 +4,7 @@
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
 import { closeBrowser, layer, openBrowser, pixels } from "./browser.mjs";
-import { answered, CAMERA, cameraOf, drawn, isInside, litPixels, opened, PANEL_PX, project, WIDTH } from "./scene.mjs";
+import { answered, CAMERA, cameraOf, drawn, isInside, litPixels, minus, opened, PANEL_PX, project, WIDTH } from "./scene.mjs";
 import { THINGS } from "./service.mjs";
 
 before(openBrowser);
@@ -164,12 +164,35 @@ test("keys: the list of them, measuring, hovering, and the opening view again", 
   assert.notDeepEqual((await cameraOf(page))[0], before);
 }, { fragment: `camera=${CAMERA}` }));
 
+test("a photo given to the page is found by the robot: the page stands there, and lays it over", () => opened(async (page, service) => {
+  await drawn(page);
+  const photo = { name: "here.png", mimeType: "image/png", buffer: await page.screenshot() };
+  service.behaviour.located = { state: "lost", reason: "too few features" };
+  await page.locator("#photo").setInputFiles(photo);
+  await page.locator("#message").getByText("Lost: too few features").waitFor();
+  const widthPx = photo.buffer.readUInt32BE(16);
+  assert.ok(Math.abs(service.behaviour.focalPx - widthPx / 2 / Math.tan((65 * Math.PI) / 360)) < 0.1, `focal length ${service.behaviour.focalPx}`);
+  // At (0, -3, 1), looking along y: x right, z up.
+  service.behaviour.located = { state: "found", position_in_world: [0, -3, 1], optical_rotation_xyzw: [-Math.SQRT1_2, 0, 0, Math.SQRT1_2], n_inliers: 57 };
+  await page.locator("#details input[type=number]").fill("300");
+  await page.locator("#details").getByText("Find its place").click();
+  await page.locator("#message").getByText("Found by 57 landmarks").waitFor();
+  assert.equal(service.behaviour.focalPx, 300);
+  const [position, target] = await cameraOf(page);
+  assert.ok(Math.hypot(...minus(position, [0, -3, 1])) < 0.01, `stands at ${position}`);
+  const looks = minus(target, position);
+  assert.ok(looks[1] > 0.99 * Math.hypot(...looks), `looks along ${looks}`);
+  await page.locator("#blend-share").fill("50");
+  assert.equal(await page.locator("#blend").isVisible(), true);
+}, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}` }));
+
 test("the robot is named, with its age and heading; a lost service has a badge; a click asks for what is under it", () => opened(async (page, service) => {
   await drawn(page);
   await page.locator("#labels .robot").getByText("Robot").waitFor();
   await page.getByText("Robot, the green mark · scene 2 h old · 80 cm around it on board").waitFor();
   await page.mouse.click(...project([-1.5, -1.5, 0.5]));
   await page.locator("#details").getByText("-1.50, -1.00, 0.50 m").waitFor();
+  await page.locator("#details").getByText("ball 81 %").waitFor();
   service.behaviour.isGone = true;
   await page.locator("#badge").getByText("offline").waitFor({ timeout: 15000 });
 }, { behaviour: { goal: "unreachable" }, fragment: `camera=${CAMERA}`, expected: /ERR_/ }));

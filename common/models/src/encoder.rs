@@ -1,10 +1,13 @@
 //! The traits of image and text encoders.
 
+use std::sync::Arc;
+
 use image::RgbImage;
 
 use crate::crop::Crop;
 use crate::error::InferenceError;
 use crate::placement::Placement;
+use crate::synonyms::KnownPhrases;
 
 /// Turns crops of photographs into unit vectors.
 pub trait ImageEncoder: Send {
@@ -44,6 +47,11 @@ pub trait TextEncoder: Send {
 
     /// Encodes `text`: `[dim]`, a unit vector, centred if the description asks for it.
     fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError>;
+
+    /// Returns the phrases that it knows, if it knows some and not others.
+    fn known_phrases(&self) -> Option<&Arc<KnownPhrases>> {
+        None
+    }
 
     /// Returns the phrases or words that it accepts; `None` if it accepts any text.
     fn vocabulary(&self) -> Option<&[String]> {

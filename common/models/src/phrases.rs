@@ -1,9 +1,10 @@
 //! A text encoder of fixed phrases with given vectors; needs no model and no ONNX Runtime.
 
-use std::{collections::HashMap, path::Path};
+use std::{collections::HashMap, path::Path, sync::Arc};
 
 use crate::encoder::TextEncoder;
 use crate::error::{InferenceError, ModelError, PhrasesError};
+use crate::synonyms::{KnownPhrases, singulars};
 use crate::{tensors, text::centred};
 
 /// Number of suggestions for an unknown phrase.
@@ -19,6 +20,7 @@ pub struct PhraseEncoder {
     dim: usize,
     phrases: Vec<String>,
     index_of_key: HashMap<String, usize>,
+    known: Arc<KnownPhrases>,
     /// `[phrases][dim]`, centred unit vectors.
     vectors: Vec<f32>,
 }
@@ -45,7 +47,9 @@ impl PhraseEncoder {
             index_of_key.entry(key).or_insert(index);
         }
         for (index, phrase) in lines.iter().enumerate() {
-            index_of_key.entry(without_hyphens(&key(phrase))).or_insert(index);
+            for other in other_keys(&key(phrase)) {
+                index_of_key.entry(other).or_insert(index);
+            }
         }
         let mut vectors = tensors::read(vectors, tensor, Some(lines.len()), dim)?;
         for (index, vector) in vectors.chunks_exact_mut(dim).enumerate() {
@@ -54,7 +58,15 @@ impl PhraseEncoder {
                 return Err(PhrasesError::NoDirection { path, line: index + 1, phrase }.into());
             }
         }
-        Ok(Self { name: name.to_owned(), dim, phrases: lines, index_of_key, vectors })
+        let known = Arc::new(KnownPhrases::new(index_of_key.keys().cloned(), true));
+        Ok(Self { name: name.to_owned(), dim, phrases: lines, index_of_key, known, vectors })
+    }
+
+    /// Returns the index of a phrase, which may be in the plural.
+    fn find(&self, key: &str) -> Option<usize> {
+        let spaced = without_hyphens(key);
+        let mut keys = [key.to_owned(), spaced.clone()].into_iter().chain(singulars(&spaced));
+        keys.find_map(|key| self.index_of_key.get(&key).copied())
     }
 
     /// Returns known phrases similar to `key`: within a few edits, or with a word in common.
@@ -102,9 +114,7 @@ impl TextEncoder for PhraseEncoder {
         if key.is_empty() {
             return Err(InferenceError::EmptyText);
         }
-        let spaced = without_hyphens(&key);
-        let mut keys = [key.clone(), spaced.clone()].into_iter().chain(singulars(&spaced));
-        match keys.find_map(|key| self.index_of_key.get(&key)) {
+        match self.find(&key).or_else(|| self.find(&self.known.asked_as(&key)?)) {
             Some(index) => Ok(self.vectors[index * self.dim..][..self.dim].to_vec()),
             None => Err(InferenceError::UnknownPhrase {
                 n_known: self.phrases.len(),
@@ -114,17 +124,19 @@ impl TextEncoder for PhraseEncoder {
         }
     }
 
+    fn known_phrases(&self) -> Option<&Arc<KnownPhrases>> {
+        Some(&self.known)
+    }
+
     fn vocabulary(&self) -> Option<&[String]> {
         Some(&self.phrases)
     }
 }
 
-/// Endings of plurals, and what takes their place.
-const PLURALS: [(&str, &str); 5] = [("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")];
-
-/// Returns what a key may be the plural of, the longest ending first.
-fn singulars(key: &str) -> impl Iterator<Item = String> {
-    PLURALS.iter().filter_map(move |(plural, end)| Some(key.strip_suffix(plural)?.to_owned() + end))
+/// Returns what else a phrase is called: `barrel` and `bucket` for `barrel/bucket`, `tractor` for `tractor (farm equipment)`.
+fn other_keys(key: &str) -> impl Iterator<Item = String> {
+    let bare = key.split(" (").next().unwrap_or(key);
+    [key, bare].into_iter().chain(bare.split('/')).map(|key| without_hyphens(key.trim()))
 }
 
 fn without_hyphens(key: &str) -> String {
@@ -132,7 +144,7 @@ fn without_hyphens(key: &str) -> String {
 }
 
 /// Returns the lookup key of a phrase: lower case, single spaces, no leading article.
-fn key(text: &str) -> String {
+pub(crate) fn key(text: &str) -> String {
     let text = text.to_lowercase();
     let mut words: Vec<&str> = text.split_whitespace().collect();
     if words.len() > 1 && ["a", "an", "the"].contains(&words[0]) {

@@ -1,6 +1,7 @@
 //! Text encoders in ONNX: a `tokenizer.json`, then the model.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use ort::value::TensorElementType;
 use tokenizers::Tokenizer;
@@ -13,6 +14,7 @@ use crate::{
     error::TokenizerError,
     placement::Placement,
     session::{Model, SessionError, SessionOptions},
+    synonyms::KnownPhrases,
 };
 
 /// Turns text into the token ids of one model.
@@ -99,6 +101,7 @@ pub struct OnnxTextEncoder {
     centre: Option<Vec<f32>>,
     /// The words of a model that knows some and not others.
     nouns: Option<Vec<String>>,
+    known: Option<Arc<KnownPhrases>>,
 }
 
 impl OnnxTextEncoder {
@@ -134,7 +137,8 @@ impl OnnxTextEncoder {
             .expect_output(description.output.as_deref(), TensorElementType::Float32, &[1, dim as i64])?
             .name;
         let (name, description) = (name.to_owned(), description.clone());
-        let mut encoder = Self { name, dim, model, tokens, description, output, is_i32, centre, nouns: None };
+        let mut encoder =
+            Self { name, dim, model, tokens, description, output, is_i32, centre, nouns: None, known: None };
         let largest = encoder.tokens.largest_id();
         let end = encoder.description.end_token_id.unwrap_or(0);
         match encoder.run(&[largest, end]) {
@@ -149,7 +153,9 @@ impl OnnxTextEncoder {
 
     /// Says which words the model knows; of one without, that it knows them all.
     pub(crate) fn with_nouns<'a>(self, words: Option<impl Iterator<Item = &'a str>>) -> Self {
-        Self { nouns: words.map(|words| words.map(str::to_owned).collect()), ..self }
+        let nouns: Option<Vec<String>> = words.map(|words| words.map(str::to_owned).collect());
+        let known = nouns.clone().map(|nouns| Arc::new(KnownPhrases::new(nouns, false)));
+        Self { nouns, known, ..self }
     }
 
     /// Runs the model on token ids; returns its vector, `[dim]`.
@@ -183,6 +189,7 @@ impl TextEncoder for OnnxTextEncoder {
         if text.is_empty() {
             return Err(InferenceError::EmptyText);
         }
+        let text = self.known.as_ref().and_then(|known| known.asked_as(&text)).unwrap_or(text);
         let mut prompt = self.description.prompt.replace("{}", &text);
         if self.description.lowercase {
             prompt = prompt.to_lowercase();
@@ -194,6 +201,10 @@ impl TextEncoder for OnnxTextEncoder {
         } else {
             Err(InferenceError::NoDirection { model: self.name.clone(), index: 0 })
         }
+    }
+
+    fn known_phrases(&self) -> Option<&Arc<KnownPhrases>> {
+        self.known.as_ref()
     }
 
     fn nouns(&self) -> Option<&[String]> {

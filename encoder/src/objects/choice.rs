@@ -26,6 +26,8 @@ const MIN_CONSENSUS: f64 = 0.3;
 const SAME_IOU: f64 = 0.5;
 /// An object needs a view whose mask shows it, of which the photo's edge cuts off at most a tenth of the outline.
 const WHOLE: f32 = 0.9;
+/// One of this many views that judge an object must show it whole: a park that one of 80 photos outlines is none.
+const JUDGES_PER_WHOLE: usize = 20;
 /// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
 const LEAST_UNCUT: f32 = 0.05;
 
@@ -110,13 +112,15 @@ fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     let is_judge =
         |view: &&NodeView| !view.masks.is_empty() && u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS;
     let judges = views.values().filter(is_judge);
-    let (mut sum, mut weights, mut is_whole) = (0.0, 0.0, false);
+    let (mut sum, mut weights, mut n_whole, mut n_judges) = (0.0, 0.0, 0_usize, 0_usize);
     for view in judges {
         let uncut = f64::from(view.uncut.max(LEAST_UNCUT));
         let weight = uncut * uncut;
         (sum, weights) = (sum + weight * view.agreement, weights + weight);
-        is_whole |= view.agreement > SAME_IOU && view.uncut >= WHOLE;
+        n_judges += 1;
+        n_whole += usize::from(view.agreement > SAME_IOU && view.uncut >= WHOLE);
     }
+    let is_whole = n_whole > 0 && JUDGES_PER_WHOLE * n_whole >= n_judges;
     if n < min_gaussians || !is_whole || sum < MIN_CONSENSUS * weights {
         return 0.0;
     }
@@ -213,4 +217,18 @@ pub(super) fn objects_of_masks(
         masks.iter().for_each(|mask| object_of_mask[*mask as usize] = Some(object));
     }
     object_of_mask
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: of 20 views one shows the node whole, and its edge cuts the others' masks; of 21 that is too few.
+    #[test]
+    fn one_of_twenty_views_must_show_an_object_whole() {
+        let view = |uncut| NodeView { n: 10, masks: vec![(0, 10)], agreement: 0.9, uncut };
+        let views = |n: u32| (0..n).map(|at| (at, view(if at == 0 { 1.0 } else { 0.5 }))).collect();
+        assert!((worth(&views(20), 16, 1) - 0.9_f64.powi(8) * 2.0).abs() < 1e-6);
+        assert_eq!(worth(&views(21), 16, 1), 0.0);
+    }
 }

@@ -33,6 +33,13 @@ const WEIGHT_STEPS: f32 = 200.0;
 const MIN_SURROUNDED: u32 = 8;
 /// Smallest mask, pixels of the working image: a JPEG block, the size of its artefacts.
 const MIN_AREA_PX: u32 = 64;
+/// Scale of observation of small things, finer than all levels: only its compact components are masks.
+const COMPACT_SCALE: f32 = 100.0;
+/// A compact component fills this share of its box, is at most this share of the photo, and touches no edge of it.
+const MIN_FILL: f32 = 0.65;
+const MAX_COMPACT_SHARE: f32 = 0.03;
+/// Boundaries along its outline that suffice for a compact component.
+const COMPACT_SUPPORT: f32 = 0.3;
 /// The neighbours to which a pixel has an edge; the other four have an edge to the pixel.
 const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (-1, 1), (0, 1), (1, 1)];
 
@@ -133,7 +140,7 @@ impl GraphSegmenter {
     pub fn new(mut settings: GraphSettings) -> Self {
         settings.scales.truncate(usize::from(Mask::FILLER));
         settings.max_side_px = settings.max_side_px.max(1);
-        let identity = format!("graph 3, {settings:?}");
+        let identity = format!("graph 4, {settings:?}");
         Self { settings, identity, model: None }
     }
 
@@ -185,38 +192,30 @@ impl Segmenter for GraphSegmenter {
         let edges = raster.edges_by_weight(&self.settings, boundaries.as_deref());
         let n_pixels = raster.lab.len();
         let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(MIN_AREA_PX);
-        let levels: Vec<Labels> = self
-            .settings
-            .scales
-            .iter()
+        let image = Segmented { raster: &raster, boundaries: boundaries.as_deref(), min_area_px };
+        let compact_scale = image.boundaries.map(|_| COMPACT_SCALE);
+        let levels: Vec<Labels> = (self.settings.scales.iter().copied().chain(compact_scale))
             .map(|scale| raster.components(&edges, scale * WEIGHT_STEPS, min_area_px))
             .collect();
 
         let mut masks = Vec::new();
+        let finest = self.settings.scales.len().checked_sub(1).map(|finest| &levels[finest]);
         // The finest component of each pixel that no mask covers.
-        let mut rest = levels.last().map_or(Vec::new(), |finest| finest.of_pixel.clone());
+        let mut rest = finest.map_or(Vec::new(), |finest| finest.of_pixel.clone());
         for (level, labels) in levels.iter().enumerate() {
-            let repeats = labels.repeats_of(&levels[..level], self.settings.max_overlap_iou);
-            let n_components = labels.area_px.len();
-            let support = boundaries.as_deref().map(|boundaries| {
-                support::of_outlines(&labels.of_pixel, raster.width_px as usize, n_components, boundaries)
-            });
-            let is_confirmed =
-                |label: usize| support.as_ref().is_none_or(|of| of[label] >= self.settings.min_support);
-            let is_kept =
-                |label: usize| labels.area_px[label] >= min_area_px && !repeats[label] && is_confirmed(label);
-            let is_kept: Vec<bool> = (0..n_components).map(is_kept).collect();
+            let kept = self.kept(&image, &levels[..level], labels);
+            let mut is_kept = vec![false; labels.area_px.len()];
+            kept.iter().for_each(|(label, _)| is_kept[*label as usize] = true);
             let covered = labels.of_pixel.iter().map(|label| is_kept.get(*label as usize) == Some(&true));
             rest.iter_mut()
                 .zip(covered)
                 .filter(|(_, covered)| *covered)
                 .for_each(|(rest, _)| *rest = NO_REGION);
-            let all = masks_of_labels(&labels.of_pixel, raster.width_px, n_components, u64::MAX);
-            let kept = all.unwrap_or_default().into_iter().filter(|(label, _)| is_kept[*label as usize]);
-            masks.extend(kept.map(|(_, mask)| Mask { level: level as u8, ..mask }));
+            let level = level.min(self.settings.scales.len().saturating_sub(1)) as u8;
+            masks.extend(kept.into_iter().map(|(_, mask)| Mask { level, ..mask }));
         }
         if boundaries.is_some() {
-            let n_components = levels.last().map_or(0, |finest| finest.area_px.len());
+            let n_components = finest.map_or(0, |finest| finest.area_px.len());
             let fillers = masks_of_labels(&rest, raster.width_px, n_components, u64::MAX).unwrap_or_default();
             let fillers = fillers.into_iter().filter(|(_, mask)| mask.area_px >= min_area_px);
             masks.extend(fillers.map(|(_, mask)| Mask { level: Mask::FILLER, ..mask }));
@@ -227,7 +226,38 @@ impl Segmenter for GraphSegmenter {
     }
 }
 
+/// What the components of one image are judged by.
+struct Segmented<'a> {
+    raster: &'a Raster,
+    boundaries: Option<&'a [f32]>,
+    min_area_px: u32,
+}
+
 impl GraphSegmenter {
+    /// Returns the components that are masks, each with its label: large enough, in no coarser level, and outlined
+    /// by boundaries. What is compact needs fewer of these; of the components finer than all levels nothing else counts.
+    fn kept(&self, image: &Segmented<'_>, coarser: &[Labels], labels: &Labels) -> Vec<(u32, Mask)> {
+        let &Segmented { raster, boundaries, min_area_px } = image;
+        let n_components = labels.area_px.len();
+        let repeats = labels.repeats_of(coarser, self.settings.max_overlap_iou);
+        let support = boundaries.map(|boundaries| {
+            support::of_outlines(&labels.of_pixel, raster.width_px as usize, n_components, boundaries)
+        });
+        let is_level = coarser.len() < self.settings.scales.len();
+        let is_confirmed = |label: usize, mask: &Mask| {
+            support.as_ref().is_none_or(|of| {
+                (is_level && of[label] >= self.settings.min_support)
+                    || (of[label] >= COMPACT_SUPPORT && raster.is_compact(mask))
+            })
+        };
+        let is_kept = |(label, mask): &(u32, Mask)| {
+            let label = *label as usize;
+            mask.area_px >= min_area_px && !repeats[label] && is_confirmed(label, mask)
+        };
+        let all = masks_of_labels(&labels.of_pixel, raster.width_px, n_components, u64::MAX);
+        all.unwrap_or_default().into_iter().filter(is_kept).collect()
+    }
+
     fn keep_largest(&self, masks: &mut Vec<Mask>) {
         if masks.len() <= self.settings.max_masks {
             return;
@@ -363,6 +393,14 @@ impl Raster {
         sorted
     }
 
+    /// Returns whether a mask has the shape of a thing rather than of what remains between things.
+    fn is_compact(&self, mask: &Mask) -> bool {
+        let BoxPx { x0, y0, x1, y1 } = mask.box_px;
+        let (area, n_box) = (mask.area_px as f32, (x1 - x0) as f32 * (y1 - y0) as f32);
+        let is_inside = x0 > 0 && y0 > 0 && x1 < self.width_px && y1 < self.height_px;
+        is_inside && area >= MIN_FILL * n_box && area <= MAX_COMPACT_SHARE * self.lab.len() as f32
+    }
+
     /// Joins pixels over ascending edges while the edge is no larger than both components' largest
     /// inner weight plus `scale` over their size; then joins what is smaller than `min_area_px` to
     /// its most similar neighbour.
@@ -472,4 +510,27 @@ fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
     }
     let area_px = inside.iter().filter(|inside| **inside).count() as u32;
     (area_px > 0).then_some(Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside, area_px, level: mask.level })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand, in 100 x 100 pixels: what fills its box, touches no edge and is no large part of the photo.
+    #[test]
+    fn compact_is_what_has_the_shape_of_a_thing() {
+        let (lab, valid) = (vec![[0.0; 3]; 10_000], vec![true; 10_000]);
+        let raster = Raster { width_px: 100, height_px: 100, lab, depth_m: None, valid };
+        let is_compact = |x0: u32, y0: u32, side: u32, is_inside: &dyn Fn(u32, u32) -> bool| {
+            let box_px = BoxPx { x0, y0, x1: x0 + side, y1: y0 + side };
+            let inside: Vec<bool> = (0..side * side).map(|at| is_inside(at % side, at / side)).collect();
+            let area_px = inside.iter().filter(|inside| **inside).count() as u32;
+            raster.is_compact(&Mask { box_px, inside, area_px, level: 0 })
+        };
+        let disc = |x: u32, y: u32| x.abs_diff(8).pow(2) + y.abs_diff(8).pow(2) <= 64;
+        assert!(is_compact(40, 40, 17, &disc));
+        assert!(!is_compact(0, 40, 17, &disc) && !is_compact(40, 83, 17, &disc));
+        assert!(!is_compact(40, 40, 17, &|x, y| x.abs_diff(y) < 4));
+        assert!(is_compact(40, 40, 17, &|_, _| true) && !is_compact(40, 40, 18, &|_, _| true));
+    }
 }

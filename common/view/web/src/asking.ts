@@ -5,8 +5,9 @@ import { type Asked, openCard, photoOf, showCards, showPhoto } from "./cards";
 import { clustersOf } from "./clusters";
 import type { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Answers, type Description, fetchAnswers, fetchScores, parseQuestion } from "./network";
+import { type Answer, type Answers, type Description, fetchAnswers, fetchScores, parseQuestion, type Photo } from "./network";
 import { panel, say, showLegend, showSecond } from "./panel";
+import { pictureOf } from "./photos";
 import type { PlacesToStand } from "./places";
 import { remember, type State, writeState } from "./state";
 
@@ -138,7 +139,7 @@ export class Asking {
   /** Shows one object that was clicked, as if it had been asked for. */
   showObject(object: Answer): void {
     this.answers = [{ ...object, score: object.score ?? 0 }];
-    this.asked = { thing: "This object", threshold: null, viewpoint: this.viewpoint(), description: this.description() };
+    this.asked = { thing: object.names?.[0]?.name ?? "Unnamed object", threshold: null, viewpoint: this.viewpoint(), description: this.description() };
     showCards(this.answers, this.asked, (index) => this.choose(index === this.chosen ? null : index));
     say("");
     this.choose(0);
@@ -147,9 +148,14 @@ export class Asking {
   /** Shows a photo with a box in it. */
   async openPhoto(index: number, boxPx: number[] | null): Promise<void> {
     const photo = this.description().views[index];
+    await this.layOver(photo, photo.has_picture ? pictureOf(index) : null, boxPx);
+  }
+
+  /** Shows a picture that the slider lays over the scene, seen from where it was taken. */
+  async layOver(photo: Photo, picture: Promise<string> | null, boxPx: number[] | null): Promise<void> {
     const opened = ++this.photoOpened;
     try {
-      await showPhoto(index, photo, boxPx, () => this.drawing.standAt(photo), (share) => {
+      await showPhoto(photo, picture, boxPx, () => this.drawing.standAt(photo), (share) => {
         if (opened !== this.photoOpened) return;
         this.drawing.standAt(photo);
         panel.blend.hidden = share === 0;

@@ -77,6 +77,7 @@ function facts(answer: Answer, { description, threshold }: Asked): HTMLDListElem
     rows.push(["Lat, lon", `${latitude_deg.toFixed(7)}, ${longitude_deg.toFixed(7)}`], ["Height", `${height_m.toFixed(2)} m`]);
   }
   rows.push(["Score", `${answer.score.toFixed(2)}${threshold === null ? "" : `, found from ${threshold.toFixed(2)}`}`]);
+  if (answer.names?.length) rows.push(["Names", answer.names.map(({ name, confidence }) => `${name} ${Math.round(confidence * 100)} %`).join(", ")]);
   if (!answer.id) rows.push(["Kind", "a group of points, not a marked object"]);
   if (answer.degree !== undefined) rows.push(["Relation", `holds to ${answer.degree.toFixed(2)}`]);
   for (const other of answer.related_to ?? []) rows.push([`To: ${other.thing}`, metres(other.position_in_world)]);
@@ -111,7 +112,7 @@ function copying(answer: Answer, question: string): HTMLElement {
 }
 
 /** Shows a photo first of the details, with a box, a button that goes there, and a slider that lays it over the scene. */
-export async function showPhoto(index: number, photo: Photo, boxPx: number[] | null, onGo: () => void, onBlend: (share: number) => void): Promise<void> {
+export async function showPhoto(photo: Photo, picture: Promise<string> | null, boxPx: number[] | null, onGo: () => void, onBlend: (share: number) => void): Promise<void> {
   const figure = make("figure");
   const caption = make("figcaption");
   caption.append(make("span", photo.name), button("Stand here", onGo));
@@ -119,10 +120,10 @@ export async function showPhoto(index: number, photo: Photo, boxPx: number[] | n
   panel.details.querySelector("figure")?.remove();
   panel.details.hidden = false;
   panel.details.prepend(figure);
-  if (!photo.has_picture) return;
-  const { svg, url } = await photoWithBox(index, photo, boxPx);
+  if (!picture) return;
+  const url = await picture;
   panel.blend.src = url;
-  figure.prepend(svg);
+  figure.prepend(photoWithBox(url, photo, boxPx));
   const blend = make("input");
   Object.assign(blend, { type: "range", min: "0", max: "100", value: "0", id: "blend-share" });
   blend.setAttribute("aria-label", "Photo over the scene");

@@ -5,6 +5,7 @@ import "./style.css";
 import type { Viewpoint } from "./answers";
 import { Asking } from "./asking";
 import { ChangesPanel } from "./changes";
+import { Dropping } from "./dropping";
 import { Drawing } from "./drawing/drawing";
 import { type Description, describe, fetchWords, follow, NotFound, setToken, Unauthorized, type Word } from "./network";
 import { askToken, covered, panel, say, showBeside, showFacts } from "./panel";
@@ -74,6 +75,8 @@ function open(): void {
   asking = new Asking(state, drawing, places, () => description, viewpoint, lookSoon, report);
   changes = new ChangesPanel(drawing, panel.changes);
   new Pointing(drawing, asking, places, () => description);
+  new Dropping(drawing, asking, () => description, report);
+  panel.locate.hidden = description.program !== "slag-edge";
   panel.form.hidden = !description.can_ask;
   if (state.camera) drawing.placeAt(state.camera);
   drawing.setTheme(themeNow());

@@ -54,6 +54,8 @@ export interface Answer {
   geographic?: { latitude_deg: number; longitude_deg: number; height_m: number };
   /** How well the relation of a phrase holds, 0.5 to 1. */
   degree?: number;
+  /** Of an object that was clicked, the likeliest first. */
+  names?: { name: string; confidence: number }[];
   related_to?: { thing: string; position_in_world: Vector; score?: number }[];
 }
 
@@ -133,11 +135,11 @@ export function parseQuestion(line: string): Question {
   };
 }
 
-async function get(path: string, signal?: AbortSignal): Promise<Response> {
+async function get(path: string, signal?: AbortSignal, body?: Blob): Promise<Response> {
   const token = sessionStorage.getItem(TOKEN);
   let response: Response;
   try {
-    response = await fetch(path, { signal, headers: token ? { authorization: `Bearer ${token}` } : {} });
+    response = await fetch(path, { signal, body, method: body ? "POST" : "GET", headers: { ...(token ? { authorization: `Bearer ${token}` } : {}), ...(body ? { "content-type": body.type } : {}) } });
   } catch (error) {
     if (signal?.aborted) throw error;
     throw new Offline("The service cannot be reached. The page tries again by itself.");
@@ -180,6 +182,16 @@ export async function fetchObjectAt(point: Vector): Promise<Answer | null> {
   const holds = (object: Answer) => point.every((v, i) => v >= object.box_min_in_world[i] - NEAR_M && v <= object.box_max_in_world[i] + NEAR_M);
   const volume = (object: Answer) => object.box_max_in_world.reduce((product, v, i) => product * (v - object.box_min_in_world[i]), 1);
   return objects.filter(holds).sort((a, b) => volume(a) - volume(b))[0] ?? null;
+}
+
+/** Where a robot says that a photo was taken; axes of the camera as in `Photo`. */
+export type Located =
+  | { state: "found"; position_in_world: Vector; optical_rotation_xyzw: Photo["rotation_xyzw"]; n_inliers: number }
+  | { state: "unsure" | "lost"; reason: string };
+
+/** Asks a robot where a JPEG or PNG was taken by a camera without lens distortion. */
+export async function locatePhoto(photo: Blob, focalPx: number): Promise<Located> {
+  return (await get(`/v1/locate?focal_px=${focalPx.toFixed(2)}`, undefined, photo)).json();
 }
 
 /** Words to ask for, those of most things first; `complete`: whether all are counted. */

@@ -42,6 +42,8 @@ export const panel = {
   theme: element<HTMLButtonElement>("theme"),
   help: element<HTMLButtonElement>("help"),
   keys: element<HTMLDialogElement>("keys"),
+  locate: element<HTMLButtonElement>("locate"),
+  photo: element<HTMLInputElement>("photo"),
   whole: element<HTMLButtonElement>("whole"),
 };
 

@@ -9,7 +9,7 @@ const AROUND = 0.35;
 const pictures = new Map<number, Promise<string>>();
 
 /** Address of a photo's picture, for as long as the page is open. */
-function pictureOf(index: number): Promise<string> {
+export function pictureOf(index: number): Promise<string> {
   let picture = pictures.get(index);
   if (!picture) {
     picture = fetchPhoto(index).then((blob) => URL.createObjectURL(blob));
@@ -30,8 +30,7 @@ function put(to: Element, values: Record<string, number | string>): void {
 }
 
 /** A photo with a box drawn in it. */
-export async function photoWithBox(index: number, photo: Photo, boxPx: number[] | null): Promise<{ svg: SVGElement; url: string }> {
-  const url = await pictureOf(index);
+export function photoWithBox(url: string, photo: Photo, boxPx: number[] | null): SVGElement {
   const svg = document.createElementNS(SVG, "svg");
   put(svg, { viewBox: `0 0 ${photo.width_px} ${photo.height_px}`, role: "img", "aria-label": `Photo ${photo.name}` });
   const image = document.createElementNS(SVG, "image");
@@ -42,7 +41,7 @@ export async function photoWithBox(index: number, photo: Photo, boxPx: number[] 
     put(box, { x: boxPx[0], y: boxPx[1], width: boxPx[2] - boxPx[0], height: boxPx[3] - boxPx[1] });
     svg.append(box);
   }
-  return { svg, url };
+  return svg;
 }
 
 /** A square cut around a box. */

@@ -1,0 +1,104 @@
+//! Everyday words of nearly one meaning, for models that know some words and not others: `couch` is asked as `sofa`.
+
+use std::collections::HashSet;
+
+use crate::phrases::key;
+
+/// Groups of words of nearly one meaning, one group a line.
+const GROUPS: &str = include_str!("synonyms.txt");
+/// Longest phrase that is looked for in a text, words.
+const MAX_WORDS: usize = 4;
+/// Endings of plurals, and what takes their place.
+const PLURALS: [(&str, &str); 5] = [("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")];
+
+/// Returns what a phrase in lower case may be the plural of, the longest ending first.
+pub(crate) fn singulars(phrase: &str) -> impl Iterator<Item = String> {
+    PLURALS.iter().filter_map(move |(plural, end)| Some(phrase.strip_suffix(plural)?.to_owned() + end))
+}
+
+/// The phrases that a model knows.
+#[derive(Debug)]
+pub struct KnownPhrases {
+    phrases: HashSet<String>,
+    /// Whether it takes nothing else; otherwise texts around them, too.
+    is_closed: bool,
+}
+
+impl KnownPhrases {
+    /// `phrases`: in lower case, with spaces for hyphens.
+    pub(crate) fn new(phrases: impl IntoIterator<Item = String>, is_closed: bool) -> Self {
+        Self { phrases: phrases.into_iter().collect(), is_closed }
+    }
+
+    /// Returns how a text is asked of the model: with known phrases in place of unknown ones of nearly the same meaning,
+    /// `sofa` for `couch`. `None` if there is nothing to replace.
+    pub fn asked_as(&self, text: &str) -> Option<String> {
+        let text = if self.is_closed { key(text) } else { text.to_lowercase() }.replace('-', " ");
+        let words: Vec<&str> = text.split_whitespace().collect();
+        let (mut asked, mut at, mut is_other) = (Vec::new(), 0, false);
+        while at < words.len() {
+            let phrases =
+                (1..=MAX_WORDS.min(words.len() - at)).rev().map(|n| (n, words[at..at + n].join(" ")));
+            let known = phrases.filter_map(|(n, phrase)| Some((n, self.known_for(&phrase)?))).next();
+            let (n, phrase) = known.unwrap_or_else(|| (1, words[at].to_owned()));
+            is_other |= phrase != words[at..at + n].join(" ");
+            asked.push(phrase);
+            at += n;
+        }
+        let asked = asked.join(" ");
+        (is_other && (!self.is_closed || self.phrases.contains(&asked))).then_some(asked)
+    }
+
+    /// Returns a phrase that is known, also as a plural, as it is; of another one the first known synonym.
+    fn known_for(&self, phrase: &str) -> Option<String> {
+        let forms: Vec<String> = [phrase.to_owned()].into_iter().chain(singulars(phrase)).collect();
+        if forms.iter().any(|form| self.phrases.contains(form)) {
+            return Some(phrase.to_owned());
+        }
+        let groups =
+            GROUPS.lines().filter(|line| line.split(", ").any(|word| forms.iter().any(|f| f == word)));
+        groups.flat_map(|line| line.split(", ")).find(|word| self.phrases.contains(*word)).map(str::to_owned)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: what is known stays, also in the plural and as part of a longer text; what nobody knows stays, too.
+    #[test]
+    fn unknown_words_are_asked_as_known_ones() {
+        let phrases = ["sofa", "trash can", "street lamp", "table"].map(str::to_owned);
+        let [open, closed] = [false, true].map(|is_closed| KnownPhrases::new(phrases.clone(), is_closed));
+        for (text, asked) in [
+            ("couch", Some("sofa")),
+            ("Couches", Some("sofa")),
+            ("a red settee", Some("a red sofa")),
+            ("wheelie-bins", Some("trash can")),
+            ("lamp post", Some("street lamp")),
+            ("coffee table", Some("table")),
+            ("sofa", None),
+            ("sofas", None),
+            ("red table", None),
+            ("zeppelin", None),
+            ("", None),
+        ] {
+            assert_eq!(open.asked_as(text).as_deref(), asked, "{text}");
+        }
+        assert_eq!(closed.asked_as("The couch").as_deref(), Some("sofa"));
+        assert_eq!((closed.asked_as("a red settee"), closed.asked_as("sofas")), (None, None));
+    }
+
+    #[test]
+    fn groups_are_lines_of_several_distinct_phrases() {
+        for line in GROUPS.lines() {
+            let mut words: Vec<&str> = line.split(", ").collect();
+            assert!(words.iter().all(|word| *word == word.trim() && *word == word.to_lowercase()), "{line}");
+            assert!(words.iter().all(|word| word.split(' ').count() <= MAX_WORDS), "{line}");
+            let n = words.len();
+            words.sort_unstable();
+            words.dedup();
+            assert!(n > 1 && words.len() == n, "{line}");
+        }
+    }
+}
