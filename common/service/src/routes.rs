@@ -214,6 +214,3 @@ async fn whole_body(
         Err(problem) => problem.into_response(),
     }
 }
-
-#[cfg(test)]
-mod tests;
