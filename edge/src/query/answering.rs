@@ -9,7 +9,7 @@ use super::ask::Ask;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::outcome::{Outcome, RelatedAnswers};
 use super::rank::Ranked;
-use super::relations::{self, Phrase, Scale, Things, Viewer};
+use super::relations::{self, Phrase, Things, Viewer};
 use super::reply::Reply;
 use super::request::{Asked, QueryRequest, unit_vector};
 use super::scene::Scene;
@@ -131,7 +131,7 @@ fn related(
     let parts = things.found();
     let viewer =
         request.near.map(|position_in_world| Viewer { position_in_world, heading_rad: request.heading_rad });
-    let found = match relations::relate(&things, phrase, viewer.as_ref(), Scale { metre }) {
+    let found = match relations::relate(&things, phrase, viewer.as_ref(), metre) {
         Ok(found) => found,
         Err(miss) => return Ok(RelatedAnswers { parts, miss: Some(miss), answers: Vec::new() }),
     };
