@@ -10,7 +10,7 @@ use slag_tests::root;
 use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
-const CRATES: [(&str, &str); 12] = [
+const CRATES: [(&str, &str); 13] = [
     ("slag_math", "common/math"),
     ("slag_common", "common"),
     ("slag_models", "common/models"),
@@ -19,6 +19,7 @@ const CRATES: [(&str, &str); 12] = [
     ("slag_encoder", "encoder"),
     ("slag_edge", "edge"),
     ("slag_lab", "encoder/lab"),
+    ("slag_api", "common/api"),
     ("slag_robot", "doors/robot"),
     ("slag_mcap", "doors/mcap"),
     ("slag_mcp", "doors/mcp"),

@@ -84,6 +84,44 @@ pub fn write(mut out: impl Write, magic: [u8; 8], version: u32, sections: &[(u32
     Ok(())
 }
 
+/// Checks preamble and table as far as their checksum covers them; returns the number of sections.
+fn check_head(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<usize, ContainerError> {
+    let length =
+        |expected_bytes: u64| Err(ContainerError::Length { expected_bytes, found_bytes: bytes.len() as u64 });
+    if bytes.len() < PREAMBLE_BYTES {
+        return length(PREAMBLE_BYTES as u64);
+    }
+    if bytes[..8] != magic {
+        let found = bytes[..8].try_into().expect("eight bytes");
+        return Err(ContainerError::Magic { expected: magic, found });
+    }
+    let found = read_u32(bytes, 8);
+    if found != version {
+        return Err(ContainerError::Version { expected: version, found });
+    }
+    let n_sections = read_u32(bytes, 12);
+    if n_sections > MAX_SECTIONS {
+        return Err(damaged(12, format!("{n_sections} sections, expected at most {MAX_SECTIONS}")));
+    }
+    let head_bytes = PREAMBLE_BYTES + n_sections as usize * SECTION_ROW_BYTES;
+    let file_bytes = read_u64(bytes, 16);
+    if file_bytes != bytes.len() as u64 || bytes.len() < head_bytes {
+        return length(file_bytes);
+    }
+    let expected = read_u64(bytes, 24);
+    let found = checksum(&[&bytes[..24], &bytes[PREAMBLE_BYTES..head_bytes]].concat());
+    if expected != found {
+        let what = format!("checksum of preamble and table {found:#018x}, expected {expected:#018x}");
+        return Err(damaged(24, what));
+    }
+    Ok(n_sections as usize)
+}
+
+/// Says what is wrong with a file at a byte.
+pub(crate) fn damaged(offset: usize, what: impl Into<String>) -> ContainerError {
+    ContainerError::Damaged { offset_bytes: offset as u64, what: what.into() }
+}
+
 /// The places of a checked container's sections.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Layout {
@@ -111,57 +149,20 @@ impl Layout {
     /// # Errors
     /// As [`Layout::check`], without the checksums of the sections.
     pub fn check_table(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<Self, ContainerError> {
-        let length = |expected: usize| ContainerError::Length {
-            expected_bytes: expected as u64,
-            found_bytes: bytes.len() as u64,
-        };
-        let damaged =
-            |offset: usize, what: String| ContainerError::Damaged { offset_bytes: offset as u64, what };
-        if bytes.len() < PREAMBLE_BYTES {
-            return Err(length(PREAMBLE_BYTES));
-        }
-        if bytes[..8] != magic {
-            let found = bytes[..8].try_into().expect("eight bytes");
-            return Err(ContainerError::Magic { expected: magic, found });
-        }
-        let found = read_u32(bytes, 8);
-        if found != version {
-            return Err(ContainerError::Version { expected: version, found });
-        }
-        let n_sections = read_u32(bytes, 12);
-        if n_sections > MAX_SECTIONS {
-            return Err(damaged(12, format!("{n_sections} sections, expected at most {MAX_SECTIONS}")));
-        }
-        let head_bytes = PREAMBLE_BYTES + n_sections as usize * SECTION_ROW_BYTES;
-        let file_bytes = read_u64(bytes, 16);
-        if file_bytes != bytes.len() as u64 || bytes.len() < head_bytes {
-            return Err(ContainerError::Length {
-                expected_bytes: file_bytes,
-                found_bytes: bytes.len() as u64,
-            });
-        }
-        let expected = read_u64(bytes, 24);
-        let found = checksum(&[&bytes[..24], &bytes[PREAMBLE_BYTES..head_bytes]].concat());
-        if expected != found {
-            return Err(damaged(
-                24,
-                format!("checksum of preamble and table {found:#018x}, expected {expected:#018x}"),
-            ));
-        }
-        let mut end = align_up(head_bytes);
-        let mut sections = Vec::with_capacity(n_sections as usize);
-        for row in 0..n_sections as usize {
+        let n_sections = check_head(bytes, magic, version)?;
+        let file_bytes = bytes.len() as u64;
+        let mut end = align_up(PREAMBLE_BYTES + n_sections * SECTION_ROW_BYTES);
+        let mut sections = Vec::with_capacity(n_sections);
+        for row in 0..n_sections {
             let at = PREAMBLE_BYTES + row * SECTION_ROW_BYTES;
             let (id, start, len) = (read_u32(bytes, at), read_u64(bytes, at + 8), read_u64(bytes, at + 16));
             // Sections follow in table order without gaps, so none can overlap another or the table.
             let stop = start.checked_add(len).filter(|stop| *stop <= file_bytes);
             let (true, Some(stop)) = (start == end as u64, stop) else {
-                return Err(damaged(
-                    at,
-                    format!(
-                        "section {id} has offset {start} and length {len}, expected offset {end} and an end within {file_bytes} bytes"
-                    ),
-                ));
+                let what = format!(
+                    "section {id} has offset {start} and length {len}, expected offset {end} and an end within {file_bytes} bytes"
+                );
+                return Err(damaged(at, what));
             };
             if sections.iter().any(|(other, _)| *other == id) {
                 return Err(damaged(at, format!("section {id} occurs twice")));
@@ -170,10 +171,8 @@ impl Layout {
             end = align_up(stop as usize);
         }
         if end as u64 != file_bytes {
-            return Err(damaged(
-                16,
-                format!("the file has {file_bytes} bytes, but its sections end at {end}"),
-            ));
+            let what = format!("the file has {file_bytes} bytes, but its sections end at {end}");
+            return Err(damaged(16, what));
         }
         Ok(Self { sections })
     }
@@ -198,7 +197,7 @@ impl Layout {
                 range.len(),
                 size_of::<T>()
             );
-            return Err(ContainerError::Damaged { offset_bytes: range.start as u64, what });
+            return Err(damaged(range.start, what));
         }
         Ok(range)
     }

@@ -133,6 +133,11 @@ impl Aabb {
         self.max = self.max.max(centre + DVec3::splat(radius));
     }
 
+    /// Returns the smallest box around both.
+    pub fn union(self, other: Self) -> Self {
+        Self { min: self.min.min(other.min), max: self.max.max(other.max) }
+    }
+
     /// Returns whether a point lies inside, borders included.
     pub fn contains(&self, point: DVec3) -> bool {
         point.cmpge(self.min).all() && point.cmple(self.max).all()

@@ -6,7 +6,7 @@ use std::ops::Range;
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
-use crate::container::{ContainerError, Layout};
+use crate::container::{ContainerError, Layout, damaged};
 
 /// Ids of the sections.
 pub mod section {
@@ -141,7 +141,7 @@ impl LandmarksLayout {
                 "landmarks from {:?} in steps of {:?}, expected finite positions and steps above 0",
                 header.origin_in_world, header.step
             );
-            return Err(ContainerError::Damaged { offset_bytes: at.start as u64, what });
+            return Err(damaged(at.start, what));
         }
         let n_bytes = layout.find(section::LANDMARKS).map_or(0, |records| records.len());
         let records =

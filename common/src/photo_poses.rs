@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
 use crate::View;
-use crate::container::{ContainerError, Layout};
+use crate::container::{ContainerError, Layout, damaged};
 use crate::objects::MAX_PHOTO_BYTES;
 
 /// Ids of the sections.
@@ -108,11 +108,9 @@ impl PhotoPosesLayout {
         let poses =
             layout.column::<PhotoPose>(section::POSES, "photo poses", at.len() / size_of::<PhotoPose>())?;
         let names = layout.column::<u8>(section::NAMES, "names of the photos", n_bytes)?;
-        let damaged =
-            |offset: usize, what: String| ContainerError::Damaged { offset_bytes: offset as u64, what };
         let text = std::str::from_utf8(&bytes[names.clone()]).ok();
         let Some(text) = text.filter(|text| !text.chars().any(char::is_control)) else {
-            let what = "the names of the photos are not UTF-8 without control characters".into();
+            let what = "the names of the photos are not UTF-8 without control characters";
             return Err(damaged(names.start, what));
         };
         let all: Vec<PhotoPose> = bytemuck::pod_collect_to_vec(&bytes[poses.clone()]);

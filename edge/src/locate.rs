@@ -4,9 +4,7 @@ use std::io::Cursor;
 
 use glam::{DMat3, DQuat, DVec3};
 use image::{DynamicImage, ImageDecoder, ImageError, ImageReader};
-use schemars::JsonSchema;
-use serde::Serialize;
-use slag_common::frames::Geographic;
+pub use slag_api::locate::{Answer, Pose};
 use slag_common::{Distortion, Intrinsics};
 use slag_locate::{
     CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, locate, map_bytes, working_bytes,
@@ -44,44 +42,6 @@ pub struct Camera {
     pub gravity: Option<DVec3>,
     /// Where it may be.
     pub prior: Option<Prior>,
-}
-
-/// Where the camera is.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
-#[serde(tag = "state", rename_all = "lowercase")]
-pub enum Answer {
-    /// One pose agrees with enough landmarks.
-    Found(Pose),
-    /// Poses that agree with some landmarks: too few, or as many as another place does.
-    Unsure {
-        /// Why none is the answer.
-        reason: String,
-        /// Best first.
-        candidates: Vec<Pose>,
-    },
-    /// The photo has no place here.
-    Lost {
-        /// Why.
-        reason: String,
-    },
-}
-
-/// Pose of a camera.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
-pub struct Pose {
-    /// The camera, world frame; east, north, up of the scene's origin if it has one.
-    pub position_in_world: [f64; 3],
-    /// World from camera with the axes of REP-103 (x forward, y left, z up): x, y, z, w.
-    pub rotation_xyzw: [f64; 4],
-    /// World from camera with the axes of images (x right, y down, z forward): x, y, z, w.
-    pub optical_rotation_xyzw: [f64; 4],
-    /// Of x, y, z and rotations about the world's x, y, z, row by row: 36 numbers, square world units and radians.
-    pub covariance: Vec<f64>,
-    /// Landmarks that agree with the pose.
-    pub n_inliers: usize,
-    /// The same on the earth, where the scene has a geo-reference.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub geographic: Option<Geographic>,
 }
 
 /// A photo whose size is known, and whose pixels are not read yet.
@@ -159,7 +119,7 @@ pub fn answer(snapshot: &Snapshot, photo: PhotoFile<'_>, camera: &Camera) -> Res
     };
     let (gravity_in_camera, prior) = (camera.gravity, camera.prior);
     let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera, prior };
-    let pose = |located: &Located| Pose::of(snapshot, located);
+    let pose = |located: &Located| pose_of(snapshot, located);
     Ok(match locate(&map, &photo, None) {
         Outcome::Found(found) => Answer::Found(pose(&found)),
         Outcome::Unsure(candidates) => {
@@ -173,21 +133,19 @@ pub fn answer(snapshot: &Snapshot, photo: PhotoFile<'_>, camera: &Camera) -> Res
     })
 }
 
-impl Pose {
-    fn of(snapshot: &Snapshot, located: &Located) -> Self {
-        let world_from_camera = located.camera_from_world.inverse();
-        // Of the image's axes: forward is z, left is -x, up is -y.
-        let camera_from_body = DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y);
-        let rotation = |matrix: DMat3| DQuat::from_mat3(&matrix).normalize().to_array();
-        let at = world_from_camera.translation;
-        Self {
-            position_in_world: at.to_array(),
-            rotation_xyzw: rotation(world_from_camera.matrix3 * camera_from_body),
-            optical_rotation_xyzw: rotation(world_from_camera.matrix3),
-            covariance: located.covariance.to_vec(),
-            n_inliers: located.n_inliers,
-            geographic: snapshot.manifest.geo_reference.map(|geo| geo.geographic_from_world(at)),
-        }
+fn pose_of(snapshot: &Snapshot, located: &Located) -> Pose {
+    let world_from_camera = located.camera_from_world.inverse();
+    // Of the image's axes: forward is z, left is -x, up is -y.
+    let camera_from_body = DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y);
+    let rotation = |matrix: DMat3| DQuat::from_mat3(&matrix).normalize().to_array();
+    let at = world_from_camera.translation;
+    Pose {
+        position_in_world: at.to_array(),
+        rotation_xyzw: rotation(world_from_camera.matrix3 * camera_from_body),
+        optical_rotation_xyzw: rotation(world_from_camera.matrix3),
+        covariance: located.covariance.to_vec(),
+        n_inliers: located.n_inliers,
+        geographic: snapshot.manifest.geo_reference.map(|geo| geo.geographic_from_world(at)),
     }
 }
 

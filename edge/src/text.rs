@@ -64,7 +64,7 @@ struct Job {
 /// A text encoder owned by one thread, with a cache of recent vectors.
 pub struct TextService {
     info: EncoderInfo,
-    vocabulary: Vec<String>,
+    nouns: Vec<String>,
     jobs: Option<SyncSender<Job>>,
     thread: Option<JoinHandle<()>>,
     cache: Mutex<Cache>,
@@ -97,19 +97,12 @@ impl TextService {
         reopen: Option<Reopen>,
     ) -> io::Result<Self> {
         let (jobs, waiting) = sync_channel(MAX_WAITING);
-        let vocabulary = encoder.nouns().unwrap_or_default().to_vec();
+        let nouns = encoder.nouns().unwrap_or_default().to_vec();
         let is_alive = Arc::new(AtomicBool::new(true));
         let told = Arc::clone(&is_alive);
         let run = move || run(encoder, reopen, &waiting, &told);
         let thread = std::thread::Builder::new().name("text-model".into()).spawn(run)?;
-        Ok(Self {
-            info,
-            vocabulary,
-            jobs: Some(jobs),
-            thread: Some(thread),
-            cache: Mutex::default(),
-            is_alive,
-        })
+        Ok(Self { info, nouns, jobs: Some(jobs), thread: Some(thread), cache: Mutex::default(), is_alive })
     }
 
     pub fn info(&self) -> &EncoderInfo {
@@ -117,8 +110,8 @@ impl TextService {
     }
 
     /// Returns the words that things can be called by; none if everyday nouns do.
-    pub fn vocabulary(&self) -> &[String] {
-        &self.vocabulary
+    pub fn nouns(&self) -> &[String] {
+        &self.nouns
     }
 
     /// Returns whether the encoder runs.

@@ -10,7 +10,7 @@ use slag_math::stats::{Rank, quantile};
 use crate::memory::{MemoryPlan, Phase};
 
 /// Marks a Gaussian that no cell holds in [`CellSplit::cell_of_gaussian`].
-pub const NO_CELL: u32 = u32::MAX;
+pub(crate) const NO_CELL: u32 = u32::MAX;
 
 /// Extent of a Gaussian in standard deviations: 99.7 % of its mass along an axis, and a tenth less than the 3.33
 /// at which a rasteriser drops an opaque one.
@@ -22,7 +22,7 @@ const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
 /// Most cells that are cut only because positions must be exact. More means that the error is finer than the
 /// scene's coordinates; each cell is a file of some kilobytes.
-pub const MAX_CELLS_FOR_PRECISION: usize = 4096;
+pub(crate) const MAX_CELLS_FOR_PRECISION: usize = 4096;
 
 /// Largest error of a position, per axis.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -133,7 +133,7 @@ pub struct Cell {
     /// Its Gaussians: indices in the input, along a Morton curve.
     pub gaussians: Vec<u32>,
     /// Box around the means.
-    pub mean_bounds: Aabb,
+    pub(crate) mean_bounds: Aabb,
     /// Box around the extents.
     pub bounds: Aabb,
     /// Where its positions may lie.
@@ -146,13 +146,13 @@ pub struct CellSplit {
     /// The cells; a cell's id is its index.
     pub cells: Vec<Cell>,
     /// `[N]`: the cell of each Gaussian of the input, or [`NO_CELL`] where it is unusable.
-    pub cell_of_gaussian: Vec<u32>,
+    pub(crate) cell_of_gaussian: Vec<u32>,
     /// `[N]`: its index within [`Cell::gaussians`].
     pub local_of_gaussian: Vec<u32>,
     /// Unusable Gaussians.
     pub n_rejected: usize,
     /// Cells that are smaller than count and width ask for, so that positions keep their error.
-    pub n_for_precision: usize,
+    pub(crate) n_for_precision: usize,
 }
 
 impl CellSplit {
@@ -162,8 +162,14 @@ impl CellSplit {
         (limits.max_gaussians, limits.max_width, precision)
     }
 
+    /// Returns the cell whose Gaussians' means are nearest to a point, the first of such cells.
+    pub(crate) fn nearest(&self, point: DVec3) -> Option<usize> {
+        let distances = self.cells.iter().map(|cell| cell.mean_bounds.distance_to(point)).enumerate();
+        distances.min_by(|a, b| a.1.total_cmp(&b.1)).map(|(cell, _)| cell)
+    }
+
     /// Reserves the partition: each Gaussian's cell, its index there, and its place in the cell's list.
-    pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
+    pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
         memory.reserve(
             Phase::Always,
             "the cell of each Gaussian",

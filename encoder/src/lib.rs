@@ -11,7 +11,7 @@
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let folder = tempfile::tempdir()?;
-//! let mut room = Scene::new(&[grammar::SceneKind::Room], 1, 3, &grammar::nouns(None)?);
+//! let mut room = Scene::new(&[grammar::SceneKind::Room], 1, 3);
 //! let files = room.write(folder.path(), &Silent)?;
 //!
 //! let mut settings = EncodeSettings::new(files.scene, files.views, folder.path().join("store"), true);

@@ -27,7 +27,7 @@ pub struct FoundObject {
     /// Its id, as answers name it.
     pub id: String,
     /// Where it is, world.
-    pub position_m: DVec3,
+    pub(crate) position_m: DVec3,
     pub bounds: Aabb,
     pub n_gaussians: u32,
     pub n_masks: u32,

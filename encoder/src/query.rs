@@ -4,15 +4,15 @@ mod hits;
 
 use std::collections::BTreeMap;
 
-use slag_common::container::AlignedBytes;
-use slag_common::manifest::Calibration;
+use slag_common::manifest::{Calibration, CellRecord};
 use slag_common::objects::object_score;
-use slag_common::shard::{Profile, ShardLayout};
+use slag_common::shard::Profile;
 
 use crate::lift::published::{ReadFieldError, read_field, read_regions};
 use crate::objects::NONE;
-use crate::store::{StoreError, StoreReader};
-pub use hits::{Hit, SceneMismatch, check_scene, located, points_ply};
+use crate::store::{StoreError, StoreReader, StoredShard};
+pub(crate) use hits::points_ply;
+pub use hits::{Hit, check_scene, located};
 use slag_math::dot;
 
 /// Cosines of every Gaussian of the input with a query.
@@ -40,8 +40,6 @@ pub enum QueryError {
     NoShard { cell_id: u32, profile: Profile },
     #[error("the store has no objects; encode again, without --no-objects")]
     NoObjects,
-    #[error("cell {cell_id}: {source}")]
-    Shard { cell_id: u32, source: slag_common::container::ContainerError },
 }
 
 /// Returns the profiles that a command needs beside any others: exact shards tell which Gaussian is which.
@@ -100,18 +98,14 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
     let mut scores = Scores::unknown(reader);
     for cell in &reader.manifest().cells {
         let cell_id = cell.cell_id;
-        let read = |profile: Profile| -> Result<(AlignedBytes, ShardLayout), QueryError> {
-            let missing = QueryError::NoShard { cell_id, profile };
-            let bytes = reader.read_object(cell.shards.get(&profile).ok_or(missing)?.hash)?;
-            let layout =
-                ShardLayout::check(&bytes).map_err(|source| QueryError::Shard { cell_id, source })?;
-            Ok((bytes, layout))
-        };
-        let (bytes, layout) = read(profile)?;
-        let shard = layout.view(&bytes);
+        let stored = shard_of(reader, cell, profile)?;
+        let shard = stored.view();
         // All profiles have the same order, so the exact one knows the indices of those encoded without them.
-        let exact = if shard.has_input_indices() { None } else { Some(read(Profile::Exact)?) };
-        let indexed = exact.as_ref().map_or(shard, |(bytes, layout)| layout.view(bytes));
+        let exact = match shard.has_input_indices() {
+            true => None,
+            false => Some(shard_of(reader, cell, Profile::Exact)?),
+        };
+        let indexed = exact.as_ref().map_or(shard, StoredShard::view);
         for (at, cosine) in shard.scores(query).into_iter().enumerate() {
             let index = indexed.input_index(at);
             let index = index.ok_or(QueryError::NoShard { cell_id, profile: Profile::Exact })?;
@@ -119,6 +113,11 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
         }
     }
     Ok(scores)
+}
+
+fn shard_of(reader: &StoreReader, cell: &CellRecord, profile: Profile) -> Result<StoredShard, QueryError> {
+    let missing = QueryError::NoShard { cell_id: cell.cell_id, profile };
+    Ok(reader.read_shard(cell.shards.get(&profile).ok_or(missing)?)?)
 }
 
 /// Share of the object's score in those of its Gaussians. On generated scenes anything up to a third changed
@@ -164,12 +163,9 @@ impl PublishedObjects {
         let mut header = None;
         for cell in &manifest.cells {
             let cell_id = cell.cell_id;
-            let missing = QueryError::NoShard { cell_id, profile: Profile::Exact };
-            let bytes = reader.read_object(cell.shards.get(&Profile::Exact).ok_or(missing)?.hash)?;
-            let layout =
-                ShardLayout::check(&bytes).map_err(|source| QueryError::Shard { cell_id, source })?;
-            let objects = layout.objects(&bytes).ok_or(QueryError::NoObjects)?;
-            let shard = layout.view(&bytes);
+            let stored = shard_of(reader, cell, Profile::Exact)?;
+            let objects = stored.objects().ok_or(QueryError::NoObjects)?;
+            let shard = stored.view();
             let indices = shard.exact.map_or(&[][..], |exact| exact.input_indices);
             for (run, object) in objects.runs() {
                 let id = object.map(|object| objects.records[object].id);

@@ -4,9 +4,10 @@ use std::path::Path;
 
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
-use slag_common::{Distortion, Intrinsics, View, poses};
+use slag_common::{View, poses};
 use slag_encoder::ingest::load_image;
 use slag_encoder::masks::Mask;
+use slag_encoder::raster::pinhole;
 use slag_encoder::segment::{GivenMasks, GraphSegmenter, GraphSettings, SegmentInput, Segmenter};
 use slag_math::random::Random;
 use slag_models::SessionOptions;
@@ -15,15 +16,7 @@ use slag_test_support::{needs_shared, shared};
 
 fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> Vec<Mask> {
     let (width_px, height_px) = image.dimensions();
-    let intrinsics = Intrinsics {
-        width_px,
-        height_px,
-        focal_x_px: 50.0,
-        focal_y_px: 50.0,
-        centre_x_px: 0.0,
-        centre_y_px: 0.0,
-        distortion: Distortion::None,
-    };
+    let intrinsics = pinhole([width_px, height_px], 50.0);
     let view =
         View { name: "a".into(), image_path: "a".into(), intrinsics, camera_from_world: DAffine3::IDENTITY };
     let input = SegmentInput { view: &view, image, valid, undistorter: None, depth, pool: None };
@@ -143,15 +136,7 @@ fn the_largest_masks_are_kept() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.png");
     image.save(&path).unwrap();
-    let intrinsics = Intrinsics {
-        width_px: 200,
-        height_px: 200,
-        focal_x_px: 1.0,
-        focal_y_px: 1.0,
-        centre_x_px: 0.0,
-        centre_y_px: 0.0,
-        distortion: Distortion::None,
-    };
+    let intrinsics = pinhole([200, 200], 1.0);
     let view = View { name: "a".into(), image_path: path, intrinsics, camera_from_world: DAffine3::IDENTITY };
     let loaded = load_image(&view).unwrap();
     let few = GraphSegmenter::new(settings(5)).segment(&SegmentInput::new(&loaded, None)).unwrap();

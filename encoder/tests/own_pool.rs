@@ -13,11 +13,8 @@ use slag_test_support::{needs_shared, onnx_runtime, workspace_root};
 fn an_encode_leaves_rayons_global_pool_alone() {
     let folder = tempfile::tempdir().expect("a folder");
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool");
-    let files = pool.install(|| {
-        let nouns = grammar::nouns(None).expect("nouns");
-        let mut room = Scene::new(&[grammar::SceneKind::Room], 1, 2, &nouns);
-        room.write(folder.path(), &Silent).expect("a room")
-    });
+    let mut room = pool.install(|| Scene::new(&[grammar::SceneKind::Room], 1, 2));
+    let files = pool.install(|| room.write(folder.path(), &Silent).expect("a room"));
     let mut settings = EncodeSettings::new(files.scene, files.views, folder.path().join("store"), true);
     settings.run.threads = 2;
     // Random weights find weak masks.

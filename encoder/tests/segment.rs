@@ -5,11 +5,12 @@ use std::path::Path;
 use glam::DAffine3;
 use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
-use slag_common::{Distortion, Intrinsics, View, poses};
+use slag_common::{Distortion, View, poses};
 use slag_encoder::ingest::{Undistorter, load_image};
 use slag_encoder::masks::regions::{absorb_slivers, partition};
 use slag_encoder::masks::rle::{Rle, RleError};
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, RegionMap};
+use slag_encoder::raster::pinhole;
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput, Segmenter};
 use slag_math::random::Random;
 use slag_test_support::{needs_shared, shared};
@@ -69,11 +70,7 @@ fn bad_run_lengths_are_refused() {
 }
 
 fn view(name: &str, width_px: u32, height_px: u32) -> View {
-    let (focal_x_px, focal_y_px) = (50.0, 50.0);
-    let (centre_x_px, centre_y_px) = (f64::from(width_px) / 2.0, f64::from(height_px) / 2.0);
-    let distortion = Distortion::None;
-    let intrinsics =
-        Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, distortion };
+    let intrinsics = pinhole([width_px, height_px], 50.0);
     View { name: name.into(), image_path: "none".into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 

@@ -3,9 +3,10 @@
 
 use glam::DAffine3;
 use image::RgbImage;
-use slag_common::{Distortion, Intrinsics, View};
+use slag_common::View;
 use slag_encoder::masks::Mask;
 use slag_encoder::masks::rle::Rle;
+use slag_encoder::raster::pinhole;
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput};
 use slag_math::random::Random;
 use slag_test_support::{damaged, memory_of};
@@ -23,19 +24,10 @@ fn check(masks: &[Mask]) {
 }
 
 fn view() -> View {
-    let intrinsics = Intrinsics {
-        width_px: WIDTH_PX,
-        height_px: HEIGHT_PX,
-        focal_x_px: 50.0,
-        focal_y_px: 50.0,
-        centre_x_px: 32.0,
-        centre_y_px: 24.0,
-        distortion: Distortion::None,
-    };
     View {
         name: "a.jpg".into(),
         image_path: "a.jpg".into(),
-        intrinsics,
+        intrinsics: pinhole([WIDTH_PX, HEIGHT_PX], 50.0),
         camera_from_world: DAffine3::IDENTITY,
     }
 }

@@ -144,7 +144,7 @@ fn splats_that_tell_too_little_are_refused() {
 #[test]
 fn a_splat_alone_is_encoded() {
     let folder = tempfile::tempdir().unwrap();
-    let mut room = Scene::new(&[grammar::SceneKind::Room], 1, 3, &grammar::nouns(None).unwrap());
+    let mut room = Scene::new(&[grammar::SceneKind::Room], 1, 3);
     let files = room.write(folder.path(), &Silent).unwrap();
     let store = folder.path().join("store");
     let poses = store.join("drawn").join(POSES_FILE);

@@ -5,6 +5,8 @@
 
 #[path = "formats.rs"]
 mod formats;
+#[path = "repository.rs"]
+mod repository;
 #[path = "seeds.rs"]
 pub mod seeds;
 #[path = "services.rs"]

@@ -115,7 +115,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         .map(|text| text.as_bytes().to_vec())
         .into(),
         "v1" => V1_BODIES.iter().map(|body| body.as_bytes().to_vec()).collect(),
-        "tuf" => super::services::tuf_seeds(),
+        "tuf" => super::repository::seeds(),
         "http_request" => HTTP_REQUESTS.iter().map(|request| request.as_bytes().to_vec()).collect(),
         "position" => text("1 2 3\n46.8,-91.9,150\n{\"x\":1,\"y\":2,\"z\":3}\n{\"lat\":1,\"lon\":2}\n"),
         _ => Vec::new(),
@@ -319,7 +319,6 @@ fn contributions() -> Vec<u8> {
     [sections(b"SLAGCONT", 2, &columns), entry].concat()
 }
 
-/// CRC-32 (IEEE 802.3), bit by bit.
 fn region_table() -> Vec<u8> {
     let columns = [u64s(&[2, 2, 2, 3]), f32s(&[1.0, 0.0, 0.0, 1.0]), u64s(&[0, 1, 3]), u32s(&[0, 0, 1])];
     sections(b"SLAGREGN", 2, &columns)

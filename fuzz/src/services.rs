@@ -7,11 +7,7 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use ed25519_dalek::SigningKey;
-use slag_common::tuf::{
-    FileMeta, Kept, Key, RoleKeys, Root, Snapshot, Source, TargetFile, Targets, Timestamp, add_signatures,
-    refresh, sign,
-};
+use slag_common::tuf::{Kept, Source, add_signatures, refresh};
 use slag_edge::http::{self, App, Settings};
 use slag_edge::query::Engine;
 use slag_edge::store::EdgeCache;
@@ -19,6 +15,7 @@ use slag_edge::text::{EncoderInfo, TextService};
 use slag_models::{InferenceError, TextEncoder};
 use slag_service::listen::{Listen, bind};
 
+use super::repository::{REPLACED, key, repository};
 use super::seeds;
 
 /// Asks for little, and ends the connection; what comes before may be whole or not.
@@ -94,50 +91,6 @@ pub fn http_request(data: &[u8]) -> bool {
     let answer = String::from_utf8_lossy(&answer);
     assert!(!answer.contains("HTTP/1.1 500"), "{answer}");
     answer.starts_with("HTTP/1.1 2")
-}
-
-fn key() -> SigningKey {
-    SigningKey::from_bytes(&[7; 32])
-}
-
-/// The files of a repository whose roles state versions alone, so that each may be replaced.
-fn repository() -> &'static BTreeMap<&'static str, Vec<u8>> {
-    static FILES: OnceLock<BTreeMap<&'static str, Vec<u8>>> = OnceLock::new();
-    FILES.get_or_init(|| {
-        let (key, never) = (key(), u64::MAX);
-        let public = Key::of(&key);
-        let role = RoleKeys { keyids: vec![public.id()], threshold: 1 };
-        let roles = ["root", "targets", "snapshot", "timestamp"].map(|name| (name.to_owned(), role.clone()));
-        let keys = BTreeMap::from([(public.id(), public)]);
-        let root = Root { consistent_snapshot: true, keys, roles: roles.into() };
-        let meta = |name: &str| {
-            BTreeMap::from([(name.to_owned(), FileMeta { version: 1, length: None, hashes: None })])
-        };
-        let targets = BTreeMap::from([("manifest".to_owned(), TargetFile::of(b"x"))]);
-        let targets = Targets { targets };
-        let snapshot = Snapshot { meta: meta("targets.json") };
-        let timestamp = Timestamp { meta: meta("snapshot.json"), signed_at: None };
-        BTreeMap::from([
-            ("1.root.json", sign(1, never, &root, &[&key])),
-            ("2.root.json", sign(2, never, &root, &[&key])),
-            ("timestamp.json", sign(1, never, &timestamp, &[&key])),
-            ("1.snapshot.json", sign(1, never, &snapshot, &[&key])),
-            ("1.targets.json", sign(1, never, &targets, &[&key])),
-        ])
-    })
-}
-
-/// The file that the first byte of an input names.
-const REPLACED: [&str; 4] = ["2.root.json", "timestamp.json", "1.snapshot.json", "1.targets.json"];
-
-/// Returns a seed for each role: its byte, and what it signs.
-pub fn tuf_seeds() -> Vec<Vec<u8>> {
-    let seed = |(number, name): (usize, &&str)| {
-        let text = String::from_utf8(repository()[name].clone()).expect("JSON is text");
-        let at = text.find("\"signed\":").expect("signed") + "\"signed\":".len();
-        [&[b'0' + number as u8], &text.as_bytes()[at..text.len() - 1]].concat()
-    };
-    REPLACED.iter().enumerate().map(seed).collect()
 }
 
 struct Files(BTreeMap<&'static str, Vec<u8>>);

@@ -40,7 +40,6 @@ mod placement;
 pub mod preprocess;
 mod provider;
 mod runtime;
-mod runtime_log;
 pub mod sam;
 mod score;
 pub mod session;

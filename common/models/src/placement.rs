@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use ort::{logging::LogLevel, session::builder::SessionBuilder};
 
 use crate::provider::Provider;
-use crate::runtime_log::forward_log;
+use crate::runtime::forward_log;
 
 /// The providers that a model's nodes run on.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

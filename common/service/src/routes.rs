@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 
 use axum::Router;
-use axum::extract::Request;
+use axum::extract::{DefaultBodyLimit, Request};
 use axum::handler::Handler;
 use axum::http::Method;
 use axum::middleware::{Next, from_fn};
@@ -156,7 +156,8 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         let whole = from_fn(move |request: Request, next: Next| {
             whole_body(media_types, max_body_bytes, request, next)
         });
-        let handler = post(handler).route_layer(whole);
+        // The length is limited by `whole`; by itself axum refuses a body of more than 2 MB.
+        let handler = post(handler).route_layer(DefaultBodyLimit::disable()).route_layer(whole);
         let mut routes = self.add::<T, H>(Method::POST, path, summary, handler);
         routes.last(|route| route.body = Some(body));
         routes
@@ -214,6 +215,3 @@ async fn whole_body(
         Err(problem) => problem.into_response(),
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::columns::{
     MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, section,
 };
-use crate::container::{ContainerError, Layout};
+use crate::container::{ContainerError, Layout, damaged};
 
 /// Largest step of a vector: components are scaled to about unit length.
 const MAX_STEP: f32 = 4096.0;
@@ -28,31 +28,12 @@ impl ObjectsLayout {
         m: usize,
     ) -> Result<Option<Self>, ContainerError> {
         let Some(at_header) = layout.find(section::HEADER) else { return Ok(None) };
-        let damaged =
-            |offset: usize, what: String| ContainerError::Damaged { offset_bytes: offset as u64, what };
         let header: ObjectsHeader = layout.value(bytes, section::HEADER, "header of the objects")?;
-        let (n, n_vectors, n_runs) =
-            (header.n_objects as usize, header.n_vectors as usize, header.n_runs as usize);
-        if n >= usize::from(NO_OBJECT) || !(1..=MAX_VECTORS).contains(&header.n_vectors) {
-            let what = format!(
-                "{n} objects of {n_vectors} vectors each, expected fewer than {NO_OBJECT} of 1 to {MAX_VECTORS}"
-            );
+        if let Some(what) = header_fault(&header) {
             return Err(damaged(at_header.start, what));
         }
-        let is_score = |score: f32| (-1.0..=1.0).contains(&score);
-        if !is_score(header.score_mean)
-            || !is_score(header.score_spread)
-            || header.score_spread < 0.0
-            || !(0.0..=MAX_ERROR).contains(&header.score_error_bound)
-        {
-            return Err(damaged(
-                at_header.start,
-                format!(
-                    "score_mean {}, score_spread {} and score_error_bound {} are not cosines: expected -1..=1, 0..=1 and 0..={MAX_ERROR}",
-                    header.score_mean, header.score_spread, header.score_error_bound
-                ),
-            ));
-        }
+        let (n, n_vectors, n_runs) =
+            (header.n_objects as usize, header.n_vectors as usize, header.n_runs as usize);
         let columns = [
             layout.column::<ObjectRecord>(section::RECORDS, "objects", n)?,
             layout.column::<i8>(section::VECTORS, "vectors of the objects", n * n_vectors * m)?,
@@ -63,40 +44,25 @@ impl ObjectsLayout {
         ];
         let photos = std::str::from_utf8(&bytes[columns[5].clone()]);
         let Some(photos) = photos.ok().filter(|names| !names.chars().any(char::is_control)) else {
-            return Err(damaged(
-                columns[5].start,
-                "the names of the photos are not UTF-8 without control characters".into(),
-            ));
+            let what = "the names of the photos are not UTF-8 without control characters";
+            return Err(damaged(columns[5].start, what));
         };
         let steps: Vec<f32> = bytemuck::pod_collect_to_vec(&bytes[columns[2].clone()]);
         if !steps.iter().all(|step| (0.0..=MAX_STEP).contains(step)) {
-            return Err(damaged(
-                columns[2].start,
-                format!("the steps of the objects are not all within 0..={MAX_STEP}"),
-            ));
+            let what = format!("the steps of the objects are not all within 0..={MAX_STEP}");
+            return Err(damaged(columns[2].start, what));
         }
         let ends: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[columns[3].clone()]);
-        let of_runs: Vec<u16> = bytemuck::pod_collect_to_vec(&bytes[columns[4].clone()]);
         let ascends = ends.first().is_none_or(|end| *end > 0) && ends.windows(2).all(|w| w[0] < w[1]);
         if !ascends || ends.last().copied().unwrap_or(0) != n_gaussians {
-            return Err(damaged(
-                columns[3].start,
-                format!("the ends of the runs do not ascend to {n_gaussians}"),
-            ));
+            let what = format!("the ends of the runs do not ascend to {n_gaussians}");
+            return Err(damaged(columns[3].start, what));
         }
-        let mut n_here = vec![0u32; n];
-        let starts = std::iter::once(&0).chain(&ends);
-        for ((start, end), object) in starts.zip(&ends).zip(&of_runs).filter(|(_, o)| **o != NO_OBJECT) {
-            match n_here.get_mut(usize::from(*object)) {
-                Some(n_here) => *n_here += end - start,
-                None => {
-                    return Err(damaged(
-                        columns[4].start,
-                        format!("a run belongs to object {object} of {n}"),
-                    ));
-                }
-            }
-        }
+        let of_runs: Vec<u16> = bytemuck::pod_collect_to_vec(&bytes[columns[4].clone()]);
+        let counted = n_by_object(&ends, &of_runs, n);
+        let n_here = counted.map_err(|object| {
+            damaged(columns[4].start, format!("a run belongs to object {object} of {n}"))
+        })?;
         let records: Vec<ObjectRecord> = bytemuck::pod_collect_to_vec(&bytes[columns[0].clone()]);
         for (at, (record, n_here)) in records.iter().zip(&n_here).enumerate() {
             if let Some(what) = fault(record, *n_here, photos) {
@@ -121,6 +87,33 @@ impl ObjectsLayout {
             photos,
         }
     }
+}
+
+fn header_fault(header: &ObjectsHeader) -> Option<String> {
+    let ObjectsHeader { n_objects: n, n_vectors, score_mean, score_spread, score_error_bound, .. } = *header;
+    if n >= u32::from(NO_OBJECT) || !(1..=MAX_VECTORS).contains(&n_vectors) {
+        return Some(format!(
+            "{n} objects of {n_vectors} vectors each, expected fewer than {NO_OBJECT} of 1 to {MAX_VECTORS}"
+        ));
+    }
+    let are_scores = (-1.0..=1.0).contains(&score_mean)
+        && (0.0..=1.0).contains(&score_spread)
+        && (0.0..=MAX_ERROR).contains(&score_error_bound);
+    (!are_scores).then(|| {
+        format!(
+            "score_mean {score_mean}, score_spread {score_spread} and score_error_bound {score_error_bound} are not cosines: expected -1..=1, 0..=1 and 0..={MAX_ERROR}"
+        )
+    })
+}
+
+/// Returns the Gaussians of each of `n` objects, or the object of a run that is none of them.
+fn n_by_object(ends: &[u32], of_runs: &[u16], n: usize) -> Result<Vec<u32>, u16> {
+    let mut n_here = vec![0u32; n];
+    let starts = std::iter::once(&0).chain(ends);
+    for ((start, end), object) in starts.zip(ends).zip(of_runs).filter(|(_, object)| **object != NO_OBJECT) {
+        *n_here.get_mut(usize::from(*object)).ok_or(*object)? += end - start;
+    }
+    Ok(n_here)
 }
 
 fn fault(record: &ObjectRecord, n_here: u32, photos: &str) -> Option<&'static str> {

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::columns::{Occupancy, OccupancyHeader, RunKind, StoredRun, section};
-use crate::container::{ContainerError, Layout};
+use crate::container::{ContainerError, Layout, damaged};
 
 /// Most blocks of a shard's box: readers count them in 32 bits, and a writer keeps within 512 along each axis.
 const MAX_BLOCKS: u64 = 1 << 27;
@@ -23,8 +23,6 @@ impl OccupancyLayout {
     /// Checks the occupancy; returns `None` if the shard has none.
     pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<Option<Self>, ContainerError> {
         let Some(at_header) = layout.find(section::HEADER) else { return Ok(None) };
-        let damaged =
-            |offset: usize, what: String| ContainerError::Damaged { offset_bytes: offset as u64, what };
         let header: OccupancyHeader = layout.value(bytes, section::HEADER, "header of the occupancy")?;
         check_header(&header).map_err(|what| damaged(at_header.start, what))?;
         let runs = layout.column::<StoredRun>(section::RUNS, "runs of blocks", header.n_runs as usize)?;

@@ -11,7 +11,7 @@ use super::format::{
 };
 use super::indices::{self, IndicesHeader, PackedIndices};
 use crate::appearance::Appearance;
-use crate::container::{ContainerError, Layout};
+use crate::container::{ContainerError, Layout, damaged};
 use crate::landmarks::{Landmarks, LandmarksLayout};
 use crate::objects::{Objects, ObjectsLayout};
 use crate::occupancy::{Occupancy, OccupancyLayout};
@@ -166,10 +166,6 @@ impl ShardLayout {
                 .map(|(header, words)| PackedIndices { header: *header, words: cast(bytes, words) }),
         }
     }
-}
-
-fn damaged(offset: usize, what: String) -> ContainerError {
-    ContainerError::Damaged { offset_bytes: offset as u64, what }
 }
 
 fn check_header(header: &ShardHeader) -> Result<(), String> {

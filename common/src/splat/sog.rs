@@ -272,10 +272,11 @@ impl Sog {
         Ok(tables)
     }
 
-    fn decode(&mut self, meta: &Meta, options: ReadOptions) -> Result<Gaussians, SplatError> {
-        let is_v1 = match meta.version {
-            None => true,
-            Some(2) => false,
+    /// Returns the number of Gaussians that the meta file states.
+    fn count(&self, meta: &Meta) -> Result<u64, SplatError> {
+        let stated = match meta.version {
+            None => meta.means.shape.as_ref().and_then(|shape| shape.first()).copied(),
+            Some(2) => meta.count,
             Some(version) => {
                 return Err(SplatError::Unsupported {
                     path: self.path.clone(),
@@ -284,10 +285,12 @@ impl Sog {
                 });
             }
         };
-        let shape = || meta.means.shape.as_ref().and_then(|shape| shape.first()).copied();
-        let Some(count) = (if is_v1 { shape() } else { meta.count }) else {
-            return Err(self.malformed("meta.json", "the number of Gaussians (`count`)", "none"));
-        };
+        stated.ok_or_else(|| self.malformed("meta.json", "the number of Gaussians (`count`)", "none"))
+    }
+
+    fn decode(&mut self, meta: &Meta, options: ReadOptions) -> Result<Gaussians, SplatError> {
+        let is_v1 = meta.version.is_none();
+        let count = self.count(meta)?;
         let place = Place::Part("meta.json".into());
         let degree = if options.with_sh_rest && meta.sh_rest.is_some() { MAX_SH_DEGREE } else { 0 };
         let n = plausible_count(&self.path, place, count, degree, self.len_bytes)?;

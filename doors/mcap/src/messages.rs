@@ -4,7 +4,8 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use serde_json::{Value, json};
-use slag_robot::{Answer, Floor, FloorPlace, PointAnswer};
+use slag_robot::api::floor::{Floor, Place};
+use slag_robot::{Answer, PointAnswer};
 
 /// Foxglove's numbers of the types of fields.
 const UINT8: u32 = 1;
@@ -48,7 +49,7 @@ pub fn things(stamp: Stamp<'_>, text: &str, answers: &[Answer]) -> Value {
             ],
             "arrows": [], "spheres": [], "cylinders": [], "lines": [], "triangles": [], "models": [],
             "cubes": [{
-                "pose": pose(of.centre_in_world, of.rotation_world_from_box), "size": vector(of.size),
+                "pose": pose(of.centre_in_world.to_array(), of.rotation_world_from_box.to_array()), "size": vector(of.size.to_array()),
                 "color": {"r": 0.2, "g": 0.7, "b": 1.0, "a": 0.3},
             }],
             "texts": [{
@@ -78,16 +79,16 @@ pub fn points(stamp: Stamp<'_>, answers: &[PointAnswer]) -> Value {
 /// Returns a `foxglove.Grid` of the ground: 0 unknown, 1 ground that the robot cannot reach, 2 reached, 3
 /// obstacle. `None` if the robot's runs are not as many cells as it says.
 pub fn ground(stamp: Stamp<'_>, floor: &Floor) -> Option<Value> {
-    let number = |place: FloorPlace| match place {
-        FloorPlace::Unknown => 0,
-        FloorPlace::Ground => 1,
-        FloorPlace::Reached => 2,
-        FloorPlace::Obstacle => 3,
+    let number = |place: Place| match place {
+        Place::Unknown => 0,
+        Place::Ground => 1,
+        Place::Reached => 2,
+        Place::Obstacle => 3,
     };
     let data: Vec<u8> = floor.cells()?.into_iter().map(number).collect();
     let [n_columns, _] = floor.size;
     Some(json!({
-        "timestamp": stamp.time(), "frame_id": stamp.frame, "pose": pose(floor.origin_in_world, [0.0, 0.0, 0.0, 1.0]),
+        "timestamp": stamp.time(), "frame_id": stamp.frame, "pose": pose(floor.origin_in_world.to_array(), [0.0, 0.0, 0.0, 1.0]),
         "column_count": n_columns, "cell_size": {"x": floor.cell_m, "y": floor.cell_m}, "row_stride": n_columns, "cell_stride": 1,
         "fields": [{"name": "ground", "offset": 0, "type": UINT8}], "data": BASE64.encode(data),
     }))

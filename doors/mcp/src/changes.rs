@@ -2,7 +2,8 @@
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
-use slag_robot::Changes;
+use slag_robot::api::changes::{ChangedThing, ChangesReply, ComparedGeneration, MovedThing, NotCompared};
+use slag_robot::xyz;
 
 /// Two states of the map, and a place.
 #[derive(Debug, Deserialize, JsonSchema)]
@@ -44,13 +45,13 @@ pub struct Difference {
     /// Things that lie elsewhere.
     pub moved: Vec<Move>,
     /// Things that are as they were, anywhere.
-    pub n_unchanged: u64,
+    pub n_unchanged: usize,
     /// Things of which it is unknown whether they changed, anywhere: the robot had their place on board in one of
     /// the generations only.
-    pub n_not_compared: u64,
+    pub n_not_compared: usize,
     /// Why nothing was compared.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub none: Option<NoDifference>,
+    pub none: Option<NotCompared>,
 }
 
 /// A thing as it is or was.
@@ -81,53 +82,42 @@ pub struct Move {
     pub distance: f64,
 }
 
-/// Why nothing was compared.
-#[derive(Debug, Serialize, JsonSchema)]
-pub struct NoDifference {
-    /// "no-earlier-generation".
-    pub kind: String,
-    /// The same in a sentence.
-    pub detail: String,
-}
-
 impl Compare {
     /// Returns the parameters of `GET /v1/changes`.
     pub fn parameters(&self) -> Vec<(&'static str, String)> {
         let words = self.words.iter().map(|word| ("text", word.clone()));
         let more = [
             self.from_generation.map(|generation| ("from", generation.to_string())),
-            self.near.map(|[x, y, z]| ("near", format!("{x},{y},{z}"))),
+            self.near.map(|near| ("near", xyz(near))),
             self.radius.map(|radius| ("radius", radius.to_string())),
         ];
         words.chain(more.into_iter().flatten()).collect()
     }
 }
 
-impl From<slag_robot::Changed> for Thing {
-    fn from(thing: slag_robot::Changed) -> Self {
-        let (low, high) = (thing.box_min_in_world, thing.box_max_in_world);
+impl From<ChangedThing> for Thing {
+    fn from(thing: ChangedThing) -> Self {
         let (most_like, likeness) = thing.like.map(|like| (like.text, like.score)).unzip();
         Self {
             id: thing.id,
-            position_in_world: thing.position_in_world,
-            size: std::array::from_fn(|axis| high[axis] - low[axis]),
+            position_in_world: thing.position_in_world.to_array(),
+            size: (thing.box_max_in_world - thing.box_min_in_world).to_array(),
             most_like,
             likeness,
         }
     }
 }
 
-impl From<Changes> for Difference {
-    fn from(changes: Changes) -> Self {
-        let things = |list: Vec<slag_robot::Changed>| list.into_iter().map(Thing::from).collect();
-        let secs = |from: slag_robot::Compared| {
+impl From<ChangesReply> for Difference {
+    fn from(changes: ChangesReply) -> Self {
+        let things = |list: Vec<ChangedThing>| list.into_iter().map(Thing::from).collect();
+        let secs = |from: ComparedGeneration| {
             changes.to.created_unix_secs.saturating_sub(from.created_unix_secs) as f64
         };
-        let moved =
-            |of: slag_robot::Moved| Move { from: of.from.into(), to: of.to.into(), distance: of.distance };
+        let moved = |of: MovedThing| Move { from: of.from.into(), to: of.to.into(), distance: of.distance };
         Self {
             scene: changes.scene,
-            unit: changes.unit,
+            unit: changes.unit.into(),
             from_generation: changes.from.map(|from| from.generation),
             to_generation: changes.to.generation,
             hours: changes.from.map(|from| secs(from) / 3600.0),
@@ -136,7 +126,7 @@ impl From<Changes> for Difference {
             moved: changes.moved.into_iter().map(moved).collect(),
             n_unchanged: changes.n_same + changes.n_stayed,
             n_not_compared: changes.n_not_compared,
-            none: changes.none.map(|none| NoDifference { kind: none.kind, detail: none.detail }),
+            none: changes.none,
         }
     }
 }
@@ -176,6 +166,7 @@ mod tests {
         let bare = json!({
             "id": "o2", "position_in_world": [0.0, 0.0, 0.0],
             "box_min_in_world": [-1.0, -1.0, -1.0], "box_max_in_world": [1.0, 1.0, 1.0],
+            "n_gaussians_in_scene": 9, "photo": "p.jpg",
         });
         let reply = json!({
             "scene": "yard", "unit": "m", "frame": "world", "generations": [4, 6],
@@ -186,7 +177,7 @@ mod tests {
             "moved": [{ "from": thing("o3"), "to": thing("o4"), "distance": 2.5 }], "none": null,
         });
         let of = |reply: &serde_json::Value| {
-            let changes: Changes = serde_json::from_value(reply.clone()).expect("a reply");
+            let changes: ChangesReply = serde_json::from_value(reply.clone()).expect("a reply");
             json!(Difference::from(changes))
         };
         let shown = |id: &str| {

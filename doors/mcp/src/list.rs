@@ -2,7 +2,10 @@
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
-use slag_robot::{OnBoard, OnBoardThing};
+use slag_robot::api::objects::{Name, ObjectOnBoard, ObjectPage};
+use slag_robot::xyz;
+
+use crate::place::ball;
 
 /// Things in an answer unless the request says otherwise: a model reads every one.
 const DEFAULT_LIMIT: u32 = 30;
@@ -40,7 +43,7 @@ pub struct Listed {
     /// Whether things have names: if not, ask again in a few seconds, or use find.
     pub named: bool,
     /// Things in the place, listed or not.
-    pub n_things: u64,
+    pub n_things: usize,
     /// The things.
     pub things: Vec<Thing>,
     /// What `after` takes for the next things; absent: these are all.
@@ -61,15 +64,6 @@ pub struct Thing {
     pub size: [f64; 3],
 }
 
-/// A name of a thing.
-#[derive(Debug, Serialize, JsonSchema)]
-pub struct Name {
-    /// The word.
-    pub name: String,
-    /// The chance that it is right.
-    pub confidence: f64,
-}
-
 impl Listing {
     /// Returns the parameters of `GET /v1/objects`, or what is wrong.
     pub fn parameters(&self) -> Result<Vec<(&'static str, String)>, String> {
@@ -79,35 +73,29 @@ impl Listing {
         }
         let sort = if self.by_name { "name" } else { "area" };
         let mut parameters = vec![("limit", limit.to_string()), ("sort", sort.to_owned())];
-        match (self.near, self.radius) {
-            (None, None) => {}
-            (Some([x, y, z]), Some(radius)) => {
-                parameters.extend([("near", format!("{x},{y},{z}")), ("radius", radius.to_string())]);
-            }
-            _ => return Err("near and radius go together: both, or neither for everywhere".to_owned()),
+        if let Some((centre, radius)) = ball(self.near, self.radius)? {
+            parameters.extend([("near", xyz(centre)), ("radius", radius.to_string())]);
         }
         parameters.extend(self.after.iter().map(|after| ("after", after.clone())));
         Ok(parameters)
     }
 }
 
-impl From<OnBoard> for Listed {
-    fn from(page: OnBoard) -> Self {
-        let OnBoard { scene, generation, unit, named, n_objects, next_after, objects } = page;
+impl From<ObjectPage> for Listed {
+    fn from(page: ObjectPage) -> Self {
+        let ObjectPage { scene, generation, unit, named, n_objects, next_after, objects, .. } = page;
         let things = objects.into_iter().map(Thing::from).collect();
-        Self { scene, generation, unit, named, n_things: n_objects, things, next_after }
+        Self { scene, generation, unit: unit.into(), named, n_things: n_objects, things, next_after }
     }
 }
 
-impl From<OnBoardThing> for Thing {
-    fn from(thing: OnBoardThing) -> Self {
-        let names = thing.names.into_iter().map(|of| Name { name: of.name, confidence: of.confidence });
-        let (min, max) = (thing.bounds.min, thing.bounds.max);
+impl From<ObjectOnBoard> for Thing {
+    fn from(thing: ObjectOnBoard) -> Self {
         Self {
             id: thing.id,
-            names: names.collect(),
-            position_in_world: thing.position_in_world,
-            size: std::array::from_fn(|axis| max[axis] - min[axis]),
+            names: thing.names,
+            position_in_world: thing.position_in_world.to_array(),
+            size: (thing.box_max_in_world - thing.box_min_in_world).to_array(),
         }
     }
 }

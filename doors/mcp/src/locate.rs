@@ -4,7 +4,8 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
-use slag_robot::{CameraPose, Robot, Whereabouts};
+use slag_robot::api::locate::{self, Answer};
+use slag_robot::{Robot, xyz};
 
 /// A photo, and what is known about its camera.
 #[derive(Debug, Deserialize, JsonSchema)]
@@ -56,11 +57,10 @@ impl Seen {
         let photo = BASE64_STANDARD.decode(&self.photo_base64);
         let photo =
             photo.map_err(|error| format!("photo_base64: {error}; give a JPEG or PNG file in base64"))?;
-        let triple = |name, of: Option<[f64; 3]>| of.map(|[x, y, z]| (name, format!("{x},{y},{z}")));
         let parameters = [
             Some(("focal_px", self.focal_px.to_string())),
-            triple("gravity", self.gravity),
-            triple("near", self.near),
+            self.gravity.map(|gravity| ("gravity", xyz(gravity))),
+            self.near.map(|near| ("near", xyz(near))),
             self.sigma.map(|sigma| ("sigma", sigma.to_string())),
         ];
         let parameters: Vec<(&str, String)> = parameters.into_iter().flatten().collect();
@@ -68,24 +68,23 @@ impl Seen {
     }
 }
 
-impl From<Whereabouts> for Places {
-    fn from(of: Whereabouts) -> Self {
+impl From<Answer> for Places {
+    fn from(of: Answer) -> Self {
         let (state, reason, poses) = match of {
-            Whereabouts::Found(pose) => ("found", None, vec![pose]),
-            Whereabouts::Unsure { reason, candidates } => ("unsure", Some(reason), candidates),
-            Whereabouts::Lost { reason } => ("lost", Some(reason), Vec::new()),
+            Answer::Found(pose) => ("found", None, vec![pose]),
+            Answer::Unsure { reason, candidates } => ("unsure", Some(reason), candidates),
+            Answer::Lost { reason } => ("lost", Some(reason), Vec::new()),
         };
         Self { state, reason, poses: poses.into_iter().map(Pose::from).collect() }
     }
 }
 
-impl From<CameraPose> for Pose {
-    fn from(of: CameraPose) -> Self {
+impl From<locate::Pose> for Pose {
+    fn from(of: locate::Pose) -> Self {
         let [x, y, z, w] = of.rotation_xyzw;
-        let variance = |axis: usize| of.covariance.get(7 * axis).copied().unwrap_or(f64::INFINITY);
         Self {
             position_in_world: of.position_in_world,
-            position_sigma: (0..3).map(variance).fold(0.0, f64::max).sqrt(),
+            position_sigma: of.position_sigma(),
             heading_rad: (2.0 * (x * y + w * z)).atan2(1.0 - 2.0 * (y * y + z * z)),
             lat_lon_deg: of.geographic.map(|place| [place.latitude_deg, place.longitude_deg]),
         }

@@ -3,7 +3,8 @@
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use slag_robot::{Box3, Place, Reply, Results, Robot, RobotError};
+use slag_robot::api::map::{MapCell, MapStatus, MissingCell};
+use slag_robot::{Reply, Results, Robot, RobotError};
 
 /// Most words in a request: what one question to the robot takes.
 const MAX_WORDS: usize = 32;
@@ -47,7 +48,7 @@ pub struct Description {
     /// Whether the map on board covers the whole place: "not found" then means that it is not there.
     pub is_complete: bool,
     /// Things in the place, named or not.
-    pub n_things: u64,
+    pub n_things: usize,
     /// What matches each of the words.
     pub kinds: Vec<Kind>,
 }
@@ -66,14 +67,19 @@ pub struct Kind {
     pub best_position_in_world: Option<[f64; 3]>,
 }
 
+/// Returns the place of a middle and a radius; `None`: everywhere.
+pub fn ball(near: Option<[f64; 3]>, radius: Option<f64>) -> Result<Option<([f64; 3], f64)>, String> {
+    match (near, radius) {
+        (None, None) => Ok(None),
+        (Some(near), Some(radius)) => Ok(Some((near, radius))),
+        _ => Err("near and radius go together: both, or neither for everywhere".to_owned()),
+    }
+}
+
 impl Asked {
     /// Asks the robot.
     pub fn describe(&self, robot: &Robot) -> Result<Description, String> {
-        let ball = match (self.near, self.radius) {
-            (None, None) => None,
-            (Some(near), Some(radius)) => Some((near, radius)),
-            _ => return Err("near and radius go together: both, or neither for all that is on board".into()),
-        };
+        let ball = ball(self.near, self.radius)?;
         if self.words.len() > MAX_WORDS {
             return Err(format!("there are {} words, expected at most {MAX_WORDS}", self.words.len()));
         }
@@ -112,24 +118,24 @@ impl Asked {
 }
 
 impl Description {
-    fn new(place: Place, ball: Option<([f64; 3], f64)>, n_things: u64, kinds: Vec<Kind>) -> Self {
-        let on_board = place.cells.iter().map(|cell| cell.bounds).reduce(Box3::union);
-        let is_missing = place.missing.iter().any(|cell| match ball {
-            Some((centre, radius)) => cell.bounds.touches(centre, radius),
+    fn new(place: MapStatus, ball: Option<([f64; 3], f64)>, n_things: usize, kinds: Vec<Kind>) -> Self {
+        let on_board = place.cells.iter().map(MapCell::bounds).reduce(|a, b| a.union(b));
+        let is_missing = |cell: &MissingCell| match ball {
+            Some((centre, radius)) => cell.bounds().distance_to(centre.into()) <= radius,
             None => cell.is_wanted,
-        });
-        let touches_any =
-            |(centre, radius)| place.cells.iter().any(|cell| cell.bounds.touches(centre, radius));
-        let is_elsewhere = ball.is_some_and(|ball| !touches_any(ball));
+        };
+        let is_here = |cell: &MapCell| {
+            ball.is_none_or(|(centre, radius)| cell.bounds().distance_to(centre.into()) <= radius)
+        };
         Self {
             scene: place.scene,
             generation: place.generation,
-            unit: place.unit,
+            unit: place.unit.into(),
             z_is_up: place.z_is_up,
             age_hours: place.age_secs as f64 / SECS_PER_HOUR,
             is_expired: place.is_expired,
-            box_in_world: on_board.map(|bounds| [bounds.min, bounds.max]),
-            is_complete: !is_missing && !is_elsewhere && on_board.is_some(),
+            box_in_world: on_board.map(|bounds| [bounds.min, bounds.max].map(|corner| corner.to_array())),
+            is_complete: !place.missing.iter().any(is_missing) && place.cells.iter().any(is_here),
             n_things,
             kinds,
         }

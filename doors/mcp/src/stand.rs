@@ -2,7 +2,8 @@
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
-use slag_robot::Goals;
+use slag_robot::api::goal::{Goal, GoalMiss, GoalReply};
+use slag_robot::xyz;
 
 /// A thing to go to, and the robot that goes.
 #[derive(Debug, Deserialize, JsonSchema)]
@@ -38,7 +39,7 @@ pub struct Stands {
     pub places: Vec<Stand>,
     /// Why there is none.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub none: Option<NoStand>,
+    pub none: Option<GoalMiss>,
 }
 
 /// The thing that the places are near.
@@ -70,20 +71,11 @@ pub struct Stand {
     pub lat_lon_deg: Option<[f64; 2]>,
 }
 
-/// Why there is no place.
-#[derive(Debug, Serialize, JsonSchema)]
-pub struct NoStand {
-    /// "no-such-thing", "unreachable", "unknown-ground" or "not-visible".
-    pub kind: String,
-    /// The same in a sentence.
-    pub detail: String,
-}
-
 impl Going {
     /// Returns the parameters of `GET /v1/goal`.
     pub fn parameters(&self) -> Vec<(&'static str, String)> {
         let number = |name, value: Option<f64>| value.map(|value| (name, value.to_string()));
-        let near = self.near.map(|[x, y, z]| ("near", format!("{x},{y},{z}")));
+        let near = self.near.map(|near| ("near", xyz(near)));
         let robot = [
             number("radius_m", self.radius_m),
             number("reach_m", self.reach_m),
@@ -93,10 +85,10 @@ impl Going {
     }
 }
 
-impl From<Goals> for Stands {
-    fn from(goals: Goals) -> Self {
-        let stand = |goal: slag_robot::Goal| Stand {
-            position_in_world: goal.position_in_world,
+impl From<GoalReply> for Stands {
+    fn from(goals: GoalReply) -> Self {
+        let stand = |goal: Goal| Stand {
+            position_in_world: goal.position_in_world.to_array(),
             yaw_rad: goal.yaw_rad,
             orientation_xyzw: goal.orientation_xyzw,
             clearance_m: goal.clearance_m,
@@ -107,9 +99,11 @@ impl From<Goals> for Stands {
         Self {
             scene: goals.scene,
             generation: goals.generation,
-            thing: goals.thing.map(|of| Target { id: of.id, position_in_world: of.position_in_world }),
+            thing: goals
+                .thing
+                .map(|of| Target { id: of.id, position_in_world: of.position_in_world.to_array() }),
             places: goals.goals.into_iter().map(stand).collect(),
-            none: goals.none.map(|none| NoStand { kind: none.kind, detail: none.detail }),
+            none: goals.none,
         }
     }
 }

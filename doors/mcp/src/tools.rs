@@ -4,7 +4,7 @@ use rmcp::handler::server::router::tool::ToolRouter;
 use rmcp::handler::server::wrapper::Parameters;
 use rmcp::model::{Implementation, ServerCapabilities, ServerConfig};
 use rmcp::{Json, ServerHandler, tool, tool_handler, tool_router};
-use slag_robot::{Robot, RobotError};
+use slag_robot::Robot;
 
 use crate::changes::{Compare, Difference};
 use crate::find::{Found, Wanted};
@@ -38,18 +38,14 @@ impl Tools {
     #[tool(annotations(title = "Find things", read_only_hint = true, open_world_hint = false))]
     async fn find(&self, Parameters(wanted): Parameters<Wanted>) -> Result<Json<Found>, String> {
         let request = wanted.request()?;
-        let refused = |error: RobotError| error.to_string();
-        self.blocking(move |robot| Found::new(robot.ask(&request).map_err(refused)?)).await.map(Json)
+        self.blocking(move |robot| Found::new(robot.ask(&request).map_err(|e| e.to_string())?)).await
     }
 
     /// List the things on the robot's map with what they are probably called, the largest first or by name.
     #[tool(annotations(title = "What is here", read_only_hint = true, open_world_hint = false))]
     async fn list(&self, Parameters(listing): Parameters<Listing>) -> Result<Json<Listed>, String> {
         let parameters = listing.parameters()?;
-        let refused = |error: RobotError| error.to_string();
-        self.blocking(move |robot| robot.objects(&parameters).map(Listed::from).map_err(refused))
-            .await
-            .map(Json)
+        self.blocking(move |robot| robot.objects(&parameters).map(Listed::from)).await
     }
 
     /// Find where the robot can stand near a thing: places that it reaches, has room at, and sees the thing from,
@@ -57,16 +53,13 @@ impl Tools {
     /// that says so.
     #[tool(annotations(title = "Where to stand", read_only_hint = true, open_world_hint = false))]
     async fn where_to_stand(&self, Parameters(going): Parameters<Going>) -> Result<Json<Stands>, String> {
-        let refused = |error: RobotError| error.to_string();
-        self.blocking(move |robot| robot.goal(&going.parameters()).map(Stands::from).map_err(refused))
-            .await
-            .map(Json)
+        self.blocking(move |robot| robot.goal(&going.parameters()).map(Stands::from)).await
     }
 
     /// Find where the camera of a photo is on the robot's map, by landmarks; or why that cannot be told.
     #[tool(annotations(title = "Where am I", read_only_hint = true, open_world_hint = false))]
     async fn where_am_i(&self, Parameters(seen): Parameters<Seen>) -> Result<Json<Places>, String> {
-        self.blocking(move |robot| seen.locate(robot)).await.map(Json)
+        self.blocking(move |robot| seen.locate(robot)).await
     }
 
     /// Describe what the robot's map covers: its extent, age and gaps, and how many things match each of some
@@ -76,7 +69,7 @@ impl Tools {
         &self,
         Parameters(asked): Parameters<Asked>,
     ) -> Result<Json<Description>, String> {
-        self.blocking(move |robot| asked.describe(robot)).await.map(Json)
+        self.blocking(move |robot| asked.describe(robot)).await
     }
 
     /// Find what changed on the robot's map since an earlier state of it: things that appeared, went or moved.
@@ -85,22 +78,18 @@ impl Tools {
         &self,
         Parameters(compare): Parameters<Compare>,
     ) -> Result<Json<Difference>, String> {
-        let refused = |error: RobotError| error.to_string();
-        self.blocking(move |robot| {
-            robot.changes(&compare.parameters()).map(Difference::from).map_err(refused)
-        })
-        .await
-        .map(Json)
+        self.blocking(move |robot| robot.changes(&compare.parameters()).map(Difference::from)).await
     }
 
     /// Asks the robot on a thread that may wait.
-    async fn blocking<T: Send + 'static>(
+    async fn blocking<T: Send + 'static, E: ToString + Send + 'static>(
         &self,
-        ask: impl FnOnce(&Robot) -> Result<T, String> + Send + 'static,
-    ) -> Result<T, String> {
+        ask: impl FnOnce(&Robot) -> Result<T, E> + Send + 'static,
+    ) -> Result<Json<T>, String> {
         let robot = self.robot.clone();
         let asked = tokio::task::spawn_blocking(move || ask(&robot)).await;
-        asked.map_err(|error| format!("slag-mcp failed: {error}"))?
+        let asked = asked.map_err(|error| format!("slag-mcp failed: {error}"))?;
+        asked.map(Json).map_err(|error| error.to_string())
     }
 }
 

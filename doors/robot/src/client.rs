@@ -4,13 +4,14 @@ use std::time::Duration;
 
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
+use slag_api::changes::ChangesReply;
+use slag_api::floor::Floor;
+use slag_api::goal::GoalReply;
+use slag_api::locate;
+use slag_api::map::MapStatus;
+use slag_api::objects::ObjectPage;
 
-use crate::changes::Changes;
 use crate::error::{MAX_TEXT_BYTES, RobotError};
-use crate::floor::Floor;
-use crate::goal::Goals;
-use crate::locate::Whereabouts;
-use crate::place::{OnBoard, Place};
 use crate::reply::{PointAnswer, Reply};
 
 /// Longest reply that is read: ten thousand answers are 10 MB.
@@ -58,31 +59,31 @@ impl Robot {
     }
 
     /// Returns what is on board.
-    pub fn place(&self) -> Result<Place, RobotError> {
+    pub fn place(&self) -> Result<MapStatus, RobotError> {
         self.get("/v1/map")
     }
 
     /// Returns things on board, by the parameters of `GET /v1/objects`.
-    pub fn objects(&self, parameters: &[(&str, String)]) -> Result<OnBoard, RobotError> {
+    pub fn objects(&self, parameters: &[(&str, String)]) -> Result<ObjectPage, RobotError> {
         self.get_with("/v1/objects", parameters)
     }
 
     /// Returns the number of things on board, or of those in a ball.
-    pub fn n_objects(&self, ball: Option<([f64; 3], f64)>) -> Result<u64, RobotError> {
+    pub fn n_objects(&self, ball: Option<([f64; 3], f64)>) -> Result<usize, RobotError> {
         let mut parameters = vec![("limit", "1".to_owned())];
-        if let Some(([x, y, z], radius)) = ball {
-            parameters.extend([("near", format!("{x},{y},{z}")), ("radius", radius.to_string())]);
+        if let Some((centre, radius)) = ball {
+            parameters.extend([("near", xyz(centre)), ("radius", radius.to_string())]);
         }
         Ok(self.objects(&parameters)?.n_objects)
     }
 
     /// Returns places to stand, by the parameters of `GET /v1/goal`.
-    pub fn goal(&self, parameters: &[(&str, String)]) -> Result<Goals, RobotError> {
+    pub fn goal(&self, parameters: &[(&str, String)]) -> Result<GoalReply, RobotError> {
         self.get_with("/v1/goal", parameters)
     }
 
     /// Returns what changed between two generations, by the parameters of `GET /v1/changes`.
-    pub fn changes(&self, parameters: &[(&str, String)]) -> Result<Changes, RobotError> {
+    pub fn changes(&self, parameters: &[(&str, String)]) -> Result<ChangesReply, RobotError> {
         self.get_with("/v1/changes", parameters)
     }
 
@@ -92,7 +93,7 @@ impl Robot {
     }
 
     /// Returns where the camera of a JPEG or PNG is, by the parameters of `POST /v1/locate`.
-    pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<Whereabouts, RobotError> {
+    pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<locate::Answer, RobotError> {
         let media_type = if photo.starts_with(b"\x89PNG") { "image/png" } else { "image/jpeg" };
         self.send("/v1/locate", parameters, media_type, photo)
     }
@@ -151,16 +152,18 @@ impl Robot {
         if !status.is_success() {
             return Err(RobotError::refused(status.as_u16(), &body));
         }
-        serde_json::from_str(&body).map_err(|cause| self.foreign(path, cause))
+        let foreign = |cause: serde_json::Error| RobotError::Foreign { url: self.address(path), cause };
+        serde_json::from_str(&body).map_err(foreign)
     }
 
     fn address(&self, path: &str) -> String {
         format!("{}{path}", self.url)
     }
+}
 
-    fn foreign(&self, path: &str, cause: impl ToString) -> RobotError {
-        RobotError::Foreign { url: self.address(path), cause: cause.to_string() }
-    }
+/// Returns a point as parameters have it.
+pub fn xyz([x, y, z]: [f64; 3]) -> String {
+    format!("{x},{y},{z}")
 }
 
 /// Returns whether a URL is of this machine.

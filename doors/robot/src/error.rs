@@ -19,7 +19,7 @@ pub enum RobotError {
     #[error(
         "{url} answers, but not as slag-edge does: {cause}; see that --robot names a slag-edge of this version"
     )]
-    Foreign { url: String, cause: String },
+    Foreign { url: String, cause: serde_json::Error },
 }
 
 impl RobotError {

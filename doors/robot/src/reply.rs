@@ -1,6 +1,8 @@
 //! The reply to `/v1/query`.
 
 use serde::Deserialize;
+use slag_api::Geographic;
+use slag_api::objects::OrientedBox;
 
 /// The results of a request, one for each question. Members that clients here do not need are left out.
 #[derive(Clone, Debug, Deserialize)]
@@ -77,28 +79,6 @@ pub struct PointAnswer {
     pub position_in_world: [f64; 3],
     /// How well it matches.
     pub score: f32,
-}
-
-/// A box along a thing's own axes.
-#[derive(Clone, Copy, Debug, Deserialize)]
-pub struct OrientedBox {
-    /// Its middle.
-    pub centre_in_world: [f64; 3],
-    /// Its edges along its own axes.
-    pub size: [f64; 3],
-    /// Rotation from its axes to the world's, as a quaternion x, y, z, w.
-    pub rotation_world_from_box: [f64; 4],
-}
-
-/// A place on the earth (WGS 84).
-#[derive(Clone, Copy, Debug, Deserialize)]
-pub struct Geographic {
-    /// Latitude, north positive.
-    pub latitude_deg: f64,
-    /// Longitude, east positive.
-    pub longitude_deg: f64,
-    /// Height, in the datum of the source.
-    pub height_m: f64,
 }
 
 /// A thing that a relation holds with.

@@ -1,7 +1,9 @@
 //! Answers as messages.
 
+use glam::DVec3;
 use ros2_client::builtin_interfaces::{Duration, Time};
-use slag_robot::{Answer, Goal, PointAnswer};
+use slag_robot::api::goal::Goal;
+use slag_robot::{Answer, PointAnswer};
 
 use crate::geometry::{Point, Pose};
 use crate::messages::{
@@ -32,7 +34,10 @@ pub fn header(frame_id: &str) -> Header {
 
 fn pose(answer: &Answer) -> Pose {
     let oriented = &answer.oriented_box;
-    Pose { position: oriented.centre_in_world.into(), orientation: oriented.rotation_world_from_box.into() }
+    Pose {
+        position: oriented.centre_in_world.to_array().into(),
+        orientation: oriented.rotation_world_from_box.to_array().into(),
+    }
 }
 
 /// Returns the answers to a text, best first. The covariance is unknown: zero.
@@ -44,7 +49,7 @@ pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3
             score: f64::from(answer.score),
             pose: PoseWithCovariance { pose: pose(answer), covariance: [[0.0; 6]; 6] },
         }],
-        bbox: BoundingBox3D { center: pose(answer), size: answer.oriented_box.size.into() },
+        bbox: BoundingBox3D { center: pose(answer), size: answer.oriented_box.size.to_array().into() },
         id: answer.id.clone(),
     };
     Detection3DArray { header: header.clone(), detections: answers.iter().map(detection).collect() }
@@ -52,7 +57,10 @@ pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3
 
 /// Returns a place to stand.
 pub fn goal_pose(header: &Header, goal: &Goal) -> PoseStamped {
-    let pose = Pose { position: goal.position_in_world.into(), orientation: goal.orientation_xyzw.into() };
+    let pose = Pose {
+        position: goal.position_in_world.to_array().into(),
+        orientation: goal.orientation_xyzw.into(),
+    };
     PoseStamped { header: header.clone(), pose }
 }
 
@@ -64,14 +72,14 @@ pub fn best_pose(header: &Header, answers: &[Answer]) -> Option<PoseStamped> {
 pub fn markers(header: &Header, text: &str, answers: &[Answer]) -> MarkerArray {
     let mut markers = vec![Marker { action: DELETE_ALL, ..marker(header, "", 0) }];
     for (id, answer) in (0..).zip(answers) {
-        let edges = answer.oriented_box.size.map(|edge| edge.max(MIN_EDGE_M));
+        let edges = answer.oriented_box.size.max(DVec3::splat(MIN_EDGE_M));
         markers.push(Marker {
             kind: CUBE,
             pose: pose(answer),
-            scale: edges.into(),
+            scale: edges.to_array().into(),
             ..marker(header, "boxes", id)
         });
-        let [x, y, _] = answer.oriented_box.centre_in_world;
+        let [x, y, _] = answer.oriented_box.centre_in_world.to_array();
         markers.push(Marker {
             kind: TEXT_VIEW_FACING,
             pose: Pose::at([x, y, answer.box_max_in_world[2] + LETTERS_M]),

@@ -1,6 +1,6 @@
 //! The ground around the robot, as a map for planners.
 
-use slag_robot::{Floor, FloorPlace};
+use slag_robot::api::floor::{Floor, Place};
 
 use crate::geometry::Pose;
 use crate::messages::{Header, MapMetaData, OccupancyGrid};
@@ -44,14 +44,14 @@ pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGri
             .filter(|y| *y < height)
             .flat_map(|y| xs.clone().filter(|x| *x < width).map(move |x| y * width + x))
         {
-            if places[cell] == FloorPlace::Obstacle {
+            if places[cell] == Place::Obstacle {
                 return OCCUPIED;
             }
             all_free &= is_free[cell];
         }
         if all_free { FREE } else { UNKNOWN }
     };
-    let [x, y, z] = floor.origin_in_world;
+    let [x, y, z] = floor.origin_in_world.to_array();
     let corner = [x + left as f64 * floor.cell_m, y + low as f64 * floor.cell_m, z];
     Some(OccupancyGrid {
         info: MapMetaData {
@@ -68,7 +68,7 @@ pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGri
 
 /// Returns the cells with their middle nearer than `radius` cells to the middle of a reached one: a cell at just
 /// that distance may be an obstacle.
-fn free(places: &[FloorPlace], [width, height]: [usize; 2], radius: f64) -> Vec<bool> {
+fn free(places: &[Place], [width, height]: [usize; 2], radius: f64) -> Vec<bool> {
     let reach = radius.clamp(0.0, 1e3).floor() as isize;
     let offsets: Vec<(isize, isize)> = (-reach..=reach)
         .flat_map(|y| (-reach..=reach).map(move |x| (x, y)))
@@ -77,9 +77,9 @@ fn free(places: &[FloorPlace], [width, height]: [usize; 2], radius: f64) -> Vec<
     let mut is_free = vec![false; places.len()];
     let is_reached = |x: isize, y: isize| {
         let inside = x >= 0 && y >= 0 && x < width as isize && y < height as isize;
-        inside && places[y as usize * width + x as usize] == FloorPlace::Reached
+        inside && places[y as usize * width + x as usize] == Place::Reached
     };
-    for cell in (0..places.len()).filter(|cell| places[*cell] == FloorPlace::Reached) {
+    for cell in (0..places.len()).filter(|cell| places[*cell] == Place::Reached) {
         is_free[cell] = true;
         let (x, y) = ((cell % width) as isize, (cell / width) as isize);
         // Within the reached area all is reached already.
@@ -98,14 +98,14 @@ fn free(places: &[FloorPlace], [width, height]: [usize; 2], radius: f64) -> Vec<
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use glam::DVec3;
 
     use super::*;
     use crate::answers::header;
 
     fn map(size: [usize; 2], runs: &str, cell_m: f64, radius_m: f64) -> OccupancyGrid {
-        let floor = json!({"cell_m": cell_m, "origin_in_world": [1.0, 2.0, 0.5], "size": size, "runs": runs});
-        let floor: Floor = serde_json::from_value(floor).expect("a floor");
+        let (frame, origin_in_world, runs) = ("world".into(), DVec3::new(1.0, 2.0, 0.5), runs.to_owned());
+        let floor = Floor { generation: 1, frame, cell_m, origin_in_world, size, runs };
         grid(header("map"), &floor, radius_m).expect("a map")
     }
 

@@ -10,7 +10,7 @@ mod messages;
 mod navigation;
 pub mod node;
 mod position;
-pub mod stand;
+mod stand;
 mod transforms;
 
 pub use args::Args;

@@ -2,7 +2,8 @@
 
 use std::collections::VecDeque;
 
-use slag_robot::CameraPose;
+use slag_robot::api::locate;
+use slag_robot::xyz;
 
 use crate::geometry::Rigid;
 use crate::messages::CameraInfo;
@@ -32,17 +33,17 @@ impl CameraFrames {
 
     /// Returns the parameters of `POST /v1/locate`: odometry keeps z up, so the direction of gravity is known.
     pub fn parameters(&self, camera: &CameraInfo) -> Vec<(&'static str, String)> {
-        let [x, y, z] = self.fixed_from_optical.to_child([0.0, 0.0, -1.0]);
+        let gravity = self.fixed_from_optical.to_child([0.0, 0.0, -1.0]);
         vec![
             ("focal_px", camera.p[0][0].to_string()),
             ("centre_px", format!("{},{}", camera.p[0][2], camera.p[1][2])),
-            ("gravity", format!("{x},{y},{z}")),
+            ("gravity", xyz(gravity)),
         ]
     }
 }
 
 /// Returns the motion that a pose states; `None` if it is none.
-pub fn scene_from_optical(pose: &CameraPose) -> Option<Rigid> {
+pub fn scene_from_optical(pose: &locate::Pose) -> Option<Rigid> {
     Rigid::new(pose.position_in_world.into(), pose.optical_rotation_xyzw.into())
 }
 

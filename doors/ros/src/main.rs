@@ -16,7 +16,7 @@ fn main() -> ExitCode {
     let default = "warn,slag_ros=info";
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(default));
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).with_writer(io::stderr).init();
-    match run(&Args::parse()) {
+    match run(Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("slag-ros: {error:#}");
@@ -25,11 +25,11 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(args: &Args) -> Result<()> {
-    let (settings, robot) = (args.settings()?, args.robot.open()?);
+fn run(args: Args) -> Result<()> {
+    let robot = args.robot.open()?;
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(ASYNC_THREADS).enable_all().build()?;
-    runtime.block_on(async { node::run(settings, robot, stop_signal()?).await })?;
+    runtime.block_on(async { node::run(args, robot, stop_signal()?).await })?;
     runtime.shutdown_background();
     Ok(())
 }

@@ -1,6 +1,5 @@
 //! The node: what it listens to, what it says.
 
-use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -13,11 +12,13 @@ use ros2_client::{
 use rustdds::DomainParticipantBuilder;
 use serde::Serialize;
 use serde_json::{Value, json};
-use slag_robot::{Answer, CameraPose, PointAnswer, Robot, RobotError, Whereabouts};
+use slag_robot::api::locate;
+use slag_robot::{Answer, PointAnswer, Robot, RobotError};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
 use crate::answers;
+use crate::args::{Args, Goals, Rmw, Source};
 use crate::locator::{CameraFrames, Fixes, scene_from_optical};
 use crate::messages::{
     CameraInfo, CompressedImage, Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix,
@@ -26,7 +27,7 @@ use crate::messages::{
 };
 use crate::navigation::{Ended, Navigator};
 use crate::position;
-use crate::stand::{self, Body};
+use crate::stand;
 use crate::transforms::Transforms;
 
 /// Messages kept for those who join later: the clouds of an answer.
@@ -44,71 +45,9 @@ const PHOTO_PERIOD: Duration = Duration::from_secs(2);
 /// Pause after a failed read, so that a broken topic does not burn the CPU.
 const READ_PAUSE: Duration = Duration::from_millis(100);
 
-/// Where the robot's position comes from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PositionSource {
-    /// Nowhere: positions are not posted.
-    Nowhere,
-    /// The place of `base_frame`, from `/tf`.
-    Transforms,
-    /// `/odom`, in a frame that `/tf` connects to the scene's.
-    Odometry,
-    /// `/fix`.
-    Fix,
-}
-
-/// How services travel, which differs between the programs that ROS sends messages with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Middleware {
-    /// `rmw_fastrtps_cpp`, the default of Humble and Jazzy.
-    FastDds,
-    /// `rmw_cyclonedds_cpp`.
-    CycloneDds,
-}
-
-/// Where places to stand are sent to.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum GoalSink {
-    Nowhere,
-    /// To the topic `/goal_pose`.
-    Topic,
-    /// To the action `/navigate_to_pose`.
-    Action,
-}
-
-/// What the node is told.
-#[derive(Clone, Debug)]
-pub struct Settings {
-    /// Name of the node, and the namespace of its topics.
-    pub name: String,
-    pub domain_id: u16,
-    /// Addresses of the interfaces to use; empty: all.
-    pub interfaces: Vec<IpAddr>,
-    /// How services travel.
-    pub middleware: Middleware,
-    pub scene_frame: String,
-    pub base_frame: String,
-    /// Where the robot's position comes from.
-    pub position: PositionSource,
-    /// Least time between two positions that are posted.
-    pub position_period: Duration,
-    /// Most things in an answer, unless the request says otherwise.
-    pub limit: u32,
-    /// Most points in the clouds of an answer.
-    pub n_points: u32,
-    /// The robot's size and reach, for places to stand.
-    pub body: Body,
-    /// Where places to stand are sent to, besides the node's own topic.
-    pub goals: GoalSink,
-    /// Namespace of the camera whose photos locate the robot.
-    pub camera: Option<String>,
-    /// Frame that odometry keeps, in which the scene's place is told.
-    pub fixed_frame: String,
-}
-
 /// What all parts of the node share.
 struct Shared {
-    settings: Settings,
+    args: Args,
     robot: Robot,
     frames: Mutex<Transforms>,
     /// Place of the robot in the scene, and when it was posted last.
@@ -146,6 +85,15 @@ struct Navigation {
 }
 
 impl Navigation {
+    fn new(node: &mut Node, args: &Args, latest: &QosProfile) -> Result<Self> {
+        let (volatile, name) = (reliable(10), args.own("navigation")?);
+        Ok(Self {
+            navigator: Navigator::new(node, args.mapping(), [&volatile, &volatile, latest])?,
+            state: publisher(node, name, ("std_msgs", "String"), latest)?,
+            newest: Mutex::default(),
+        })
+    }
+
     /// Cancels the newest goal, if it has not ended, and waits until that is sent.
     async fn stop(&self) {
         let newest = self.newest.lock().expect("no holder panics").take();
@@ -167,141 +115,164 @@ struct Found {
 }
 
 /// Runs the node until `stop` completes.
-pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()>) -> Result<()> {
-    let mut participant = DomainParticipantBuilder::new(settings.domain_id);
-    if !settings.interfaces.is_empty() {
-        participant = participant.with_only_networks(settings.interfaces.iter().copied());
-    }
-    let joined =
-        participant.build().map_err(|e| anyhow!("cannot join domain {}: {e}", settings.domain_id))?;
-    let context = Context::from_domain_participant(joined).map_err(|e| anyhow!("cannot start DDS: {e}"))?;
-    let name = NodeName::new("/", &settings.name)
-        .map_err(|e| anyhow!("{:?} is no name of a node: {e}", settings.name))?;
-    let node = context.new_node(name, NodeOptions::new().enable_rosout(true));
-    let mut node = node.map_err(|e| anyhow!("cannot make the node: {e:?}"))?;
-    let own = |topic: &str| Name::new(&format!("/{}", settings.name), topic);
-    let kept = reliable(KEPT).durability(Durability::TransientLocal);
-    // Those who join later hear no earlier answer, which they would take for the last; so map_server offers its
-    // map.
-    let latest = reliable(1).durability(Durability::TransientLocal);
-    let pose = ("geometry_msgs", "PoseStamped");
-    let goal_pose = (settings.goals == GoalSink::Topic).then(|| {
-        publisher(
-            &mut node,
-            Name::new("/", "goal_pose")?,
-            pose,
-            &reliable(1).durability(Durability::Volatile),
-        )
-    });
-    let goal_pose = goal_pose.transpose()?;
-    let (volatile, latched) = (reliable(10), reliable(100).durability(Durability::TransientLocal));
-    let mapping = match settings.middleware {
-        Middleware::FastDds => ServiceMapping::Enhanced,
-        Middleware::CycloneDds => ServiceMapping::Cyclone,
-    };
-    let navigation = (settings.goals == GoalSink::Action).then(|| -> Result<Navigation> {
-        Ok(Navigation {
-            navigator: Navigator::new(&mut node, mapping, [&volatile, &volatile, &latest])?,
-            state: publisher(&mut node, own("navigation")?, ("std_msgs", "String"), &latest)?,
-            newest: Mutex::default(),
-        })
-    });
-    let navigation = navigation.transpose()?;
-    let located = ("geometry_msgs", "PoseWithCovarianceStamped");
-    let locating = settings.camera.is_some().then(|| -> Result<Locating> {
-        Ok(Locating {
-            camera: Mutex::default(),
-            fixes: Mutex::default(),
-            last: Mutex::default(),
-            pose: publisher(&mut node, own("pose")?, located, &latest)?,
-            transforms: publisher(
-                &mut node,
-                Name::new("/", "tf")?,
-                ("tf2_msgs", "TFMessage"),
-                &reliable(100),
-            )?,
-        })
-    });
-    let locating = locating.transpose()?;
-    let shared = Arc::new(Shared {
-        detections: publisher(&mut node, own("detections")?, ("vision_msgs", "Detection3DArray"), &latest)?,
-        markers: publisher(&mut node, own("markers")?, ("visualization_msgs", "MarkerArray"), &latest)?,
-        points: publisher(&mut node, own("points")?, ("sensor_msgs", "PointCloud2"), &kept)?,
-        best_pose: publisher(&mut node, own("best_pose")?, ("geometry_msgs", "PoseStamped"), &latest)?,
-        goal: publisher(&mut node, own("goal")?, ("geometry_msgs", "PoseStamped"), &latest)?,
-        ground: publisher(&mut node, own("ground")?, ("nav_msgs", "OccupancyGrid"), &latest)?,
-        goal_pose,
-        navigation,
-        locating,
-        frames: Mutex::default(),
-        place: Mutex::default(),
-        robot,
-        settings: settings.clone(),
-    });
-    let watched = Arc::clone(&shared);
-    let sensor = QosProfile::subscription_default();
-
-    let texts = subscription::<Text>(&mut node, own("query")?, ("std_msgs", "String"), &volatile)?;
-    let asked = Arc::clone(&shared);
-    tokio::spawn(listen(texts, async move |text: Text| Arc::clone(&asked).publish_answers(text.data).await));
-
-    let going = subscription::<Text>(&mut node, own("go_to")?, ("std_msgs", "String"), &volatile)?;
-    let asked = Arc::clone(&shared);
-    tokio::spawn(listen(going, async move |text: Text| {
-        if let Err(reason) = Arc::clone(&asked).go(text.data.clone()).await {
-            tracing::warn!("{:?}: {reason}", text.data);
-            asked.stop_driving(&text.data, &reason).await;
-        }
-    }));
-
-    let kind = ServiceTypeName::new("slag_msgs", "Find");
-    let server = node.create_server(mapping, &own("find")?, &kind, volatile.clone(), volatile.clone());
-    tokio::spawn(serve(server.map_err(|e| anyhow!("cannot offer find: {e}"))?, Arc::clone(&shared)));
-    let kind = ServiceTypeName::new("slag_msgs", "Stand");
-    let server = node.create_server(mapping, &own("stand")?, &kind, volatile.clone(), volatile);
-    tokio::spawn(serve_stand(server.map_err(|e| anyhow!("cannot offer stand: {e}"))?, Arc::clone(&shared)));
-
-    let is_told = matches!(settings.position, PositionSource::Transforms | PositionSource::Odometry);
-    if is_told || settings.camera.is_some() {
-        for (topic, qos) in [("tf", &reliable(100)), ("tf_static", &latched)] {
-            let told = subscription(&mut node, Name::new("/", topic)?, ("tf2_msgs", "TFMessage"), qos)?;
-            let shared = Arc::clone(&shared);
-            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_transforms(told).await));
-        }
-    }
-    if let Some(camera) = &settings.camera {
-        let kind = ("sensor_msgs", "CameraInfo");
-        let told = subscription(&mut node, Name::new(camera, "camera_info")?, kind, &sensor)?;
-        let heard = Arc::clone(&shared);
-        tokio::spawn(listen(told, async move |told| heard.hear_camera(told)));
-        let name = Name::new(&format!("{camera}/image_rect"), "compressed")?;
-        let told = subscription(&mut node, name, ("sensor_msgs", "CompressedImage"), &sensor)?;
-        let heard = Arc::clone(&shared);
-        tokio::spawn(listen(told, async move |told| Arc::clone(&heard).hear_photo(told).await));
-    }
-    match settings.position {
-        PositionSource::Odometry => {
-            let told = subscription(&mut node, Name::new("/", "odom")?, ("nav_msgs", "Odometry"), &sensor)?;
-            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_odometry(told).await));
-        }
-        PositionSource::Fix => {
-            let told =
-                subscription(&mut node, Name::new("/", "fix")?, ("sensor_msgs", "NavSatFix"), &sensor)?;
-            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_fix(told).await));
-        }
-        PositionSource::Transforms | PositionSource::Nowhere => {}
-    }
+pub async fn run(args: Args, robot: Robot, stop: impl Future<Output = ()>) -> Result<()> {
+    let mut node = join(&args)?;
+    let shared = Arc::new(Shared::new(&mut node, args, robot)?);
+    shared.answer_asked(&mut node)?;
+    shared.listen_to_robot(&mut node)?;
     let spinner = node.spinner().map_err(|e| anyhow!("cannot start the node: {e}"))?;
     tokio::spawn(spinner.spin());
-    tracing::info!("/{} listens in domain {}", settings.name, settings.domain_id);
-    tokio::spawn(Arc::clone(&watched).watch());
+    tracing::info!("/{} listens in domain {}", shared.args.name, shared.args.domain_id);
+    tokio::spawn(Arc::clone(&shared).watch());
     stop.await;
-    if let Some(navigation) = &watched.navigation {
+    if let Some(navigation) = &shared.navigation {
         navigation.stop().await;
         // DDS sends in the background: a call to cancel must not end with the process.
         tokio::time::sleep(SEND_TIME).await;
     }
     Ok(())
+}
+
+/// Makes the node in its domain.
+fn join(args: &Args) -> Result<Node> {
+    let mut participant = DomainParticipantBuilder::new(args.domain_id);
+    if !args.interfaces().is_empty() {
+        participant = participant.with_only_networks(args.interfaces().iter().copied());
+    }
+    let joined = participant.build().map_err(|e| anyhow!("cannot join domain {}: {e}", args.domain_id))?;
+    let context = Context::from_domain_participant(joined).map_err(|e| anyhow!("cannot start DDS: {e}"))?;
+    let name =
+        NodeName::new("/", &args.name).map_err(|e| anyhow!("{:?} is no name of a node: {e}", args.name))?;
+    let node = context.new_node(name, NodeOptions::new().enable_rosout(true));
+    node.map_err(|e| anyhow!("cannot make the node: {e:?}"))
+}
+
+impl Args {
+    /// Returns the name of a topic in the node's namespace.
+    fn own(&self, topic: &str) -> Result<Name> {
+        Ok(Name::new(&format!("/{}", self.name), topic)?)
+    }
+
+    fn mapping(&self) -> ServiceMapping {
+        match self.rmw {
+            Rmw::FastDds => ServiceMapping::Enhanced,
+            Rmw::CycloneDds => ServiceMapping::Cyclone,
+        }
+    }
+}
+
+impl Shared {
+    /// Makes the publishers.
+    fn new(node: &mut Node, args: Args, robot: Robot) -> Result<Self> {
+        // Those who join later hear no earlier answer, which they would take for the last; so map_server offers
+        // its map.
+        let latest = reliable(1).durability(Durability::TransientLocal);
+        let kept = reliable(KEPT).durability(Durability::TransientLocal);
+        let now = reliable(1).durability(Durability::Volatile);
+        let pose = ("geometry_msgs", "PoseStamped");
+        let own = |topic: &str| args.own(topic);
+        let goal_pose = match args.send_goals {
+            Goals::Topic => Some(publisher(node, Name::new("/", "goal_pose")?, pose, &now)?),
+            Goals::None | Goals::Action => None,
+        };
+        let navigation = match args.send_goals {
+            Goals::Action => Some(Navigation::new(node, &args, &latest)?),
+            Goals::None | Goals::Topic => None,
+        };
+        let locating = match args.camera {
+            Some(_) => Some(Locating::new(node, own("pose")?, &latest)?),
+            None => None,
+        };
+        Ok(Self {
+            detections: publisher(node, own("detections")?, ("vision_msgs", "Detection3DArray"), &latest)?,
+            markers: publisher(node, own("markers")?, ("visualization_msgs", "MarkerArray"), &latest)?,
+            points: publisher(node, own("points")?, ("sensor_msgs", "PointCloud2"), &kept)?,
+            best_pose: publisher(node, own("best_pose")?, pose, &latest)?,
+            goal: publisher(node, own("goal")?, pose, &latest)?,
+            ground: publisher(node, own("ground")?, ("nav_msgs", "OccupancyGrid"), &latest)?,
+            goal_pose,
+            navigation,
+            locating,
+            frames: Mutex::default(),
+            place: Mutex::default(),
+            robot,
+            args,
+        })
+    }
+
+    /// Answers the topics and services that ask.
+    fn answer_asked(self: &Arc<Self>, node: &mut Node) -> Result<()> {
+        let (args, volatile, text) = (&self.args, reliable(10), ("std_msgs", "String"));
+        let texts = subscription::<Text>(node, args.own("query")?, text, &volatile)?;
+        let shared = Arc::clone(self);
+        tokio::spawn(listen(texts, async move |text: Text| {
+            Arc::clone(&shared).publish_answers(text.data).await;
+        }));
+        let going = subscription::<Text>(node, args.own("go_to")?, text, &volatile)?;
+        let shared = Arc::clone(self);
+        tokio::spawn(listen(going, async move |text: Text| {
+            if let Err(reason) = Arc::clone(&shared).go(text.data.clone()).await {
+                tracing::warn!("{:?}: {reason}", text.data);
+                shared.stop_driving(&text.data, &reason).await;
+            }
+        }));
+        let mapping = args.mapping();
+        let kind = ServiceTypeName::new("slag_msgs", "Find");
+        let server =
+            node.create_server(mapping, &args.own("find")?, &kind, volatile.clone(), volatile.clone());
+        let shared = Arc::clone(self);
+        tokio::spawn(serve(
+            server.map_err(|e| anyhow!("cannot offer find: {e}"))?,
+            async move |request: FindRequest| Arc::clone(&shared).find(request).await,
+        ));
+        let kind = ServiceTypeName::new("slag_msgs", "Stand");
+        let server = node.create_server(mapping, &args.own("stand")?, &kind, volatile.clone(), volatile);
+        let shared = Arc::clone(self);
+        // A place that was asked for is not a goal yet: nothing is sent to navigation.
+        tokio::spawn(serve(
+            server.map_err(|e| anyhow!("cannot offer stand: {e}"))?,
+            async move |request: StandRequest| Arc::clone(&shared).stand(request.text).await,
+        ));
+        Ok(())
+    }
+
+    /// Listens to what tells where the robot is.
+    fn listen_to_robot(self: &Arc<Self>, node: &mut Node) -> Result<()> {
+        let args = &self.args;
+        let (sensor, latched) =
+            (QosProfile::subscription_default(), reliable(100).durability(Durability::TransientLocal));
+        let is_told = matches!(args.position, Source::Tf | Source::Odom);
+        if is_told || args.camera.is_some() {
+            for (topic, qos) in [("tf", &reliable(100)), ("tf_static", &latched)] {
+                let told = subscription(node, Name::new("/", topic)?, ("tf2_msgs", "TFMessage"), qos)?;
+                let shared = Arc::clone(self);
+                tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_transforms(told).await));
+            }
+        }
+        if let Some(camera) = &args.camera {
+            let kind = ("sensor_msgs", "CameraInfo");
+            let told = subscription(node, Name::new(camera, "camera_info")?, kind, &sensor)?;
+            let shared = Arc::clone(self);
+            tokio::spawn(listen(told, async move |told| shared.hear_camera(told)));
+            let name = Name::new(&format!("{camera}/image_rect"), "compressed")?;
+            let told = subscription(node, name, ("sensor_msgs", "CompressedImage"), &sensor)?;
+            let shared = Arc::clone(self);
+            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_photo(told).await));
+        }
+        let shared = Arc::clone(self);
+        match args.position {
+            Source::Odom => {
+                let told = subscription(node, Name::new("/", "odom")?, ("nav_msgs", "Odometry"), &sensor)?;
+                tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_odometry(told).await));
+            }
+            Source::Fix => {
+                let told = subscription(node, Name::new("/", "fix")?, ("sensor_msgs", "NavSatFix"), &sensor)?;
+                tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_fix(told).await));
+            }
+            Source::Tf | Source::None => {}
+        }
+        Ok(())
+    }
 }
 
 /// Returns the usual quality of topics: every message, the last few of them.
@@ -348,8 +319,11 @@ async fn listen<M: ros2_client::Message + 'static>(topic: Subscription<M>, handl
     }
 }
 
-/// Answers the calls of the service.
-async fn serve(server: Server<FindRequest, FindReply>, shared: Arc<Shared>) {
+/// Answers the calls of a service, one after the other.
+async fn serve<Q: ros2_client::Message + 'static, R: ros2_client::Message + 'static>(
+    server: Server<Q, R>,
+    answer: impl AsyncFn(Q) -> R,
+) {
     loop {
         let (id, request) = match server.async_receive_request().await {
             Ok(received) => received,
@@ -359,50 +333,29 @@ async fn serve(server: Server<FindRequest, FindReply>, shared: Arc<Shared>) {
                 continue;
             }
         };
-        let text = request.text.clone();
-        let header = answers::header(&shared.settings.scene_frame);
-        let reply = match Arc::clone(&shared).ask(request, false).await {
-            Ok(found) => FindReply {
-                success: !found.answers.is_empty(),
-                message: found.reason,
-                detections: answers::detections(&header, &text, &found.answers),
-            },
-            Err(message) => {
-                FindReply { success: false, message, detections: answers::detections(&header, &text, &[]) }
-            }
-        };
-        if let Err(error) = server.async_send_response(id, reply).await {
-            tracing::warn!("the reply to {text:?} cannot be sent: {error:?}");
-        }
-    }
-}
-
-/// Answers the calls for places to stand. A place that was asked for is not a goal yet: nothing is sent to
-/// navigation.
-async fn serve_stand(server: Server<StandRequest, StandReply>, shared: Arc<Shared>) {
-    loop {
-        let (id, request) = match server.async_receive_request().await {
-            Ok(received) => received,
-            Err(error) => {
-                tracing::warn!("a call cannot be read: {error}");
-                tokio::time::sleep(READ_PAUSE).await;
-                continue;
-            }
-        };
-        let reply = Arc::clone(&shared).stand(request.text.clone()).await;
-        if let Err(error) = server.async_send_response(id, reply).await {
-            tracing::warn!("the reply to {:?} cannot be sent: {error:?}", request.text);
+        if let Err(error) = server.async_send_response(id, answer(request).await).await {
+            tracing::warn!("a reply cannot be sent: {error:?}");
         }
     }
 }
 
 impl Shared {
+    /// Answers a call of the service that finds things.
+    async fn find(self: Arc<Self>, request: FindRequest) -> FindReply {
+        let (text, header) = (request.text.clone(), answers::header(&self.args.scene_frame));
+        let (answers, message) = match self.ask(request, false).await {
+            Ok(found) => (found.answers, found.reason),
+            Err(message) => (Vec::new(), message),
+        };
+        let detections = answers::detections(&header, &text, &answers);
+        FindReply { success: !answers.is_empty(), message, detections }
+    }
+
     /// Asks the robot for a place to stand, on a thread that may wait.
     async fn stand(self: Arc<Self>, text: String) -> StandReply {
         let place = self.place.lock().expect("no holder panics").0;
-        let frame = self.settings.scene_frame.clone();
-        let asked =
-            tokio::task::spawn_blocking(move || self.settings.body.stand(&self.robot, &text, place)).await;
+        let frame = self.args.scene_frame.clone();
+        let asked = tokio::task::spawn_blocking(move || self.args.stand(&self.robot, &text, place)).await;
         stand::reply(&frame, asked.unwrap_or_else(|error| Err(format!("slag-ros failed: {error}"))))
     }
 
@@ -411,8 +364,7 @@ impl Shared {
         let shared = Arc::clone(&self);
         let ground = tokio::task::spawn_blocking(move || {
             let place = shared.place.lock().expect("no holder panics").0;
-            let Settings { body, scene_frame, .. } = &shared.settings;
-            body.ground(&shared.robot, scene_frame, place)
+            shared.args.ground(&shared.robot, place)
         });
         let ground = ground.await.map_err(|error| format!("slag-ros failed: {error}"))??;
         if let Some(ground) = ground {
@@ -494,7 +446,7 @@ impl Shared {
     }
 
     fn ask_now(&self, request: &FindRequest, with_points: bool) -> Result<Found, String> {
-        let limit = if request.limit == 0 { self.settings.limit } else { request.limit };
+        let limit = if request.limit == 0 { self.args.limit } else { request.limit };
         let mut asked = json!({"texts": [request.text], "limit": limit});
         if let Some(place) = self.place.lock().expect("no holder panics").0 {
             asked["near"] = json!(place);
@@ -504,7 +456,7 @@ impl Shared {
         let mut points = Vec::new();
         // A phrase has things, but no Gaussians of its own.
         if with_points && result.understood.is_none() && !result.answers.is_empty() {
-            asked["limit"] = json!(self.settings.n_points);
+            asked["limit"] = json!(self.args.points);
             let reply = self.robot.ask_points(&asked).map_err(|e| e.to_string())?;
             points = reply.results.into_iter().next().map(|result| result.answers).unwrap_or_default();
         }
@@ -522,7 +474,7 @@ impl Shared {
         if found.answers.is_empty() {
             tracing::info!("{text:?}: {}", found.reason);
         }
-        let header = answers::header(&self.settings.scene_frame);
+        let header = answers::header(&self.args.scene_frame);
         publish(&self.detections, answers::detections(&header, &text, &found.answers)).await;
         publish(&self.markers, answers::markers(&header, &text, &found.answers)).await;
         for cloud in answers::clouds(&header, &found.points) {
@@ -537,9 +489,9 @@ impl Shared {
         let place = {
             let mut frames = self.frames.lock().expect("no holder panics");
             told.transforms.into_iter().for_each(|transform| frames.insert(transform));
-            position::of_frame(&frames, &self.settings.scene_frame, &self.settings.base_frame)
+            position::of_frame(&frames, &self.args.scene_frame, &self.args.base_frame)
         };
-        if self.settings.position == PositionSource::Transforms
+        if self.args.position == Source::Tf
             && let Some(place) = place
         {
             self.moved_to(place).await;
@@ -549,7 +501,7 @@ impl Shared {
     async fn hear_odometry(self: Arc<Self>, told: Odometry) {
         let place = {
             let frames = self.frames.lock().expect("no holder panics");
-            position::of_odometry(&frames, &self.settings.scene_frame, &told)
+            position::of_odometry(&frames, &self.args.scene_frame, &told)
         };
         match place {
             Some(place) => self.moved_to(place).await,
@@ -575,7 +527,7 @@ impl Shared {
     async fn hear_photo(self: Arc<Self>, photo: CompressedImage) {
         let Some(locating) = &self.locating else { return };
         let Some(camera) = locating.camera_of_due_photo() else { return };
-        let Settings { scene_frame, base_frame, fixed_frame, .. } = &self.settings;
+        let Args { scene_frame, base_frame, fixed_frame, .. } = &self.args;
         let optical_frame = photo.header.frame_id.clone();
         let of_camera = {
             let frames = self.frames.lock().expect("no holder panics");
@@ -590,8 +542,8 @@ impl Shared {
         let (shared, parameters) = (Arc::clone(&self), of_camera.parameters(&camera));
         let asked = tokio::task::spawn_blocking(move || shared.robot.locate(&parameters, &photo.data)).await;
         let pose = match asked {
-            Ok(Ok(Whereabouts::Found(pose))) => pose,
-            Ok(Ok(Whereabouts::Unsure { reason, .. } | Whereabouts::Lost { reason })) => {
+            Ok(Ok(locate::Answer::Found(pose))) => pose,
+            Ok(Ok(locate::Answer::Unsure { reason, .. } | locate::Answer::Lost { reason })) => {
                 return tracing::info!("a photo is not located: {reason}");
             }
             Ok(Err(error)) => return tracing::warn!("a photo is not located: {error}"),
@@ -627,7 +579,7 @@ impl Shared {
     /// Returns whether a position may be posted, and if so counts from here.
     fn is_due(&self) -> bool {
         let (_, posted) = &mut *self.place.lock().expect("no holder panics");
-        let is_due = posted.is_none_or(|posted| posted.elapsed() >= self.settings.position_period);
+        let is_due = posted.is_none_or(|posted| posted.elapsed() >= self.args.position_period);
         if is_due {
             *posted = Some(Instant::now());
         }
@@ -643,6 +595,17 @@ impl Shared {
 }
 
 impl Locating {
+    fn new(node: &mut Node, pose: Name, latest: &QosProfile) -> Result<Self> {
+        let (tf, kind) = (Name::new("/", "tf")?, ("geometry_msgs", "PoseWithCovarianceStamped"));
+        Ok(Self {
+            camera: Mutex::default(),
+            fixes: Mutex::default(),
+            last: Mutex::default(),
+            pose: publisher(node, pose, kind, latest)?,
+            transforms: publisher(node, tf, ("tf2_msgs", "TFMessage"), &reliable(100))?,
+        })
+    }
+
     /// Returns the camera of a photo, if it is known and a photo is due; then counts from here.
     fn camera_of_due_photo(&self) -> Option<CameraInfo> {
         let camera = self.camera.lock().expect("no holder panics").clone()?;
@@ -654,7 +617,7 @@ impl Locating {
 }
 
 /// Returns the covariance of a pose in the order of ROS, which is that of the robot's program.
-fn covariance(pose: &CameraPose) -> [[f64; 6]; 6] {
+fn covariance(pose: &locate::Pose) -> [[f64; 6]; 6] {
     let at = |row: usize, column: usize| pose.covariance.get(6 * row + column).copied().unwrap_or(0.0);
     std::array::from_fn(|row| std::array::from_fn(|column| at(row, column)))
 }

@@ -2,9 +2,10 @@
 
 use std::io::Write;
 
-use crate::query::{ChangedThing, ChangesError, ChangesReply, ChangesRequest, MovedThing};
+use crate::query::{ChangesError, ChangesRequest};
 use crate::score::Budget;
 use clap::Args;
+use slag_api::changes::{ChangedThing, ChangesReply, MovedThing};
 
 use super::args::{CacheArgs, ModelArgs, engine};
 use super::failure::{Failure, store_failure};
@@ -77,7 +78,7 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::query::{ComparedGeneration, Likeness, NotCompared};
+    use slag_api::changes::{ComparedGeneration, Likeness, NotCompared};
 
     fn thing(id: &str, x: f64, like: Option<&str>) -> ChangedThing {
         let at = DVec3::new(x, 2.0, 0.5);
@@ -100,8 +101,8 @@ mod tests {
         let (from, to) = (thing("o3", 3.0, None), thing("o4", 5.5, Some("chair")));
         let mut reply = ChangesReply {
             scene: "yard".into(),
-            frame: "world",
-            unit: "m",
+            frame: "world".into(),
+            unit: "m".into(),
             from: Some(of(4, 1000)),
             to: of(6, 500),
             generations: vec![4, 6],
@@ -119,9 +120,10 @@ mod tests {
             moved     2.50 m: o4 at 5.50, 2.00, 0.50, like \"chair\" (0.50); was o3 at 3.00, 2.00, 0.50\n\
             things    7 stayed, 3 of them unchanged; 5 not compared: one generation alone knows their place\n";
         assert_eq!(lines(&reply), expected);
-        reply.unit = "world";
+        reply.unit = "world".into();
         assert!(lines(&reply).contains("moved     2.50: o4"), "{}", lines(&reply));
-        reply.none = Some(NotCompared { kind: "no-earlier-generation", detail: "there is none".into() });
+        reply.none =
+            Some(NotCompared { kind: "no-earlier-generation".into(), detail: "there is none".into() });
         assert_eq!(lines(&reply), "there is none\n");
     }
 }

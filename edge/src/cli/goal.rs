@@ -3,11 +3,12 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use crate::goal::{self, Goal, GoalError, GoalReply, GoalRequest, GoalTarget};
+use crate::goal::{self, GoalError, GoalRequest, GoalTarget};
 use crate::query::{object_id, parse_point};
 use crate::score::Budget;
 use clap::Args;
 use glam::DVec3;
+use slag_api::goal::{Goal, GoalReply};
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};

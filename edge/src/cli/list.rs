@@ -7,14 +7,13 @@ use clap::Args;
 use glam::DVec3;
 use serde::de::value::{Error, StrDeserializer};
 use serde::de::{DeserializeOwned, IntoDeserializer};
+use slag_api::objects::{Name, ObjectOnBoard, ObjectPage};
 use slag_common::frames::Aabb;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
-use crate::query::{
-    ListFormat, Name, ObjectFilter, ObjectOnBoard, ObjectOrder, ObjectPage, parse_box, parse_point,
-};
+use crate::query::{ListFormat, ObjectFilter, ObjectOrder, parse_box, parse_point};
 use crate::score::{Ball, Budget, Region};
 
 /// Longest wait for the words to be encoded: a large text model on a slow core takes minutes, once.

@@ -96,12 +96,10 @@ fn located(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer,
 
 fn pairs(pose: &Pose) -> Vec<(&'static str, String)> {
     let numbers = |of: &[f64]| of.iter().map(|v| format!("{v:.4}")).collect::<Vec<_>>().join(",");
-    // The standard deviation along the worst axis of the world.
-    let sigma = [0, 7, 14].map(|at| pose.covariance[at]).into_iter().fold(0.0, f64::max).sqrt();
     let mut pairs = vec![
         ("position", numbers(&pose.position_in_world)),
         ("rotation_xyzw", numbers(&pose.rotation_xyzw)),
-        ("sigma", format!("{sigma:.4}")),
+        ("sigma", format!("{:.4}", pose.position_sigma())),
         ("landmarks", pose.n_inliers.to_string()),
     ];
     if let Some(at) = pose.geographic {

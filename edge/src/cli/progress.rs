@@ -11,12 +11,9 @@ use super::output::print_pairs;
 
 pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     let tally = |t: &Tally| format!("{} shards, {}", t.n_shards, ByteSize(t.bytes));
-    let trust = match (report.root_version, report.is_first_contact) {
-        (Some(version), true) => {
-            format!("root {version}, trusted at first contact: compare it with the store's")
-        }
-        (Some(version), false) => format!("root {version}"),
-        (None, _) => "no root yet".into(),
+    let news = match report.is_first_contact {
+        true => ", trusted at first contact: compare it with the store's",
+        false => "",
     };
     print_pairs(&[
         ("scene", report.scene.clone()),
@@ -28,7 +25,7 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
         ("spare", tally(&report.spare)),
         ("freed", tally(&report.freed)),
         ("seconds", format!("{:.2}", report.seconds)),
-        ("trusted by", trust),
+        ("trusted by", format!("root {}{news}", report.root_version)),
     ])
 }
 
@@ -84,7 +81,7 @@ impl Bar {
 }
 
 impl Progress for Bar {
-    fn planned(&self, _n_shards: usize, bytes: u64) {
+    fn planned(&self, bytes: u64) {
         self.planned_bytes.store(bytes, Ordering::Relaxed);
     }
 

@@ -4,8 +4,8 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use crate::query::{
-    AnswerKind, Answers, DEFAULT_MIN_COUNT, Format, Found, Negatives, QueryRequest, Reply, ThresholdSource,
-    parse_box, parse_point,
+    AnswerKind, Answers, BadCellAnswer, ClusterAnswer, DEFAULT_MIN_COUNT, Format, Found, GaussianAnswer,
+    Negatives, QueryRequest, Reply, Searched, ThresholdSource, parse_box, parse_point,
 };
 use crate::score::{Ball, Budget, Precision, Region};
 use clap::Args;
@@ -125,89 +125,60 @@ fn print_reply(reply: &Reply) -> Result<(), Failure> {
 
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     if let Some(reason) = &answers.reason {
-        writeln!(io::stderr(), "{}", reason.detail)?;
-        return Ok(());
+        return Ok(writeln!(io::stderr(), "{}", reason.detail)?);
     }
-    let found = &answers.searched;
+    write!(io::stderr(), "{}", notes(&answers.searched))?;
+    let row = |rank: usize, at: DVec3, of: [String; 4], from: Option<f64>| {
+        let [size, score, count, id] = of;
+        let distance = from.map_or_else(|| "-".to_owned(), |d| format!("{d:.2}"));
+        let position = format!("{:.2}, {:.2}, {:.2}", at.x, at.y, at.z);
+        vec![rank.to_string(), distance, position, size, score, count, id]
+    };
+    let cluster = |c: &ClusterAnswer| {
+        let size = format!("{:.2} x {:.2} x {:.2}", c.size.x, c.size.y, c.size.z);
+        let shown = c.evidence.as_ref().map(|evidence| format!(" in {}", visible(&evidence.photo)));
+        let id = c.id.clone() + &shown.unwrap_or_default();
+        let of = [size, format!("{:.3}", c.score), c.n_gaussians.to_string(), id];
+        row(c.rank, c.position_in_world, of, c.distance)
+    };
+    let gaussian = |g: GaussianAnswer| {
+        let of = ["-".into(), format!("{:.3}", g.score), "1".into(), format!("{}-{}", g.cell_id, g.index)];
+        row(g.rank, g.position_in_world, of, g.distance)
+    };
+    let rows: Vec<Vec<String>> = match &answers.answers {
+        Found::Clusters(clusters) => clusters.iter().map(cluster).collect(),
+        Found::Gaussians(_) => reply.gaussians(answers).into_iter().map(gaussian).collect(),
+    };
+    let [distance, position, size] =
+        ["distance", "position", "size"].map(|name| format!("{name} [{}]", answers.unit));
+    let head = ["rank", &distance, &position, &size, "score", "count", "id"];
+    Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
+}
+
+/// Returns what is to be said about answers, in lines.
+fn notes(found: &Searched) -> String {
     let exactness = match found.score_error_likely.filter(|_| !found.is_exact) {
         Some(likely) => format!("; 99 of 100 scores within ±{likely:.3}"),
         None => String::new(),
     };
-    let (n, threshold) = (found.n_matching, found.threshold);
     let source = match found.threshold_source {
         ThresholdSource::Request => "as requested",
         ThresholdSource::Scene => "calibrated on the scene",
         ThresholdSource::Encoder => "the encoder's default",
         ThresholdSource::Relevancy => "closer than any negative",
     };
-    let searched = found.n_searched;
-    writeln!(io::stderr(), "{n} Gaussians of {searched} reach {threshold}, {source}{exactness}")?;
+    let Searched { n_matching, n_searched, threshold, .. } = found;
+    let mut notes =
+        format!("{n_matching} Gaussians of {n_searched} reach {threshold}, {source}{exactness}\n");
     if found.area_fetched == Some(false) {
-        writeln!(io::stderr(), "part of that area is not on board; fetch it for a complete answer")?;
+        notes += "part of that area is not on board; fetch it for a complete answer\n";
     }
-    for bad in &found.bad_cells {
-        let id = bad.cell_id;
-        match bad.generation {
-            Some(old) => {
-                writeln!(io::stderr(), "cell {id} could not be fetched; generation {old} answers for it")?
-            }
-            None => writeln!(io::stderr(), "cell {id} could not be fetched, and is not on board")?,
-        }
+    for BadCellAnswer { cell_id, generation } in &found.bad_cells {
+        let instead = match generation {
+            Some(old) => format!("; generation {old} answers for it"),
+            None => ", and is not on board".to_owned(),
+        };
+        notes += &format!("cell {cell_id} could not be fetched{instead}\n");
     }
-    let rows: Vec<Vec<String>> = match &answers.answers {
-        Found::Clusters(clusters) => clusters
-            .iter()
-            .map(|c| {
-                let size = format!("{:.2} x {:.2} x {:.2}", c.size.x, c.size.y, c.size.z);
-                let (score, n) = (format!("{:.3}", c.score), c.n_gaussians.to_string());
-                vec![
-                    c.rank.to_string(),
-                    distance(c.distance),
-                    point(c.position_in_world),
-                    size,
-                    score,
-                    n,
-                    match &c.evidence {
-                        Some(evidence) => format!("{} in {}", c.id, visible(&evidence.photo)),
-                        None => c.id.clone(),
-                    },
-                ]
-            })
-            .collect(),
-        Found::Gaussians(_) => reply
-            .gaussians(answers)
-            .into_iter()
-            .map(|g| {
-                let (score, id) = (format!("{:.3}", g.score), format!("{}-{}", g.cell_id, g.index));
-                vec![
-                    g.rank.to_string(),
-                    distance(g.distance),
-                    point(g.position_in_world),
-                    "-".into(),
-                    score,
-                    "1".into(),
-                    id,
-                ]
-            })
-            .collect(),
-    };
-    let unit = answers.unit;
-    let head = [
-        "rank",
-        &format!("distance [{unit}]"),
-        &format!("position [{unit}]"),
-        &format!("size [{unit}]"),
-        "score",
-        "count",
-        "id",
-    ];
-    Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
-}
-
-fn point(p: DVec3) -> String {
-    format!("{:.2}, {:.2}, {:.2}", p.x, p.y, p.z)
-}
-
-fn distance(distance: Option<f64>) -> String {
-    distance.map_or_else(|| "-".to_owned(), |d| format!("{d:.2}"))
+    notes
 }

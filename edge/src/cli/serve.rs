@@ -8,13 +8,14 @@ use std::time::Duration;
 
 use crate::fetch::follow::Following;
 use crate::http::{self, App, Settings};
+use crate::query::Engine;
 use crate::store::{EdgeCache, StoreError};
 use anyhow::anyhow;
 use clap::Args;
 use slag_service::access::{Access, AccessSettings};
 use slag_service::listen::{Listen, answers, bind};
 use slag_service::stop::stop_signal;
-use slag_service::tls::TlsFiles;
+use slag_service::tls::{Tls, TlsFiles};
 
 use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, parse_bytes};
 use super::failure::Failure;
@@ -81,15 +82,7 @@ pub struct ServeArgs {
 pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     args.threads.apply()?;
     let access = access(&mut args)?;
-    // One of them may come from the configuration.
-    if args.tls_cert.is_some() != args.tls_key.is_some() {
-        return Err(Failure::Usage(anyhow!(
-            "TLS needs both --tls-cert and --tls-key; give both, or neither"
-        )));
-    }
-    let files = args.tls_cert.take().zip(args.tls_key.take());
-    let tls = args.listen.tls(files.map(|(cert, key)| TlsFiles { cert, key }));
-    let tls = tls.map_err(|e| Failure::Usage(e.into()))?;
+    let tls = tls(&mut args)?;
     let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
     if let Some(path) = open_to_everybody(&cache) {
         tracing::warn!(
@@ -99,6 +92,62 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         );
     }
     let engine = engine(cache.clone(), &args.models)?;
+    load(&engine);
+    let query_timeout = Duration::from_secs(args.max_query_secs);
+    let settings = Settings { access, ..Settings::with_budget(args.max_query_bytes, query_timeout) };
+    let (drain, blocking_threads) =
+        (settings.connections.drain_timeout, settings.max_queries + SPARE_BLOCKING_THREADS);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(ASYNC_THREADS)
+        .max_blocking_threads(blocking_threads)
+        .enable_all()
+        .build()?;
+    let served = runtime.block_on(serve(args, tls, cache, engine, settings));
+    // A query that does not end must not keep the process alive.
+    runtime.shutdown_timeout(drain);
+    served
+}
+
+/// Serves until a signal to stop.
+async fn serve(
+    args: ServeArgs,
+    tls: Option<Tls>,
+    cache: EdgeCache,
+    engine: Engine,
+    settings: Settings,
+) -> Result<(), Failure> {
+    let stop = stop_signal()?;
+    let listener = bind(&args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
+    let listener = listener.with_tls(tls);
+    // For scripts that let the system choose a port.
+    let url = listener.url()?;
+    writeln!(io::stdout(), "listening on {url}")?;
+    let following = args.follow.is_some().then(Arc::<Following>::default);
+    let app = App::following(engine, settings, following.clone());
+    let follower = match following {
+        Some(following) => {
+            let settings = args.following.settings(args.download.radius)?;
+            let ca = args.download.ca.clone();
+            let request = args.download.request(args.follow, None);
+            Some(follow_in_background(request, ca, settings, cache, following, Arc::clone(&app))?)
+        }
+        None => None,
+    };
+    let scrub = scrub_in_background(&app, args.scrub_secs)?;
+    supervisor::tell(News::Ready);
+    tokio::spawn(async move { supervisor::pulse(|| answers(&url)).await });
+    let stop = async {
+        stop.await;
+        supervisor::tell(News::Stopping);
+    };
+    let served = http::serve(app, listener, stop).await;
+    // A fetch in progress need not be awaited: the next one resumes it.
+    [follower, scrub].iter().flatten().for_each(|cancel| cancel.store(true, Ordering::Relaxed));
+    Ok(served?)
+}
+
+/// Loads what is on board, if anything is, and begins to name its things.
+fn load(engine: &Engine) {
     match engine.reload() {
         Ok(()) => {}
         Err(StoreError::Empty { path }) => {
@@ -112,48 +161,20 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         tracing::warn!("{error}");
     }
     engine.begin_names();
-    let query_timeout = Duration::from_secs(args.max_query_secs);
-    let settings = Settings { access, ..Settings::with_budget(args.max_query_bytes, query_timeout) };
-    let (drain, blocking_threads) =
-        (settings.connections.drain_timeout, settings.max_queries + SPARE_BLOCKING_THREADS);
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(ASYNC_THREADS)
-        .max_blocking_threads(blocking_threads)
-        .enable_all()
-        .build()?;
-    let served = runtime.block_on(async {
-        let stop = stop_signal()?;
-        let listener = bind(&args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
-        let listener = listener.with_tls(tls);
-        // For scripts that let the system choose a port.
-        let url = listener.url()?;
-        writeln!(io::stdout(), "listening on {url}")?;
-        let following = args.follow.is_some().then(Arc::<Following>::default);
-        let app = App::following(engine, settings, following.clone());
-        let follower = match following {
-            Some(following) => {
-                let settings = args.following.settings(args.download.radius)?;
-                let ca = args.download.ca.clone();
-                let request = args.download.request(args.follow, None);
-                Some(follow_in_background(request, ca, settings, cache, following, Arc::clone(&app))?)
-            }
-            None => None,
-        };
-        let scrub = scrub_in_background(&app, args.scrub_secs)?;
-        supervisor::tell(News::Ready);
-        tokio::spawn(async move { supervisor::pulse(|| answers(&url)).await });
-        let stop = async {
-            stop.await;
-            supervisor::tell(News::Stopping);
-        };
-        let served = http::serve(app, listener, stop).await;
-        // A fetch in progress need not be awaited: the next one resumes it.
-        [follower, scrub].iter().flatten().for_each(|cancel| cancel.store(true, Ordering::Relaxed));
-        Ok(served?)
-    });
-    // A query that does not end must not keep the process alive.
-    runtime.shutdown_timeout(drain);
-    served
+}
+
+/// Returns the certificate to speak TLS with, if there is one.
+fn tls(args: &mut ServeArgs) -> Result<Option<Tls>, Failure> {
+    let files = match (args.tls_cert.take(), args.tls_key.take()) {
+        (Some(cert), Some(key)) => Some(TlsFiles { cert, key }),
+        (None, None) => None,
+        // One of them may come from the configuration.
+        _ => {
+            let what = anyhow!("TLS needs both --tls-cert and --tls-key; give both, or neither");
+            return Err(Failure::Usage(what));
+        }
+    };
+    args.listen.tls(files).map_err(|e| Failure::Usage(e.into()))
 }
 
 /// Returns a folder of the cache that every user of the machine may write to: what is on board is opened by its

@@ -52,17 +52,11 @@ pub enum FetchError {
     )]
     Scene { expected: String, offered: String },
     #[error(
-        "the scene was encoded with encoder {found}, expected {expected}; use that model, or have the scene encoded again"
-    )]
-    Encoder { expected: Hash32, found: Hash32 },
-    #[error(
         "shard {hash} matches its hash but is not a valid shard of this scene; have the scene published again"
     )]
     Published { hash: Hash32, source: Box<StoreError> },
     #[error(transparent)]
     Plan(#[from] PlanError),
-    #[error("{n_shards} shards ({bytes} bytes) are not on board; fetch with network")]
-    Offline { n_shards: usize, bytes: u64 },
     #[error(
         "{path}: {free_bytes} bytes are free, the fetch needs {needed_bytes}; free some space, or fetch a smaller radius", path = path.display()
     )]

@@ -8,7 +8,6 @@ use slag_common::tuf::{Source, TargetFile, TufError, refresh};
 use super::download::Client;
 use super::error::FetchError;
 use super::records::Records;
-use super::request::FetchRequest;
 use crate::store::{Current, EdgeCache};
 
 /// A manifest that the store's metadata names.
@@ -71,16 +70,14 @@ impl Offer {
         models.flat_map(TextModelRecord::objects).map(|object| object.hash)
     }
 
-    /// Refuses a manifest of another scene or encoder. `scene`: the one that the robot keeps to.
-    pub fn check(&self, scene: Option<&str>, request: &FetchRequest) -> Result<(), FetchError> {
+    /// Refuses a manifest of another scene than the one that the robot keeps to.
+    pub fn check(&self, scene: Option<&str>) -> Result<(), FetchError> {
         let offered = &self.manifest.scene;
-        if let Some(expected) = scene.filter(|expected| expected != offered) {
-            return Err(FetchError::Scene { expected: expected.to_owned(), offered: offered.clone() });
-        }
-        let found = self.manifest.encoder.id;
-        match request.expected_encoder {
-            Some(expected) if expected != found => Err(FetchError::Encoder { expected, found }),
-            _ => Ok(()),
+        match scene.filter(|expected| expected != offered) {
+            Some(expected) => {
+                Err(FetchError::Scene { expected: expected.to_owned(), offered: offered.clone() })
+            }
+            None => Ok(()),
         }
     }
 }

@@ -38,8 +38,8 @@ pub struct FetchReport {
     pub generation: u64,
     /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
-    /// Version of the root by which the manifest is trusted; absent if nothing was trusted yet (offline).
-    pub root_version: Option<u64>,
+    /// Version of the root by which the manifest is trusted.
+    pub root_version: u64,
     /// Whether that root was accepted because it was the first.
     pub is_first_contact: bool,
     /// The encoder whose text model answers queries.

@@ -4,7 +4,6 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use slag_common::Hash32;
 use slag_common::shard::Profile;
 use slag_models::download::{DownloadFailure, NetworkLimits};
 
@@ -28,13 +27,9 @@ pub struct FetchRequest {
     /// The only scene accepted, from now on; absent: the one accepted before or, at the first contact, the
     /// server's.
     pub scene: Option<String>,
-    /// The only encoder accepted; absent: any.
-    pub expected_encoder: Option<Hash32>,
     /// Byte budget for shards; absent: twice the length of the needed ones.
     pub max_bytes: Option<u64>,
     pub parallel: usize,
-    /// Use the manifest and shards on board only.
-    pub offline: bool,
 }
 
 impl Default for FetchRequest {
@@ -46,18 +41,16 @@ impl Default for FetchRequest {
             profile: Profile::Compact,
             trust_first: false,
             scene: None,
-            expected_encoder: None,
             max_bytes: None,
             parallel: DEFAULT_PARALLEL,
-            offline: false,
         }
     }
 }
 
 /// Receives the progress of a fetch, from any of its threads.
 pub trait Progress: Sync {
-    /// Called once with the number and total length of the shards to download.
-    fn planned(&self, _n_shards: usize, _bytes: u64) {}
+    /// Called once with the length of the shards to download.
+    fn planned(&self, _bytes: u64) {}
     /// Called with the number of bytes received since the last call.
     fn received(&self, _bytes: u64) {}
     /// Called when an attempt failed and another follows.

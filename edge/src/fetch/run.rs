@@ -106,27 +106,19 @@ impl<'a> Locked<'a> {
         })
     }
 
-    /// Brings metadata up to date and takes the manifest that it names, if it is of the robot's scene and encoder.
+    /// Brings metadata up to date and takes the manifest that it names, if it is of the robot's scene.
     fn accept_offer(mut self) -> Result<Offered<'a>, FetchError> {
         let Self { cache, request, ref client, ref on_board, .. } = self;
         let records = &mut self.records;
-        let mut is_first_contact = false;
-        let offer = if request.offline {
-            let advice = "fetch once with network";
-            on_board.clone().ok_or(FetchError::NotGiven { what: "manifest", advice })?
-        } else {
-            if let Some(damage) = records.damage() {
-                return Err(damage.into());
-            }
-            if request.trust_first {
-                is_first_contact = trust_first(client, cache, records)?;
-            }
-            let now_unix_secs = self.environment.now_unix_secs;
-            let offer = Offer::get(client, cache, records, now_unix_secs, on_board.as_ref());
-            offer.map_err(|e| disk_full(e, SPARE_BYTES))?
-        };
+        if let Some(damage) = records.damage() {
+            return Err(damage.into());
+        }
+        let is_first_contact = request.trust_first && trust_first(client, cache, records)?;
+        let now_unix_secs = self.environment.now_unix_secs;
+        let offer = Offer::get(client, cache, records, now_unix_secs, on_board.as_ref());
+        let offer = offer.map_err(|e| disk_full(e, SPARE_BYTES))?;
         let known = records.scene().or(on_board.as_ref().map(|offer| offer.manifest.scene.as_str()));
-        offer.check(request.scene.as_deref().or(known), request)?;
+        offer.check(request.scene.as_deref().or(known))?;
         Ok(Offered { locked: self, offer, is_first_contact })
     }
 }
@@ -144,7 +136,7 @@ impl<'a> Offered<'a> {
     fn plan(self) -> Result<Planned<'a>, FetchError> {
         let Locked { cache, request, usage, last, on_board, .. } = &self.locked;
         let manifest = &self.offer.manifest;
-        let FetchRequest { profile, radius, max_bytes, offline, .. } = **request;
+        let FetchRequest { profile, radius, max_bytes, .. } = **request;
         let wanted = Wanted { profile, centre_in_world: last.at.in_world(manifest)?, radius, max_bytes };
         let mut held = usage.held_shards(cache)?;
         let mut plan = Plan::new(manifest, &wanted, &held)?;
@@ -156,10 +148,6 @@ impl<'a> Offered<'a> {
         if !unfit.is_empty() {
             held.retain(|hash, _| !unfit.contains(hash));
             plan = Plan::new(manifest, &wanted, &held)?;
-        }
-        let planned = plan.to_download();
-        if offline && planned.n_shards > 0 {
-            return Err(FetchError::Offline { n_shards: planned.n_shards, bytes: planned.bytes });
         }
         Ok(Planned { offered: self, wanted, held, plan, marked })
     }
@@ -199,8 +187,7 @@ impl<'a> Planned<'a> {
             history::note(cache, old, &on_board.manifest, offer.manifest_hash, &self.plan.cells);
         }
         clear_staging(cache, &self.plan.download)?;
-        let planned = self.plan.to_download();
-        locked.environment.progress.planned(planned.n_shards, planned.bytes);
+        locked.environment.progress.planned(self.plan.to_download().bytes);
         let manifest_bytes = offer.bytes.len() as u64;
         let other_bytes = manifest_bytes + self.plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
         match check_space(cache, &self.plan.download, other_bytes) {
@@ -298,7 +285,7 @@ impl Switched<'_> {
             freed: of_held(&plan.free),
             generation: offer.manifest.generation,
             manifest_hash: offer.manifest_hash,
-            root_version: locked.records.kept().and_then(Kept::root_version),
+            root_version: locked.records.kept().and_then(Kept::root_version).unwrap_or(0),
             is_first_contact,
             encoder_id: offer.manifest.encoder.id,
             encoder_name: offer.manifest.encoder.name,

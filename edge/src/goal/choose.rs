@@ -2,10 +2,10 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
+use slag_api::goal::{Goal, NoGoal};
 use slag_math::distance_transform::{FAR, squared_distances};
 
 use super::ground::Floor;
-use super::reply::{Goal, NoGoal};
 use super::request::GoalRequest;
 use super::sight;
 use super::space::Window;

@@ -1,11 +1,11 @@
 //! From a request to poses.
 
 use glam::DVec3;
+use slag_api::goal::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use slag_common::objects::public_id;
 
 use super::choose::choose;
 use super::error::GoalError;
-use super::reply::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use super::request::{GoalRequest, GoalTarget};
 use super::surroundings::{START_M, Surroundings};
 use crate::query::{Ask, Engine, Outcome, Point, object_id};

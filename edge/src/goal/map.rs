@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use glam::DVec3;
+use slag_api::floor::Place;
 
 use super::error::GoalError;
 use super::ground::Floor;
@@ -11,19 +12,6 @@ use super::request::GoalRequest;
 use super::surroundings::Surroundings;
 use crate::query::Engine;
 use crate::score::Budget;
-
-/// What a cell of a floor map is to a robot.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Place {
-    /// Nobody has seen ground there.
-    Unknown,
-    /// It must not be touched.
-    Obstacle,
-    /// Ground; the robot's middle may not or cannot go there.
-    Ground,
-    /// The robot's middle can go there.
-    Reached,
-}
 
 /// The ground around a robot.
 #[derive(Clone, Debug, PartialEq)]

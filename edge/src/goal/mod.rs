@@ -17,7 +17,6 @@ mod find;
 mod ground;
 mod map;
 mod paths;
-mod reply;
 pub mod request;
 mod sight;
 mod space;
@@ -28,6 +27,5 @@ mod tests;
 
 pub use error::GoalError;
 pub use find::find;
-pub use map::{FloorMap, Place, floor_map};
-pub use reply::{Goal, GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
+pub use map::{FloorMap, floor_map};
 pub use request::{GoalRequest, GoalTarget};

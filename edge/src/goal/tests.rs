@@ -1,6 +1,7 @@
 use std::time::Duration;
 
 use glam::DVec3;
+use slag_api::goal::{Goal, NoGoal};
 use slag_common::occupancy::{Block, BuiltOccupancy};
 
 use super::choose::choose;

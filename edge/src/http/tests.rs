@@ -7,7 +7,6 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
 use glam::DVec3;
 use serde_json::{Value, json};
-use slag_service::listener::ConnectionLimits;
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -172,6 +171,7 @@ async fn refusals_are_problem_details() {
         ("/query?text=0&negatives=%07", 400, "negatives"),
         ("/query?text=0&negatives=1&threshold=-0.1", 400, "threshold"),
         ("/query?text=0&negatives=canonical", 422, "negatives"),
+        ("/query?text=0&offset=1", 400, "offset"),
         ("/query?text=0&colour=red", 400, "colour"),
         ("/query?text=sofa", 422, "text"),
     ];
@@ -456,17 +456,4 @@ async fn stops_gracefully() {
     assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("\"rank\":1"), "{answer}");
     soon(end).await.expect("no panic").expect("a clean end");
     assert!(TcpStream::connect(address).await.is_err());
-}
-
-#[tokio::test]
-async fn stopping_has_a_deadline() {
-    let settings = Settings::default();
-    let connections = ConnectionLimits { drain_timeout: Duration::from_millis(1), ..settings.connections };
-    let service = Service::new(Some(&chair(None)), Settings { connections, ..settings });
-    let (address, stop, end) = serve_for_real(&service).await;
-    let _waiting = talk(address, ASK_AND_WAIT).await;
-    until_in_flight(&service).await;
-    stop.send(()).expect("the server lives");
-    assert_eq!(soon(end).await.expect("no panic").expect_err("cut off").kind(), std::io::ErrorKind::TimedOut);
-    open_gate(&service.gate);
 }

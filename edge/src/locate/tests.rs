@@ -106,7 +106,7 @@ fn the_body_of_a_level_camera_is_not_turned() {
     let camera_from_world = world_from_camera.inverse();
     let found = Located { camera_from_world, covariance: [0.0; 36], n_inliers: 9, is_verified: false };
     let Pose { position_in_world, rotation_xyzw, optical_rotation_xyzw, geographic, .. } =
-        Pose::of(&snapshot, &found);
+        pose_of(&snapshot, &found);
     assert!(DVec3::from(position_in_world).distance(DVec3::new(1.0, 2.0, 3.0)) < 1e-12);
     assert!(DQuat::from_array(rotation_xyzw).angle_between(DQuat::IDENTITY) < 1e-6, "{rotation_xyzw:?}");
     let forward = DQuat::from_array(optical_rotation_xyzw) * DVec3::Z;

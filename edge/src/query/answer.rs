@@ -2,20 +2,18 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
+use slag_api::objects::Evidence;
 
-use super::answers::{
-    Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, Reason, Searched, Whole,
-};
+use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Found, Reason, Searched, Whole};
 use super::cluster::{Cluster, Grouping, cluster};
 use super::extent::Extent;
-use super::frame::unit;
 use super::objects::{self, FoundObject};
 use super::outcome::RelatedAnswers;
 use super::rank::{Order, Ranked};
 use super::reason;
 use super::request::{AnswerKind, QueryRequest};
 use super::scale::Scale;
-use super::scene::{Scene, alignment, default_voxel};
+use super::scene::{Scene, alignment, default_voxel, unit};
 use super::threshold::ThresholdSource;
 use crate::score::{
     Budget, Hit, ObjectScores, Question, Region, Run, ScoreError, Scratch, Search, score_objects,
@@ -171,41 +169,12 @@ fn answer_gaussians(
     let scale = Scale::of(question);
     let (threshold, threshold_source) = scale.threshold(request, manifest, manifest.encoder.calibration);
     let score_threshold = scale.to_score(threshold);
-    let mut clustering = None;
-    let n_matching;
-    let found = if kind == AnswerKind::Gaussians {
-        let limit = request.n_ranked();
-        budget
-            .take(limit.min(search.searched().map(|shard| shard.n_with_evidence()).sum()) * size_of::<Hit>());
-        let mut hits = search.best(limit, score_threshold, request.near);
-        // If all are listed, their number is known.
-        let is_whole = hits.len() < limit;
-        n_matching = if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
-        hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
-        Found::Gaussians(hits)
-    } else {
-        let mut matches = search.matching(score_threshold);
-        matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
-        n_matching = matches.n_gaussians;
-        let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
-        let (min_count, alignment, with_members) = (request.min_count, alignment(manifest), request.members);
-        let grouped = cluster(
-            scene.shards,
-            &matches.runs,
-            &Grouping { voxel, min_count, threshold, alignment, with_members },
-            budget,
-        );
-        clustering = Some(Clustering {
-            voxel: grouped.voxel,
-            min_count,
-            n_clusters: grouped.clusters.len() as u64,
-            n_small_clusters: grouped.n_small,
-            n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
-        });
-        let key = |of: &Cluster| (of.score, of.extent.position_in_world);
-        let order = Order::new(scale.base(manifest.encoder.calibration), manifest, request);
-        let ranked = order.rank(grouped.clusters, key);
-        Found::Clusters(ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect())
+    let (found, n_matching, clustering) = match kind {
+        AnswerKind::Gaussians => {
+            let (hits, n_matching) = hits(search, scale, score_threshold, budget, request);
+            (Found::Gaussians(hits), n_matching, None)
+        }
+        _ => clusters(scene, search, scale, threshold, budget, request),
     };
     // Gaussians of exact shards are listed with their own scores, clusters with their centroids'.
     let score_error_bound = scale.error_bound(match (search.is_exact(), kind) {
@@ -230,6 +199,55 @@ fn answer_gaussians(
         answers: found,
         ..empty
     }
+}
+
+/// Returns the Gaussians that match best, and how many match.
+fn hits(
+    search: &Search<'_>,
+    scale: Scale,
+    score_threshold: f32,
+    budget: &Budget,
+    request: &QueryRequest,
+) -> (Vec<Hit>, u64) {
+    let limit = request.n_ranked();
+    let n_searched: usize = search.searched().map(|shard| shard.n_with_evidence()).sum();
+    budget.take(limit.min(n_searched) * size_of::<Hit>());
+    let mut hits = search.best(limit, score_threshold, request.near);
+    // If all are listed, their number is known.
+    let is_whole = hits.len() < limit;
+    let n_matching = if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
+    hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
+    (hits, n_matching)
+}
+
+/// Returns the best clusters of the Gaussians that match, how many match, and how they were clustered.
+fn clusters(
+    scene: &Scene<'_>,
+    search: &Search<'_>,
+    scale: Scale,
+    threshold: f32,
+    budget: &Budget,
+    request: &QueryRequest,
+) -> (Found, u64, Option<Clustering>) {
+    let manifest = scene.manifest;
+    let mut matches = search.matching(scale.to_score(threshold));
+    matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
+    let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
+    let (min_count, alignment, with_members) = (request.min_count, alignment(manifest), request.members);
+    let grouping = Grouping { voxel, min_count, threshold, alignment, with_members };
+    let grouped = cluster(scene.shards, &matches.runs, &grouping, budget);
+    let clustering = Clustering {
+        voxel: grouped.voxel,
+        min_count,
+        n_clusters: grouped.clusters.len() as u64,
+        n_small_clusters: grouped.n_small,
+        n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
+    };
+    let key = |of: &Cluster| (of.score, of.extent.position_in_world);
+    let order = Order::new(scale.base(manifest.encoder.calibration), manifest, request);
+    let ranked = order.rank(grouped.clusters, key);
+    let answers = ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect();
+    (Found::Clusters(answers), matches.n_gaussians, Some(clustering))
 }
 
 /// Returns the answers to a phrase as answers to a text: without degrees, and without what they are related to.

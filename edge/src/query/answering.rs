@@ -9,7 +9,7 @@ use super::ask::Ask;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::outcome::{Outcome, RelatedAnswers};
 use super::rank::Ranked;
-use super::relations::{self, Phrase, Scale, Things, Viewer};
+use super::relations::{self, Phrase, Things, Viewer};
 use super::reply::Reply;
 use super::request::{Asked, QueryRequest, unit_vector};
 use super::scene::Scene;
@@ -30,7 +30,6 @@ impl Engine {
 
     /// Answers a request that is in the world frame already, as [`Engine::ask`] does.
     pub fn answer(&self, mut request: QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
-        request.check()?;
         let on_board = self.on_board()?;
         on_board.check()?;
         request.understand(&on_board.snapshot);
@@ -52,37 +51,14 @@ impl Engine {
         for (at, asked) in request.asked.iter().enumerate() {
             let vector = match asked {
                 Asked::Text(text) => on_board.encode(text)?,
-                Asked::Vector { vector, .. } => {
-                    let dim = snapshot.manifest.encoder.dim;
-                    if vector.len() != dim as usize {
-                        let found = format!("{} components", vector.len());
-                        let expected = format!("{dim}, as the scene's embeddings have");
-                        return Err(RequestError::new("vectors", &found, expected).into());
-                    }
-                    unit_vector(vector).unwrap_or_default().into()
-                }
+                Asked::Vector { vector, .. } => vector_of(vector, snapshot.manifest.encoder.dim)?,
                 Asked::Phrase { phrase, .. } => {
-                    let vectors =
-                        phrase.things().into_iter().map(|thing| Ok(question(on_board.encode(thing)?)));
-                    let vectors = vectors.collect::<Result<Vec<_>, QueryError>>()?;
-                    budget
-                        .take(vectors.len() * (snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES));
-                    budget.check().map_err(ScoreError::from)?;
-                    let work = |_: &mut Scratch, scene: &Scene<'_>| {
-                        let related = related(scene, phrase, &vectors, &request)?;
-                        Ok::<_, QueryError>(match request.paged {
-                            true => Outcome::Related(related),
-                            false => Outcome::Plain(of_related(
-                                scene,
-                                asked.label(),
-                                related,
-                                &vectors[0],
-                                &request,
-                            )),
-                        })
-                    };
-                    outcomes[at] = Some(self.on_scene(snapshot, budget, work)?);
-                    budget.check().map_err(ScoreError::from)?;
+                    let things = phrase.things();
+                    let questions = things.into_iter().map(|thing| Ok(question(on_board.encode(thing)?)));
+                    let questions = questions.collect::<Result<Vec<_>, QueryError>>()?;
+                    let outcome =
+                        self.relate(&on_board, asked.label(), phrase, &questions, &request, budget)?;
+                    outcomes[at] = Some(outcome);
                     continue;
                 }
             };
@@ -101,6 +77,40 @@ impl Engine {
         let outcomes = outcomes.into_iter().flatten().collect();
         Ok(Reply { request, outcomes, snapshot: on_board.snapshot })
     }
+
+    /// Answers a phrase. `questions`: its things, in their order.
+    fn relate(
+        &self,
+        on_board: &OnBoard,
+        label: &str,
+        phrase: &Phrase,
+        questions: &[Question],
+        request: &QueryRequest,
+        budget: &Budget,
+    ) -> Result<Outcome, QueryError> {
+        let snapshot = &on_board.snapshot;
+        budget.take(questions.len() * (snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES));
+        budget.check().map_err(ScoreError::from)?;
+        let outcome = self.on_scene(snapshot, budget, |_, scene| {
+            let related = related(scene, phrase, questions, request)?;
+            Ok::<_, QueryError>(match request.paged {
+                true => Outcome::Related(related),
+                false => Outcome::Plain(of_related(scene, label, related, &questions[0], request)),
+            })
+        })?;
+        budget.check().map_err(ScoreError::from)?;
+        Ok(outcome)
+    }
+}
+
+/// Returns the vector of a question that is one, at unit length.
+fn vector_of(vector: &[f32], dim: u32) -> Result<Arc<[f32]>, QueryError> {
+    if vector.len() != dim as usize {
+        let found = format!("{} components", vector.len());
+        let expected = format!("{dim}, as the scene's embeddings have");
+        return Err(RequestError::new("vectors", &found, expected).into());
+    }
+    Ok(unit_vector(vector).unwrap_or_default().into())
 }
 
 fn related(
@@ -121,7 +131,7 @@ fn related(
     let parts = things.found();
     let viewer =
         request.near.map(|position_in_world| Viewer { position_in_world, heading_rad: request.heading_rad });
-    let found = match relations::relate(&things, phrase, viewer.as_ref(), Scale { metre }) {
+    let found = match relations::relate(&things, phrase, viewer.as_ref(), metre) {
         Ok(found) => found,
         Err(miss) => return Ok(RelatedAnswers { parts, miss: Some(miss), answers: Vec::new() }),
     };

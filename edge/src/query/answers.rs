@@ -4,11 +4,11 @@ use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Serialize;
 use serde::ser::{SerializeSeq, Serializer};
+use slag_api::UNITS;
+use slag_api::objects::{Evidence, OrientedBox};
 use slag_common::frames::Geographic;
 use slag_common::shard::ShardView;
 
-use super::frame::UNITS;
-use super::oriented::OrientedBox;
 use super::request::AnswerKind;
 use super::threshold::ThresholdSource;
 use crate::score::{Hit, Run};
@@ -233,15 +233,6 @@ pub struct Whole {
     /// Largest corner.
     #[schemars(with = "[f64; 3]")]
     pub box_max_in_world: DVec3,
-}
-
-/// The photo that shows an object best.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, JsonSchema)]
-pub struct Evidence {
-    /// Name of the view.
-    pub photo: String,
-    /// The object's box in the undistorted photo: x0, y0, x1, y1, the latter exclusive.
-    pub box_px: [u32; 4],
 }
 
 /// A matching Gaussian.

@@ -9,12 +9,13 @@
 
 use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
+use slag_api::objects::{Alignment, OrientedBox};
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 use slag_math::union_find::UnionFind;
 
 use super::extent::{Extent, TRIMMED};
-use super::oriented::{Alignment, OrientedBox};
+use super::oriented::box_around;
 use crate::score::{Budget, Run};
 
 /// Bits of a voxel coordinate in its key; three of them fill a `u64`.
@@ -128,8 +129,7 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping, budg
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
     let mut reach = Aabb::EMPTY;
     for runs_of_shard in runs.chunk_by(|a, b| a.shard == b.shard) {
-        let of_shard = shards[runs_of_shard[0].shard as usize].position_box();
-        reach = Aabb { min: reach.min.min(of_shard.min), max: reach.max.max(of_shard.max) };
+        reach = reach.union(shards[runs_of_shard[0].shard as usize].position_box());
     }
     if runs.is_empty() {
         return result;
@@ -301,7 +301,7 @@ fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: 
         score: (score_sum / points.len() as f64) as f32,
         best_score,
         extent,
-        oriented_box: OrientedBox::around(&points, inside, alignment, TRIMMED),
+        oriented_box: box_around(&points, inside, alignment, TRIMMED),
         members: Vec::new(),
     }
 }

@@ -4,6 +4,7 @@
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
+use slag_api::objects::OrientedBox;
 use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 use slag_common::objects::Objects;
@@ -12,7 +13,6 @@ use slag_models::{InferenceError, SessionOptions};
 
 use super::carried;
 use super::names::{Names, Words};
-use super::oriented::OrientedBox;
 use super::relations;
 use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;

@@ -7,22 +7,23 @@ use std::time::Duration;
 use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use slag_common::frames::{Aabb, Geographic};
+use slag_api::FRAME;
+use slag_api::objects::{Evidence, MAX_NAMES, ObjectOnBoard, ObjectPage, OrientedBox};
+use slag_common::frames::Aabb;
 use slag_common::objects::public_id;
-use slag_models::names::MAX_NAMES;
 
-use super::answers::Evidence;
 use super::cluster::{Grouping, cluster};
 use super::engine::{Engine, OnBoard, QueryError};
 use super::extent::Extent;
-use super::frame::{FRAME, UNITS, unit};
-use super::names::{Name, Names};
+use super::names::Names;
 use super::objects::{self, FoundObject};
-use super::oriented::OrientedBox;
 use super::request::RequestError;
-use super::scene::{Scene, alignment, default_voxel};
+use super::scene::{Scene, alignment, default_voxel, unit};
 use crate::score::{Budget, Region, Run, ScoreError};
 use crate::store::Snapshot;
+
+// The description says how many names there are.
+const _: () = assert!(MAX_NAMES == slag_models::names::MAX_NAMES);
 
 /// The form of an object's id.
 pub const OBJECT_ID: &str = "^o[0-9a-f]{16}$";
@@ -49,66 +50,6 @@ pub struct ObjectFilter {
     /// Least length of the longest edge of the box.
     pub min_size: f64,
     pub order: ObjectOrder,
-}
-
-/// An object on board.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
-#[schemars(rename = "Object")]
-pub struct ObjectOnBoard {
-    /// Its id: `o` and 16 hex digits.
-    pub id: String,
-    /// What it is called, best first; see the page's `named`.
-    #[schemars(length(max = MAX_NAMES))]
-    pub names: Vec<Name>,
-    /// Frame of every position.
-    #[schemars(extend("enum" = [FRAME]))]
-    pub frame: &'static str,
-    /// Generation that they belong to.
-    pub generation: u64,
-    /// Mean of its Gaussians inside the box.
-    #[schemars(with = "[f64; 3]")]
-    pub position_in_world: DVec3,
-    /// The same on the earth, if the scene is geo-referenced.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub geographic: Option<Geographic>,
-    /// Smallest corner of its box.
-    #[schemars(with = "[f64; 3]")]
-    pub box_min_in_world: DVec3,
-    /// Largest corner.
-    #[schemars(with = "[f64; 3]")]
-    pub box_max_in_world: DVec3,
-    /// Its box along axes of its own; of the part on board.
-    pub oriented_box: OrientedBox,
-    /// Its Gaussians on board.
-    pub n_gaussians: u64,
-    /// Its Gaussians in the whole scene.
-    pub n_gaussians_in_scene: u64,
-    /// The photo that shows it best.
-    pub evidence: Evidence,
-}
-
-/// A page of the objects on board.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
-pub struct ObjectPage {
-    /// Name of the scene.
-    pub scene: String,
-    /// Its generation.
-    pub generation: u64,
-    /// Frame of every position: the scene's world frame.
-    #[schemars(extend("enum" = [FRAME]))]
-    pub frame: &'static str,
-    /// Unit of every position and length: `m`, or `world` if the scene is not metric.
-    #[schemars(extend("enum" = UNITS))]
-    pub unit: &'static str,
-    /// Whether the objects have names: not while the text model encodes the words (ask again in a second), nor if it
-    /// is another than the scene's.
-    pub named: bool,
-    /// Objects that pass the filter, over all pages.
-    pub n_objects: usize,
-    /// `after` of the next page; null if there is none.
-    pub next_after: Option<String>,
-    /// The objects, in the order asked for.
-    pub objects: Vec<ObjectOnBoard>,
 }
 
 /// Reads an object's id as answers name it.
@@ -252,8 +193,8 @@ fn page(
     Ok(ObjectPage {
         scene: manifest.scene.clone(),
         generation: manifest.generation,
-        frame: FRAME,
-        unit: unit(manifest),
+        frame: FRAME.into(),
+        unit: unit(manifest).into(),
         named: names.is_some(),
         n_objects: all.len(),
         next_after,
@@ -296,7 +237,7 @@ fn describe(
     ObjectOnBoard {
         id: found.public_id(),
         names: names.map(|names| names.describe(object)).unwrap_or_default(),
-        frame: FRAME,
+        frame: FRAME.into(),
         generation: scene.manifest.generation,
         position_in_world,
         geographic: scene.manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),

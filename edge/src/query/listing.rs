@@ -3,9 +3,9 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
+use slag_api::objects::{ObjectOnBoard, ObjectPage};
 use slag_common::manifest::Manifest;
 
-use super::inventory::{ObjectOnBoard, ObjectPage};
 use super::request::RequestError;
 
 /// Format of a list of objects.
@@ -108,16 +108,4 @@ fn geojson(page: &ObjectPage) -> Value {
         "type": "FeatureCollection", "scene": scene, "generation": generation, "next_after": next_after,
         "features": features,
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn cells_of_a_table_are_quoted_where_they_must_be() {
-        assert_eq!(quoted("traffic cone"), "traffic cone");
-        assert_eq!(quoted("monitor, \"tv\""), "\"monitor, \"\"tv\"\"\"");
-        assert_eq!(COLUMNS.split(',').count(), 1 + 2 * N_NAMES + 3 * 3 + 2);
-    }
 }

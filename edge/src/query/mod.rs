@@ -13,7 +13,6 @@ pub mod cluster;
 mod engine;
 mod extent;
 mod format;
-mod frame;
 mod inventory;
 mod json;
 mod listing;
@@ -40,24 +39,18 @@ mod words;
 
 pub use answer::answer;
 pub use answers::{
-    Answers, AnswersOrBatch, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, GaussianAnswer,
-    Reason, ReasonKind, ScoreKind, Searched,
+    Answers, AnswersOrBatch, BadCellAnswer, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason,
+    ReasonKind, ScoreKind, Searched,
 };
 pub use area::{Area, AreaBall, AreaBox};
 pub use ask::Ask;
-pub use changes::{
-    ChangedThing, ChangesError, ChangesReply, ChangesRequest, ComparedGeneration, Likeness, MovedThing,
-    NotCompared,
-};
+pub use changes::{ChangesError, ChangesRequest};
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
-pub use frame::{FRAME, UNITS, unit};
-pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOnBoard, ObjectOrder, ObjectPage, object_id};
+pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder, object_id};
 pub use listing::ListFormat;
-pub use map::{MapCell, MapStatus, MissingCell};
-pub use names::Name;
+pub use map::map_status;
 pub(crate) use naming::NAMES_WAIT;
-pub use oriented::{Alignment, OrientedBox};
 pub use outcome::{Outcome, RelatedAnswers};
 pub use page::Page;
 pub use point::{Corner, LatLon, Point};
@@ -67,7 +60,7 @@ pub use request::{
     AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_CLUSTERS, MAX_GAUSSIANS,
     MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
 };
-pub use scene::{Scene, default_voxel};
+pub use scene::{Scene, default_voxel, unit};
 pub use status::{ShardStatus, Status};
 pub use threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
 pub use words::Words;

@@ -4,8 +4,7 @@
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use schemars::JsonSchema;
-use serde::Serialize;
+use slag_api::objects::Name;
 use slag_common::Hash32;
 use slag_models::names::{Confidence, Naming, Spread, words_of};
 
@@ -23,15 +22,6 @@ const MEASURED: usize = 4;
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
 /// Words that took less are not kept on disk.
 const WORTH_KEEPING: Duration = Duration::from_secs(2);
-
-/// A name of a thing.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
-pub struct Name {
-    /// The word.
-    pub name: String,
-    /// The chance that it is right, as measured on labelled scenes; a thing may have several right names.
-    pub confidence: f32,
-}
 
 /// The names of a generation's things.
 pub struct Names {
@@ -140,8 +130,8 @@ impl Words {
 
 /// Encodes the words that a text model knows, or reads what was kept of them.
 fn encode(cache: &EdgeCache, text: &TextService) -> Option<Vec<WordVector>> {
-    let vocabulary = Some(text.vocabulary()).filter(|words| !words.is_empty());
-    let (asked, info) = (words_of(vocabulary), text.info());
+    let nouns = Some(text.nouns()).filter(|nouns| !nouns.is_empty());
+    let (asked, info) = (words_of(nouns), text.info());
     if let Some(kept) = words::read(cache, info.id, info.dim as usize, &asked) {
         return Some(kept);
     }

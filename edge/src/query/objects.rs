@@ -4,11 +4,12 @@
 //! Gaussians are those on board in the region asked for.
 
 use glam::DVec3;
+use slag_api::objects::{Alignment, OrientedBox};
 use slag_common::manifest::Calibration;
 use slag_common::objects::{ObjectRecord, Objects, public_id};
 
 use super::extent::{Extent, TRIMMED};
-use super::oriented::{Alignment, OrientedBox};
+use super::oriented::box_around;
 use super::scene::Scene;
 use crate::score::{Region, Run};
 use crate::store::objects::Part;
@@ -105,7 +106,7 @@ pub fn oriented_box(
     let parts = scene.index.parts(found.object).iter();
     let points: Vec<DVec3> = parts.flat_map(|part| points(scene, *part, region)).collect();
     let bounds = found.extent().box_in_world;
-    OrientedBox::around(&points, |point| bounds.contains(*point), alignment, TRIMMED)
+    box_around(&points, |point| bounds.contains(*point), alignment, TRIMMED)
 }
 
 /// Returns an object's Gaussians in a region, by shard and index. `score`: the object's.

@@ -1,64 +1,35 @@
 //! Oriented boxes of points: principal axes, or upright where the world has a known up.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use schemars::JsonSchema;
-use serde::Serialize;
+use slag_api::objects::{Alignment, OrientedBox};
 use slag_math::eigen::eigen_symmetric;
 use slag_math::stats::trimmed_range;
 
-/// Permitted orientations of a box.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Alignment {
-    /// Upright: rotated about the world's z axis only, which points up.
-    Gravity,
-    /// Aligned with the points' principal axes.
-    Principal,
-}
-
-/// A box along axes of its own.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
-pub struct OrientedBox {
-    /// Its centre.
-    #[schemars(with = "[f64; 3]")]
-    pub centre_in_world: DVec3,
-    /// Its edges along its own axes; x is the longest (of the horizontal ones, if upright).
-    #[schemars(with = "[f64; 3]")]
-    pub size: DVec3,
-    /// Unit quaternion x, y, z, w that rotates the box's axes into the world's.
-    #[schemars(with = "[f64; 4]")]
-    pub rotation_world_from_box: DQuat,
-    /// The orientations permitted.
-    pub alignment: Alignment,
-}
-
-impl OrientedBox {
-    /// Returns the box of a set of points: axes from the points inside `core`, extents from the `trimmed` to
-    /// the `1 - trimmed` quantile of all points.
-    ///
-    /// `core` keeps floaters out of the axes: their leverage grows with the square of their distance.
-    pub fn around(
-        points: &[DVec3],
-        core: impl Fn(&DVec3) -> bool,
-        alignment: Alignment,
-        trimmed: f64,
-    ) -> Self {
-        let inside: Vec<DVec3> = points.iter().copied().filter(core).collect();
-        let axes = axes_of(&inside, alignment);
-        let mut values = Vec::with_capacity(points.len());
-        let (mut min, mut max) = (DVec3::ZERO, DVec3::ZERO);
-        for axis in 0..3 {
-            values.clear();
-            values.extend(points.iter().map(|point| axes.col(axis).dot(*point)));
-            (min[axis], max[axis]) = trimmed_range(&mut values, trimmed).unwrap_or_default();
-        }
-        let (axes, min, max) = longest_first(axes, min, max, alignment);
-        Self {
-            centre_in_world: axes * ((min + max) * 0.5),
-            size: max - min,
-            rotation_world_from_box: DQuat::from_mat3(&axes).normalize(),
-            alignment,
-        }
+/// Returns the box of a set of points: axes from the points inside `core`, extents from the `trimmed` to
+/// the `1 - trimmed` quantile of all points.
+///
+/// `core` keeps floaters out of the axes: their leverage grows with the square of their distance.
+pub fn box_around(
+    points: &[DVec3],
+    core: impl Fn(&DVec3) -> bool,
+    alignment: Alignment,
+    trimmed: f64,
+) -> OrientedBox {
+    let inside: Vec<DVec3> = points.iter().copied().filter(core).collect();
+    let axes = axes_of(&inside, alignment);
+    let mut values = Vec::with_capacity(points.len());
+    let (mut min, mut max) = (DVec3::ZERO, DVec3::ZERO);
+    for axis in 0..3 {
+        values.clear();
+        values.extend(points.iter().map(|point| axes.col(axis).dot(*point)));
+        (min[axis], max[axis]) = trimmed_range(&mut values, trimmed).unwrap_or_default();
+    }
+    let (axes, min, max) = longest_first(axes, min, max, alignment);
+    OrientedBox {
+        centre_in_world: axes * ((min + max) * 0.5),
+        size: max - min,
+        rotation_world_from_box: DQuat::from_mat3(&axes).normalize(),
+        alignment,
     }
 }
 
@@ -154,14 +125,14 @@ mod tests {
             let size = DVec3::new(2.0, 1.0, 0.5) + DVec3::from(edges);
             let centre = DVec3::from(centre);
             let points = lattice(size, rotation, centre);
-            let found = OrientedBox::around(&points, |_| true, Alignment::Principal, 0.0);
+            let found = box_around(&points, |_| true, Alignment::Principal, 0.0);
             prop_assert!((found.size - size).length() < 1e-6, "{found:?}");
             prop_assert!(corner_error(&found, size, rotation, centre) < 1e-6, "{found:?}");
 
             let upright = DQuat::from_rotation_z(yaw);
             let tall = DVec3::new(size.y, size.z, size.x);
             let points = lattice(tall, upright, centre);
-            let found = OrientedBox::around(&points, |_| true, Alignment::Gravity, 0.0);
+            let found = box_around(&points, |_| true, Alignment::Gravity, 0.0);
             prop_assert!((found.size - tall).length() < 1e-6, "{found:?}");
             prop_assert!(corner_error(&found, tall, upright, centre) < 1e-6, "{found:?}");
             let up = found.rotation_world_from_box * DVec3::Z;
@@ -175,7 +146,7 @@ mod tests {
         ) {
             let points: Vec<DVec3> = points.into_iter().map(DVec3::from).collect();
             let alignment = if gravity { Alignment::Gravity } else { Alignment::Principal };
-            let found = OrientedBox::around(&points, |_| true, alignment, 0.0);
+            let found = box_around(&points, |_| true, alignment, 0.0);
             prop_assert!(found.rotation_world_from_box.is_normalized() && found.size.is_finite());
             prop_assert!(!gravity || ((found.rotation_world_from_box * DVec3::Z) - DVec3::Z).length() < 1e-9);
             for point in &points {
@@ -202,12 +173,12 @@ mod tests {
         };
         let core: [(f64, f64); 3] = std::array::from_fn(range);
         let in_core = |p: &DVec3| (0..3).all(|axis| (core[axis].0..=core[axis].1).contains(&p[axis]));
-        let found = OrientedBox::around(&points, in_core, Alignment::Gravity, 0.02);
+        let found = box_around(&points, in_core, Alignment::Gravity, 0.02);
         // A lattice step is a tenth of an edge at most.
         assert!((found.size - size).abs().max_element() < 0.13, "{found:?}");
         let yaw = found.rotation_world_from_box.to_scaled_axis().z;
         assert!((yaw - 0.6).abs() < 0.05, "{yaw}");
-        let deluded = OrientedBox::around(&points, |_| true, Alignment::Gravity, 0.0);
+        let deluded = box_around(&points, |_| true, Alignment::Gravity, 0.0);
         assert!(deluded.size.max_element() > 20.0, "the floaters were too tame: {deluded:?}");
     }
 }

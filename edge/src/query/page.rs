@@ -3,13 +3,14 @@
 use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Serialize;
+use slag_api::{FRAME, UNITS};
 
 use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, ReasonKind, Searched};
-use super::frame::{FRAME, UNITS, unit};
 use super::outcome::{Outcome, RelatedAnswers};
 use super::relations::{self, Phrase, Witness};
 use super::reply::Reply;
 use super::request::{AnswerKind, Asked};
+use super::scene::unit;
 
 /// The reply of version 1, to one question or many.
 #[derive(Serialize, JsonSchema)]

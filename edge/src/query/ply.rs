@@ -6,8 +6,8 @@ use std::io;
 use slag_common::splat::ply::{Point, PointProperties};
 
 use super::answers::{Answers, Found};
-use super::frame::unit;
 use super::reply::Reply;
+use super::scene::unit;
 use crate::score::Run;
 
 /// A piece ends with the first point past this size.

@@ -353,65 +353,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn poison_is_refused_by_name() {
-        fn text(text: &str) -> Asked {
-            Asked::Text(text.into())
-        }
-        let refused = |edit: fn(&mut QueryRequest)| {
-            let mut request = QueryRequest::new("chair");
-            assert_eq!(request.check(), Ok(()));
-            edit(&mut request);
-            request.check().expect_err("must be refused").parameter
-        };
-        assert_eq!(refused(|r| r.asked = vec![text(" \t ")]), "text");
-        assert_eq!(refused(|r| r.asked.push(text(&"x".repeat(513)))), "text");
-        assert_eq!(refused(|r| r.asked.push(text("a\u{1b}[2Jb"))), "text");
-        assert_eq!(refused(|r| r.asked.clear()), "text");
-        assert_eq!(refused(|r| r.asked = vec![text("a"); MAX_TEXTS + 1]), "text");
-        assert_eq!(refused(|r| r.negatives = Negatives::Phrases(vec!["\0".into()])), "negatives");
-        assert_eq!(
-            refused(|r| r.negatives = Negatives::Phrases(vec!["a".into(); MAX_NEGATIVES + 1])),
-            "negatives"
-        );
-        assert_eq!(refused(|r| (r.negatives, r.threshold) = (Negatives::Canonical, Some(-0.1))), "threshold");
-        assert_eq!(refused(|r| r.limit = Some(MAX_CLUSTERS + 1)), "limit");
-        assert_eq!(
-            refused(|r| (r.kind, r.limit) = (Some(AnswerKind::Gaussians), Some(MAX_GAUSSIANS + 1))),
-            "limit"
-        );
-        assert_eq!(
-            refused(|r| {
-                (r.kind, r.limit) = (Some(AnswerKind::Gaussians), Some(MAX_GAUSSIANS / 2 + 1));
-                r.asked.push(text("table"));
-            }),
-            "limit"
-        );
-        let bounds = |min: f64, max: f64| Some(Aabb { min: DVec3::splat(min), max: DVec3::splat(max) });
-        let boxes = [bounds(1.0, 0.0), bounds(f64::NAN, 0.0), bounds(0.0, f64::INFINITY), bounds(-1e10, 0.0)];
-        for bounds in boxes {
-            let region = Region { bounds, ..Region::default() };
-            let request = QueryRequest { region, ..QueryRequest::new("chair") };
-            assert_eq!(request.check().expect_err("must be refused").parameter, "box");
-        }
-        assert_eq!(refused(|r| r.limit = Some(0)), "limit");
-        assert_eq!(refused(|r| r.limit = Some(usize::MAX)), "limit");
-        assert_eq!(refused(|r| r.threshold = Some(f32::NAN)), "threshold");
-        assert_eq!(refused(|r| r.threshold = Some(1.5)), "threshold");
-        assert_eq!(refused(|r| r.near = Some(DVec3::new(0.0, f64::INFINITY, 0.0))), "near");
-        assert_eq!(refused(|r| r.near = Some(DVec3::new(0.0, 0.0, f64::NAN))), "near");
-        fn ball(x: f64, radius: f64) -> Option<Ball> {
-            Some(Ball { centre_in_world: DVec3::new(x, 0.0, 0.0), radius })
-        }
-        assert_eq!(refused(|r| r.region.ball = ball(0.0, f64::NAN)), "radius");
-        assert_eq!(refused(|r| r.region.ball = ball(0.0, -1.0)), "radius");
-        assert_eq!(refused(|r| r.region.ball = ball(f64::NAN, 1.0)), "region");
-        assert_eq!(refused(|r| r.offset = 1), "offset");
-        assert_eq!(refused(|r| (r.paged, r.offset) = (true, MAX_CLUSTERS)), "limit");
-        assert_eq!(refused(|r| r.voxel = Some(0.0)), "voxel");
-        assert_eq!(refused(|r| r.min_count = 0), "min_count");
-    }
-
-    #[test]
     fn points_parse_or_say_what_they_should_be() {
         assert_eq!(parse_point("1, -2.5,3e2"), Ok(DVec3::new(1.0, -2.5, 300.0)));
         for bad in ["", "1,2", "1,2,3,4", "1,2,x", "NaN,0,0", "inf,0,0", "0,0,1e10"] {

@@ -1,12 +1,13 @@
 //! The data that a query runs on.
 
 use glam::DVec3;
+use slag_api::UNITS;
+use slag_api::objects::Alignment;
 use slag_common::manifest::Manifest;
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
 use slag_math::stats::median;
 
-use super::oriented::Alignment;
 use crate::store::BadCell;
 use crate::store::objects::ObjectIndex;
 
@@ -28,6 +29,11 @@ pub struct Scene<'a> {
     pub fetched: (DVec3, f64),
     /// Cells within it whose shards could not be fetched.
     pub bad_cells: &'a [BadCell],
+}
+
+/// Returns the unit of a scene's positions and lengths.
+pub fn unit(manifest: &Manifest) -> &'static str {
+    UNITS[usize::from(!manifest.metric)]
 }
 
 /// Returns the default edge of the voxels: 0.25 m in a metric scene, else a 64th of the median cell's middle

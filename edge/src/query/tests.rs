@@ -1,4 +1,5 @@
 use glam::DVec3;
+use slag_api::objects::Alignment;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::{Calibration, Manifest};
 

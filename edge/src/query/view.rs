@@ -8,7 +8,7 @@ use slag_view::{
 };
 
 use super::engine::{Engine, QueryError};
-use super::map::MapStatus;
+use super::map::map_status;
 use super::naming::NAMES_WAIT;
 use super::request::{Negatives, QueryRequest};
 use crate::score::{Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy};
@@ -33,7 +33,7 @@ impl Engine {
         budget.take(n_photos * size_of::<Photo>() + snapshot.manifest.cells.len() * size_of::<Cell>());
         budget.check().map_err(ScoreError::from)?;
         let can_ask = on_board.check().is_ok();
-        let map = MapStatus::of(snapshot, 0, None);
+        let map = map_status(snapshot, 0, None);
         let known = map.cells.iter().map(|cell| Cell {
             cell: cell.cell_id,
             n_gaussians: cell.n_gaussians,
@@ -101,7 +101,7 @@ impl Engine {
             return Ok(Words::pending(generation));
         };
         let best = (0..names.len()).filter_map(|object| names.of(object).next());
-        Ok(Words::new(generation, best, on_board.text.vocabulary()))
+        Ok(Words::new(generation, best, on_board.text.nouns()))
     }
 
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
+use slag_api::changes::{ChangedThing, ChangesReply};
 use slag_common::Hash32;
-use slag_edge::query::{ChangesError, ChangesReply, ChangesRequest, Engine};
+use slag_edge::query::{ChangesError, ChangesRequest, Engine};
 use slag_edge::score::Budget;
 use slag_edge::store::history;
 
@@ -41,7 +42,7 @@ fn changes(robot: &Robot, from: Option<u64>) -> Result<ChangesReply, ChangesErro
 /// Returns the ids that appeared, that went, and that things had and have which moved.
 fn ids(reply: &ChangesReply) -> (Vec<u64>, Vec<u64>, Vec<(u64, u64)>) {
     let id = |text: &str| u64::from_str_radix(&text[1..], 16).expect("hex digits");
-    let of = |things: &[slag_edge::query::ChangedThing]| things.iter().map(|thing| id(&thing.id)).collect();
+    let of = |things: &[ChangedThing]| things.iter().map(|thing| id(&thing.id)).collect();
     let moved = reply.moved.iter().map(|moved| (id(&moved.from.id), id(&moved.to.id))).collect();
     (of(&reply.appeared), of(&reply.went), moved)
 }
@@ -58,7 +59,7 @@ fn changes_are_told_where_both_generations_are_known() {
     let mut robot = Robot::of(&server);
     robot.fetch().expect("works");
     let reply = changes(&robot, None).expect("a reply");
-    assert_eq!(reply.none.map(|none| none.kind), Some("no-earlier-generation"));
+    assert!(reply.none.is_some_and(|none| none.kind == "no-earlier-generation"));
     server.publish(after());
     robot.fetch().expect("works");
     assert_changed(&robot, "after the fetch");
@@ -90,7 +91,7 @@ fn changes_are_told_where_both_generations_are_known() {
     bytes[200] ^= 1;
     fs_err::write(&path, bytes).expect("writes");
     let reply = changes(&robot, None).expect("a reply");
-    assert_eq!(reply.none.map(|none| none.kind), Some("no-earlier-generation"));
+    assert!(reply.none.is_some_and(|none| none.kind == "no-earlier-generation"));
 }
 
 /// The robot had the places of 1, 2 and 3 on board in the earlier generation alone, that of 10 in the later one.

@@ -30,23 +30,6 @@ impl Progress for Count {
     }
 }
 
-/// A scene in another space than the robot's text model is refused, and the previous generation still answers.
-#[test]
-fn another_embedding_space_leaves_the_old_generation() {
-    let (second, third) = (Published::new(2, &[0; 4], 50), Published::new(3, &[1; 4], 50));
-    let server = Server::start(second.clone());
-    let mut robot = Robot::of(&server);
-    robot.fetch().expect("works");
-    robot.request.expected_encoder = Some(Hash32([3; 32]));
-    server.publish(third.clone());
-    let error = robot.fetch().expect_err("refused");
-    assert!(matches!(error, FetchError::Encoder { found: ENCODER, .. }), "{error}");
-    assert_holds(&robot.snapshot(), &second, 0..3);
-    robot.request.expected_encoder = Some(ENCODER);
-    robot.fetch().expect("the right space");
-    assert_holds(&robot.snapshot(), &third, 0..3);
-}
-
 /// An intact shard of the right cell and length under another shard's hash: only the hash reveals it.
 #[test]
 fn other_content_under_a_hash_is_refused() {

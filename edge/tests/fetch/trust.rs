@@ -30,7 +30,7 @@ impl Rotated {
         robot.fetch().expect("first contact");
         robot.request.trust_first = false;
         server.publish(of(2, &[FIRST, SECOND]));
-        assert_eq!(robot.fetch().expect("accepted").root_version, Some(2));
+        assert_eq!(robot.fetch().expect("accepted").root_version, 2);
         Self { server, robot }
     }
 
@@ -130,7 +130,7 @@ fn first_trust_is_a_step_of_its_own() {
     let added = robot.add_root(&by_hash(sha256_hex(&second_root)), false).expect("there");
     assert_eq!((added.version, added.is_new), (2, true));
     let report = robot.fetch().expect("works");
-    assert_eq!((report.root_version, report.is_first_contact), (Some(2), false));
+    assert_eq!((report.root_version, report.is_first_contact), (2, false));
     assert_holds(&robot.snapshot(), &published, 0..3);
     let kept = accepted(&robot.cache).expect("recorded");
     assert_eq!((kept.scene.as_deref(), kept.root_version), (Some("yard"), 2));

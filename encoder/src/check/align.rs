@@ -18,10 +18,10 @@ pub struct Alignment {
     /// From the first set's world to the second's.
     pub similarity: Similarity,
     /// Cameras in both sets.
-    pub n_cameras: usize,
+    pub(crate) n_cameras: usize,
     /// Root mean square of the distances that remain, over the root mean square distance of the second set's
     /// cameras from their mean.
-    pub residual: f64,
+    pub(crate) residual: f64,
 }
 
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]

@@ -46,7 +46,7 @@ pub struct Trial {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Diagnosis {
     /// PSNR of the sampled views with the inputs as given, dB.
-    pub given_psnr_db: f64,
+    pub(crate) given_psnr_db: f64,
     /// The mistake whose correction explains the photos, if any does.
     pub mistake: Option<Mistake>,
     /// The similarity from the world of the poses to that of the splat, where the mistake is one.
@@ -54,9 +54,9 @@ pub struct Diagnosis {
     /// The best corrections that were tried, best first.
     pub tried: Vec<Trial>,
     /// Diagonal of the box around the middle 90 % of the Gaussians along each axis, world units.
-    pub scene_diagonal: f64,
+    pub(crate) scene_diagonal: f64,
     /// Largest distance of a camera from the cameras' mean position, world units.
-    pub camera_spread: f64,
+    pub(crate) camera_spread: f64,
     /// The findings as sentences.
     pub advice: Vec<String>,
 }

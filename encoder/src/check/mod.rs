@@ -21,13 +21,14 @@ use crate::raster::Rasterizer;
 use diagnosis::{FLAWLESS_DB, Means, Samples};
 use view::{at_width, mean, picture, picture_name};
 
-pub use align::{AlignError, Alignment, align};
-pub use diagnosis::{Diagnosis, Trial};
+pub(crate) use align::Alignment;
+pub use align::align;
 pub use error::CheckError;
 pub use mistake::{FrameCandidate, FrameCause, Mistake, nerfstudio_defaults};
 pub use options::CheckOptions;
-pub use report::{CheckReport, ViewCheck};
-pub use suspicion::{Suspicion, suspicions};
+pub use report::CheckReport;
+pub(crate) use report::ViewCheck;
+pub use suspicion::suspicions;
 pub use view::{CheckView, psnr_db};
 
 /// Draws the views of a scene and compares them with their photos.

@@ -13,10 +13,10 @@ pub struct ViewCheck {
     /// Peak signal-to-noise ratio of the drawing against the photo, dB.
     pub psnr_db: f64,
     /// PSNR of a plane of the photo's mean colour, dB: the score without any knowledge of the scene.
-    pub flat_psnr_db: f64,
+    pub(crate) flat_psnr_db: f64,
     /// Share of the image that the scene covers (alpha above 0.5).
-    pub covered_share: f64,
-    pub visible_gaussians: usize,
+    pub(crate) covered_share: f64,
+    pub(crate) visible_gaussians: usize,
 }
 
 /// Comparison of a scene with its photos.
@@ -26,7 +26,7 @@ pub struct CheckReport {
     /// Mean of `psnr_db` over the views, dB.
     pub mean_psnr_db: f64,
     /// Mean of `flat_psnr_db` over the views, dB.
-    pub mean_flat_psnr_db: f64,
+    pub(crate) mean_flat_psnr_db: f64,
     /// Mean of `covered_share` over the views.
     pub mean_covered_share: f64,
     /// Largest number of Gaussians that cannot be drawn in a view.

@@ -3,23 +3,17 @@
 use std::path::PathBuf;
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
-use slag_common::{Distortion, Intrinsics, Similarity, View};
+use slag_common::{Similarity, View};
 
-use super::{AlignError, FrameCause, align, nerfstudio_defaults};
+use super::align::AlignError;
+use super::{FrameCause, align, nerfstudio_defaults};
+use crate::raster::pinhole;
 
 fn view(name: &str, world_from_camera: DAffine3) -> View {
     View {
         name: name.to_owned(),
         image_path: PathBuf::from(name),
-        intrinsics: Intrinsics {
-            width_px: 64,
-            height_px: 48,
-            focal_x_px: 50.0,
-            focal_y_px: 50.0,
-            centre_x_px: 32.0,
-            centre_y_px: 24.0,
-            distortion: Distortion::None,
-        },
+        intrinsics: pinhole([64, 48], 50.0),
         camera_from_world: world_from_camera.inverse(),
     }
 }

@@ -36,18 +36,18 @@ pub struct CheckArgs {
     pub device: DeviceChoice,
     /// Width to render at, pixels.
     #[arg(long, value_name = "PX", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(16..=8192), help_heading = "Speed and accuracy", hide_short_help = true)]
-    pub raster_width: u32,
+    pub(crate) raster_width: u32,
     /// Folder for PNGs of each photo beside its rendering.
     #[arg(long, value_name = "DIR", help_heading = "Output")]
     pub out: Option<PathBuf>,
     /// A second set of poses of the same photos, in the splat's world: the similarity between both worlds follows
     /// from the camera centres, and is tried.
     #[arg(long, value_name = "PATH", help_heading = "Inputs", hide_short_help = true)]
-    pub also_poses: Option<PathBuf>,
+    pub(crate) also_poses: Option<PathBuf>,
     /// Where splat and poses differ by a similarity (rotation, scale, translation), writes it into this file, in
     /// the format of nerfstudio's dataparser_transforms.json; `encode --splat-frame FILE` applies it.
     #[arg(long, value_name = "FILE", help_heading = "Output")]
-    pub write_frame: Option<PathBuf>,
+    pub(crate) write_frame: Option<PathBuf>,
 }
 
 pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
@@ -101,10 +101,10 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         ingest::check_memory(view, free_memory_bytes().unwrap_or(u64::MAX))?;
         let loaded = ingest::load_image(view)?;
         rotated.add(&loaded);
-        let LoadedImage { view: View { name, intrinsics, camera_from_world, .. }, image, valid, .. } = loaded;
+        let LoadedImage { view, image, valid, .. } = loaded;
         let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());
         let valid = bytes.and_then(|bytes| GrayImage::from_raw(image.width(), image.height(), bytes));
-        Ok(CheckView { name, image, valid, view: RasterView { camera_from_world, intrinsics } })
+        Ok(CheckView { view: RasterView::of(&view), name: view.name, image, valid })
     });
     let options = CheckOptions {
         width_px: args.raster_width,

@@ -8,7 +8,7 @@ use crate::raster::WeightKind;
 /// The choices, each the preset's where its flag is absent.
 #[derive(Clone, Debug, Default, Args)]
 #[group(id = "choices", multiple = true)]
-pub struct ChoiceArgs {
+pub(crate) struct ChoiceArgs {
     /// Bundle of choices; other flags override single choices.
     #[arg(long, value_enum, default_value_t, help_heading = "Speed and accuracy")]
     pub preset: Preset,

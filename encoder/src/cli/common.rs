@@ -195,7 +195,7 @@ pub fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
 }
 
 /// Returns the models of the flags as a later run in another folder finds them.
-pub fn lasting_name(models: &Path) -> PathBuf {
+pub(crate) fn lasting_name(models: &Path) -> PathBuf {
     // A name of a pulled model is no path.
     if models.is_dir() {
         std::path::absolute(models).unwrap_or_else(|_| models.into())
@@ -230,7 +230,7 @@ pub fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn
 }
 
 /// Returns the number of cores.
-pub fn available_threads() -> usize {
+pub(crate) fn available_threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
@@ -251,6 +251,6 @@ pub fn runtime() -> Result<tokio::runtime::Runtime> {
 }
 
 /// Returns the parser of profiles, whose names the help text lists.
-pub fn profile_parser() -> impl TypedValueParser<Value = Profile> {
+pub(crate) fn profile_parser() -> impl TypedValueParser<Value = Profile> {
     PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
 }

@@ -121,11 +121,7 @@ pub(super) fn draw(args: &DrawArgs, progress: &dyn Progress, json: bool) -> Resu
 fn drawn_view(view: &View) -> DrawnView {
     let intrinsics = view.intrinsics.without_distortion();
     let name = Path::new(&view.name).with_extension("png").to_string_lossy().into_owned();
-    DrawnView {
-        name,
-        view: RasterView { camera_from_world: view.camera_from_world, intrinsics },
-        about: json!({}),
-    }
+    DrawnView { name, view: RasterView { intrinsics, ..RasterView::of(view) }, about: json!({}) }
 }
 
 #[cfg(test)]

@@ -22,7 +22,7 @@ use crate::raster::gpu::GpuOptions;
 /// The queue of a fleet.
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Fleet")]
-pub struct QueueArgs {
+pub(crate) struct QueueArgs {
     /// NATS server with JetStream that hands out the work; without it, workers have shares. TLS with tls://.
     #[arg(long, value_name = "nats://HOST:PORT", hide_short_help = true)]
     fleet: Option<String>,
@@ -65,7 +65,7 @@ impl QueueArgs {
 /// `encode` by a fleet.
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Fleet")]
-pub struct CoordinatorArgs {
+pub(crate) struct CoordinatorArgs {
     /// Bucket over which workers do the views: file:///FOLDER that all machines see, or s3://BUCKET/PREFIX,
     /// with credentials in the usual variables. Start `slag-encoder worker` with the same bucket.
     #[arg(long, value_name = "URL", conflicts_with = "time_budget", hide_short_help = true)]

@@ -79,7 +79,7 @@ pub struct KeysArgs {
     pub store: PathBuf,
     /// Folder of root's keys [default: keys/root in the store].
     #[arg(long, value_name = "DIR")]
-    pub root_keys: Option<PathBuf>,
+    pub(crate) root_keys: Option<PathBuf>,
 }
 
 impl KeysArgs {

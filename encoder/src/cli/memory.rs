@@ -11,7 +11,7 @@ const MIN_MEMORY_BYTES: u64 = 64 << 20;
 const UNKNOWN_MEMORY_BYTES: u64 = 2 << 30;
 
 /// Reads the size of the working memory, see [`ByteSize`].
-pub fn parse_memory(text: &str) -> Result<u64, String> {
+pub(crate) fn parse_memory(text: &str) -> Result<u64, String> {
     let ByteSize(bytes) = text.parse().map_err(|e: ByteSizeError| e.to_string())?;
     if bytes < MIN_MEMORY_BYTES {
         return Err(format!("{text:?} is too little; expected at least 64MiB"));
@@ -20,7 +20,7 @@ pub fn parse_memory(text: &str) -> Result<u64, String> {
 }
 
 /// Returns half of the free memory.
-pub fn default_memory_bytes() -> u64 {
+pub(crate) fn default_memory_bytes() -> u64 {
     half_of(free_memory_bytes())
 }
 

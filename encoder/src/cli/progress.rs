@@ -17,7 +17,7 @@ pub fn shown(is_shown: bool) -> Box<dyn Progress> {
 }
 
 /// Shows progress to a person or writes it to a log.
-pub struct TerminalProgress {
+pub(crate) struct TerminalProgress {
     terminal: bool,
     stage: Mutex<Stage>,
 }

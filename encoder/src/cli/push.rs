@@ -29,10 +29,10 @@ pub struct QdrantArgs {
     pub url: String,
     /// Collection; created if it does not exist. With `--layout cells`: NAME-cell-ID for each cell.
     #[arg(long, value_name = "NAME")]
-    pub collection: String,
+    pub(crate) collection: String,
     /// API key.
     #[arg(long, value_name = "KEY", env = "QDRANT_API_KEY", hide_env_values = true)]
-    pub api_key: Option<String>,
+    pub(crate) api_key: Option<String>,
     /// Points per request.
     #[arg(long, value_name = "N", default_value = "256")]
     pub batch: NonZeroUsize,
@@ -41,7 +41,7 @@ pub struct QdrantArgs {
     pub layout: qdrant::Layout,
     /// Makes a snapshot of each collection at the end, on the server's disk.
     #[arg(long)]
-    pub snapshots: bool,
+    pub(crate) snapshots: bool,
     /// Settings of the collections.
     #[command(flatten)]
     pub index: qdrant::IndexSettings,

@@ -13,7 +13,7 @@ use crate::segment::{SamLevels, SamSettings};
 /// Masks from Segment Anything; the other flags need `--segmenter`.
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Segment Anything")]
-pub struct SamArgs {
+pub(crate) struct SamArgs {
     /// SAM, SAM 2, MobileSAM, EdgeTAM or another model of that kind: a folder with model.toml, or the name of a
     /// pulled model (`models list`).
     #[arg(long, value_name = "NAME|DIR", help_heading = "Models")]

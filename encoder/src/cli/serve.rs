@@ -34,16 +34,16 @@ pub struct ServeArgs {
     /// Name that robots call this machine by; other names are then refused. May be repeated [default: any name
     /// beyond this machine, else localhost and IP addresses].
     #[arg(long, value_name = "NAME")]
-    pub host: Vec<String>,
+    pub(crate) host: Vec<String>,
     /// Let pages of this origin read answers (CORS), such as https://map.example. May be repeated.
     #[arg(long, value_name = "ORIGIN")]
-    pub cors: Vec<String>,
+    pub(crate) cors: Vec<String>,
     /// Speak TLS with this certificate and the chain to its authority (PEM); it is read anew when it changes.
     #[arg(long, value_name = "FILE", requires = "tls_key")]
-    pub tls_cert: Option<PathBuf>,
+    pub(crate) tls_cert: Option<PathBuf>,
     /// Private key of --tls-cert (PEM).
     #[arg(long, value_name = "FILE", requires = "tls_cert")]
-    pub tls_key: Option<PathBuf>,
+    pub(crate) tls_key: Option<PathBuf>,
     /// Models of the page at /view; they must be those that the store was encoded with.
     #[command(flatten)]
     pub models: ModelArgs,

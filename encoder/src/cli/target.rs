@@ -13,7 +13,7 @@ use crate::encode::{InputSettings, count_inputs};
 /// A target instead of a preset.
 #[derive(Clone, Debug, Default, Args)]
 #[command(next_help_heading = "Target")]
-pub struct TargetArgs {
+pub(crate) struct TargetArgs {
     /// Picks the most accurate measured setting that is expected to take at most this many seconds. The
     /// expectation holds for the machine, models and size of photos that the front was measured with.
     #[arg(long, value_name = "S", value_parser = parse_seconds, requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]

@@ -56,7 +56,7 @@ pub struct ViewArgs {
     pub listen: Listen,
     /// Prints the link and opens no browser.
     #[arg(long)]
-    pub no_open: bool,
+    pub(crate) no_open: bool,
 }
 
 /// Parses an axis of the world.

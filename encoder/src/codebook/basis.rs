@@ -13,7 +13,7 @@ use slag_math::{dot, dot_f64};
 
 /// Share of an isotropic covariance in that of the texts: it keeps directions in which no text of the bank points.
 const ISOTROPIC_SHARE: f64 = 0.2;
-pub const MAX_COMPONENTS: usize = 128;
+pub(crate) const MAX_COMPONENTS: usize = 128;
 
 /// Most texts of a bank, and fewest that show the directions of queries.
 const MAX_TEXTS: usize = 2048;

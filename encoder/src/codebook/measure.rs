@@ -15,7 +15,7 @@ const LIKELY_SCORES: usize = 990;
 const SAMPLE: usize = 1024;
 
 /// The true scores of some Gaussians.
-pub struct Sample<'a> {
+pub(crate) struct Sample<'a> {
     bank: &'a TextBank,
     texts: Panels,
     stride: usize,
@@ -28,7 +28,7 @@ pub struct Sample<'a> {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ScoreMoments {
     pub mean: f64,
-    pub mean_square: f64,
+    pub(crate) mean_square: f64,
 }
 
 impl ScoreMoments {
@@ -86,7 +86,11 @@ impl<'a> Sample<'a> {
 ///
 /// `errors`: `[n][n_texts]`, absolute. The bound is the ceil(0.95 (h + 1))-th smallest of the h held-out texts'
 /// own 99th percentiles; `None` if that is more than h.
-pub fn likely_error(errors: &[f32], n_texts: usize, is_held_out: impl Fn(usize) -> bool) -> Option<f32> {
+pub(crate) fn likely_error(
+    errors: &[f32],
+    n_texts: usize,
+    is_held_out: impl Fn(usize) -> bool,
+) -> Option<f32> {
     if errors.is_empty() {
         return None;
     }

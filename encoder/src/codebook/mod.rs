@@ -13,7 +13,7 @@ mod fine;
 pub mod measure;
 mod members;
 mod outliers;
-pub mod residual;
+pub(crate) mod residual;
 
 use half::f16;
 use rayon::prelude::*;
@@ -28,7 +28,7 @@ use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 
 pub use basis::{ScoreMetric, TextBank};
-pub use fine::FineResiduals;
+pub(crate) use fine::FineResiduals;
 
 /// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled
 /// house, whose errors have heavy tails; 1.25 for normally distributed errors.
@@ -43,7 +43,7 @@ const CENTROID_STEP: f32 = 1.0 / 127.0;
 const TAIL_SHARE: f32 = 0.3;
 
 /// Returns the most bytes per embedding that building a codebook takes: components, residuals, codes.
-pub fn working_bytes_per_embedding(dim: usize) -> usize {
+pub(crate) fn working_bytes_per_embedding(dim: usize) -> usize {
     4 * dim.min(128) * size_of::<f32>() + 64
 }
 
@@ -52,21 +52,21 @@ pub fn working_bytes_per_embedding(dim: usize) -> usize {
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CodebookSettings {
     /// Largest accepted error of the compact profile.
-    pub compact_error: f32,
+    pub(crate) compact_error: f32,
     /// Largest accepted error of the balanced profile.
-    pub balanced_error: f32,
+    pub(crate) balanced_error: f32,
     /// Most components of a centroid: the dimension of compact and balanced shards. Fewer are taken where the
     /// errors allow it; even, 2 to [`MAX_COMPONENTS`].
-    pub max_components: usize,
+    pub(crate) max_components: usize,
     /// Fewest Gaussians per centroid, on average.
-    pub min_gaussians_per_centroid: usize,
+    pub(crate) min_gaussians_per_centroid: usize,
     /// Bytes per Gaussian that centroids of outliers may take, beside a sixteenth of the basis: they lower the
     /// hard bound of scores. 0: no such centroids.
-    pub outlier_bytes: f32,
+    pub(crate) outlier_bytes: f32,
     /// Most subspaces of the residual code (half a byte each); below 2 there is no code.
-    pub max_subspaces: usize,
+    pub(crate) max_subspaces: usize,
     /// Whether residuals are also stored in 8 bits per component, as in exact shards.
-    pub has_fine: bool,
+    pub(crate) has_fine: bool,
 }
 
 impl Default for CodebookSettings {
@@ -106,7 +106,7 @@ pub struct Codebook {
     /// `[m][dim]`.
     pub basis: Vec<i8>,
     /// `[m]`.
-    pub basis_steps: Vec<f32>,
+    pub(crate) basis_steps: Vec<f32>,
     /// `[K][m]`.
     pub centroids: Vec<i8>,
     pub centroid_step: f32,

@@ -58,7 +58,7 @@ pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
 
 /// Assigns components to subspaces with the least total loss. Returns the components in the order of their
 /// subspaces (those in none last), and the starts of the subspaces.
-pub fn subspaces(variances: &[f64], n_subspaces: usize) -> (Vec<usize>, Vec<u32>) {
+pub(crate) fn subspaces(variances: &[f64], n_subspaces: usize) -> (Vec<usize>, Vec<u32>) {
     let log = |c: usize| log_variance(variances[c]);
     let mut members: Vec<Vec<usize>> = (0..n_subspaces).map(|c| vec![c]).collect();
     let mut log_products: Vec<f64> = (0..n_subspaces).map(log).collect();

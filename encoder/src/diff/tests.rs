@@ -7,7 +7,7 @@ use slag_common::shard::{Profile, ShardHeader, ShardLayout};
 
 use super::*;
 use crate::store::tests::manifest;
-use crate::store::{Extras, Store, StoreReader};
+use crate::store::{Extras, Store, StoreError, StoreReader};
 
 /// A shard whose things have a Gaussian each, unit boxes around x = their ids, and vectors along one axis. `seed`
 /// makes other bytes of the same things.
@@ -141,7 +141,7 @@ fn what_does_not_compare_is_refused() {
     publish(&store, 1, &[cell], |_| {});
     publish(&store, 2, &[cell, &[(Profile::Compact, b"no shard".to_vec())]], |_| {});
     let refused = compare(&store.reader().expect("published")).expect_err("damaged");
-    assert!(matches!(refused, DiffError::Shard { cell_id: 1, .. }), "{refused}");
+    assert!(matches!(refused, DiffError::Store(StoreError::Shard { .. })), "{refused}");
 }
 
 fn without_objects() -> Vec<u8> {

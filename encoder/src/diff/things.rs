@@ -2,9 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use slag_common::container::ContainerError;
 use slag_common::objects::Thing;
-use slag_common::shard::ShardLayout;
 
 use crate::store::{Published, StoreError, StoreReader};
 
@@ -20,8 +18,6 @@ pub(crate) struct Generation<'a> {
 pub(crate) enum DiffError {
     #[error(transparent)]
     Store(#[from] StoreError),
-    #[error("cell {cell_id}: {source}; encode again: what is damaged is written anew")]
-    Shard { cell_id: u32, source: ContainerError },
     #[error("generation {generation} has no objects to compare; encode again, without --no-objects")]
     NoObjects { generation: u64 },
     #[error(
@@ -36,12 +32,10 @@ pub(super) fn read(generation: Generation<'_>) -> Result<Vec<Thing>, DiffError> 
     let mut things: BTreeMap<u64, Thing> = BTreeMap::new();
     for cell in &manifest.cells {
         let Some(shard) = cell.shards.values().next_back() else { continue };
-        let bytes = generation.reader.read_object(shard.hash)?;
-        let layout = ShardLayout::check(&bytes)
-            .map_err(|source| DiffError::Shard { cell_id: cell.cell_id, source })?;
+        let shard = generation.reader.read_shard(shard)?;
         let no_objects = DiffError::NoObjects { generation: manifest.generation };
-        let objects = layout.objects(&bytes).ok_or(no_objects)?;
-        Thing::add_all(&mut things, &layout.view(&bytes), &objects);
+        let objects = shard.objects().ok_or(no_objects)?;
+        Thing::add_all(&mut things, &shard.view(), &objects);
     }
     Ok(things.into_values().collect())
 }

@@ -10,8 +10,8 @@ use slag_models::{Crop, ImageEncoder, InferenceError, preprocess::Preprocess};
 
 use crate::masks::{BoxPx, Mask};
 
-pub use shared::{Failure, OpenEncoder, SharedEncoders};
-pub use surroundings::Surroundings;
+pub(crate) use shared::{Failure, SharedEncoders};
+pub(crate) use surroundings::Surroundings;
 
 #[derive(Debug, thiserror::Error)]
 pub enum EmbedError {
@@ -40,7 +40,7 @@ impl EmbedError {
 }
 
 /// How the vectors of a photo's patches are used.
-pub enum PatchUse {
+pub(crate) enum PatchUse {
     /// Each of these patches is a region with a vector of its own; numbers row by row.
     Regions(Vec<usize>),
     /// Masks take a share.
@@ -111,7 +111,7 @@ pub fn squares(image: &RgbImage, masks: &[Mask], preprocess: &Preprocess) -> Res
 }
 
 /// Returns a unit vector per crop, `[crops][dim]`; the first crop is that of mask `first`.
-pub fn embed_crops(
+pub(crate) fn embed_crops(
     crops: &[Crop],
     first: usize,
     encoder: &mut dyn ImageEncoder,

@@ -23,10 +23,10 @@ const VIEWS_PER_LANE: usize = 12;
 /// Crops of so many views, or of fewer with many masks.
 const CROPS_PER_LANE: u64 = 512;
 
-pub type OpenEncoder = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Send + Sync;
+pub(crate) type OpenEncoder = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Send + Sync;
 
 /// Image encoders on GPUs that work off the crops of all views.
-pub struct SharedEncoders {
+pub(crate) struct SharedEncoders {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
 }
@@ -67,7 +67,7 @@ struct Request {
 
 /// Reason why crops could not be embedded.
 #[derive(Debug, thiserror::Error)]
-pub enum Failure {
+pub(crate) enum Failure {
     #[error(transparent)]
     Model(#[from] ModelError),
     #[error(transparent)]
@@ -97,7 +97,7 @@ impl SharedEncoders {
     }
 
     /// Reserves the squares that wait, each of `square_bytes`.
-    pub fn reserve(memory: &mut MemoryPlan, gpus: &[u32], square_bytes: u64) {
+    pub(crate) fn reserve(memory: &mut MemoryPlan, gpus: &[u32], square_bytes: u64) {
         let n = gpus.len() as u64 * LANES_PER_GPU as u64 * CROPS_PER_LANE;
         memory.reserve(Phase::Views, "crops that wait for GPUs", n * square_bytes);
     }

@@ -183,7 +183,7 @@ fn inner(width_px: u32, height_px: u32) -> RegionMap {
 
 /// Returns the numbers below `n` so that those before any place are about evenly spread: by their reversed bits
 /// (van der Corput 1935).
-pub fn spread_order(n: usize) -> Vec<usize> {
+pub(crate) fn spread_order(n: usize) -> Vec<usize> {
     let n_bits = n.next_power_of_two().trailing_zeros();
     let reversed = |i: usize| i.reverse_bits().checked_shr(usize::BITS - n_bits).unwrap_or(0);
     (0..n.next_power_of_two()).map(reversed).filter(|i| *i < n).collect()
@@ -191,11 +191,11 @@ pub fn spread_order(n: usize) -> Vec<usize> {
 
 #[cfg(test)]
 mod tests {
-    use slag_common::{Distortion, Gaussians, Intrinsics};
+    use slag_common::Gaussians;
     use slag_math::random::Random;
 
     use super::*;
-    use crate::raster::{CpuRasterizer, Rasterizer};
+    use crate::raster::{CpuRasterizer, Rasterizer, pinhole};
 
     fn small(random: &mut Random, n_views: usize, n_gaussians: usize) -> Vec<Vec<(u32, f32)>> {
         let mut view = || {
@@ -302,15 +302,7 @@ mod tests {
                 scene.sh_dc.push([0.0; 3]);
             }
         }
-        let intrinsics = Intrinsics {
-            width_px: 640,
-            height_px: 480,
-            focal_x_px: 500.0,
-            focal_y_px: 500.0,
-            centre_x_px: 320.0,
-            centre_y_px: 240.0,
-            distortion: Distortion::None,
-        };
+        let intrinsics = pinhole([640, 480], 500.0);
         let at = |eye: [f64; 3]| RasterView {
             camera_from_world: glam::DAffine3::from_mat4(glam::DMat4::look_at_rh(
                 eye.into(),

@@ -148,29 +148,19 @@ fn hash_scene(scene: &Gaussians) -> Hash32 {
 mod tests {
     use std::path::{Path, PathBuf};
 
-    use slag_common::Distortion;
     use slag_models::{ModelDir, Provider, SessionOptions};
 
     use super::*;
     use crate::cells::CellSplit;
     use crate::encode::Masks;
-    use crate::raster::CpuRasterizer;
+    use crate::raster::{CpuRasterizer, pinhole};
     use crate::segment::{GivenMasks, GraphSegmenter};
 
     fn inputs(photo: &Path) -> Inputs {
-        let intrinsics = Intrinsics {
-            width_px: 8,
-            height_px: 8,
-            focal_x_px: 8.0,
-            focal_y_px: 8.0,
-            centre_x_px: 4.0,
-            centre_y_px: 4.0,
-            distortion: Distortion::None,
-        };
         let view = View {
             name: "a.png".into(),
             image_path: photo.to_owned(),
-            intrinsics,
+            intrinsics: pinhole([8, 8], 8.0),
             camera_from_world: glam::DAffine3::IDENTITY,
         };
         Inputs {

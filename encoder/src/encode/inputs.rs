@@ -103,7 +103,7 @@ pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work:
 }
 
 /// Returns the numbers of views with a photo and of Gaussians.
-pub fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeError> {
+pub(crate) fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeError> {
     let scene = splat::read(&inputs.scene, &ReadOptions { with_sh_rest: false })?;
     if let Some(planned) = &inputs.planned {
         return Ok((planned.n_views, scene.len()));
@@ -207,15 +207,7 @@ mod tests {
         let view = |name: &str| View {
             name: name.into(),
             image_path: folder.path().join(name),
-            intrinsics: slag_common::Intrinsics {
-                width_px: 400,
-                height_px: 300,
-                focal_x_px: 300.0,
-                focal_y_px: 300.0,
-                centre_x_px: 200.0,
-                centre_y_px: 150.0,
-                distortion: slag_common::Distortion::None,
-            },
+            intrinsics: crate::raster::pinhole([400, 300], 300.0),
             camera_from_world: glam::DAffine3::IDENTITY,
         };
         for name in ["a.png", "c.png"] {

@@ -24,7 +24,7 @@ const VIEWS_FOLDER: &str = "views";
 
 /// What a store knows of the encode that it keeps views of.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct JobStatus {
+pub(crate) struct JobStatus {
     /// Views whose contributions are on disk.
     pub n_views: usize,
     /// Whether all of them are published; otherwise the encode is unfinished.
@@ -35,7 +35,7 @@ pub struct JobStatus {
 
 /// Returns the state of the encode that a store keeps views of, if there is one. `db`: the store's catalogue, or a
 /// copy.
-pub fn job_status(db: &sled::Db, store: &Path) -> Result<Option<JobStatus>, EncodeError> {
+pub(crate) fn job_status(db: &sled::Db, store: &Path) -> Result<Option<JobStatus>, EncodeError> {
     let records = |source| EncodeError::Records { path: store.to_owned(), source };
     let tree = db.open_tree(TREE).map_err(records)?;
     if !tree.contains_key(IDENTITY_KEY).map_err(records)? {
@@ -296,15 +296,7 @@ mod tests {
             masks_of_region: Vec::new(),
             entries_of_cell: Vec::new(),
         };
-        let intrinsics = slag_common::Intrinsics {
-            width_px: 1,
-            height_px: 1,
-            focal_x_px: 1.0,
-            focal_y_px: 1.0,
-            centre_x_px: 0.5,
-            centre_y_px: 0.5,
-            distortion: slag_common::Distortion::None,
-        };
+        let intrinsics = crate::raster::pinhole([1, 1], 1.0);
         let (name, image_path) = (view.to_owned(), PathBuf::new());
         let view = View { name, image_path, intrinsics, camera_from_world: glam::DAffine3::IDENTITY };
         job.keep(&view, &contributions, &[], ViewRecord::default()).expect("keeps");

@@ -46,20 +46,18 @@ use crate::store::Store;
 use context::RunContext;
 use executor::Executor;
 
-pub use crate::memory::{MemoryError, Reservation};
 pub use engines::Engines;
-pub use error::EncodeError;
-pub use inputs::count_inputs;
-pub use job::{JobStatus, job_status};
+pub(crate) use error::EncodeError;
+pub(crate) use inputs::count_inputs;
+pub(crate) use job::{JobStatus, job_status};
 pub use preset::Preset;
-pub use report::{
-    CellReport, EncodeSummary, GpuReport, LostViews, Phase, PhaseReport, SkippedView, StageReport,
-    ViewsReport,
-};
+pub use report::EncodeSummary;
+pub(crate) use report::{GpuReport, Phase, SkippedView, StageReport};
 pub use settings::{
-    CellSettings, DEFAULT_CELL_WIDTH_M, DEFAULT_MASK_LEVELS, EncodeSettings, InputSettings,
-    MAX_CELL_GAUSSIANS, Masks, OutputSettings, RasterWidth, Regions, RunSettings, ViewOrder, ViewSettings,
-    ViewsLimit,
+    CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit,
+};
+pub(crate) use settings::{
+    DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth, ViewSettings,
 };
 
 /// The parts of which a fleet makes its own encode.

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use slag_common::{Hash32, View};
+use slag_common::Hash32;
 use slag_models::SessionOptions;
 
 use super::context::RunContext;
@@ -244,9 +244,7 @@ fn choose_views(
         }
         ViewOrder::Nth => (spread(limit), None),
         ViewOrder::Coverage => {
-            let raster_view =
-                |v: &View| RasterView { camera_from_world: v.camera_from_world, intrinsics: v.intrinsics };
-            let raster_views: Vec<RasterView> = views.iter().map(raster_view).collect();
+            let raster_views: Vec<RasterView> = views.iter().map(RasterView::of).collect();
             let measured = Coverage::measure(scene, inputs.scene.len(), &raster_views, context.cancel());
             let coverage = measured
                 .map_err(|(view, source)| EncodeError::Raster { view: views[view].name.clone(), source })?

@@ -84,9 +84,9 @@ pub struct ViewsReport {
 pub struct StageReport {
     pub stage: String,
     /// Views that it takes at once.
-    pub n_slots: usize,
+    pub(crate) n_slots: usize,
     /// Seconds of work, added over the slots.
-    pub busy_secs: f64,
+    pub(crate) busy_secs: f64,
     /// Mean share of the time in which its slots were busy, 0 to 1.
     pub busy_share: f64,
     /// The load of each GPU that runs the stage's models; empty on the processor.
@@ -100,8 +100,8 @@ pub struct GpuReport {
     /// The GPU, as CUDA numbers it.
     pub gpu: u32,
     /// Lanes: models that may be at work at once.
-    pub n_lanes: usize,
-    pub busy_secs: f64,
+    pub(crate) n_lanes: usize,
+    pub(crate) busy_secs: f64,
     /// Their share of the time, 0 to 1.
     pub busy_share: f64,
 }
@@ -122,7 +122,7 @@ impl StageReport {
 /// A part of a run, one after the other.
 #[derive(Clone, Copy, Debug, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Phase {
+pub(crate) enum Phase {
     /// Scene and poses are read and split into cells.
     Read,
     /// What is to do is decided, and what is done is found.
@@ -146,7 +146,7 @@ pub enum Phase {
 
 /// A part of the run. The parts follow each other and add up to the run's time.
 #[derive(Clone, Debug, Serialize)]
-pub struct PhaseReport {
+pub(crate) struct PhaseReport {
     pub phase: Phase,
     pub secs: f64,
     /// The most memory of the process until its end, bytes; absent where the system does not tell.
@@ -177,7 +177,7 @@ pub struct EncodeSummary {
     /// Kept views that were done anew, and why; absent where none were kept, or those could be taken over.
     pub lost_views: Option<LostViews>,
     /// The encoder of the generation before, if it was another: robots need the text model of this one.
-    pub encoder_before: Option<String>,
+    pub(crate) encoder_before: Option<String>,
     /// Views without any mask: no mask file, or no mask that is large enough.
     pub n_views_without_masks: usize,
     /// Views that were left out.
@@ -197,17 +197,17 @@ pub struct EncodeSummary {
     pub cells: Vec<CellReport>,
     pub views: ViewsReport,
     /// Seconds spent in each stage, added over threads.
-    pub busy_secs: BTreeMap<String, f64>,
+    pub(crate) busy_secs: BTreeMap<String, f64>,
     /// The load of the views' stages, in their order.
     pub view_stages: Vec<StageReport>,
     /// The parts of the run, in their order.
-    pub phases: Vec<PhaseReport>,
+    pub(crate) phases: Vec<PhaseReport>,
     /// Seconds from the first view to the last.
     pub views_secs: f64,
     /// Seconds from start to end.
     pub wall_secs: f64,
     /// The device that ran the image model; absent where no view was left to do, or the model needs no runtime.
-    pub images_on: Option<String>,
+    pub(crate) images_on: Option<String>,
     /// The encoder's name.
     pub encoder: String,
 }

@@ -25,11 +25,11 @@ use crate::viewpoints::ViewpointSettings;
 pub const DEFAULT_MASK_LEVELS: usize = 3;
 /// Widest raster where the settings do not ask for more: masks are coarser than this, and time grows with the
 /// square.
-pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
+pub(crate) const MAX_RASTER_WIDTH_PX: u32 = 1024;
 /// Gaussians of a cell at most: shards number them with 16 bits.
-pub const MAX_CELL_GAUSSIANS: usize = 65_536;
+pub(crate) const MAX_CELL_GAUSSIANS: usize = 65_536;
 /// Largest width of a cell of a metric scene.
-pub const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
+pub(crate) const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 
 #[derive(Clone, Debug)]
 pub struct EncodeSettings {
@@ -81,10 +81,10 @@ pub struct ViewSettings {
     /// Masks with fewer pixels are left out.
     pub min_mask_px: u32,
     /// Width at which weights are rasterised.
-    pub raster_width: RasterWidth,
+    pub(crate) raster_width: RasterWidth,
     pub weights: WeightKind,
     /// Whether slivers between masks join their neighbours.
-    pub merges_slivers: bool,
+    pub(crate) merges_slivers: bool,
     #[serde(default, skip_serializing_if = "Regions::are_masks")]
     pub regions: Regions,
 }
@@ -147,7 +147,7 @@ pub enum Masks {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum RasterWidth {
+pub(crate) enum RasterWidth {
     /// The photo's own width, at most `MAX_RASTER_WIDTH_PX`.
     Photo,
     Px(u32),
@@ -203,11 +203,11 @@ pub struct RunSettings {
     pub views_limit: ViewsLimit,
     pub view_order: ViewOrder,
     /// Time from the start after which no view is begun; at least one view is used.
-    pub time_budget: Option<Duration>,
+    pub(crate) time_budget: Option<Duration>,
     /// Whether a missing or unreadable input ends the encode.
     pub strict: bool,
     /// Publishes a generation in which no Gaussian has an embedding.
-    pub allow_empty: bool,
+    pub(crate) allow_empty: bool,
     /// Whether an unfinished encode of another splat or with other settings is dropped.
     pub restart: bool,
     /// Whether the views' contributions are kept after publication, for an encode with another aggregation.

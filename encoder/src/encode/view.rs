@@ -442,10 +442,8 @@ impl<'a> ViewStages<'a> {
 }
 
 fn raster_view(loaded: &LoadedImage, width_px: u32) -> RasterView {
-    RasterView {
-        camera_from_world: loaded.view.camera_from_world,
-        intrinsics: loaded.view.intrinsics.scaled_to_width(width_px),
-    }
+    let intrinsics = loaded.view.intrinsics.scaled_to_width(width_px);
+    RasterView { intrinsics, ..RasterView::of(&loaded.view) }
 }
 
 /// Returns a raster's values at the photo's size, nearest.

@@ -18,7 +18,8 @@ use jpeg::Damage;
 
 pub use drawn::drawn_from;
 pub use geo::{GeoError, read_geo_reference};
-pub use splat_frame::{Activated, FoundFrame, FrameChoice, find_frame};
+pub(crate) use splat_frame::FoundFrame;
+pub use splat_frame::{Activated, FrameChoice, find_frame};
 pub use undistort::Undistorter;
 
 /// Largest factor between the size in the intrinsics and that of downscaled photos.
@@ -104,7 +105,7 @@ pub enum IngestError {
 }
 
 /// Returns the BLAKE3 hash of a file's content.
-pub fn hash_file(path: &Path) -> io::Result<Hash32> {
+pub(crate) fn hash_file(path: &Path) -> io::Result<Hash32> {
     Ok(Hash32::of_reader(fs_err::File::open(path)?)?.0)
 }
 
@@ -114,7 +115,7 @@ pub fn missing_images(views: &[View]) -> Vec<&View> {
 }
 
 /// Returns the pixels of a view's photo, see [`photo_size_px`].
-pub fn photo_area_px(view: &View) -> u64 {
+pub(crate) fn photo_area_px(view: &View) -> u64 {
     photo_size_px(view).map(u64::from).iter().product()
 }
 

@@ -20,19 +20,19 @@ const VERSION: u32 = 2;
 const REGION_BITS: u32 = 20;
 
 /// Gaussians of a slice: the contributions of one slice from all views fit a core's cache.
-pub const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
+pub(crate) const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
 /// Most regions, or masks, of all views and mixtures together.
-pub const MAX_IN_ALL: usize = u32::MAX as usize - 1;
-pub const MAX_REGIONS: usize = 1 << REGION_BITS;
+pub(crate) const MAX_IN_ALL: usize = u32::MAX as usize - 1;
+pub(crate) const MAX_REGIONS: usize = 1 << REGION_BITS;
 
 mod section {
-    pub const HEADER: u32 = 1;
-    pub const REGION_STARTS: u32 = 2;
-    pub const REGION_MASKS: u32 = 3;
-    pub const MASK_VECTORS: u32 = 4;
-    pub const RUNS: u32 = 5;
+    pub(crate) const HEADER: u32 = 1;
+    pub(crate) const REGION_STARTS: u32 = 2;
+    pub(crate) const REGION_MASKS: u32 = 3;
+    pub(crate) const MASK_VECTORS: u32 = 4;
+    pub(crate) const RUNS: u32 = 5;
     /// Follows the container; errors name the section by this number.
-    pub const ENTRIES: u32 = 6;
+    pub(crate) const ENTRIES: u32 = 6;
 }
 
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -52,7 +52,7 @@ struct Header {
 pub struct Run {
     pub cell_id: u32,
     /// The slice: index within the cell / [`GAUSSIANS_PER_SLICE`].
-    pub slice: u32,
+    pub(crate) slice: u32,
     /// Its first entry in the file.
     pub start: u64,
     /// CRC-32 of its entries.

@@ -159,7 +159,7 @@ impl ContributionIndex {
     }
 
     /// Reserves the index's bytes.
-    pub fn reserve(&self, memory: &mut MemoryPlan) {
+    pub(crate) fn reserve(&self, memory: &mut MemoryPlan) {
         memory.reserve(Phase::Always, "the index of contributions", self.len_bytes());
     }
 

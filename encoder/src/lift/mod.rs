@@ -34,20 +34,17 @@ mod part;
 mod passes;
 pub mod photos;
 pub mod published;
-pub mod refine;
-pub mod superpoint;
+pub(crate) mod refine;
+pub(crate) mod superpoint;
 mod table;
 #[cfg(test)]
 mod tests;
 mod transpose;
 
-pub use contributions::{
-    Contribution, ContributionError, ContributionFile, GAUSSIANS_PER_SLICE, MAX_REGIONS, ViewContributions,
-    ViewRegions,
-};
+pub use contributions::{Contribution, ContributionError, ContributionFile, ViewContributions};
 pub use field::CellField;
-pub use index::{ContributionIndex, RawGroup};
+pub use index::ContributionIndex;
 pub use part::{Part, PartContributions};
-pub use passes::SceneContributions;
+pub(crate) use passes::SceneContributions;
 pub use refine::Aggregation;
 pub use table::RegionTable;

@@ -11,7 +11,7 @@ pub struct Part {
     /// Number of the part within the cell.
     pub number: u32,
     /// Its Gaussians, by their index within the cell.
-    pub locals: Range<usize>,
+    pub(crate) locals: Range<usize>,
     pub n_entries: u64,
     /// Its slices, numbered over the whole scene.
     pub(super) slices: Range<usize>,

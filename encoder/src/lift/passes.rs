@@ -16,14 +16,14 @@ use crate::cells::CellSplit;
 
 /// The contributions of all views to a scene, and how passes go over them.
 #[derive(Clone, Copy)]
-pub struct SceneContributions<'a> {
+pub(crate) struct SceneContributions<'a> {
     pub index: &'a ContributionIndex,
     pub gaussians: &'a Gaussians,
     pub split: &'a CellSplit,
     /// Each view's masks, in the order of the index.
     pub photos: &'a [Photo],
     /// Bytes for the contributions of a group of parts.
-    pub group_bytes: u64,
+    pub(crate) group_bytes: u64,
     /// Set when the user asks to stop.
     pub cancel: &'a AtomicBool,
 }

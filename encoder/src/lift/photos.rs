@@ -25,7 +25,7 @@ pub struct MaskOutline {
     /// Box, pixels of the undistorted photo: x0, y0, x1, y1, the last two exclusive.
     pub box_px: [u32; 4],
     /// Length of outline on the photo's edge, pixels.
-    pub cut_px: u32,
+    pub(crate) cut_px: u32,
     /// Coarseness, as of [`Mask::level`].
     pub level: u32,
 }
@@ -59,12 +59,12 @@ impl MaskOutline {
 }
 
 /// Writes the outlines of a view's masks durably.
-pub fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<(), ContributionError> {
+pub(crate) fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<(), ContributionError> {
     Ok(slag_common::durable::write(path, &outlines_to_bytes(outlines)?)?)
 }
 
 /// Returns the bytes of the file of the outlines of a view's masks.
-pub fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec<u8>> {
+pub(crate) fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let n = outlines.len() as u64;
     let sections = [(1, bytemuck::bytes_of(&n)), (2, container::bytes_of(outlines))];
@@ -73,7 +73,7 @@ pub fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec<u8>> {
 }
 
 /// Reads the outlines of a view of `n_masks` masks.
-pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<MaskOutline>, ContributionError> {
+pub(crate) fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<MaskOutline>, ContributionError> {
     let damaged = |source| ContributionError::Damaged { path: path.to_owned(), source };
     let bytes = AlignedBytes::read(path)?;
     let layout = Layout::check(&bytes, MAGIC, VERSION).map_err(damaged)?;

@@ -7,13 +7,13 @@ use super::table::RegionTable;
 use crate::store::{StoreError, StoreReader};
 
 /// Name of the region table among a generation's extras.
-pub const EXTRA_REGIONS: &str = "regions";
+pub(crate) const EXTRA_REGIONS: &str = "regions";
 
 /// Name of the record ([`super::Aggregation`], JSON) of the refinements; absent for the plain average.
-pub const EXTRA_AGGREGATION: &str = "aggregation";
+pub(crate) const EXTRA_AGGREGATION: &str = "aggregation";
 
 /// Returns the name of a part of a cell's field among a generation's extras.
-pub fn extra_field(cell_id: u32, part: u32) -> String {
+pub(crate) fn extra_field(cell_id: u32, part: u32) -> String {
     format!("field/{cell_id}/{part}")
 }
 

@@ -14,13 +14,13 @@ use slag_math::nearest::{self, Neighbours};
 use slag_math::union_find::{NOT_NUMBERED, Numbering};
 
 /// The superpoint of a Gaussian that cannot be drawn.
-pub const NO_SUPERPOINT: u32 = NOT_NUMBERED;
+pub(crate) const NO_SUPERPOINT: u32 = NOT_NUMBERED;
 
 /// The differences that edges measure, and the size of superpoints.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SuperpointSettings {
+pub(crate) struct SuperpointSettings {
     /// Nearest neighbours of a Gaussian that get an edge.
-    pub n_neighbours: usize,
+    pub(crate) n_neighbours: usize,
     /// Length of an edge from black to white, over the square root of 3.
     pub colour: f32,
     /// Length of a right angle between thinnest axes.
@@ -31,7 +31,7 @@ pub struct SuperpointSettings {
     /// plus k over its size.
     pub scale: f32,
     /// Smaller components are joined to their most similar neighbour.
-    pub min_gaussians: u32,
+    pub(crate) min_gaussians: u32,
 }
 
 impl Default for SuperpointSettings {
@@ -51,16 +51,16 @@ impl SuperpointSettings {
 
 /// A partition of a scene's Gaussians.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Superpoints {
+pub(crate) struct Superpoints {
     /// `[N]`: the superpoint of each Gaussian, [`NO_SUPERPOINT`] where it cannot be drawn.
-    pub of_gaussian: Vec<u32>,
+    pub(crate) of_gaussian: Vec<u32>,
     /// Number of superpoints; they are numbered in the order of their first Gaussians.
     pub n: usize,
 }
 
 /// Short vectors that differ as embeddings do, of any common scale; zeros where unknown.
 #[derive(Clone, Copy, Debug)]
-pub struct Sketches<'a> {
+pub(crate) struct Sketches<'a> {
     /// Components.
     pub width: usize,
     /// `[N][width]`.

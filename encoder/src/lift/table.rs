@@ -79,7 +79,7 @@ impl RegionTable {
     }
 
     /// Reserves the table's bytes.
-    pub fn reserve(&self, memory: &mut MemoryPlan) {
+    pub(crate) fn reserve(&self, memory: &mut MemoryPlan) {
         memory.reserve(Phase::Always, "masks and regions of all views", self.len_bytes());
     }
 
@@ -88,7 +88,7 @@ impl RegionTable {
     ///
     /// # Errors
     /// [`ContributionError::TooManyInAll`] if regions or masks can no longer be numbered; the table is then as it was.
-    pub fn append<'a>(
+    pub(crate) fn append<'a>(
         &mut self,
         mask_vectors: &[f32],
         masks_of_region: impl ExactSizeIterator<Item = &'a [u32]>,

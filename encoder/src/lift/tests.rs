@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use proptest::prelude::*;
 use slag_common::container::AlignedBytes;
 
+use super::contributions::{GAUSSIANS_PER_SLICE, MAX_REGIONS};
 use super::*;
 use slag_math::dot;
 use slag_math::random::mix64;

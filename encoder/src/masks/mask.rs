@@ -39,7 +39,7 @@ pub struct Mask {
 impl Mask {
     /// The level of a mask that only gives pixels without any other a place: its outline is nobody's, so it says
     /// nothing of things.
-    pub const FILLER: u8 = u8::MAX;
+    pub(crate) const FILLER: u8 = u8::MAX;
 
     /// Returns whether the mask contains a pixel of the image.
     pub fn contains(&self, x: u32, y: u32) -> bool {

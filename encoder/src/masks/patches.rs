@@ -6,7 +6,7 @@ use super::mask::{BoxPx, Mask};
 
 /// Returns the patches of a photo that have pixels, with their numbers, row by row. Patch `k` of `per_side` covers
 /// the pixels whose centres lie in `[k, k + 1) * width / per_side`, and the same down the photo.
-pub fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, Mask)> {
+pub(crate) fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, Mask)> {
     // The first pixel whose centre is at or after the patch's edge: ceil(k * edge / per_side - 1/2).
     let first = |k: u32, edge_px: u32| {
         let (k, edge, n) = (u64::from(k), u64::from(edge_px), u64::from(per_side.max(1)));

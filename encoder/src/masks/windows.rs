@@ -5,7 +5,7 @@ use super::patches;
 
 /// Windows over a photo: for each size `s` those of `1/s` of its edges, half of one apart, so `(2 s - 1)^2`, row
 /// by row.
-pub struct Windows {
+pub(crate) struct Windows {
     sizes: Vec<u32>,
     width_px: u32,
     height_px: u32,

@@ -10,7 +10,8 @@ mod process;
 
 use std::fmt;
 
-pub use process::{give_back, peak_bytes};
+pub(crate) use process::give_back;
+pub use process::peak_bytes;
 
 /// The steps that hold memory one after the other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -17,12 +17,12 @@ use super::lattice::{BlockAt, Lattice};
 /// Opacity from which a voxel is occupied (splat-transform's, for voxels of 5 cm).
 pub const MIN_OPACITY: f32 = 0.1;
 /// Distance from a mean, in standard deviations, up to which a Gaussian counts.
-pub const MAX_SIGMAS: f64 = 3.0;
+pub(crate) const MAX_SIGMAS: f64 = 3.0;
 /// Variance that widens a Gaussian, in squared edges of a voxel. A surface is thinner than a voxel: without it a
 /// voxel's centre beside the surface sees nothing. With 0.15 a closed surface of opaque Gaussians that touches a
 /// corner of the voxel,
 /// 0.866 edges from its centre, still gives an opacity of 0.16.
-pub const VOXEL_VARIANCE: f64 = 0.15;
+pub(crate) const VOXEL_VARIANCE: f64 = 0.15;
 
 /// Blocks along an edge of a tile: its sums, 1 MiB, stay in a core's cache.
 const TILE_BLOCKS: i32 = 16;

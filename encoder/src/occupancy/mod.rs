@@ -22,14 +22,14 @@ use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{LoadedScene, RasterError, RasterView};
 use lattice::Lattice;
 
-pub use density::{MAX_SIGMAS, MIN_OPACITY, VOXEL_VARIANCE};
-pub use seen::MIN_VIEWS;
+pub use density::MIN_OPACITY;
+pub(crate) use seen::MIN_VIEWS;
 
 /// How places are told apart.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OccupancySettings {
     /// Edge of a voxel, metres.
-    pub voxel_m: f64,
+    pub(crate) voxel_m: f64,
 }
 
 pub struct SceneOccupancy {
@@ -41,13 +41,13 @@ pub struct SceneOccupancy {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct OccupancyReport {
     /// Edge of a voxel, metres.
-    pub voxel_m: f64,
+    pub(crate) voxel_m: f64,
     /// Voxels with a surface.
-    pub n_occupied: u64,
+    pub(crate) n_occupied: u64,
     /// Voxels that views have looked through.
     pub n_free: u64,
     /// Gaussians too large to be a thing, which were left out.
-    pub n_background: usize,
+    pub(crate) n_background: usize,
     /// Bytes of all cells, in each profile.
     pub len_bytes: u64,
     pub secs: f64,
@@ -55,7 +55,7 @@ pub struct OccupancyReport {
 
 impl SceneOccupancy {
     /// Reserves what is held until the last shard is written.
-    pub fn reserve(&self, memory: &mut MemoryPlan) {
+    pub(crate) fn reserve(&self, memory: &mut MemoryPlan) {
         memory.reserve(Phase::Always, "free and occupied places", self.report.len_bytes);
     }
 }

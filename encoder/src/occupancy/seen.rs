@@ -9,7 +9,7 @@ use super::lattice::{BlockAt, Lattice};
 use crate::raster::{Drawing, RasterView};
 
 /// Views that must have looked through a voxel for it to be free: one may look through a hole in the splat.
-pub const MIN_VIEWS: u32 = 2;
+pub(crate) const MIN_VIEWS: u32 = 2;
 /// Width of the depth pictures, pixels: at 60 degrees and 8 m a pixel is 3 cm wide.
 pub(super) const DEPTH_WIDTH_PX: u32 = 320;
 /// Height above an occupied voxel up to which places are looked at, world units: a robot with its load.

@@ -10,7 +10,7 @@ use slag_common::manifest::Manifest;
 
 /// Why a scene cannot be placed on the earth.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum GeographicError {
+pub(crate) enum GeographicError {
     #[error(
         "the scene is not geo-referenced; ask in the world frame (x, y, z), or encode it with a geo-reference"
     )]
@@ -29,7 +29,7 @@ fn reference_of(manifest: &Manifest) -> Result<&GeoReference, GeographicError> {
 
 /// Returns a geographic position in the world frame, metres. Without a height, the position has the height
 /// of the world frame's origin.
-pub fn world_from_geographic(
+pub(crate) fn world_from_geographic(
     manifest: &Manifest,
     latitude_deg: f64,
     longitude_deg: f64,
@@ -51,17 +51,17 @@ pub fn world_from_geographic(
 
 /// A piece of the earth's surface.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Footprint {
+pub(crate) struct Footprint {
     /// Degrees of longitude and latitude. Rings are closed and counter-clockwise. A shape across the
     /// antimeridian is cut in two (RFC 7946, 3.1.9); a shape around a pole becomes the band of latitudes
     /// that covers it.
     pub polygons: MultiPolygon,
     /// Geodesic area on the WGS 84 ellipsoid.
-    pub area_m2: f64,
+    pub(crate) area_m2: f64,
 }
 
 /// Returns the footprint of a box, at half its height.
-pub fn footprint(bounds: &Aabb, reference: &GeoReference) -> Footprint {
+pub(crate) fn footprint(bounds: &Aabb, reference: &GeoReference) -> Footprint {
     Footprint::of_ring(&rectangle(bounds), bounds.centre().z, reference)
 }
 

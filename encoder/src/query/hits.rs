@@ -6,13 +6,12 @@ use std::collections::HashMap;
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::Gaussians;
-use slag_common::container::AlignedBytes;
 use slag_common::manifest::CellRecord;
-use slag_common::shard::{Profile, ShardLayout};
+use slag_common::shard::Profile;
 use slag_common::splat::ply::{Point, PointProperties};
 
 use super::{QueryError, Scores};
-use crate::store::StoreReader;
+use crate::store::{StoreReader, StoredShard};
 
 /// Largest f32 rounding of a coordinate, relative to it: splat files keep means in f32.
 const F32_ROUNDING: f64 = 1e-7;
@@ -63,8 +62,8 @@ pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result
         return Ok(Vec::new());
     }
     for cell in &reader.manifest().cells {
-        let Some((bytes, layout)) = indexed_shard(reader, cell)? else { continue };
-        let shard = layout.view(&bytes);
+        let Some(stored) = indexed_shard(reader, cell)? else { continue };
+        let shard = stored.view();
         for at in 0..shard.header.n_gaussians as usize {
             if let Some(place) = shard.input_index(at).and_then(|index| positions.get_mut(&index)) {
                 *place = Some(shard.position_in_world(at));
@@ -79,16 +78,11 @@ pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result
 }
 
 /// Returns the smallest shard of a cell that knows the indices of its Gaussians.
-fn indexed_shard(
-    reader: &StoreReader,
-    cell: &CellRecord,
-) -> Result<Option<(AlignedBytes, ShardLayout)>, QueryError> {
+fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<StoredShard>, QueryError> {
     for record in Profile::ALL.iter().filter_map(|profile| cell.shards.get(profile)) {
-        let bytes = reader.read_object(record.hash)?;
-        let layout = ShardLayout::check(&bytes)
-            .map_err(|source| QueryError::Shard { cell_id: cell.cell_id, source })?;
-        if layout.view(&bytes).has_input_indices() {
-            return Ok(Some((bytes, layout)));
+        let shard = reader.read_shard(record)?;
+        if shard.view().has_input_indices() {
+            return Ok(Some(shard));
         }
     }
     Ok(None)
@@ -117,7 +111,7 @@ pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Res
 }
 
 /// Returns Gaussians as a PLY of points; the answer of each is its rank.
-pub fn points_ply(hits: &[Hit], comments: &[String]) -> Vec<u8> {
+pub(crate) fn points_ply(hits: &[Hit], comments: &[String]) -> Vec<u8> {
     let properties = PointProperties { question: false, shard_index: false, input_index: true };
     let mut file = properties.header(hits.len() as u64, comments).into_bytes();
     file.reserve_exact(hits.len() * properties.point_bytes());

@@ -16,7 +16,7 @@ const MANY: usize = 1 << 16;
 
 /// The Gaussians of every tile of an image.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Tiles {
+pub(crate) struct Tiles {
     /// Rows of tiles, top to bottom. Each has one bucket per tile, left to right, with indices into the visible
     /// Gaussians, from near to far.
     pub rows: Vec<Buckets<u32>>,

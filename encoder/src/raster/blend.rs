@@ -14,10 +14,10 @@ use super::weights::WeightKind;
 const BATCH: usize = 32;
 
 /// Largest exponent that matters: `exp(-6)` is below 1/255, so no alpha beyond it counts.
-pub const MAX_POWER: f32 = 6.0;
+pub(crate) const MAX_POWER: f32 = 6.0;
 /// Polynomial for `exp(t - 3/4)` with `|t| <= 3/4`, interpolated at the Chebyshev nodes. Its fourth power has a
 /// relative error of at most 1.6e-7.
-pub const EXP_OF_MINUS_C: [f32; 8] = [
+pub(crate) const EXP_OF_MINUS_C: [f32; 8] = [
     0.472_366_54,
     0.472_366_55,
     0.236_183_8,
@@ -28,11 +28,11 @@ pub const EXP_OF_MINUS_C: [f32; 8] = [
     0.000_095_198_29,
 ];
 
-pub type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
+pub(crate) type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
 
 /// Position of a tile, and its pixels inside the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct TileRect {
+pub(crate) struct TileRect {
     /// Left edge, pixels.
     pub x_px: usize,
     /// Top edge, pixels.
@@ -58,7 +58,7 @@ impl TileRect {
 
 /// Consumes the weights of the Gaussians of a tile, from near to far. `member` is an index into the visible
 /// Gaussians.
-pub trait WeightSink {
+pub(crate) trait WeightSink {
     /// Consumes the weights at the pixels of vector `v` in row `y`; 0 at pixels without weight.
     fn add<S: Lanes>(&mut self, simd: S, member: u32, y: usize, v: usize, weights: S::f32s);
     fn end<S: Lanes>(&mut self, simd: S, member: u32);
@@ -67,7 +67,7 @@ pub trait WeightSink {
 /// Blends the Gaussians of a tile and returns the remaining transmittance at each pixel.
 ///
 /// With [`WeightKind::Falloff`] there is no occlusion, and the transmittance stays 1.
-pub fn walk_tile(
+pub(crate) fn walk_tile(
     instructions: InstructionSet,
     visible: &[ScreenGaussian],
     members: &[u32],

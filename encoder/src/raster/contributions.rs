@@ -25,7 +25,7 @@ const _: () = {
 
 /// Contribution of a Gaussian to a region within one tile.
 #[derive(Clone, Copy, Zeroable)]
-pub struct TileContribution {
+pub(crate) struct TileContribution {
     /// Index into the visible Gaussians.
     member: u32,
     region: u32,
@@ -37,7 +37,7 @@ pub struct TileContribution {
 const RANGE: usize = 1 << 13;
 
 /// Returns the contributions within each tile: for each row of tiles, one bucket per range of Gaussians.
-pub fn tile_contributions(
+pub(crate) fn tile_contributions(
     visible: &[ScreenGaussian],
     tiles: &Tiles,
     regions: &RegionMap,
@@ -71,7 +71,7 @@ pub fn tile_contributions(
 }
 
 /// Sums contributions over all tiles. Returns those above zero, ordered by (Gaussian, region).
-pub fn merge(visible: &[ScreenGaussian], rows: &[Buckets<TileContribution>]) -> Vec<RegionWeight> {
+pub(crate) fn merge(visible: &[ScreenGaussian], rows: &[Buckets<TileContribution>]) -> Vec<RegionWeight> {
     let parts: Vec<Vec<RegionWeight>> = visible
         .par_chunks(RANGE)
         .enumerate()

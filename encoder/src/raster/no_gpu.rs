@@ -4,11 +4,12 @@ use std::convert::Infallible;
 
 use slag_common::Gaussians;
 
-pub use super::adapter::{AdapterReport, GpuOptions, Precision};
+pub(crate) use super::adapter::AdapterReport;
+pub use super::adapter::{GpuOptions, Precision};
 use super::error::RasterError;
 use super::rasterizer::{LoadedScene, Rasterizer};
 
-pub struct Adapter {
+pub(crate) struct Adapter {
     /// Its description.
     pub report: AdapterReport,
     none: Infallible,

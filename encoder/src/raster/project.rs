@@ -19,22 +19,22 @@ use crate::memory::{MemoryPlan, Phase};
 /// loses no digits, whereas the terms of `a dx^2 + 2 b dx dy + c dy^2` cancel for needles. The size is 56 bytes,
 /// because tiles access Gaussians at random and a cache line has 64.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Zeroable)]
-pub struct ScreenGaussian {
+pub(crate) struct ScreenGaussian {
     /// Index in the scene.
     pub gaussian: u32,
     /// Camera z, world units.
     pub depth: f32,
     pub opacity: f32,
     /// Largest `u^2 + v^2` at which alpha may count.
-    pub reach2: f32,
+    pub(crate) reach2: f32,
     /// Centre on the screen, pixels.
     pub mean_px: DVec2,
     /// 1 / standard deviation along x at fixed y, 1/px.
-    pub inv_width: f64,
+    pub(crate) inv_width: f64,
     /// Shift of the centre of the ellipse per row, pixels of x per pixel of y.
     pub slope: f64,
     /// 1 / standard deviation along y, 1/px.
-    pub inv_height: f64,
+    pub(crate) inv_height: f64,
 }
 
 impl ScreenGaussian {
@@ -68,7 +68,7 @@ impl ScreenGaussian {
 
 /// The Gaussians of a scene that a view can see.
 #[derive(Clone, Debug, Default)]
-pub struct Projection {
+pub(crate) struct Projection {
     /// Gaussians with at least one pixel centre of the image in the bounding box of their footprint, in scene
     /// order.
     pub visible: Vec<ScreenGaussian>,
@@ -98,7 +98,7 @@ struct Size {
 
 impl<'s> Prepared<'s> {
     /// Reserves the sizes of a scene's Gaussians.
-    pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
+    pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
         memory.reserve(Phase::Views, "the size of each Gaussian", (n_gaussians * size_of::<Size>()) as u64);
     }
 
@@ -206,7 +206,7 @@ impl Bounds {
 }
 
 /// Returns the squared Mahalanobis distance within which the alpha of a Gaussian may reach 1/255.
-pub fn reach2(opacity: f32) -> f32 {
+pub(crate) fn reach2(opacity: f32) -> f32 {
     ((2.0 * (255.0 * f64::from(opacity)).ln()).max(0.0) + REACH2_MARGIN) as f32
 }
 

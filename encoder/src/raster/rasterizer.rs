@@ -11,7 +11,7 @@ use crate::masks::RegionMap;
 /// The GPUs that rasterise a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpuSlots {
-    pub n_gpus: usize,
+    pub(crate) n_gpus: usize,
     /// Views that each of them works on at once.
     pub views_in_flight: usize,
 }

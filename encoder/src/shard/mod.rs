@@ -73,19 +73,19 @@ pub struct CellEmbeddings {
 
 /// Returns the bytes that building the shards of a cell of `n_gaussians` takes: embeddings in f32, in f16 and in
 /// the shard, and the codebook.
-pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
+pub(crate) fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     let per_component = size_of::<f32>() + 2 * size_of::<f16>();
     (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
 }
 
 /// Returns the bytes that building the shards of a scene's largest cell takes.
-pub fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
+pub(crate) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
     let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max();
     largest.map_or(0, |n_gaussians| working_bytes(n_gaussians, dim))
 }
 
 /// Reserves the bytes of the largest cell.
-pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
+pub(crate) fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
 
@@ -275,29 +275,23 @@ fn built(profile: Profile, view: &ShardView<'_>, additions: Additions<'_>) -> Bu
 /// Largest distance between an embedding and its f16 form: half a step of f16 at 1, and of its denormals.
 const F16_ROUNDING: f32 = 5e-4;
 
-/// Returns the photos of each cell: a photo belongs to the cell whose Gaussians' means are nearest to its camera,
-/// the first of such cells, so a robot has the cameras of the area that it fetched and no photo twice.
+/// Returns the photos of each cell: a photo belongs to the cell that is nearest to its camera, so a robot has the
+/// cameras of the area that it fetched and no photo twice.
 pub fn photo_poses(split: &CellSplit, views: &[&View]) -> Vec<BuiltPhotoPoses> {
     let mut of_cells = vec![BuiltPhotoPoses::default(); split.cells.len()];
     for view in views {
-        let at = view.camera_from_world.inverse().translation;
-        let distances = split.cells.iter().map(|cell| cell.mean_bounds.distance_to(at));
-        let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
-        if let Some((cell, _)) = nearest {
+        if let Some(cell) = split.nearest(view.position_in_world()) {
             of_cells[cell].push(split.cells[cell].mean_bounds.min, view);
         }
     }
     of_cells
 }
 
-/// Returns the landmarks of each cell: a landmark belongs to the cell whose Gaussians' means are nearest to it, the
-/// first of such cells.
+/// Returns the landmarks of each cell, the one that is nearest to each.
 pub fn landmarks(split: &CellSplit, code_version: u32, all: &[Landmark]) -> Vec<BuiltLandmarks> {
     let mut of_cells = vec![Vec::new(); split.cells.len()];
     for landmark in all {
-        let of_cell = |cell: &Cell| cell.mean_bounds.distance_to(landmark.position_in_world);
-        let distances = split.cells.iter().map(of_cell).enumerate();
-        if let Some((cell, _)) = distances.min_by(|a, b| a.1.total_cmp(&b.1)) {
+        if let Some(cell) = split.nearest(landmark.position_in_world) {
             of_cells[cell].push(*landmark);
         }
     }

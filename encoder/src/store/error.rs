@@ -4,6 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use slag_common::Hash32;
+use slag_common::container::ContainerError;
 use slag_common::manifest::ManifestError;
 use slag_common::tuf::TufError;
 
@@ -39,6 +40,8 @@ pub enum StoreError {
     MissingObject { hash: Hash32, path: PathBuf, expected_bytes: u64, found_bytes: Option<u64> },
     #[error("{}: content has hash {found}, not that of its name: the file is damaged; remove it and encode again", path.display())]
     ObjectHash { path: PathBuf, found: Hash32 },
+    #[error("{}: {cause}; encode again: what is damaged is written anew", path.display())]
+    Shard { path: PathBuf, cause: ContainerError },
     #[error("{} has a root already; to change its keys, run `slag-encoder keys rotate` or `revoke`", store.display())]
     HasRoot { store: PathBuf },
     #[error("{} has no root yet; run `slag-encoder keys init`, or encode", store.display())]

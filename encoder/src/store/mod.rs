@@ -40,10 +40,10 @@ mod verify;
 mod writer;
 
 pub(crate) use catalogue::{CatalogueCopy, GenerationRecord};
-pub use error::StoreError;
+pub(crate) use error::StoreError;
 pub(crate) use export::{Exported, export};
 pub(crate) use models::ModelsRecord;
-pub(crate) use reader::Stamp;
-pub use reader::{Extras, Published, StoreReader};
+pub use reader::{Extras, StoreReader};
+pub(crate) use reader::{Published, Stamp, StoredShard};
 pub(crate) use verify::{Fault, Verified};
-pub use writer::{Pruned, Store};
+pub use writer::Store;

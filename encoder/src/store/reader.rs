@@ -7,7 +7,9 @@ use std::time::SystemTime;
 
 use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
-use slag_common::manifest::{Manifest, TextModelRecord};
+use slag_common::manifest::{Manifest, ShardRecord, TextModelRecord};
+use slag_common::objects::Objects;
+use slag_common::shard::{ShardLayout, ShardView};
 
 use super::error::StoreError;
 use super::files;
@@ -160,6 +162,28 @@ impl StoreReader {
             found if found == hash => Ok(bytes),
             found => Err(StoreError::ObjectHash { path, found }),
         }
+    }
+
+    pub fn read_shard(&self, record: &ShardRecord) -> Result<StoredShard, StoreError> {
+        let bytes = self.read_object(record.hash)?;
+        let damaged = |cause| StoreError::Shard { path: self.object_path(record.hash), cause };
+        Ok(StoredShard { layout: ShardLayout::check(&bytes).map_err(damaged)?, bytes })
+    }
+}
+
+/// A shard as it was read.
+pub struct StoredShard {
+    pub bytes: AlignedBytes,
+    pub layout: ShardLayout,
+}
+
+impl StoredShard {
+    pub fn view(&self) -> ShardView<'_> {
+        self.layout.view(&self.bytes)
+    }
+
+    pub fn objects(&self) -> Option<Objects<'_>> {
+        self.layout.objects(&self.bytes)
     }
 }
 

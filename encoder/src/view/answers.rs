@@ -8,7 +8,8 @@ use slag_common::manifest::{Calibration, Manifest};
 use slag_common::objects::{ObjectRecord, public_id};
 use slag_models::names::{Confidence, Naming, Spread};
 
-use super::shards::{Shard, combined};
+use super::shards::combined;
+use crate::store::StoredShard;
 
 /// Spreads above the mean from which a score is an answer, as on robots.
 const SPREADS_ABOVE_MEAN: f32 = 3.0;
@@ -19,15 +20,15 @@ const RELEVANCY_THRESHOLD: f32 = 0.5;
 #[derive(Default)]
 pub(super) struct Things {
     /// Shards, and which of their objects are scored there.
-    shards: Vec<(Shard, Vec<usize>)>,
+    shards: Vec<(StoredShard, Vec<usize>)>,
     calibration: Option<Calibration>,
     ids: BTreeSet<u64>,
 }
 
 impl Things {
     /// Adds the objects of the next cell's smallest shard.
-    pub(super) fn add(&mut self, shard: Shard) {
-        let Some(objects) = shard.layout.objects(&shard.bytes) else { return };
+    pub(super) fn add(&mut self, shard: StoredShard) {
+        let Some(objects) = shard.objects() else { return };
         let (score_mean, score_spread) = (objects.header.score_mean, objects.header.score_spread);
         self.calibration.get_or_insert(Calibration { score_mean, score_spread });
         let is_first = |at: &usize| self.ids.insert(objects.records[*at].id);
@@ -55,8 +56,8 @@ impl Things {
     ) -> Vec<(&'a str, f32)> {
         let mut of_things: Vec<Vec<f32>> = Vec::new();
         for (shard, here) in &self.shards {
-            let Some(objects) = shard.layout.objects(&shard.bytes) else { continue };
-            let view = shard.layout.view(&shard.bytes);
+            let Some(objects) = shard.objects() else { continue };
+            let view = shard.view();
             let of_words: Vec<Vec<f32>> =
                 words.iter().map(|(_, vector)| view.object_scores(&objects, vector)).collect();
             of_things.extend(here.iter().map(|at| of_words.iter().map(|scores| scores[*at]).collect()));
@@ -83,8 +84,8 @@ impl Things {
         let threshold = self.threshold(manifest, vectors.len() > 1);
         let mut found: Vec<(f32, ObjectRecord, String)> = Vec::new();
         for (shard, here) in &self.shards {
-            let Some(objects) = shard.layout.objects(&shard.bytes) else { continue };
-            let view = shard.layout.view(&shard.bytes);
+            let Some(objects) = shard.objects() else { continue };
+            let view = shard.view();
             let scores =
                 combined(vectors.iter().map(|vector| view.object_scores(&objects, vector)).collect());
             let matching = here.iter().filter(|at| scores[**at] >= threshold);

@@ -1,7 +1,6 @@
 //! Why the page gets no answer.
 
 use axum::http::StatusCode;
-use slag_common::container::ContainerError;
 use slag_models::InferenceError;
 use slag_service::problem::Problem;
 
@@ -17,8 +16,6 @@ pub(crate) enum ViewError {
     Store(#[from] StoreError),
     #[error(transparent)]
     Field(#[from] ReadFieldError),
-    #[error("cell {cell_id}: {source}; encode again: what is damaged is written anew")]
-    Shard { cell_id: u32, source: ContainerError },
     #[error(
         "the splat has {found} Gaussians, but the store was encoded from one with {expected}; give that one with --scene"
     )]

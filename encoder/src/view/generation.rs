@@ -7,7 +7,7 @@ use slag_view::{Cell, CellState, Description, Photo, ScoresMessage, Step, cell_m
 
 use super::answers::Things;
 use super::error::ViewError;
-use super::shards::{Shard, combined, smallest_shard};
+use super::shards::{combined, photos_of, scores_of, smallest_shard};
 use super::splat::{PROGRAM, Splat};
 use crate::lift::published::{read_field, read_regions};
 use crate::lift::{CellField, RegionTable};
@@ -35,7 +35,7 @@ impl Generation {
         let (mut things, mut photos) = (Things::default(), Vec::new());
         for cell in &reader.manifest().cells {
             let Some(shard) = smallest_shard(&reader, cell)? else { continue };
-            photos.extend(shard.photos());
+            photos.extend(photos_of(&shard));
             things.add(shard);
         }
         let Some(splat) = splat else { return Ok(Self { reader, things, photos, scored: Scored::Shards }) };
@@ -97,11 +97,12 @@ impl Generation {
             (Scored::Fields(_, fields), Some(splat)) => Ok(splat.message(&fields[at].input_indices, step)),
             _ => {
                 let shard = smallest_shard(&self.reader, &manifest.cells[at])?;
-                let Shard { bytes, layout } = shard.ok_or(ViewError::NoCell { cell_id })?;
-                let view = layout.view(&bytes);
+                let shard = shard.ok_or(ViewError::NoCell { cell_id })?;
+                let view = shard.view();
                 let n_gaussians = view.header.n_gaussians as usize;
                 let positions = step.indices(n_gaussians).map(|at| view.position_in_world(at));
-                Ok(cell_message(&positions.collect::<Vec<DVec3>>(), layout.appearance(&bytes), step))
+                let appearance = shard.layout.appearance(&shard.bytes);
+                Ok(cell_message(&positions.collect::<Vec<DVec3>>(), appearance, step))
             }
         }
     }
@@ -122,7 +123,7 @@ impl Generation {
                 let scores = |cell: &CellRecord| {
                     let shard = smallest_shard(&self.reader, cell)?;
                     let n_gaussians = cell.n_gaussians as usize;
-                    Ok(shard.map_or_else(|| vec![f32::NAN; n_gaussians], |shard| shard.scores(vectors)))
+                    Ok(shard.map_or_else(|| vec![f32::NAN; n_gaussians], |shard| scores_of(&shard, vectors)))
                 };
                 manifest.cells.par_iter().map(scores).collect::<Result<_, ViewError>>()?
             }

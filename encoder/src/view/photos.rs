@@ -34,7 +34,6 @@ pub(crate) fn up_of(views: &[View]) -> Option<Vec3> {
 #[cfg(test)]
 mod tests {
     use glam::{DAffine3, DMat3};
-    use slag_common::{Distortion, Intrinsics};
 
     use super::*;
 
@@ -47,15 +46,7 @@ mod tests {
         View {
             name: "a.jpg".into(),
             image_path: "none".into(),
-            intrinsics: Intrinsics {
-                width_px: 64,
-                height_px: 48,
-                focal_x_px: 60.0,
-                focal_y_px: 60.0,
-                centre_x_px: 32.0,
-                centre_y_px: 24.0,
-                distortion: Distortion::None,
-            },
+            intrinsics: crate::raster::pinhole([64, 48], 60.0),
             camera_from_world: world_from_camera.inverse(),
         }
     }

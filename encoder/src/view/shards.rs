@@ -1,37 +1,27 @@
 //! The smallest shard of a cell, and scores of questions with negatives.
 
 use glam::DVec3;
-use slag_common::container::AlignedBytes;
 use slag_common::manifest::CellRecord;
-use slag_common::shard::ShardLayout;
 use slag_math::relevancy::relevancy;
 use slag_view::Photo;
 
-use super::error::ViewError;
-use crate::store::StoreReader;
+use crate::store::{StoreError, StoreReader, StoredShard};
 
-pub(super) struct Shard {
-    pub(super) bytes: AlignedBytes,
-    pub(super) layout: ShardLayout,
+pub(super) fn photos_of(shard: &StoredShard) -> Vec<Photo> {
+    let origin = DVec3::from(shard.layout.header.origin_in_world);
+    let photos = shard.layout.photo_poses(&shard.bytes);
+    photos.into_iter().flat_map(|photos| Photo::of_shard(origin, photos)).collect()
 }
 
-impl Shard {
-    pub(super) fn photos(&self) -> Vec<Photo> {
-        let origin = DVec3::from(self.layout.header.origin_in_world);
-        let photos = self.layout.photo_poses(&self.bytes);
-        photos.into_iter().flat_map(|photos| Photo::of_shard(origin, photos)).collect()
+/// Returns the score of each Gaussian's centroid; NaN without one.
+pub(super) fn scores_of(shard: &StoredShard, vectors: &[Vec<f32>]) -> Vec<f32> {
+    let view = shard.view();
+    let of_centroids = combined(vectors.iter().map(|vector| view.centroid_scores(vector)).collect());
+    let mut scores = vec![f32::NAN; view.header.n_gaussians as usize];
+    for (centroid, score) in of_centroids.iter().enumerate() {
+        scores[view.members(centroid)].fill(*score);
     }
-
-    /// Returns the score of each Gaussian's centroid; NaN without one.
-    pub(super) fn scores(&self, vectors: &[Vec<f32>]) -> Vec<f32> {
-        let view = self.layout.view(&self.bytes);
-        let of_centroids = combined(vectors.iter().map(|vector| view.centroid_scores(vector)).collect());
-        let mut scores = vec![f32::NAN; view.header.n_gaussians as usize];
-        for (centroid, score) in of_centroids.iter().enumerate() {
-            scores[view.members(centroid)].fill(*score);
-        }
-        scores
-    }
+    scores
 }
 
 /// Combines the scores of a question with those of its negatives: the relevancy (LERF, Kerr et al. 2023, section
@@ -47,10 +37,9 @@ pub(super) fn combined(mut of_vectors: Vec<Vec<f32>>) -> Vec<f32> {
     own
 }
 
-pub(super) fn smallest_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<Shard>, ViewError> {
-    let Some(record) = cell.shards.values().next() else { return Ok(None) };
-    let bytes = reader.read_object(record.hash)?;
-    let layout =
-        ShardLayout::check(&bytes).map_err(|source| ViewError::Shard { cell_id: cell.cell_id, source })?;
-    Ok(Some(Shard { bytes, layout }))
+pub(super) fn smallest_shard(
+    reader: &StoreReader,
+    cell: &CellRecord,
+) -> Result<Option<StoredShard>, StoreError> {
+    cell.shards.values().next().map(|record| reader.read_shard(record)).transpose()
 }

@@ -39,7 +39,7 @@ pub struct DrawnView {
 }
 
 /// Returns the views of a plan; their names are in the plan's order.
-pub fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
+pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
     let [width_px, height_px] = SIZE_PX;
     let intrinsics = pinhole(width_px, height_px);
     let view = |(number, viewpoint): (usize, &Viewpoint)| DrawnView {

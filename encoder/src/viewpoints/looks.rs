@@ -1,12 +1,12 @@
 //! A small drawing of a candidate: can it be trusted, and which Gaussians does it show?
 
 use glam::{DAffine3, DMat3, DVec3};
-use slag_common::{Distortion, Intrinsics};
+use slag_common::Intrinsics;
 
 use super::plan::{SceneKind, Verdict};
 use super::space::{Space, WIDTH};
 use crate::masks::RegionMap;
-use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
+use crate::raster::{self, LoadedScene, RasterError, RasterView, WeightKind};
 
 /// Size of the drawings, pixels.
 const SIZE_PX: [u32; 2] = [40, 30];
@@ -50,16 +50,7 @@ pub(super) fn look_at(eye: DVec3, target: DVec3) -> DAffine3 {
 
 /// Returns an ideal camera with the planner's field of view.
 pub(super) fn pinhole(width_px: u32, height_px: u32) -> Intrinsics {
-    let focal_px = 0.5 * f64::from(width_px) / HALF_WIDTH;
-    Intrinsics {
-        width_px,
-        height_px,
-        focal_x_px: focal_px,
-        focal_y_px: focal_px,
-        centre_x_px: 0.5 * f64::from(width_px),
-        centre_y_px: 0.5 * f64::from(height_px),
-        distortion: Distortion::None,
-    }
+    raster::pinhole([width_px, height_px], 0.5 * f64::from(width_px) / HALF_WIDTH)
 }
 
 /// Draws the weight of each Gaussian at each pixel, and judges it.

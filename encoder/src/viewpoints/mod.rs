@@ -29,8 +29,10 @@ use crate::raster::{RasterError, Rasterizer};
 use looks::Look;
 use space::Space;
 
-pub use draw::{DrawError, DrawnView, POSES_FILE, draw, views_of};
-pub use plan::{Fault, SceneKind, Verdict, Viewpoint, ViewpointError, ViewpointPlan, ViewpointSettings};
+pub(crate) use draw::{DrawError, DrawnView, views_of};
+pub use draw::{POSES_FILE, draw};
+pub(crate) use plan::{Fault, Viewpoint};
+pub use plan::{SceneKind, Verdict, ViewpointError, ViewpointPlan, ViewpointSettings};
 
 /// Views where nothing else is asked for: more find no more (twice as many gain 1 % of average precision).
 pub const DEFAULT_N_VIEWS: usize = 48;

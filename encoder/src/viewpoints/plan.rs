@@ -49,8 +49,8 @@ pub struct ViewpointPlan {
     /// Unit, world.
     pub up_in_world: DVec3,
     pub views: Vec<Viewpoint>,
-    pub n_candidates: usize,
-    pub n_good: usize,
+    pub(crate) n_candidates: usize,
+    pub(crate) n_good: usize,
     /// Share of the Gaussians that any candidate shows which the views show, 0 to 1.
     pub seen: f64,
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{DAffine3, DQuat, DVec3};
-use slag_common::{Distortion, Gaussians, Intrinsics, View};
+use slag_common::{Gaussians, Intrinsics, View};
 use slag_encoder::check::{
     CheckError, CheckOptions, CheckReport, CheckView, FrameCause, Mistake, check, suspicions,
 };
@@ -12,6 +12,7 @@ use slag_encoder::ingest::IngestError;
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::{
     CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, WeightKind,
+    pinhole,
 };
 
 use super::fixtures::{needs_shared, shared};
@@ -40,15 +41,7 @@ fn read_scene(path: &Path) -> Gaussians {
 
 /// Reads every `step`-th view of the model, by name.
 fn read_views(root: &Path, step: usize) -> Vec<CheckView> {
-    let intrinsics = Intrinsics {
-        width_px: 1574,
-        height_px: 884,
-        focal_x_px: 924.0,
-        focal_y_px: 924.0,
-        centre_x_px: 787.0,
-        centre_y_px: 442.0,
-        distortion: Distortion::None,
-    };
+    let intrinsics = pinhole([1574, 884], 924.0);
     let text = fs_err::read_to_string(root.join("sparse/0/images.txt")).unwrap();
     let mut lines: Vec<Vec<&str>> =
         text.lines().filter(|line| line.ends_with(".jpg")).map(|line| line.split(' ').collect()).collect();
@@ -217,20 +210,11 @@ fn contradictions_are_errors() {
 }
 
 fn tiny_view() -> CheckView {
-    let intrinsics = Intrinsics {
-        width_px: 4,
-        height_px: 4,
-        focal_x_px: 4.0,
-        focal_y_px: 4.0,
-        centre_x_px: 2.0,
-        centre_y_px: 2.0,
-        distortion: Distortion::None,
-    };
     CheckView {
         name: "a".to_owned(),
         image: image::RgbImage::new(4, 4),
         valid: None,
-        view: RasterView { camera_from_world: DAffine3::IDENTITY, intrinsics },
+        view: RasterView { camera_from_world: DAffine3::IDENTITY, intrinsics: pinhole([4, 4], 4.0) },
     }
 }
 

@@ -9,9 +9,6 @@ use super::*;
 use crate::fetch::follow::{FollowEnvironment, FollowSettings, follow};
 use crate::fetch::{FetchError, FetchRequest};
 
-const HALF_A_BODY: &str = "POST /position HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: application/json\r\n\
-                           content-length: 20\r\n\r\n{\"x\":1,";
-
 /// Sends a request with headers to a service that follows a robot; returns the status and the problem's type.
 async fn ask(app: &Arc<App>, method: &str, uri: &str, headers: &[(&str, &str)]) -> (u16, Value) {
     let mut request = Request::builder().method(method).uri(uri).header("host", "127.0.0.1:7734");
@@ -34,25 +31,6 @@ fn following_app(service: &Service, access: Access) -> (Arc<App>, Arc<Following>
     engine.reload().expect("a scene");
     let settings = Settings { access, ..Settings::default() };
     (App::following(engine, settings, Some(Arc::clone(&following))), following)
-}
-
-/// 513 sockets send half a body: one more than the service has connections.
-#[tokio::test]
-async fn half_bodies_do_not_stop_health_checks() {
-    let service = Service::with_chair();
-    let (address, stop, end) = serve_for_real(&service).await;
-    let mut half = Vec::new();
-    for _ in 0..513 {
-        half.push(talk(address, HALF_A_BODY).await);
-    }
-    for path in ["/healthz", "/readyz", "/metrics"] {
-        let request = format!("GET {path} HTTP/1.1\r\nhost: 127.0.0.1\r\nconnection: close\r\n\r\n");
-        let answer = rest(talk(address, &request).await).await;
-        assert!(answer.starts_with("HTTP/1.1 200"), "{path}: {answer}");
-    }
-    drop(half);
-    stop.send(()).expect("the server lives");
-    soon(end).await.expect("no panic").expect("a clean end");
 }
 
 /// A web page posts to the robot, or reads it by a name that it lets resolve to the robot.

@@ -21,8 +21,12 @@ async fn post(service: &Service, query: &str, kind: &str, photo: Vec<u8>) -> (St
 }
 
 fn png(width: u32, height: u32) -> Vec<u8> {
+    encoded(&image::RgbImage::new(width, height))
+}
+
+fn encoded(photo: &image::RgbImage) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
-    image::RgbImage::new(width, height).write_to(&mut bytes, image::ImageFormat::Png).expect("memory");
+    photo.write_to(&mut bytes, image::ImageFormat::Png).expect("memory");
     bytes.into_inner()
 }
 
@@ -51,6 +55,18 @@ async fn photos_are_lost_or_refused() {
     assert_eq!(refused.0, StatusCode::UNSUPPORTED_MEDIA_TYPE);
     let refused = post(&service, "focal_px=500", "image/png", vec![0; (32 << 20) + 1]).await;
     assert_eq!(refused.0, StatusCode::PAYLOAD_TOO_LARGE);
+}
+
+/// Noise does not compress: a file as long as a camera's, 3 MB.
+#[tokio::test]
+async fn long_photos_are_taken() {
+    let mut random = slag_math::random::Random::new(3);
+    let noise = encoded(&image::RgbImage::from_fn(1000, 1000, |_, _| {
+        image::Rgb([(); 3].map(|()| random.bits() as u8))
+    }));
+    assert!(noise.len() > 2_900_000, "{}", noise.len());
+    let (status, body) = post(&Service::with_chair(), "focal_px=500", "image/png", noise).await;
+    assert_eq!((status, &body["state"]), (StatusCode::OK, &json!("lost")), "{body:#}");
 }
 
 /// A picture of one colour is short as a file: what it takes is refused before it is read.

@@ -119,6 +119,7 @@ async fn every_route_and_parameter_is_described() {
     let help = service.get("/").await.2;
     let help = help.as_str().expect("text");
     assert!(known.iter().all(|name| help.contains(&format!("    {name}="))), "{help}");
+    assert!(help.contains(" Default: 10.\n"), "{help}");
     let listed = |route: &Route| help.contains(&format!("\n{} {} ", route.method, route.path));
     assert!(table.iter().all(listed), "{help}");
 }

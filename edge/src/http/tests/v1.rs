@@ -5,7 +5,7 @@ use slag_common::manifest::Calibration;
 use slag_common::occupancy::BuiltOccupancy;
 
 use super::*;
-use crate::query::MapStatus;
+use crate::query::map_status;
 use crate::testing::TestObject;
 
 /// Gaussians on a lattice between two corners, in steps of 0.01.
@@ -205,6 +205,7 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({"vectors": [[1.0, 0.0]]}), "vectors"),
         (json!({"vectors": [[0.0, 0.0, 0.0]]}), "vectors"),
         (json!({"vectors": [[1e39, 0.0, 0.0]]}), "body"),
+        (json!({"texts": ["0"], "negatives": vec!["1"; 17]}), "negatives"),
         (json!({"texts": ["0"], "limit": 0}), "limit"),
         (json!({"texts": ["0", "1"], "limit": 5001}), "limit"),
         (json!({"texts": ["0"], "offset": 1u64 << 40}), "limit"),
@@ -349,7 +350,7 @@ async fn things_on_board_are_listed_in_pages() {
     // Before a generation's time, as where the robot's clock is behind, it has no age.
     let snapshot = service.app.engine.snapshot().expect("loaded");
     let made = snapshot.manifest.created_unix_secs;
-    let at = |now| MapStatus::of(&snapshot, now, Some(made + 30));
+    let at = |now| map_status(&snapshot, now, Some(made + 30));
     assert_eq!(
         [made - 60, made + 60].map(|now| (at(now).age_secs, at(now).is_expired)),
         [(0, false), (60, true)]

@@ -7,13 +7,14 @@ use axum::extract::State;
 use axum::http::StatusCode;
 use schemars::JsonSchema;
 use serde::Deserialize;
+use slag_api::changes::ChangesReply;
 use slag_service::params::Params;
 use slag_service::problem::Problem;
 
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, XyzText};
 use crate::http::problem::query_problem;
-use crate::query::{ChangesError, ChangesReply, ChangesRequest, MAX_TEXTS, RequestError, Words};
+use crate::query::{ChangesError, ChangesRequest, MAX_TEXTS, RequestError, Words};
 use crate::score::MAX_COORDINATE;
 
 /// Which changes are asked for.

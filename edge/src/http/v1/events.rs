@@ -19,7 +19,7 @@ use tokio::sync::mpsc::{Receiver, channel};
 use crate::fetch::follow::FollowStatus;
 use crate::http::app::App;
 use crate::http::problem::too_many_listeners;
-use crate::query::FRAME;
+use slag_api::FRAME;
 
 const MEDIA_TYPE: &str = "text/event-stream";
 /// Time between looks at what is on board.

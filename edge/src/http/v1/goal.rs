@@ -5,20 +5,22 @@ use std::sync::Arc;
 use axum::Json;
 use axum::extract::State;
 use axum::http::StatusCode;
-use glam::DVec3;
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
+use slag_api::FRAME;
+use slag_api::floor::{Floor, runs_of};
+use slag_api::goal::GoalReply;
 use slag_service::params::Params;
 use slag_service::problem::Problem;
 
 use crate::goal::request::{
     HEIGHT_M, MAX_POSES, MIN_VISIBLE, RADIUS_M, RANGE_M, REACH_M, SENSOR_HEIGHT_M, SLOPE, STEP_M,
 };
-use crate::goal::{self, FloorMap, GoalError, GoalReply, GoalRequest, GoalTarget, Place};
+use crate::goal::{self, GoalError, GoalRequest, GoalTarget};
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, ObjectIdText, XyzText};
 use crate::http::problem::query_problem;
-use crate::query::{FRAME, Point, RequestError, Words};
+use crate::query::{Point, RequestError, Words};
 use crate::score::Budget;
 
 /// The thing to go to, and how near.
@@ -121,7 +123,15 @@ pub async fn floor(
     let (request, near) = robot.request()?;
     answer(&app, near, request, |app, request, budget| {
         let generation = app.engine.snapshot()?.manifest.generation;
-        Ok(Floor::new(generation, &goal::floor_map(&app.engine, request, budget)?))
+        let map = goal::floor_map(&app.engine, request, budget)?;
+        Ok(Floor {
+            generation,
+            frame: FRAME.into(),
+            cell_m: map.cell_m,
+            origin_in_world: map.origin_in_world,
+            size: map.size,
+            runs: runs_of(&map.places),
+        })
     })
     .await
 }
@@ -149,45 +159,5 @@ fn problem(error: GoalError) -> Problem {
     match error {
         GoalError::Query(error) => query_problem(error),
         error => Problem::new(StatusCode::CONFLICT, kind, "No places known", error.to_string()),
-    }
-}
-
-/// The ground around the robot, in square cells.
-#[derive(Serialize, JsonSchema)]
-pub struct Floor {
-    /// Generation that answers.
-    generation: u64,
-    /// Frame of every position: the scene's world frame.
-    #[schemars(extend("enum" = [FRAME]))]
-    frame: &'static str,
-    /// Edge of a cell.
-    cell_m: f64,
-    /// Corner of the first cell.
-    #[schemars(with = "[f64; 3]")]
-    origin_in_world: DVec3,
-    /// Cells along x and y.
-    size: [usize; 2],
-    /// A letter and a count for each run of equal cells, x first: u unknown, o obstacle, g ground, r ground that
-    /// the robot reaches.
-    runs: String,
-}
-
-impl Floor {
-    fn new(generation: u64, map: &FloorMap) -> Self {
-        let code = |place: &Place| match place {
-            Place::Unknown => 'u',
-            Place::Obstacle => 'o',
-            Place::Ground => 'g',
-            Place::Reached => 'r',
-        };
-        let runs = map.places.chunk_by(|a, b| a == b).map(|run| format!("{}{}", code(&run[0]), run.len()));
-        Self {
-            generation,
-            frame: FRAME,
-            cell_m: map.cell_m,
-            origin_in_world: map.origin_in_world,
-            size: map.size,
-            runs: runs.collect(),
-        }
     }
 }

@@ -7,6 +7,7 @@ use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
 use schemars::{JsonSchema, SchemaGenerator};
 use serde::Deserialize;
+use slag_api::objects::{ObjectOnBoard, ObjectPage};
 use slag_common::manifest::Manifest;
 use slag_service::params::Params;
 use slag_service::problem::Problem;
@@ -15,10 +16,7 @@ use slag_service::replies::{As, Binary, Described, Reply};
 use crate::http::app::App;
 use crate::http::forms::{self, BoxText, LatLonPolygonText, LatLonText, ObjectIdText, PolygonText, XyzText};
 use crate::http::problem::query_problem;
-use crate::query::{
-    Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOnBoard, ObjectOrder, ObjectPage, RequestError,
-    object_id,
-};
+use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError, object_id};
 use crate::score::MAX_COORDINATE;
 
 /// Objects in a page unless the request says otherwise.

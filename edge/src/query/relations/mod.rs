@@ -8,7 +8,7 @@ mod phrase;
 mod rank;
 
 pub use candidates::{Found, Things, metre};
-pub use geometry::{HOLDS, Scale, Viewer};
+pub use geometry::{HOLDS, Viewer};
 pub use grammar::{asked_thing, understand};
 pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation};
 pub use rank::{Miss, Related, Witness, relate};

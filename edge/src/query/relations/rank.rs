@@ -5,7 +5,7 @@ use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::candidates::{Candidate, Things};
-use super::geometry::{self, HOLDS, Scale, Solid, Viewer};
+use super::geometry::{self, HOLDS, Solid, Viewer};
 use super::phrase::{By, Phrase, Pick, Place};
 use crate::query::answers::ReasonKind;
 
@@ -74,7 +74,7 @@ struct Anchor {
 struct Measure<'a, 'b> {
     things: &'a Things<'b>,
     viewer: Option<&'a Viewer>,
-    scale: Scale,
+    metre: f64,
 }
 
 /// Returns the things that a phrase means, best first; only those in the region asked for.
@@ -82,7 +82,7 @@ pub fn relate(
     things: &Things<'_>,
     phrase: &Phrase,
     viewer: Option<&Viewer>,
-    scale: Scale,
+    metre: f64,
 ) -> Result<Vec<Related>, Miss> {
     let of = things.of(&phrase.thing);
     let missing = || {
@@ -92,7 +92,7 @@ pub fn relate(
     if !of.is_empty() && !of.iter().any(|candidate| candidate.is_inside) {
         return Err(missing());
     }
-    Measure { things, viewer, scale }.matches(phrase, |candidate| candidate.is_inside)
+    Measure { things, viewer, metre }.matches(phrase, |candidate| candidate.is_inside)
 }
 
 impl<'b> Measure<'_, 'b> {
@@ -147,7 +147,7 @@ impl<'b> Measure<'_, 'b> {
                 match &others {
                     None => {
                         let degree =
-                            geometry::degree(place.is, &thing.solid, &one.solid, self.viewer, self.scale);
+                            geometry::degree(place.is, &thing.solid, &one.solid, self.viewer, self.metre);
                         consider(degree, one.score, &[one]);
                     }
                     Some((_, others)) => {

@@ -1,3 +1,5 @@
+use slag_api::objects::Evidence;
+
 use super::*;
 use crate::testing::TestObject;
 

@@ -7,6 +7,5 @@ mod plot;
 pub(crate) mod query;
 pub(crate) mod raster;
 pub(crate) mod robot;
-mod scene;
 pub(crate) mod tradeoff;
 mod truth;

@@ -1,47 +1,45 @@
 //! `bench raster`: the time of each backend of the rasteriser for the weights of a view.
+//!
+//! For a scene of any size, `generate copies` makes one.
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::Serialize;
+use slag_common::splat::{self, ReadOptions};
+use slag_common::{Gaussians, View, poses};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::devices::{DeviceChoice, Devices};
 use slag_encoder::raster::gpu::GpuOptions;
-use slag_encoder::raster::{LoadedScene, RasterError, Rasterizer, ViewWeights, WeightKind};
+use slag_encoder::raster::{RasterError, RasterView, Rasterizer, ViewWeights, WeightKind};
 
-use super::scene::{BenchScene, cell_regions, grid_regions};
 use crate::harness::{Machine, Times, timed_ms};
 use crate::table::Table;
 
+/// Most views that are drawn in turn.
+const N_VIEWS: usize = 4;
+/// Columns and rows of regions: about as many as a photo's masks make.
+const GRID: [u32; 2] = [8, 6];
+
 #[derive(Debug, Args)]
 pub(crate) struct RasterArgs {
-    /// A splat of yours, with --views [default: generated scenes].
-    #[arg(long, value_name = "FILE", requires = "views")]
-    scene: Option<PathBuf>,
+    /// A splat.
+    #[arg(long, value_name = "FILE")]
+    scene: PathBuf,
     /// Its poses: the folder of a COLMAP model or transforms.json.
-    #[arg(long, value_name = "PATH", requires = "scene")]
-    views: Option<PathBuf>,
-    /// Gaussians of the generated scenes [default: 100000,1000000,2000000,8000000; none with --scene].
-    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
-    gaussians: Vec<u32>,
-    /// Regions of a view; a scene of yours is also measured with a grid of 8 x 6.
-    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "8,64,512,4096",
-        value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
-    regions: Vec<u32>,
+    #[arg(long, value_name = "PATH")]
+    views: PathBuf,
     /// Devices to compare: cpu, gpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", value_delimiter = ',', default_value = "cpu")]
     device: Vec<DeviceChoice>,
     /// Width of views, pixels.
     #[arg(long, value_name = "PX", default_value_t = 648, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     width: u32,
-    /// Height of generated views, pixels.
-    #[arg(long, value_name = "PX", default_value_t = 484, value_parser = clap::value_parser!(u32).range(1..=16_384))]
-    height: u32,
-    /// Timed views per case.
+    /// Timed views per device.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
     repeats: u32,
     /// Threads [default: all cores].
@@ -49,63 +47,24 @@ pub(crate) struct RasterArgs {
     threads: Option<u32>,
 }
 
-/// A backend and its name in the report.
-struct Device {
+/// A splat, and views of one image size; at least one.
+struct BenchScene {
     name: String,
-    rasterizer: Box<dyn Rasterizer>,
+    gaussians: Gaussians,
+    views: Vec<RasterView>,
 }
 
-/// Opens the devices, measures all of them on each scene, and reports.
-pub(crate) fn run(args: &RasterArgs, progress: &dyn Progress) -> Result<RasterReport> {
-    let threads = args.threads.map_or(0, |n| n as usize);
-    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("cannot start threads")?;
-    let mut devices = Vec::new();
-    for choice in &args.device {
-        let opened = Devices::open(choice, GpuOptions::default())?;
-        devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
-    }
-    let sizes = match (&args.scene, args.gaussians.is_empty()) {
-        (None, true) => vec![100_000, 1_000_000, 2_000_000, 8_000_000],
-        _ => args.gaussians.clone(),
-    };
-    let n_cases = sizes.len() * args.regions.len() + args.scene.iter().count() * (args.regions.len() + 1);
-    progress.begin("bench", "case", n_cases as u64, 0);
-    let bench = RasterBench { n_repeats: args.repeats as usize };
-    let mut report = RasterReport { machine: Machine::here(), cases: Vec::new() };
-    let mut measure = |scene: &BenchScene, with_grid: bool| -> Result<()> {
-        let camera = scene.views[0].intrinsics;
-        let (width_px, height_px) = (camera.width_px, camera.height_px);
-        let grid = with_grid.then(|| grid_regions(width_px, height_px, 8, 6));
-        let cells = args.regions.iter().map(|&n| cell_regions(width_px, height_px, n));
-        let maps: Vec<_> = grid.into_iter().chain(cells).collect();
-        report.cases.extend(bench.run(scene, &maps, &devices, progress)?);
-        Ok(())
-    };
-    if let (Some(scene), Some(views)) = (&args.scene, &args.views) {
-        measure(&BenchScene::read(scene, views, args.width)?, true)?;
-    }
-    for n in sizes {
-        measure(&BenchScene::generated(n as usize, args.width, args.height), false)?;
-    }
-    progress.end();
-    Ok(report)
-}
-
-/// Settings of the benchmark.
-#[derive(Clone, Copy, Debug)]
-struct RasterBench {
-    /// Timed views per case and device; at least 1.
-    n_repeats: usize,
-}
+/// A backend and its name in the report.
+type Device = (String, Box<dyn Rasterizer>);
 
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct RasterReport {
     machine: Machine,
-    /// One per scene, region map and device.
+    /// One per device.
     cases: Vec<RasterCase>,
 }
 
-/// Figures of one scene with one region map on one device; counts are means over the views.
+/// Figures of one device; counts are means over the views.
 #[derive(Clone, Debug, Serialize)]
 struct RasterCase {
     scene: String,
@@ -126,74 +85,97 @@ struct RasterCase {
     relative_l1: f64,
 }
 
-impl RasterBench {
-    /// Measures all devices on a scene, for each region map. Devices take turns view by view, so that other load
-    /// on the machine affects all of them alike.
-    fn run(
-        &self,
-        scene: &BenchScene,
-        region_maps: &[RegionMap],
-        devices: &[Device],
-        progress: &dyn Progress,
-    ) -> Result<Vec<RasterCase>, RasterError> {
-        let mut loaded = Vec::with_capacity(devices.len());
-        for device in devices {
-            let (ready, load_ms) = timed_ms(|| device.rasterizer.load(&scene.gaussians));
-            loaded.push((device.name.as_str(), load_ms, ready?));
-        }
-        let mut cases = Vec::new();
-        for regions in region_maps {
-            cases.extend(self.measure(scene, regions, &loaded)?);
-            progress.advance(1);
-        }
-        Ok(cases)
+/// Opens the devices, measures all of them, and reports.
+pub(crate) fn run(args: &RasterArgs, progress: &dyn Progress) -> Result<RasterReport> {
+    let threads = args.threads.map_or(0, |n| n as usize);
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("cannot start threads")?;
+    let mut devices: Vec<Device> = Vec::new();
+    for choice in &args.device {
+        let opened = Devices::open(choice, GpuOptions::default())?;
+        devices.push((opened.names().join(", "), Box::new(opened)));
     }
+    let scene = BenchScene::read(&args.scene, &args.views, args.width)?;
+    progress.begin("bench", "view", u64::from(args.repeats), 0);
+    let cases = measure(&scene, &devices, args.repeats, progress)?;
+    progress.end();
+    Ok(RasterReport { machine: Machine::here(), cases })
+}
 
-    fn measure(
-        &self,
-        scene: &BenchScene,
-        regions: &RegionMap,
-        devices: &[(&str, f64, Box<dyn LoadedScene + '_>)],
-    ) -> Result<Vec<RasterCase>, RasterError> {
-        let view = |turn: usize| &scene.views[turn % scene.views.len()];
-        // Warms up and gives the counts.
-        let mut results = Vec::with_capacity(devices.len());
-        for (_, _, device) in devices {
-            let views = scene.views.iter().map(|view| device.weights(view, regions, WeightKind::Blend));
-            results.push(views.collect::<Result<Vec<_>, _>>()?);
-        }
-        let mut timings = vec![Vec::with_capacity(self.n_repeats); devices.len()];
-        for turn in 0..self.n_repeats {
-            for (i, (_, _, device)) in devices.iter().enumerate() {
-                let (result, ms) = timed_ms(|| device.weights(view(turn), regions, WeightKind::Blend));
-                result?;
-                timings[i].push(ms);
-            }
-        }
-        let mut cases = Vec::with_capacity(devices.len());
-        for (i, ((name, load_ms, _), timings)) in devices.iter().zip(timings).enumerate() {
-            let mean = |count: fn(&ViewWeights) -> usize| {
-                results[i].iter().map(count).sum::<usize>() as f64 / scene.views.len() as f64
-            };
-            let weights = Times::of(timings);
-            let (width_px, height_px) = (regions.width_px, regions.height_px);
-            cases.push(RasterCase {
-                scene: scene.name.clone(),
-                device: (*name).to_owned(),
-                n_gaussians: scene.gaussians.len(),
-                width_px,
-                height_px,
-                n_regions: regions.n_regions,
-                n_visible: mean(|v| v.counters.visible),
-                n_pairs: mean(|v| v.counters.pairs),
-                n_entries: mean(|v| v.entries.len()),
-                load_ms: *load_ms,
-                weights,
-                relative_l1: relative_l1(&results[i], &results[0]),
-            });
-        }
-        Ok(cases)
+impl BenchScene {
+    /// Reads a splat and its poses, scaled to `width_px`.
+    fn read(splat: &Path, poses: &Path, width_px: u32) -> Result<Self> {
+        let gaussians = splat::read(splat, &ReadOptions { with_sh_rest: false })?;
+        let view = |view: &View| {
+            let intrinsics = view.intrinsics.without_distortion().scaled_to_width(width_px);
+            RasterView { intrinsics, ..RasterView::of(view) }
+        };
+        let read: Vec<RasterView> = poses::read(poses, None)?.views.iter().map(view).collect();
+        let size = |view: &RasterView| (view.intrinsics.width_px, view.intrinsics.height_px);
+        let Some(first) = read.first().map(size) else { bail!("{}: no views", poses.display()) };
+        let step = read.len().div_ceil(N_VIEWS);
+        let views = read.into_iter().filter(|view| size(view) == first).step_by(step).collect();
+        let name = splat.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self { name, gaussians, views })
     }
+}
+
+/// Returns a map of equal rectangles.
+fn grid_regions(width_px: u32, height_px: u32) -> RegionMap {
+    let [columns, rows] = GRID;
+    let region = |x: u32, y: u32| y * rows / height_px * columns + x * columns / width_px;
+    let region_of_pixel = (0..height_px).flat_map(|y| (0..width_px).map(move |x| region(x, y))).collect();
+    RegionMap { width_px, height_px, region_of_pixel, n_regions: columns * rows }
+}
+
+/// Measures all devices on a scene. They take turns view by view, so that other load on the machine affects all of
+/// them alike.
+fn measure(
+    scene: &BenchScene,
+    devices: &[Device],
+    n_repeats: u32,
+    progress: &dyn Progress,
+) -> Result<Vec<RasterCase>, RasterError> {
+    let camera = scene.views[0].intrinsics;
+    let regions = &grid_regions(camera.width_px, camera.height_px);
+    let (mut loaded, mut results) = (Vec::new(), Vec::new());
+    for (_, rasterizer) in devices {
+        let (ready, load_ms) = timed_ms(|| rasterizer.load(&scene.gaussians));
+        let ready = ready?;
+        // Warms up and gives the counts.
+        let views = scene.views.iter().map(|view| ready.weights(view, regions, WeightKind::Blend));
+        results.push(views.collect::<Result<Vec<_>, _>>()?);
+        loaded.push((ready, load_ms));
+    }
+    let mut timings = vec![Vec::new(); devices.len()];
+    for turn in 0..n_repeats as usize {
+        let view = &scene.views[turn % scene.views.len()];
+        for ((device, _), timings) in loaded.iter().zip(&mut timings) {
+            let (result, ms) = timed_ms(|| device.weights(view, regions, WeightKind::Blend));
+            result?;
+            timings.push(ms);
+        }
+        progress.advance(1);
+    }
+    let case = |(at, timings): (usize, Vec<f64>)| {
+        let mean = |count: fn(&ViewWeights) -> usize| {
+            results[at].iter().map(count).sum::<usize>() as f64 / scene.views.len() as f64
+        };
+        RasterCase {
+            scene: scene.name.clone(),
+            device: devices[at].0.clone(),
+            n_gaussians: scene.gaussians.len(),
+            width_px: camera.width_px,
+            height_px: camera.height_px,
+            n_regions: regions.n_regions,
+            n_visible: mean(|v| v.counters.visible),
+            n_pairs: mean(|v| v.counters.pairs),
+            n_entries: mean(|v| v.entries.len()),
+            load_ms: loaded[at].1,
+            weights: Times::of(timings),
+            relative_l1: relative_l1(&results[at], &results[0]),
+        }
+    };
+    Ok(timings.into_iter().enumerate().map(case).collect())
 }
 
 /// Returns the sum of absolute differences between found and expected contributions, over all (Gaussian, region)
@@ -217,14 +199,12 @@ fn relative_l1(found: &[ViewWeights], expected: &[ViewWeights]) -> f64 {
 impl fmt::Display for RasterReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}\n", self.machine)?;
-        let columns =
-            ["scene", "device", "regions", "visible", "pairs", "contributions", "median ms", "p90 ms"];
+        let columns = ["scene", "device", "visible", "pairs", "contributions", "median ms", "p90 ms"];
         let mut table = Table::new(columns.into_iter().chain(["rel. L1"]));
         for case in &self.cases {
             table.row([
                 case.scene.clone(),
                 case.device.clone(),
-                case.n_regions.to_string(),
                 format!("{:.0}", case.n_visible),
                 format!("{:.0}", case.n_pairs),
                 format!("{:.0}", case.n_entries),
@@ -239,23 +219,23 @@ impl fmt::Display for RasterReport {
 
 #[cfg(test)]
 mod tests {
-    use super::super::scene::grid_regions;
     use super::*;
+    use crate::generate::Scene;
+    use crate::generate::grammar::SceneKind;
     use slag_encoder::progress::Silent;
     use slag_encoder::raster::{CpuRasterizer, RegionWeight};
 
     #[test]
-    fn every_device_is_measured_on_every_map() {
-        let scene = BenchScene::generated(3000, 64, 48);
-        let maps = [grid_regions(64, 48, 2, 1), grid_regions(64, 48, 4, 4)];
+    fn every_device_is_measured() {
+        let Scene { gaussians, mut views, .. } = Scene::new(&[SceneKind::Room], 1, 2);
+        views.iter_mut().for_each(|view| view.intrinsics = view.intrinsics.scaled_to_width(64));
+        let scene = BenchScene { name: "room".into(), gaussians, views };
         let devices =
-            ["a", "b"].map(|name| Device { name: name.into(), rasterizer: Box::new(CpuRasterizer) });
-        let bench = RasterBench { n_repeats: 3 };
-        let cases = bench.run(&scene, &maps, &devices, &Silent).unwrap();
-        let of: Vec<_> = cases.iter().map(|c| (c.device.as_str(), c.n_regions)).collect();
-        assert_eq!(of, [("a", 2), ("b", 2), ("a", 16), ("b", 16)]);
+            ["a", "b"].map(|name| (name.to_owned(), Box::new(CpuRasterizer) as Box<dyn Rasterizer>));
+        let cases = measure(&scene, &devices, 3, &Silent).expect("rasterises");
+        assert_eq!(cases.iter().map(|case| case.device.as_str()).collect::<Vec<_>>(), ["a", "b"]);
         for case in &cases {
-            assert_eq!((case.weights.n, case.relative_l1, case.n_gaussians), (3, 0.0, 3000));
+            assert_eq!((case.weights.n, case.relative_l1, case.n_regions), (3, 0.0, 48));
             assert!(case.n_pairs > case.n_visible && case.weights.min_ms > 0.0);
         }
     }

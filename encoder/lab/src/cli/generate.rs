@@ -10,7 +10,7 @@ use slag_encoder::progress::Progress;
 use crate::generate::compose::Walk;
 use crate::generate::copies::{self, CopiesSettings};
 use crate::generate::crops::{self, Split};
-use crate::generate::grammar::{self, Noun, SceneKind};
+use crate::generate::grammar::{NOUNS, SceneKind};
 use crate::generate::{Scene, photos};
 
 #[derive(Debug, Subcommand)]
@@ -25,27 +25,11 @@ pub(super) enum GenerateCommand {
     Photos(PhotosArgs),
 }
 
-/// Where generated data goes, and what objects it is made of.
 #[derive(Debug, Args)]
-struct OutArgs {
+pub(super) struct SceneArgs {
     /// Output folder; created if absent.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Folder of object files (`NOUN.txt`) instead of the built-in ones.
-    #[arg(long, value_name = "DIR")]
-    objects: Option<PathBuf>,
-}
-
-impl OutArgs {
-    fn nouns(&self) -> Result<Vec<Noun>> {
-        Ok(grammar::nouns(self.objects.as_deref())?)
-    }
-}
-
-#[derive(Debug, Args)]
-pub(super) struct SceneArgs {
-    #[command(flatten)]
-    to: OutArgs,
     /// Kind of scene; several kinds, separated by commas, are placed side by side.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "room")]
     kind: Vec<SceneKind>,
@@ -78,8 +62,9 @@ pub(super) struct CopiesArgs {
 
 #[derive(Debug, Args)]
 pub(super) struct CropsArgs {
-    #[command(flatten)]
-    to: OutArgs,
+    /// Output folder; created if absent.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
     /// For training or for testing.
     #[arg(long, value_enum, default_value = "train")]
     split: Split,
@@ -96,8 +81,9 @@ pub(super) struct CropsArgs {
 
 #[derive(Debug, Args)]
 pub(super) struct PhotosArgs {
-    #[command(flatten)]
-    to: OutArgs,
+    /// Output folder; created if absent.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
     /// Number of scenes to photograph.
     #[arg(long, value_name = "N", default_value_t = 100)]
     n_scenes: u64,
@@ -119,26 +105,26 @@ pub(super) fn run(command: &GenerateCommand, progress: &dyn Progress) -> Result<
             next(&written.scene, &written.views, &masks);
         }
         GenerateCommand::Crops(args) => {
-            let (nouns, seeds) = (args.to.nouns()?, args.seed..args.seed + args.n_scenes);
-            let n = crops::write(&args.to.out, args.split, &nouns, seeds, args.edge, progress)?;
-            println!("{n} crops of {} nouns in {}", nouns.len(), args.to.out.display());
+            let seeds = args.seed..args.seed + args.n_scenes;
+            let n = crops::write(&args.out, args.split, seeds, args.edge, progress)?;
+            println!("{n} crops of {} nouns in {}", NOUNS.len(), args.out.display());
         }
         GenerateCommand::Photos(args) => {
             let seeds = args.seed..args.seed + args.n_scenes;
-            let n = photos::write(&args.to.out, &args.to.nouns()?, seeds, progress)?;
-            println!("{n} photos in {}", args.to.out.display());
+            let n = photos::write(&args.out, seeds, progress)?;
+            println!("{n} photos in {}", args.out.display());
         }
     }
     Ok(Exit::Done)
 }
 
 fn scene(args: &SceneArgs, progress: &dyn Progress) -> Result<()> {
-    let mut scene = Scene::new(&args.kind, args.seed, args.n_views, &args.to.nouns()?);
+    let mut scene = Scene::new(&args.kind, args.seed, args.n_views);
     scene.photograph(args.walk, args.n_views);
-    let written = scene.write(&args.to.out, progress)?;
+    let written = scene.write(&args.out, progress)?;
     let n_things = scene.objects.iter().filter(|object| !object.background).count();
     let (n_gaussians, n_photos) = (scene.gaussians.len(), scene.views.len());
-    println!("{n_gaussians} Gaussians, {n_things} things, {n_photos} photos in {}", args.to.out.display());
+    println!("{n_gaussians} Gaussians, {n_things} things, {n_photos} photos in {}", args.out.display());
     next(&written.scene, &written.views, "--metric ");
     Ok(())
 }

@@ -19,7 +19,7 @@ use slag_models::{ModelDir, SessionOptions, TextEncoder};
 pub use answer::EdgeAnswer;
 
 use crate::generate::Scene;
-use crate::generate::grammar::{self, SceneKind};
+use crate::generate::grammar::SceneKind;
 use slag_encoder::cells::CellLimits;
 use slag_encoder::encode::{self, EncodeSettings, EncodeSummary, Engines};
 use slag_encoder::progress::Progress;
@@ -149,8 +149,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let store = options.out.join("store");
     let cache = options.out.join("cache");
 
-    let nouns = grammar::nouns(None).context("generate")?;
-    let mut scene = Scene::new(&KINDS, options.seed, N_VIEWS, &nouns);
+    let mut scene = Scene::new(&KINDS, options.seed, N_VIEWS);
     let written = tokio::task::block_in_place(|| scene.write(&options.out.join("scene"), progress))
         .context("generate")?;
     let camera_in_world = scene.views[ROBOT_VIEW].camera_from_world.inverse().translation;

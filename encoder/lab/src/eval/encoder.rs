@@ -14,7 +14,7 @@ use slag_models::Crop;
 
 use super::judge::ABSENT;
 use crate::generate::crops::{self, Label, Split};
-use crate::generate::grammar::{self, Noun};
+use crate::generate::grammar::{NOUNS, Noun};
 use crate::generate::paint::{Colour, Material};
 use crate::harness::Times;
 use crate::table::Table;
@@ -87,7 +87,7 @@ pub(crate) struct EncoderReport {
 /// Evaluates an encoder on the crops of scenes.
 pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<EncoderReport> {
     let (models, session) = open_models(&args.models)?;
-    let (nouns, seeds) = (&grammar::nouns(None)?, args.seed..args.seed + args.n_scenes);
+    let (nouns, seeds) = (&NOUNS[..], args.seed..args.seed + args.n_scenes);
     let mut text = models.text_encoder(&session)?;
     let mut encode = |texts: Vec<String>| -> Result<Vec<Vec<f32>>> {
         Ok(texts.iter().map(|content| text.encode(content)).collect::<Result<_, _>>()?)
@@ -109,7 +109,7 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
         let seeds = first..(first + SCENES_AT_A_TIME).min(seeds.end);
         let n_scenes = seeds.end - seeds.start;
         let (crops, labels): (Vec<Crop>, Vec<Label>) =
-            seeds.into_par_iter().flat_map_iter(|seed| crops::crops(Split::Test, nouns, seed)).unzip();
+            seeds.into_par_iter().flat_map_iter(|seed| crops::crops(Split::Test, seed)).unzip();
         if timing.is_empty() {
             timing = crops.iter().take(N_TIMED).cloned().collect();
         }

@@ -8,7 +8,7 @@ use glam::{DAffine3, DVec3};
 use serde_json::{Value, json};
 use slag_common::gaussians::SH_C0;
 use slag_common::shard::Profile;
-use slag_common::{Distortion, Gaussians, Intrinsics, poses, splat};
+use slag_common::{Gaussians, Intrinsics, poses, splat};
 use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 
 use super::lerf::{self, LerfLabels};
@@ -19,7 +19,7 @@ use slag_encoder::codebook::CodebookSettings;
 use slag_encoder::encode::{self, CellSettings, EncodeSettings, Engines, Masks};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
-use slag_encoder::raster::{CpuRasterizer, RasterView, Rasterizer};
+use slag_encoder::raster::{CpuRasterizer, RasterView, Rasterizer, pinhole};
 use slag_encoder::shard::ShardSettings;
 use slag_encoder::store::StoreReader;
 
@@ -116,15 +116,7 @@ impl Wall {
 }
 
 fn camera() -> Intrinsics {
-    Intrinsics {
-        width_px: PHOTO_PX[0],
-        height_px: PHOTO_PX[1],
-        focal_x_px: 200.0,
-        focal_y_px: 200.0,
-        centre_x_px: 160.0,
-        centre_y_px: 120.0,
-        distortion: Distortion::None,
-    }
+    pinhole(PHOTO_PX, 200.0)
 }
 
 /// The built-in colour encoder with other words for its colours.

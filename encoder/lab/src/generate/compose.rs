@@ -1,16 +1,16 @@
 //! Layout of a scene: poses of things, light, and cameras.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
+use slag_common::Intrinsics;
 use slag_common::frames::Aabb;
-use slag_common::{Distortion, Intrinsics};
 
-use super::grammar::{Noun, Object, Place, SceneKind};
+use super::grammar::{NOUNS, Noun, Object, Place, SceneKind};
 use super::paint::Colour;
 use super::render::{Light, Solids, Thing};
 use slag_math::random::Xorshift;
 
 use super::solid::{Part, Shape};
-use slag_encoder::raster::RasterView;
+use slag_encoder::raster::{self, RasterView};
 
 pub(super) const PHOTO_PX: [u32; 2] = [640, 480];
 /// Horizontal field of view, 75 degrees: a phone's wide camera.
@@ -76,7 +76,7 @@ pub type Colours<'a> = &'a dyn Fn(&Noun, Colour) -> bool;
 
 impl Layout {
     /// Furnishes scenes side by side along x. Equal seeds give equal layouts.
-    pub fn new(kinds: &[SceneKind], seed: u64, nouns: &[Noun], colours: Colours<'_>) -> Self {
+    pub fn new(kinds: &[SceneKind], seed: u64, colours: Colours<'_>) -> Self {
         let mut random = Xorshift::new(seed);
         let outdoors = kinds.iter().any(|kind| *kind != SceneKind::Room);
         let mut layout = Self {
@@ -98,7 +98,7 @@ impl Layout {
                 }
             };
             let area = Area { kind: *kind, corner, size, height_m };
-            layout.furnish(&area, nouns, colours, &mut random);
+            layout.furnish(&area, colours, &mut random);
             layout.areas.push(area);
             corner.x += size.x + 0.5;
         }
@@ -119,9 +119,9 @@ impl Layout {
     }
 
     /// Furnishes a training scene. Consecutive seeds cycle through the kinds.
-    pub fn of_any_kind(seed: u64, nouns: &[Noun], colours: Colours<'_>) -> Self {
+    pub fn of_any_kind(seed: u64, colours: Colours<'_>) -> Self {
         let kinds = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
-        Self::new(&[kinds[(seed % 3) as usize]], seed, nouns, colours)
+        Self::new(&[kinds[(seed % 3) as usize]], seed, colours)
     }
 
     /// Returns the solids to cast rays at, in the order of [`Layout::placed`].
@@ -130,14 +130,14 @@ impl Layout {
         Solids::new(things, self.light, self.ambient, self.tint)
     }
 
-    fn furnish(&mut self, area: &Area, nouns: &[Noun], colours: Colours<'_>, random: &mut Xorshift) {
+    fn furnish(&mut self, area: &Area, colours: Colours<'_>, random: &mut Xorshift) {
         let make = |noun: &Noun, random: &mut Xorshift| noun.make(random, |colour| colours(noun, colour));
         let of_place = |place: Place| -> Vec<usize> {
-            (0..nouns.len()).filter(|i| nouns[*i].found.contains(&(area.kind, place))).collect()
+            (0..NOUNS.len()).filter(|i| NOUNS[*i].found.contains(&(area.kind, place))).collect()
         };
         for noun in of_place(Place::Shell) {
-            let mut object = make(&nouns[noun], random);
-            object.parts = area.shell(&nouns[noun].name, &object);
+            let mut object = make(&NOUNS[noun], random);
+            object.parts = area.shell(&NOUNS[noun].name, &object);
             if !object.parts.is_empty() {
                 self.place(noun, object, DAffine3::IDENTITY, true);
             }
@@ -151,8 +151,8 @@ impl Layout {
             let mut choice = of_place(place);
             random.shuffle(&mut choice);
             for noun in choice.into_iter().cycle().take(n) {
-                let object = make(&nouns[noun], random);
-                let vehicle = nouns[noun].kinds.iter().any(|kind| kind == "vehicle");
+                let object = make(&NOUNS[noun], random);
+                let vehicle = NOUNS[noun].kinds.iter().any(|kind| kind == "vehicle");
                 for _ in 0..N_TRIES {
                     let Some(pose) = self.propose(area, place, &object, vehicle, random) else { break };
                     let bounds = bounds(&object.parts, pose);
@@ -396,14 +396,5 @@ pub fn photo_intrinsics() -> Intrinsics {
 
 /// Returns the intrinsics of an ideal pinhole with square pixels.
 pub fn pinhole([width_px, height_px]: [u32; 2], field_of_view_rad: f64) -> Intrinsics {
-    let focal_px = f64::from(width_px) / 2.0 / (field_of_view_rad / 2.0).tan();
-    Intrinsics {
-        width_px,
-        height_px,
-        focal_x_px: focal_px,
-        focal_y_px: focal_px,
-        centre_x_px: f64::from(width_px) / 2.0,
-        centre_y_px: f64::from(height_px) / 2.0,
-        distortion: Distortion::None,
-    }
+    raster::pinhole([width_px, height_px], f64::from(width_px) / 2.0 / (field_of_view_rad / 2.0).tan())
 }

@@ -147,7 +147,7 @@ fn link(from: &Path, to: &Path) -> std::io::Result<()> {
 mod tests {
     use super::*;
     use crate::generate::Scene;
-    use crate::generate::grammar::{self, SceneKind};
+    use crate::generate::grammar::SceneKind;
     use slag_common::poses;
     use slag_encoder::progress::Silent;
 
@@ -156,8 +156,7 @@ mod tests {
     fn copies_look_like_their_source() {
         let dir = tempfile::tempdir().expect("a folder");
         let (source, copies) = (dir.path().join("source"), dir.path().join("copies"));
-        let nouns = grammar::nouns(None).expect("object files");
-        Scene::new(&[SceneKind::Room], 5, 6, &nouns).write(&source, &Silent).expect("writes");
+        Scene::new(&[SceneKind::Room], 5, 6).write(&source, &Silent).expect("writes");
         let settings = CopiesSettings { n_copies: 5, n_views: 13 };
         let written = write(&source, &copies, settings, &Silent).expect("writes");
         let read = |path: &Path| splat::read(path, &ReadOptions { with_sh_rest: true }).expect("reads");
@@ -189,8 +188,7 @@ mod tests {
     #[test]
     fn too_many_photos_are_refused() {
         let dir = tempfile::tempdir().expect("a folder");
-        let nouns = grammar::nouns(None).expect("object files");
-        Scene::new(&[SceneKind::Room], 5, 2, &nouns).write(dir.path(), &Silent).expect("writes");
+        Scene::new(&[SceneKind::Room], 5, 2).write(dir.path(), &Silent).expect("writes");
         let settings = CopiesSettings { n_copies: 2, n_views: 5 };
         let error = write(dir.path(), &dir.path().join("out"), settings, &Silent).expect_err("too many");
         assert!(error.to_string().contains("it has 2 photos"), "{error}");

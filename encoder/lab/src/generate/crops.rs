@@ -13,7 +13,7 @@ use slag_models::Crop;
 use slag_models::preprocess::{Filter, Preprocess, Resize};
 
 use super::compose::{Layout, looking, pinhole};
-use super::grammar::Noun;
+use super::grammar::{NOUNS, Noun};
 use super::paint::{Colour, Material};
 use super::render::{NOTHING, Photo, Solids};
 use slag_encoder::embed;
@@ -82,7 +82,6 @@ pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
 pub fn write(
     folder: &Path,
     split: Split,
-    nouns: &[Noun],
     seeds: std::ops::Range<u64>,
     edge_px: u32,
     progress: &dyn Progress,
@@ -91,7 +90,7 @@ pub fn write(
     let preprocess = Preprocess::new(edge_px, Resize::Pad, Filter::Bicubic, [0.0; 3], [1.0; 3]);
     progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
     let of_seed = |seed: u64| {
-        let crops: Vec<(RgbImage, Label)> = crops(split, nouns, seed)
+        let crops: Vec<(RgbImage, Label)> = crops(split, seed)
             .into_iter()
             .map(|(crop, label)| (preprocess.square(crop.image()), label))
             .collect();
@@ -106,7 +105,7 @@ pub fn write(
     let labels: Vec<&Label> = crops.iter().map(|(_, label)| label).collect();
     fs_err::write(folder.join("labels.json"), serde_json::to_vec(&labels)?)?;
     let mut out = fs_err::File::create(folder.join("nouns.json"))?;
-    let words: Vec<_> = nouns
+    let words: Vec<_> = NOUNS
         .iter()
         .map(|noun| {
             serde_json::json!({
@@ -119,9 +118,9 @@ pub fn write(
     Ok(crops.len())
 }
 
-pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label)> {
+pub(crate) fn crops(split: Split, seed: u64) -> Vec<(Crop, Label)> {
     let allowed = |noun: &Noun, colour| split == Split::Test || !is_held_out(noun, colour);
-    let layout = Layout::of_any_kind(seed, nouns, &allowed);
+    let layout = Layout::of_any_kind(seed, &allowed);
     let solids = layout.solids();
     let mut random = Xorshift::new(seed ^ 0xc405);
     let mut out = Vec::new();
@@ -150,7 +149,7 @@ pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label
                 noun: placed.noun,
                 colour: placed.object.colours[0],
                 material: placed.object.paint.material,
-                held_out: is_held_out(&nouns[placed.noun], placed.object.colours[0]),
+                held_out: is_held_out(&NOUNS[placed.noun], placed.object.colours[0]),
                 slenderness: size.z / size.x.max(size.y),
                 area_px: mask.area_px,
                 shown,
@@ -257,16 +256,14 @@ fn cut_mask(mask: &Mask, random: &mut Xorshift) -> Mask {
 
 #[cfg(test)]
 mod tests {
-    use super::super::grammar;
     use super::*;
 
     #[test]
     fn held_out_pairs_are_never_in_the_training_split() {
-        let nouns = grammar::nouns(None).expect("parse");
         let held_out = |split| {
-            let of_seed = |seed| crops(split, &nouns, seed);
+            let of_seed = |seed| crops(split, seed);
             let labels = (0..9).flat_map(of_seed).map(|(_, label)| label);
-            labels.filter(|label| is_held_out(&nouns[label.noun], label.colour)).count()
+            labels.filter(|label| is_held_out(&NOUNS[label.noun], label.colour)).count()
         };
         assert_eq!(held_out(Split::Train), 0);
         assert!(held_out(Split::Test) > 20);
@@ -275,8 +272,7 @@ mod tests {
     /// A crop has as many pixels inside its mask as its label states, and is white outside.
     #[test]
     fn crops_are_what_their_labels_say() {
-        let nouns = grammar::nouns(None).expect("parse");
-        let of_seed = |seed| crops(Split::Test, &nouns, seed);
+        let of_seed = |seed| crops(Split::Test, seed);
         let made: Vec<(Crop, Label)> = (0..6).flat_map(of_seed).collect();
         let n_segmented = made.iter().filter(|(_, label)| label.segmented).count();
         assert!(n_segmented > 20 && made.len() - n_segmented > 20, "{n_segmented} of {}", made.len());
@@ -287,7 +283,7 @@ mod tests {
             assert!(outside.into_iter().all(|(pixel, _)| pixel.0 == [255; 3]));
             // A segment may include surroundings of the thing.
             assert!(label.shown > 0.0 && (label.shown <= 1.0 || label.segmented));
-            assert!(nouns[label.noun].colours().contains(&label.colour));
+            assert!(NOUNS[label.noun].colours().contains(&label.colour));
         }
         let again: Vec<(Crop, Label)> = (0..6).flat_map(of_seed).collect();
         assert!(made.iter().zip(&again).all(|(a, b)| a.0 == b.0));

@@ -24,7 +24,7 @@
 //!   B, C`, `if EXPRESSION` (the part exists where it is above 0).
 //! - `top: z | w, d`: a surface for other things.
 
-use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
 use glam::{DAffine3, DQuat, DVec3, EulerRot};
 use include_dir::{Dir, include_dir};
@@ -37,13 +37,17 @@ use super::solid::{Part, Shape};
 
 static OBJECTS: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/src/generate/objects");
 
-#[derive(Debug, thiserror::Error)]
-pub enum GrammarError {
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-    #[error("{}:{line}: {reason}", path.display())]
-    Line { path: PathBuf, line: usize, reason: String },
-}
+/// The nouns of the object files, sorted by name.
+pub(crate) static NOUNS: LazyLock<Vec<Noun>> = LazyLock::new(|| {
+    let mut files: Vec<_> = OBJECTS.files().collect();
+    files.sort_by_key(|file| file.path());
+    let noun = |file: &&include_dir::File<'_>| {
+        let name = file.path().file_stem().unwrap_or_default().to_string_lossy().replace('_', " ");
+        let noun = Noun::parse(name, file.contents_utf8().unwrap_or_default());
+        noun.unwrap_or_else(|reason| panic!("{}:{reason}", file.path().display()))
+    };
+    files.iter().map(noun).collect()
+});
 
 /// Kind of a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
@@ -143,28 +147,6 @@ pub struct Object {
     pub top: Option<Top>,
 }
 
-/// Returns the nouns of a folder of object files, or the built-in ones, sorted by name.
-pub fn nouns(folder: Option<&Path>) -> Result<Vec<Noun>, GrammarError> {
-    let mut texts: Vec<(PathBuf, String)> = match folder {
-        None => OBJECTS
-            .files()
-            .map(|file| (file.path().to_owned(), file.contents_utf8().unwrap_or_default().to_owned()))
-            .collect(),
-        Some(folder) => {
-            let mut texts = Vec::new();
-            for entry in fs_err::read_dir(folder)? {
-                let path = entry?.path();
-                if path.extension().is_some_and(|extension| extension == "txt") {
-                    texts.push((path.clone(), fs_err::read_to_string(&path)?));
-                }
-            }
-            texts
-        }
-    };
-    texts.sort();
-    texts.iter().map(|(path, text)| Noun::parse(path, text)).collect()
-}
-
 /// Returns the items of a list, trimmed.
 fn list(text: &str) -> impl Iterator<Item = &str> {
     text.split(',').map(str::trim)
@@ -181,9 +163,11 @@ fn exactly<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; 
 }
 
 impl Noun {
-    /// Parses an object file's text; the file's name is the noun.
-    pub fn parse(path: &Path, text: &str) -> Result<Self, GrammarError> {
-        let name = path.file_stem().unwrap_or_default().to_string_lossy().replace('_', " ");
+    /// Parses an object file's text.
+    ///
+    /// # Errors
+    /// The number of the wrong line, and what is wrong.
+    fn parse(name: String, text: &str) -> Result<Self, String> {
         let mut noun = Self {
             name,
             words: Vec::new(),
@@ -195,26 +179,15 @@ impl Noun {
             top: None,
         };
         let mut names = Vec::new();
-        let mut last = 0;
-        for (i, line) in text.lines().enumerate() {
-            last = i + 1;
+        for (line, number) in text.lines().zip(1..) {
             let line = line.split('#').next().unwrap_or_default().trim();
             if !line.is_empty() {
-                noun.line(line, &mut names).map_err(|reason| GrammarError::Line {
-                    path: path.to_owned(),
-                    line: i + 1,
-                    reason,
-                })?;
+                noun.line(line, &mut names).map_err(|reason| format!("{number}: {reason}"))?;
             }
         }
-        let missing = [("paint", noun.paints.is_empty()), ("found", noun.found.is_empty())];
-        match missing.iter().find(|(_, missing)| *missing) {
-            None => Ok(noun),
-            Some((what, _)) => Err(GrammarError::Line {
-                path: path.to_owned(),
-                line: last,
-                reason: format!("the file ends without `{what}`; add a line that begins with it"),
-            }),
+        match noun.paints.is_empty() || noun.found.is_empty() {
+            false => Ok(noun),
+            true => Err(format!("{}: the file ends without `paint` or `found`", text.lines().count())),
         }
     }
 

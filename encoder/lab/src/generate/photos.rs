@@ -7,7 +7,6 @@ use rayon::prelude::*;
 use slag_common::npy;
 
 use super::compose::{FIELD_OF_VIEW_RAD, Layout, PHOTO_PX, pinhole};
-use super::grammar::Noun;
 use super::render::{NOTHING, Photo};
 use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
@@ -17,16 +16,11 @@ const N_PHOTOS: u32 = 4;
 /// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`), `things.npy` (u16
 /// `[n][height][width]`: the thing's number, 65535 for the sky) and `depths.npy` (f32 `[n][height][width]`: metres
 /// along the camera's axis, infinite for the sky). Returns the number of photos.
-pub fn write(
-    folder: &Path,
-    nouns: &[Noun],
-    seeds: std::ops::Range<u64>,
-    progress: &dyn Progress,
-) -> Result<usize> {
+pub fn write(folder: &Path, seeds: std::ops::Range<u64>, progress: &dyn Progress) -> Result<usize> {
     fs_err::create_dir_all(folder)?;
     progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
     let of_seed = |seed: u64| {
-        let layout = Layout::of_any_kind(seed, nouns, &|_, _| true);
+        let layout = Layout::of_any_kind(seed, &|_, _| true);
         let solids = layout.solids();
         let start = Xorshift::new(seed ^ 0xf070).between(0.0, 1.0);
         let views = layout.walk(N_PHOTOS, start, pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD));

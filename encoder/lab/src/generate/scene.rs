@@ -13,7 +13,7 @@ use slag_encoder::raster::RasterView;
 use slag_math::random::Xorshift;
 
 use super::compose::{Layout, Walk, photo_intrinsics};
-use super::grammar::{Noun, SceneKind};
+use super::grammar::{NOUNS, SceneKind};
 use super::render::NOTHING;
 
 /// Distance between surface Gaussians, relative to the thing's radius.
@@ -78,8 +78,8 @@ pub struct WrittenScene {
 
 impl Scene {
     /// Makes scenes of these kinds side by side along x. Equal seeds give equal scenes.
-    pub fn new(kinds: &[SceneKind], seed: u64, n_views: u32, nouns: &[Noun]) -> Self {
-        let layout = Layout::new(kinds, seed, nouns, &|_, _| true);
+    pub fn new(kinds: &[SceneKind], seed: u64, n_views: u32) -> Self {
+        let layout = Layout::new(kinds, seed, &|_, _| true);
         let solids = layout.solids();
         let mut random = Xorshift::new(seed ^ 0x5ca1e);
         let mut gaussians = Gaussians::default();
@@ -105,7 +105,7 @@ impl Scene {
                 gaussians.sh_dc.push(rgb.map(|c| ((c + uneven).clamp(0.0, 1.0) as f32 - 0.5) / SH_C0));
                 id_of_gaussian.push(id);
             }
-            let noun = &nouns[placed.noun];
+            let noun = &NOUNS[placed.noun];
             objects.push(TrueObject {
                 id,
                 category: noun.name.clone(),
@@ -222,7 +222,6 @@ fn write_json(path: &Path, value: &serde_json::Value) -> std::io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::generate::grammar;
     use slag_encoder::check::psnr_db;
     use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 
@@ -230,20 +229,19 @@ mod tests {
 
     #[test]
     fn things_stand_apart_and_within() {
-        let nouns = grammar::nouns(None).expect("parse");
         for (seed, kind) in (0..30).zip(KINDS.into_iter().cycle()) {
-            let layout = Layout::new(&[kind], seed, &nouns, &|_, _| true);
+            let layout = Layout::new(&[kind], seed, &|_, _| true);
             let things: Vec<_> = layout.placed.iter().filter(|p| !p.shell).collect();
             assert!(things.len() >= 8, "{kind:?} {seed}: {} things", things.len());
             for (i, a) in things.iter().enumerate() {
-                assert!(a.bounds.min.z > -0.1, "{} is below the ground", nouns[a.noun].name);
+                assert!(a.bounds.min.z > -0.1, "{} is below the ground", NOUNS[a.noun].name);
                 for b in &things[..i] {
                     let apart = (a.bounds.min - b.bounds.max).max(b.bounds.min - a.bounds.max).max_element();
                     assert!(
                         apart > -0.04,
                         "{kind:?} {seed}: {} in {}",
-                        nouns[a.noun].name,
-                        nouns[b.noun].name
+                        NOUNS[a.noun].name,
+                        NOUNS[b.noun].name
                     );
                 }
             }
@@ -252,8 +250,7 @@ mod tests {
 
     #[test]
     fn the_same_seed_makes_the_same_scene() {
-        let nouns = grammar::nouns(None).expect("parse");
-        let scene = |seed| Scene::new(&KINDS, seed, 3, &nouns);
+        let scene = |seed| Scene::new(&KINDS, seed, 3);
         let (a, b, other) = (scene(5), scene(5), scene(6));
         assert!(a.gaussians == b.gaussians && a.objects == b.objects && a.id_of_gaussian == b.id_of_gaussian);
         assert!(a.objects != other.objects);
@@ -267,9 +264,8 @@ mod tests {
     /// Renderings of the Gaussians match the ray-cast photos.
     #[test]
     fn gaussians_look_like_the_photos() {
-        let nouns = grammar::nouns(None).expect("parse");
         for kind in KINDS {
-            let scene = Scene::new(&[kind], 3, 4, &nouns);
+            let scene = Scene::new(&[kind], 3, 4);
             assert!((0..scene.gaussians.len()).all(|i| scene.gaussians.is_usable(i)));
             let solids = scene.layout.solids();
             for view in &scene.views {

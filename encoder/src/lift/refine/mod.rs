@@ -42,7 +42,7 @@ const LEAST_MASK_WEIGHT: f32 = 0.01;
 
 /// The refinements of a scene, ready to be applied part by part.
 #[derive(Debug, PartialEq)]
-pub struct Refinement {
+pub(crate) struct Refinement {
     settings: Aggregation,
     /// Of each view, ascending.
     first_regions: Vec<u32>,
@@ -56,7 +56,7 @@ pub struct Refinement {
 
 /// A refinement of which masks are weighed and superpoints found. Objects, made of superpoints, come next; then
 /// Gaussians share evidence within both.
-pub struct PendingRefinement {
+pub(crate) struct PendingRefinement {
     refinement: Refinement,
     table: RegionTable,
     /// `[n_masks]`: each mask's vector in principal coordinates; empty where none is needed.

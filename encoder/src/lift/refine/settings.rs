@@ -7,12 +7,12 @@ use serde::{Deserialize, Serialize};
 #[serde(default, deny_unknown_fields)]
 pub struct Aggregation {
     /// Drops views in which a Gaussian has less than this share of its weight in its best view, 0..=1.
-    pub min_view_share: f32,
+    pub(crate) min_view_share: f32,
     /// Each mask counts (1 - truncation)^`truncation_power`. A mask's truncation is the share of its outline that
     /// the photo's edge cuts off.
-    pub truncation_power: f32,
+    pub(crate) truncation_power: f32,
     /// Weight of the superpoint's mean, relative to the Gaussian's own.
-    pub superpoint: f32,
+    pub(crate) superpoint: f32,
     /// Weight of the larger superpoint's mean, relative to the result so far.
     pub coarse: f32,
     /// Weight of the mean of the Gaussian's object, relative to the result so far.
@@ -33,7 +33,7 @@ impl Aggregation {
     };
     /// The refinements that help both on trained splats and on generated ones (docs/decisions.md). Larger shares
     /// of superpoints smooth small things away.
-    pub const REFINED: Self = Self {
+    pub(crate) const REFINED: Self = Self {
         min_view_share: 0.05,
         truncation_power: 2.0,
         superpoint: 1.5,

@@ -16,18 +16,16 @@ mod settings;
 mod tests;
 
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::ValueEnum;
 use serde::Serialize;
-use slag_common::container::ContainerError;
 use slag_common::shard::Profile;
 
 use crate::store::StoreError;
 
 pub(crate) use push::push;
-pub use settings::{IndexSettings, Quantisation};
+pub(crate) use settings::IndexSettings;
 
 /// Which collections a scene is pushed to.
 ///
@@ -134,8 +132,6 @@ pub(crate) enum PushError {
     NoShard { cell_id: u32 },
     #[error(transparent)]
     Store(#[from] StoreError),
-    #[error("{}: {cause}; encode again", path.display())]
-    Shard { path: PathBuf, cause: ContainerError },
     #[error("the progress of the push cannot be recorded: {0}; check the store's free space and permissions")]
     Records(#[from] sled::Error),
     #[error(

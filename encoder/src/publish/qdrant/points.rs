@@ -2,16 +2,14 @@
 
 use qdrant_client::Payload;
 use qdrant_client::qdrant::{GeoPoint, PointStruct};
-use slag_common::container::AlignedBytes;
 use slag_common::manifest::{CellRecord, Manifest};
-use slag_common::shard::{Profile, ShardLayout};
+use slag_common::shard::Profile;
 
 use super::PushError;
-use crate::store::StoreReader;
+use crate::store::{StoreReader, StoredShard};
 
 pub(super) struct CellShard {
-    bytes: AlignedBytes,
-    layout: ShardLayout,
+    stored: StoredShard,
     cell_id: u32,
 }
 
@@ -19,28 +17,26 @@ impl CellShard {
     pub(super) fn load(reader: &StoreReader, cell: &CellRecord) -> Result<Self, PushError> {
         let cell_id = cell.cell_id;
         let record = cell.shards.get(&Profile::Exact).ok_or(PushError::NoShard { cell_id })?;
-        let bytes = reader.read_object(record.hash)?;
-        let layout = ShardLayout::check(&bytes)
-            .map_err(|cause| PushError::Shard { path: reader.object_path(record.hash), cause })?;
-        match layout.view(&bytes).exact.is_some() {
-            true => Ok(Self { layout, bytes, cell_id }),
+        let stored = reader.read_shard(record)?;
+        match stored.view().exact.is_some() {
+            true => Ok(Self { stored, cell_id }),
             false => Err(PushError::NoShard { cell_id }),
         }
     }
 
     /// Returns the number of points: Gaussians that have an embedding.
     pub(super) fn n_points(&self) -> usize {
-        self.layout.view(&self.bytes).n_with_evidence()
+        self.stored.view().n_with_evidence()
     }
 
     pub(super) fn n_without_evidence(&self) -> u64 {
-        let n_gaussians = self.layout.view(&self.bytes).header.n_gaussians;
+        let n_gaussians = self.stored.view().header.n_gaussians;
         u64::from(n_gaussians) - self.n_points() as u64
     }
 
     /// Builds some of the points, in the shard's order.
     pub(super) fn points(&self, range: std::ops::Range<usize>, manifest: &Manifest) -> Vec<PointStruct> {
-        let shard = self.layout.view(&self.bytes);
+        let shard = self.stored.view();
         let Some(exact) = &shard.exact else { return Vec::new() };
         let dim = shard.header.dim as usize;
         let point = |i: usize| {

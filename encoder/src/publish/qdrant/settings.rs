@@ -32,7 +32,7 @@ pub struct IndexSettings {
 
 /// Compressed copies of vectors; they stay in memory wherever the vectors are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Quantisation {
+pub(crate) enum Quantisation {
     /// None.
     None,
     /// Scalar: a byte a component, a quarter of the vectors' size.

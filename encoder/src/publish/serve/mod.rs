@@ -16,8 +16,10 @@ use slag_service::listener;
 use slag_service::tls::Tls;
 
 use crate::store::StoreError;
-pub use router::{bounded, router, router_with};
-pub use slag_service::access::{Access, AccessSettings};
+pub use router::bounded;
+pub(crate) use router::{router, router_with};
+pub use slag_service::access::Access;
+pub(crate) use slag_service::access::AccessSettings;
 pub use state::Limits;
 
 #[derive(Debug, thiserror::Error)]
@@ -47,7 +49,7 @@ pub async fn serve(
     serve_router(router(dir, limits, access)?, listen, limits, tls, on_listening, shutdown).await
 }
 
-pub async fn serve_router(
+pub(crate) async fn serve_router(
     router: axum::Router,
     listen: impl Into<Listen>,
     limits: Limits,

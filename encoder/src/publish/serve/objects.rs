@@ -2,9 +2,7 @@
 
 use std::io;
 use std::marker::PhantomData;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 
 use axum::Json;
 use axum::body::Body;
@@ -19,9 +17,8 @@ use slag_common::tuf::Envelope;
 use slag_service::problem::Problem;
 use slag_service::range::{EntityTag, Selection};
 use slag_service::replies::{As, Binary, Described, Reply};
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncSeekExt, ReadBuf};
-use tokio::sync::OwnedSemaphorePermit;
-use tokio_util::io::ReaderStream;
+use tokio::io::{AsyncReadExt, AsyncSeekExt};
+use tokio_util::io::{InspectReader, ReaderStream};
 
 use super::problem;
 use super::state::{AppState, Snapshot};
@@ -108,7 +105,10 @@ pub(super) async fn object(
         let mut file = tokio::fs::File::from_std(file);
         let sought = file.seek(io::SeekFrom::Start(start)).await;
         sought.map_err(|e| Problem::internal(format!("{hash}: {e}")))?;
-        let download = Download { file: file.take(n_bytes), _permit: permit };
+        // Holds its permit until it is sent or the client is gone.
+        let download = InspectReader::new(file.take(n_bytes), move |_| {
+            let _held = &permit;
+        });
         Body::from_stream(ReaderStream::with_capacity(download, PIECE_BYTES))
     };
     let mut response = (status, about, BINARY, body).into_response();
@@ -139,22 +139,6 @@ fn open_object(snapshot: &Snapshot, hash: Hash32, with_file: bool) -> Result<Ope
         return Err(Problem::internal(cause));
     }
     Ok(Opened { file: Some(file.into_file()), len_bytes })
-}
-
-/// An object being sent; holds its permit until it is sent or the client is gone.
-struct Download {
-    file: tokio::io::Take<tokio::fs::File>,
-    _permit: OwnedSemaphorePermit,
-}
-
-impl AsyncRead for Download {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.file).poll_read(context, buffer)
-    }
 }
 
 type Name = Result<UrlPath<String>, PathRejection>;

@@ -43,7 +43,7 @@ const STORE: [(u16, &str); 1] = [(500, "The service failed.")];
 const REQUEST_BODY_BYTES: usize = 1024;
 
 /// Returns the service of a store, without a listener.
-pub fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, StoreError> {
+pub(crate) fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, StoreError> {
     router_with(dir, limits, access, Router::new())
 }
 
@@ -51,7 +51,12 @@ pub fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, Stor
 ///
 /// # Errors
 /// As [`router`].
-pub fn router_with(dir: &Path, limits: Limits, access: Access, page: Router) -> Result<Router, StoreError> {
+pub(crate) fn router_with(
+    dir: &Path,
+    limits: Limits,
+    access: Access,
+    page: Router,
+) -> Result<Router, StoreError> {
     let service = Arc::new(Service::open(dir, &limits)?);
     let responses = Arc::clone(&service.responses);
     let (router, _) = described();

@@ -26,11 +26,11 @@ const RETRY_PAUSE: Duration = Duration::from_secs(10);
 pub struct Limits {
     pub connections: ConnectionLimits,
     /// Requests in progress; further ones get 503.
-    pub n_requests: usize,
+    pub(crate) n_requests: usize,
     /// Objects being sent; further ones get 503.
-    pub n_downloads: usize,
+    pub(crate) n_downloads: usize,
     /// Time until an answer must begin, else 503.
-    pub answer_timeout: Duration,
+    pub(crate) answer_timeout: Duration,
 }
 
 impl Default for Limits {

@@ -6,11 +6,11 @@ use super::layout::ViewBlock;
 use crate::raster::constants::TILE_SIZE_PX;
 use crate::raster::error::RasterError;
 
-pub struct Band<'a> {
+pub(crate) struct Band<'a> {
     pub device: &'a Device,
     pub chunks: &'a [SceneChunk],
     /// Uploads the Gaussians of a chunk that is not on the device.
-    pub upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
+    pub(crate) upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
     /// The view and the rows of tiles of the band.
     pub view: &'a ViewBlock,
 }
@@ -23,7 +23,7 @@ impl Band<'_> {
     }
 }
 
-pub fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (u32, u32) {
+pub(crate) fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (u32, u32) {
     let tile = TILE_SIZE_PX as u32;
     let rows_px = (tile_rows[1] * tile).min(height_px) - tile_rows[0] * tile;
     ((tile_rows[1] - tile_rows[0]) * width_px.div_ceil(tile), rows_px * width_px)

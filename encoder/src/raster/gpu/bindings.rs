@@ -33,7 +33,7 @@ pub fn bind(
 }
 
 /// Returns the bind group with this name and number, and creates it at the first use.
-pub fn cached<'g>(
+pub(crate) fn cached<'g>(
     groups: &'g mut HashMap<(&'static str, u32), wgpu::BindGroup>,
     key: (&'static str, u32),
     make: impl FnOnce() -> wgpu::BindGroup,
@@ -42,7 +42,7 @@ pub fn cached<'g>(
 }
 
 /// Records a kernel with `n` workgroups along x and y.
-pub fn dispatch(
+pub(crate) fn dispatch(
     pass: &mut wgpu::ComputePass<'_>,
     kernel: &wgpu::ComputePipeline,
     group: &wgpu::BindGroup,
@@ -54,7 +54,7 @@ pub fn dispatch(
 }
 
 /// Records a kernel with the number of workgroups from a buffer.
-pub fn dispatch_indirect(
+pub(crate) fn dispatch_indirect(
     pass: &mut wgpu::ComputePass<'_>,
     kernel: &wgpu::ComputePipeline,
     group: &wgpu::BindGroup,

@@ -10,16 +10,16 @@ use super::layout::{Capacities, screen_layout};
 use super::shader::{Counter, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZE};
 
 /// Size of the counters, bytes.
-pub const COUNTERS_BYTES: u64 = 64;
+pub(crate) const COUNTERS_BYTES: u64 = 64;
 
 /// Size of the parameters of a band, with room to spare, bytes.
-pub const VIEW_BYTES: u64 = 256;
+pub(crate) const VIEW_BYTES: u64 = 256;
 
 /// Size of a pixel's region, bytes.
-pub const REGION_BYTES: u64 = REGION_BITS as u64 / 8;
+pub(crate) const REGION_BYTES: u64 = REGION_BITS as u64 / 8;
 
 /// Returns the size of the regions of so many pixels, in whole words, bytes.
-pub fn regions_bytes(n_px: usize) -> u64 {
+pub(crate) fn regions_bytes(n_px: usize) -> u64 {
     (n_px as u64 * REGION_BYTES).next_multiple_of(4)
 }
 
@@ -27,33 +27,33 @@ pub fn regions_bytes(n_px: usize) -> u64 {
 #[derive(Clone, Copy)]
 pub struct Size {
     /// Capacities for the output of the shaders.
-    pub capacities: Capacities,
-    pub n_tiles: u32,
+    pub(crate) capacities: Capacities,
+    pub(crate) n_tiles: u32,
     /// Pixels of a band.
     pub n_px: u32,
     /// Gaussians of the largest chunk.
-    pub n_chunk: u32,
+    pub(crate) n_chunk: u32,
 }
 
 pub struct Buffers {
     pub view: wgpu::Buffer,
     pub counters: wgpu::Buffer,
-    pub dispatches: wgpu::Buffer,
+    pub(crate) dispatches: wgpu::Buffer,
     pub jobs: wgpu::Buffer,
-    pub block_counts: wgpu::Buffer,
-    pub histogram: wgpu::Buffer,
-    pub screen: wgpu::Buffer,
-    pub tile_counts: wgpu::Buffer,
-    pub visible_order: [wgpu::Buffer; 2],
+    pub(crate) block_counts: wgpu::Buffer,
+    pub(crate) histogram: wgpu::Buffer,
+    pub(crate) screen: wgpu::Buffer,
+    pub(crate) tile_counts: wgpu::Buffer,
+    pub(crate) visible_order: [wgpu::Buffer; 2],
     pub pairs: wgpu::Buffer,
-    pub pair_order: [wgpu::Buffer; 2],
+    pub(crate) pair_order: [wgpu::Buffer; 2],
     pub members: wgpu::Buffer,
-    pub ranges: wgpu::Buffer,
-    pub tile_order: wgpu::Buffer,
+    pub(crate) ranges: wgpu::Buffer,
+    pub(crate) tile_order: wgpu::Buffer,
     pub regions: wgpu::Buffer,
     pub entries: wgpu::Buffer,
-    pub entry_order: [wgpu::Buffer; 2],
-    pub region_sums: wgpu::Buffer,
+    pub(crate) entry_order: [wgpu::Buffer; 2],
+    pub(crate) region_sums: wgpu::Buffer,
 }
 
 impl Buffers {

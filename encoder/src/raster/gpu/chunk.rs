@@ -8,9 +8,9 @@ use super::layout::{Chunk, ScanJob, SceneGaussian};
 use super::shader::{Counter, NONE, WORKGROUP_SIZE};
 
 /// Size of a Gaussian in device memory, bytes.
-pub const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
+pub(crate) const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
 
-pub struct SceneChunk {
+pub(crate) struct SceneChunk {
     pub n_gaussians: u32,
     /// The [`Chunk`] and the [`ScanJob`] of its blocks, [`JOB_STRIDE_BYTES`] apart.
     pub jobs: wgpu::Buffer,

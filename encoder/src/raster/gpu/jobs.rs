@@ -6,13 +6,13 @@ use super::shader::{Counter, NONE, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZ
 use crate::raster::constants::{FAR_Z, NEAR_Z};
 
 /// Distance between records, bytes; bindings must be aligned.
-pub const JOB_STRIDE_BYTES: u64 = 256;
+pub(crate) const JOB_STRIDE_BYTES: u64 = 256;
 /// Size of a record of dispatch sizes, bytes.
-pub const DISPATCH_BYTES: u64 = 16;
+pub(crate) const DISPATCH_BYTES: u64 = 16;
 /// Size of a pair, words.
-pub const PAIR_WORDS: u32 = 2;
+pub(crate) const PAIR_WORDS: u32 = 2;
 /// Size of an entry, words.
-pub const ENTRY_WORDS: u32 = 4;
+pub(crate) const ENTRY_WORDS: u32 = 4;
 
 #[derive(Clone, Copy)]
 pub enum Scan {
@@ -24,7 +24,7 @@ pub enum Scan {
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SortKey {
+pub(crate) enum SortKey {
     /// Depth of a visible Gaussian.
     Depth,
     Tile,
@@ -33,9 +33,9 @@ pub enum SortKey {
 }
 
 /// Bits per sort pass.
-pub const DIGIT_BITS: u32 = RADIX.ilog2();
+pub(crate) const DIGIT_BITS: u32 = RADIX.ilog2();
 /// Passes for the longest key.
-pub const MAX_PASSES: u32 = (u32::BITS + REGION_BITS).div_ceil(DIGIT_BITS);
+pub(crate) const MAX_PASSES: u32 = (u32::BITS + REGION_BITS).div_ceil(DIGIT_BITS);
 
 impl SortKey {
     pub fn counter(self) -> Counter {
@@ -49,12 +49,12 @@ impl SortKey {
 
 /// Returns the least key of a depth, and how many bits keys have once it is subtracted. A key is the bits of a
 /// float between the near and the far plane: positive floats and their bits have the same order.
-pub fn depth_keys() -> (u32, u32) {
+pub(crate) fn depth_keys() -> (u32, u32) {
     let [least, most] = [NEAR_Z, FAR_Z].map(|z| (z as f32).to_bits());
     (least, bits_of(most - least + 1))
 }
 
-pub const SCAN_JOBS: u64 = 6;
+pub(crate) const SCAN_JOBS: u64 = 6;
 
 impl Scan {
     pub fn index(self) -> u64 {
@@ -70,18 +70,18 @@ impl Scan {
 }
 
 /// Returns the index of the record of a sort pass.
-pub fn sort_job(key: SortKey, pass: u32) -> u64 {
+pub(crate) fn sort_job(key: SortKey, pass: u32) -> u64 {
     SCAN_JOBS + key as u64 * u64::from(MAX_PASSES) + u64::from(pass)
 }
 
 /// Returns the offset of the dispatch sizes for the items of a counter: one thread per item, or one workgroup per
 /// sort block.
-pub fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
+pub(crate) fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
     (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
 }
 
 /// Returns the number of bits of the numbers below `n`.
-pub fn bits_of(n: u32) -> u32 {
+pub(crate) fn bits_of(n: u32) -> u32 {
     u32::BITS - n.saturating_sub(1).leading_zeros()
 }
 
@@ -94,7 +94,7 @@ pub fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
 }
 
 /// Writes the records of all scans, and of the sorts by depth and tile, for the given capacities.
-pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) {
+pub(crate) fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) {
     let write = |index: u64, bytes: &[u8]| {
         device.queue.write_buffer(jobs, index * JOB_STRIDE_BYTES, bytes);
     };
@@ -125,7 +125,7 @@ pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) 
 }
 
 /// Writes the records of the passes of a sort. `low_bits` of the key lie in its second word; 0 if it has one word.
-pub fn write_sort_jobs(
+pub(crate) fn write_sort_jobs(
     device: &Device,
     jobs: &wgpu::Buffer,
     capacities: Capacities,

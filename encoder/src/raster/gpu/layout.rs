@@ -14,16 +14,16 @@ use crate::raster::weights::RegionWeight;
 /// A Gaussian in device memory.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-pub struct SceneGaussian {
+pub(crate) struct SceneGaussian {
     /// Mean relative to the scene's origin, rounded to `f32`.
-    pub mean_high: [f32; 3],
+    pub(crate) mean_high: [f32; 3],
     /// Opacity; 0 if the Gaussian cannot be drawn.
     pub opacity: f32,
     /// Rounding error of `mean_high`.
-    pub mean_low: [f32; 3],
+    pub(crate) mean_low: [f32; 3],
     /// See [`crate::raster::project::ScreenGaussian::reach2`].
-    pub reach2: f32,
-    pub rotation_wxyz: [f32; 4],
+    pub(crate) reach2: f32,
+    pub(crate) rotation_wxyz: [f32; 4],
     /// Standard deviations, world units.
     pub scales: [f32; 3],
     /// Unused.
@@ -61,19 +61,19 @@ fn high_and_low(value: DVec3) -> ([f32; 3], [f32; 3]) {
 
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-pub struct Chunk {
+pub(crate) struct Chunk {
     /// Index of its first Gaussian in the scene.
-    pub first_gaussian: u32,
+    pub(crate) first_gaussian: u32,
     pub n_gaussians: u32,
 }
 
 /// Parameters of a prefix sum; see `scan.wgsl`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-pub struct ScanJob {
+pub(crate) struct ScanJob {
     pub items: u32,
     /// Upper limit of the number of items; the number itself if there is no counter.
-    pub n_most: u32,
+    pub(crate) n_most: u32,
     pub block: u32,
     /// Values per block.
     pub columns: u32,
@@ -84,7 +84,7 @@ pub struct ScanJob {
 /// Parameters of a pass of a radix sort; see `sort.wgsl`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-pub struct SortPass {
+pub(crate) struct SortPass {
     pub items: u32,
     /// Words between keys.
     pub stride: u32,
@@ -93,7 +93,7 @@ pub struct SortPass {
     /// Subtracted from each word at `offset`.
     pub least: u32,
     /// Bits of the key that come from the word after that at `offset`, the lower ones.
-    pub low_bits: u32,
+    pub(crate) low_bits: u32,
     /// Position of the digit, bits.
     pub shift: u32,
     /// Capacity for items.
@@ -103,7 +103,7 @@ pub struct SortPass {
 /// A contribution summed over all tiles of a band, in units of `2^-SUM_FRACTION_BITS`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-pub struct RegionSum {
+pub(crate) struct RegionSum {
     /// Index in the scene.
     pub gaussian: u32,
     pub region: u32,
@@ -128,7 +128,7 @@ impl RegionSum {
 
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-pub struct Background {
+pub(crate) struct Background {
     pub rgb: [f32; 3],
     /// Unused.
     pub padding: u32,
@@ -136,7 +136,7 @@ pub struct Background {
 
 /// Capacities of the buffers of a workspace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Capacities {
+pub(crate) struct Capacities {
     pub visible: u32,
     /// (Tile, Gaussian) pairs.
     pub pairs: u32,
@@ -145,9 +145,9 @@ pub struct Capacities {
 }
 
 /// Parameters of the shaders for a band of a view.
-pub struct ViewBlock {
+pub(crate) struct ViewBlock {
     /// `rotation` (9), `position_high` (3), `position_low` (3), focal lengths, centre.
-    pub reals: [f64; 19],
+    pub(crate) reals: [f64; 19],
     /// From `width_px` to `capacity_entries`.
     pub words: [u32; 8],
 }
@@ -201,7 +201,7 @@ impl ViewBlock {
 }
 
 /// Returns the size of a Gaussian on the screen in bytes, and the index of its depth word.
-pub fn screen_layout(precision: Precision) -> (u32, u32) {
+pub(crate) fn screen_layout(precision: Precision) -> (u32, u32) {
     match precision {
         Precision::F64 => (56, 10),
         Precision::F32 => (36, 5),

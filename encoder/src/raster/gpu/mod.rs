@@ -26,7 +26,8 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_math::stats::{Rank, quantile};
 
-pub use super::adapter::{AdapterReport, GpuOptions, Precision};
+pub(crate) use super::adapter::AdapterReport;
+pub use super::adapter::{GpuOptions, Precision};
 use super::constants::TILE_SIZE_PX;
 use super::cpu::CpuRasterizer;
 use super::draw::Drawing;
@@ -40,7 +41,8 @@ use crate::masks::RegionMap;
 use band::{Band, band_size};
 use buffers::{REGION_BYTES, Size};
 use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
-pub use device::{Adapter, Device, adapters};
+pub(crate) use device::Adapter;
+pub use device::{Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
 use workspace::{Counts, PIXEL_BYTES, Workspace};
@@ -489,15 +491,7 @@ mod tests {
         let scene = GpuScene::new(device, options, &gaussians).expect("loads");
         let mut view = RasterView {
             camera_from_world: glam::DAffine3::IDENTITY,
-            intrinsics: slag_common::Intrinsics {
-                width_px: 16,
-                height_px: 16,
-                focal_x_px: 16.0,
-                focal_y_px: 16.0,
-                centre_x_px: 8.0,
-                centre_y_px: 8.0,
-                distortion: slag_common::Distortion::None,
-            },
+            intrinsics: crate::raster::pinhole([16, 16], 16.0),
         };
         let panics = || scene.each_band(&view, REGION_BYTES, |_, _, _| panic!("a broken view"));
         std::panic::catch_unwind(std::panic::AssertUnwindSafe(panics)).expect_err("it panics");

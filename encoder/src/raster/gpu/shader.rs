@@ -12,26 +12,26 @@ use crate::raster::constants::{
 use crate::raster::weights::WeightKind;
 
 /// Threads of a workgroup, equal to the pixels of a tile.
-pub const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
+pub(crate) const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
 /// Items that a workgroup sorts at once.
-pub const SORT_BLOCK: u32 = 2048;
+pub(crate) const SORT_BLOCK: u32 = 2048;
 /// Digits of a sort pass.
-pub const RADIX: u32 = 32;
+pub(crate) const RADIX: u32 = 32;
 /// Largest number of workgroups of a dispatch that every device supports.
-pub const MAX_DISPATCH: u32 = 65_535;
+pub(crate) const MAX_DISPATCH: u32 = 65_535;
 /// Fraction bits of fixed-point weights; with the 2^28 pixels of the largest image, sums need 63 bits.
 pub const SUM_FRACTION_BITS: u32 = 35;
 /// Bits of a region number: two share a word, and so do a region and a pixel of its tile.
-pub const REGION_BITS: u32 = 16;
+pub(crate) const REGION_BITS: u32 = 16;
 /// Most items of a buffer: counts above it do not fit, and stay far below 2^32.
-pub const MAX_CAPACITY: u32 = 1 << 31;
+pub(crate) const MAX_CAPACITY: u32 = 1 << 31;
 /// Stands for "no counter".
 pub const NONE: u32 = u32::MAX;
 
 /// Counters that shaders increment; the host reads them after each band.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
-pub enum Counter {
+pub(crate) enum Counter {
     /// Gaussians visible in the band.
     Visible,
     /// Visible Gaussians that were not visible in an earlier band.
@@ -59,7 +59,7 @@ impl Counter {
 }
 
 /// The shaders of the stages, without the common part.
-pub const STAGES: [(&str, &str); 7] = [
+pub(crate) const STAGES: [(&str, &str); 7] = [
     ("project", include_str!("../project.wgsl")),
     ("scan", include_str!("../scan.wgsl")),
     ("sort", include_str!("../sort.wgsl")),
@@ -71,7 +71,7 @@ pub const STAGES: [(&str, &str); 7] = [
 const COMMON: &str = include_str!("../common.wgsl");
 
 /// Returns the complete source of a stage.
-pub fn module_text(stage: &str, precision: Precision) -> String {
+pub(crate) fn module_text(stage: &str, precision: Precision) -> String {
     let mut text = String::new();
     let real = match precision {
         Precision::F64 => "f64",
@@ -136,20 +136,20 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
 }
 
 /// The compute pipelines of all stages.
-pub struct Kernels {
-    pub count_visible: wgpu::ComputePipeline,
-    pub write_visible: wgpu::ComputePipeline,
+pub(crate) struct Kernels {
+    pub(crate) count_visible: wgpu::ComputePipeline,
+    pub(crate) write_visible: wgpu::ComputePipeline,
     pub scan: wgpu::ComputePipeline,
-    pub count_digits: wgpu::ComputePipeline,
-    pub scatter: wgpu::ComputePipeline,
-    pub count_pairs: wgpu::ComputePipeline,
-    pub write_pairs: wgpu::ComputePipeline,
-    pub find_ranges: wgpu::ComputePipeline,
-    pub order_tiles: wgpu::ComputePipeline,
+    pub(crate) count_digits: wgpu::ComputePipeline,
+    pub(crate) scatter: wgpu::ComputePipeline,
+    pub(crate) count_pairs: wgpu::ComputePipeline,
+    pub(crate) write_pairs: wgpu::ComputePipeline,
+    pub(crate) find_ranges: wgpu::ComputePipeline,
+    pub(crate) order_tiles: wgpu::ComputePipeline,
     /// One for each [`WeightKind`].
-    pub sum_regions: [wgpu::ComputePipeline; 2],
-    pub count_heads: wgpu::ComputePipeline,
-    pub add_up: wgpu::ComputePipeline,
+    pub(crate) sum_regions: [wgpu::ComputePipeline; 2],
+    pub(crate) count_heads: wgpu::ComputePipeline,
+    pub(crate) add_up: wgpu::ComputePipeline,
     pub draw: wgpu::ComputePipeline,
 }
 

@@ -11,7 +11,7 @@ use super::shader::{Counter, WORKGROUP_SIZE};
 use crate::raster::weights::WeightKind;
 
 /// Records the stages of one view in flight.
-pub struct Stages {
+pub(crate) struct Stages {
     pub buffers: Buffers,
     /// Bind groups by kernel and variant.
     groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
@@ -177,7 +177,7 @@ impl Stages {
     }
 
     /// Blends all tiles and sums their weights of this kind over regions.
-    pub fn blend(
+    pub(crate) fn blend(
         &mut self,
         device: &Device,
         pass: &mut wgpu::ComputePass<'_>,

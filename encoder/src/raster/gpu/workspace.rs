@@ -19,11 +19,11 @@ use crate::raster::weights::WeightKind;
 pub type Counts = [u32; Counter::ALL.len()];
 
 /// Size of a drawn pixel, bytes.
-pub const PIXEL_BYTES: u64 = 20;
+pub(crate) const PIXEL_BYTES: u64 = 20;
 
 /// The resources of one view in flight.
 pub struct Workspace {
-    pub capacities: Capacities,
+    pub(crate) capacities: Capacities,
     n_tiles: u32,
     n_px: u32,
     stages: Stages,

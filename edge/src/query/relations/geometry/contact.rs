@@ -1,6 +1,6 @@
 //! On, under and above: one thing over another.
 
-use super::measure::{Scale, falling};
+use super::measure::falling;
 use super::solid::Solid;
 
 /// Distance, in metres, between a thing's bottom and the surface below it that still counts as touching: positions
@@ -17,36 +17,34 @@ const OVER: [f64; 2] = [0.6, 0.2];
 const PANEL: f64 = 0.25;
 
 /// Returns the degree to which a thing rests on another, or hangs on it if that is a panel.
-pub fn on(thing: &Solid, support: &Solid, scale: Scale) -> f64 {
-    resting(thing, support, scale).max(hanging(thing, support, scale))
+pub fn on(thing: &Solid, support: &Solid, metre: f64) -> f64 {
+    resting(thing, support, metre).max(hanging(thing, support, metre))
 }
 
-fn resting(thing: &Solid, support: &Solid, scale: Scale) -> f64 {
-    let m = scale.metre;
+fn resting(thing: &Solid, support: &Solid, metre: f64) -> f64 {
     // A thing that is much larger than its support rests on something else.
     if thing.area() > 2.0 * support.area() || thing.centre.z <= support.centre.z {
         return 0.0;
     }
     let over = thing.shared_area(support) / thing.area().max(f64::MIN_POSITIVE);
     let gap = thing.bottom() - support.top();
-    let sunk = -gap / (SUNK * support.height()).max(TOUCHES_M * m);
-    let touches = falling(gap, TOUCHES_M * m, APART_M * m) * falling(sunk, 1.0, 1.5);
+    let sunk = -gap / (SUNK * support.height()).max(TOUCHES_M * metre);
+    let touches = falling(gap, TOUCHES_M * metre, APART_M * metre) * falling(sunk, 1.0, 1.5);
     touches * falling(-over, -OVER[0], -OVER[1])
 }
 
-fn hanging(thing: &Solid, panel: &Solid, scale: Scale) -> f64 {
-    let m = scale.metre;
+fn hanging(thing: &Solid, panel: &Solid, metre: f64) -> f64 {
     let (thick, wide) = (panel.half.x.min(panel.half.y), panel.half.x.max(panel.half.y));
     let is_panel = thick < PANEL * wide && thing.volume() < panel.volume().max(wide * wide * thick);
-    let is_off_the_ground = thing.bottom() > panel.bottom() + TOUCHES_M * m;
+    let is_off_the_ground = thing.bottom() > panel.bottom() + TOUCHES_M * metre;
     if !is_panel || !is_off_the_ground || thing.shared_height(panel) < 0.5 * thing.height() {
         return 0.0;
     }
-    falling(thing.horizontal_gap(panel), TOUCHES_M * m, APART_M * m)
+    falling(thing.horizontal_gap(panel), TOUCHES_M * metre, APART_M * metre)
 }
 
 /// Returns the degree to which a thing is below another and within its outline.
-pub fn under(thing: &Solid, cover: &Solid, scale: Scale) -> f64 {
+pub fn under(thing: &Solid, cover: &Solid, metre: f64) -> f64 {
     if thing.centre.z >= cover.centre.z || thing.top() > cover.top() {
         return 0.0;
     }
@@ -54,6 +52,6 @@ pub fn under(thing: &Solid, cover: &Solid, scale: Scale) -> f64 {
     let share = thing.shared_area(cover) / smaller;
     // Under a table, not in the middle of a cupboard: it begins near the cover's bottom or below it.
     let raised = thing.bottom() - cover.bottom();
-    let low = falling(raised, TOUCHES_M * scale.metre, (APART_M * scale.metre).max(0.3 * cover.height()));
+    let low = falling(raised, TOUCHES_M * metre, (APART_M * metre).max(0.3 * cover.height()));
     falling(-share, -OVER[0], -OVER[1]) * low
 }

@@ -1,6 +1,6 @@
 //! Near, beside and between.
 
-use super::measure::{Scale, falling};
+use super::measure::falling;
 use super::outline::to_segment;
 use super::solid::Solid;
 
@@ -18,19 +18,18 @@ const LEVEL: [f64; 2] = [0.5, 0.1];
 const OFF_LINE: [f64; 2] = [0.2, 0.5];
 
 /// Returns the degree to which two things are near each other.
-pub fn near(thing: &Solid, other: &Solid, scale: Scale) -> f64 {
+pub fn near(thing: &Solid, other: &Solid, metre: f64) -> f64 {
     let more = OF_SIZE * thing.half.max_element().min(other.half.max_element());
-    falling(thing.gap(other), NEAR_M * scale.metre + more, FAR_M * scale.metre + more)
+    falling(thing.gap(other), NEAR_M * metre + more, FAR_M * metre + more)
 }
 
 /// Returns the degree to which two things stand side by side.
-pub fn beside(thing: &Solid, other: &Solid, scale: Scale) -> f64 {
-    let m = scale.metre;
+pub fn beside(thing: &Solid, other: &Solid, metre: f64) -> f64 {
     let lower = thing.height().min(other.height()).max(f64::MIN_POSITIVE);
     let level = falling(-thing.shared_height(other) / lower, -LEVEL[0], -LEVEL[1]);
     let smaller = thing.area().min(other.area()).max(f64::MIN_POSITIVE);
     let apart = falling(thing.shared_area(other) / smaller, 0.2, 0.6);
-    level * apart * falling(thing.horizontal_gap(other), BESIDE_M[0] * m, BESIDE_M[1] * m)
+    level * apart * falling(thing.horizontal_gap(other), BESIDE_M[0] * metre, BESIDE_M[1] * metre)
 }
 
 /// Returns the degree to which a thing is between two others.

@@ -10,7 +10,6 @@ mod seen;
 mod solid;
 
 pub use distance::between;
-pub use measure::Scale;
 pub use seen::Viewer;
 pub use solid::Solid;
 
@@ -20,17 +19,17 @@ use super::phrase::Relation;
 pub const HOLDS: f64 = 0.5;
 
 /// Returns the degree to which a thing is so placed to another; `between` is 0 here, see [`between`].
-pub fn degree(is: Relation, thing: &Solid, of: &Solid, viewer: Option<&Viewer>, scale: Scale) -> f64 {
+pub fn degree(is: Relation, thing: &Solid, of: &Solid, viewer: Option<&Viewer>, metre: f64) -> f64 {
     match is {
-        Relation::On => contact::on(thing, of, scale),
-        Relation::Under => contact::under(thing, of, scale),
-        Relation::Above => contact::under(of, thing, scale),
-        Relation::In => enclosed::inside(thing, of, scale),
-        Relation::Near => distance::near(thing, of, scale),
-        Relation::Beside => distance::beside(thing, of, scale),
+        Relation::On => contact::on(thing, of, metre),
+        Relation::Under => contact::under(thing, of, metre),
+        Relation::Above => contact::under(of, thing, metre),
+        Relation::In => enclosed::inside(thing, of, metre),
+        Relation::Near => distance::near(thing, of, metre),
+        Relation::Beside => distance::beside(thing, of, metre),
         Relation::Between => 0.0,
         Relation::LeftOf | Relation::RightOf | Relation::InFrontOf | Relation::Behind => {
-            viewer.map_or(0.0, |viewer| seen::towards(is, thing, of, viewer, scale))
+            viewer.map_or(0.0, |viewer| seen::towards(is, thing, of, viewer, metre))
         }
     }
 }

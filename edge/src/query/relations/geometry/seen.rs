@@ -4,7 +4,7 @@ use std::f64::consts::FRAC_PI_2;
 
 use glam::{DVec2, DVec3};
 
-use super::measure::{Scale, falling};
+use super::measure::falling;
 use super::solid::Solid;
 use crate::query::relations::phrase::Relation;
 
@@ -26,7 +26,7 @@ pub struct Viewer {
 /// Returns the degree to which a thing is left of another, right of it, in front of it or behind it.
 ///
 /// Seen from the asker, who looks at the other thing; beside the asker itself, from its heading.
-pub fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, scale: Scale) -> f64 {
+pub fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, metre: f64) -> f64 {
     let anchor = of.centre.truncate();
     let sight = anchor - viewer.position_in_world.truncate();
     let heading = viewer.heading_rad.map(DVec2::from_angle);
@@ -60,7 +60,7 @@ pub fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, scale: 
         return 0.0;
     }
     let angle = offset.angle_to(meant).abs().min(FRAC_PI_2).to_degrees();
-    let gap = thing.horizontal_gap(of) / scale.metre;
+    let gap = thing.horizontal_gap(of) / metre;
     let reach = 1.0 - 0.5 * (1.0 - falling(gap, REACH_M[0], REACH_M[1]));
     falling(angle, OFF_DEG[0], OFF_DEG[1]) * reach
 }

@@ -1,10 +1,10 @@
 //! An upright box: a rectangle on the ground, turned about the vertical, and a range of heights.
 
 use glam::{DVec2, DVec3};
+use slag_api::objects::{Alignment, OrientedBox};
 use slag_common::frames::Aabb;
 
 use super::outline;
-use crate::query::oriented::{Alignment, OrientedBox};
 
 /// Share of the smaller of two boxes that lies in the larger one if they are of one thing.
 const PIECE: f64 = 0.6;

@@ -5,7 +5,8 @@ use slag_common::frames::Aabb;
 use super::*;
 use glam::DVec3;
 
-const METRES: Scale = Scale { metre: 1.0 };
+/// World units in a metre.
+const METRES: f64 = 1.0;
 
 fn solid(centre: [f64; 3], size: [f64; 3]) -> Solid {
     Solid { centre: centre.into(), half: DVec3::from(size) * 0.5, along: DVec2::X }

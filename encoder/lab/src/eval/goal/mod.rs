@@ -22,7 +22,7 @@ use slag_encoder::store::StoreReader;
 
 use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
-use crate::generate::grammar::{self, SceneKind};
+use crate::generate::grammar::{NOUNS, SceneKind};
 use crate::harness::Times;
 use crate::programs::{Prepared, Service, flag_value, sibling};
 use crate::table::{Table, percent};
@@ -83,8 +83,7 @@ pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport
 }
 
 fn judge(args: &GoalArgs, at: &Prepared<'_>, kind: SceneKind, report: &mut GoalReport) -> Result<()> {
-    let nouns = grammar::nouns(None)?;
-    let layout = Layout::new(&[kind], at.seed, &nouns, &|_, _| true);
+    let layout = Layout::new(&[kind], at.seed, &|_, _| true);
     report.voxels.add(voxels::compare(&layout, &at.dir.join("store"))?);
     let views = layout.photos(args.walk, args.n_views);
     let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
@@ -108,7 +107,7 @@ fn judge(args: &GoalArgs, at: &Prepared<'_>, kind: SceneKind, report: &mut GoalR
                 verdict(&truth, index, &reply)?
             }
         };
-        let noun = &nouns[placed.noun].name;
+        let noun = &NOUNS[placed.noun].name;
         if args.list && verdict.is_fault(is_reachable) {
             let id = label.object.as_deref().unwrap_or("no object");
             tracing::warn!("{}-{} {noun} {id} (reachable: {is_reachable}): {verdict:?}", at.kind, at.seed);

@@ -7,7 +7,6 @@ use anyhow::Result;
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::occupancy::BLOCK_EDGE;
-use slag_common::shard::ShardLayout;
 use slag_encoder::store::StoreReader;
 
 use crate::generate::compose::Layout;
@@ -38,9 +37,8 @@ pub(super) fn compare(layout: &Layout, store: &Path) -> Result<Voxels> {
     let mut surfaces: Option<HashSet<[i32; 3]>> = None;
     for cell in &reader.manifest().cells {
         let Some(record) = cell.shards.values().next() else { continue };
-        let bytes = reader.read_object(record.hash)?;
-        let layout_of_shard = ShardLayout::check(&bytes)?;
-        let Some(occupancy) = layout_of_shard.occupancy(&bytes) else { continue };
+        let shard = reader.read_shard(record)?;
+        let Some(occupancy) = shard.layout.occupancy(&shard.bytes) else { continue };
         let voxel = occupancy.header.voxel;
         let surfaces = surfaces.get_or_insert_with(|| surface_voxels(layout, voxel));
         found.len_bytes += occupancy.sections().iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();

@@ -31,7 +31,7 @@ use slag_models::commands::RunArgs;
 use super::metrics::mean;
 use super::truth::read_things;
 use crate::generate::Scene;
-use crate::generate::grammar::{self, SceneKind};
+use crate::generate::grammar::SceneKind;
 use crate::programs::flag_value;
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure, percent};
@@ -129,7 +129,7 @@ pub(crate) fn run(args: &MasksArgs, progress: &dyn Progress) -> Result<MasksRepo
 fn generated(kind: SceneKind, seed: u64, out: &Path) -> Result<PathBuf> {
     let dir = out.join(format!("{}-{seed}", flag_value(&kind)?));
     if !dir.join("transforms.json").is_file() {
-        Scene::new(&[kind], seed, N_GENERATED_VIEWS, &grammar::nouns(None)?).write(&dir, &Silent)?;
+        Scene::new(&[kind], seed, N_GENERATED_VIEWS).write(&dir, &Silent)?;
     }
     Ok(dir)
 }
@@ -190,10 +190,7 @@ impl Judge<'_> {
     /// Segments a photo and counts its masks.
     fn photo(&self, view: &View, row: &mut Row) -> Result<Seen> {
         let loaded = ingest::load_image(view)?;
-        let view = RasterView {
-            camera_from_world: loaded.view.camera_from_world,
-            intrinsics: loaded.view.intrinsics,
-        };
+        let view = RasterView::of(&loaded.view);
         let drawing = self.scene.draw(&view, [0.0; 3])?;
         let is_seen: Vec<bool> = drawing.coverage.iter().map(|share| *share > MIN_COVERAGE).collect();
         let depth: Vec<f32> = drawing

@@ -11,6 +11,7 @@ use qdrant_client::qdrant::{
 
 use super::server::Server;
 use super::*;
+use crate::publish::qdrant::settings::Quantisation;
 
 /// A creation without any setting: vectors and distance alone.
 fn plain() -> CreateCollection {

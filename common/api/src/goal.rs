@@ -1,14 +1,15 @@
-//! Poses, or why there is none.
+//! `GET /v1/goal`.
+
+use std::borrow::Cow;
 
 use glam::DVec3;
 use schemars::JsonSchema;
-use serde::Serialize;
-use slag_common::frames::Geographic;
+use serde::{Deserialize, Serialize};
 
-use crate::query::FRAME;
+use crate::{FRAME, Geographic};
 
 /// A pose to stand in, in the scene's world frame: x forward, y left, z up (REP-103).
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Goal {
     /// The ground below the robot's middle.
     #[schemars(with = "[f64; 3]")]
@@ -36,7 +37,7 @@ pub struct Goal {
 }
 
 /// Why there is no pose.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum NoGoal {
     /// Nothing on board matches.
@@ -50,7 +51,7 @@ pub enum NoGoal {
 }
 
 /// Why there is no pose, for programs and people.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct GoalMiss {
     /// The reason.
     pub kind: NoGoal,
@@ -59,7 +60,7 @@ pub struct GoalMiss {
 }
 
 /// The thing to go to.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[schemars(rename = "GoalThing")]
 pub struct TargetThing {
     /// Its id.
@@ -73,7 +74,7 @@ pub struct TargetThing {
 }
 
 /// A thing that matches better, but without a pose.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MissedThing {
     /// The thing.
     #[serde(flatten)]
@@ -83,7 +84,7 @@ pub struct MissedThing {
 }
 
 /// The places to stand.
-#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct GoalReply {
     /// Name of the scene.
     pub scene: String,
@@ -91,7 +92,7 @@ pub struct GoalReply {
     pub generation: u64,
     /// Frame of every position.
     #[schemars(extend("enum" = [FRAME]))]
-    pub frame: &'static str,
+    pub frame: Cow<'static, str>,
     /// Edge of the voxels that places are known by.
     pub voxel_m: f64,
     /// Where the robot was taken to be.
@@ -108,11 +109,12 @@ pub struct GoalReply {
 }
 
 impl GoalReply {
-    pub(super) fn empty(scene: &str, generation: u64, voxel_m: f64, near_in_world: DVec3) -> Self {
+    /// Returns a reply without poses.
+    pub fn empty(scene: &str, generation: u64, voxel_m: f64, near_in_world: DVec3) -> Self {
         Self {
             scene: scene.to_owned(),
             generation,
-            frame: FRAME,
+            frame: FRAME.into(),
             voxel_m,
             near_in_world,
             thing: None,

@@ -1,0 +1,16 @@
+//! The replies of version 1 of the robot's interface that its clients read too: the service writes them, the doors
+//! parse them, and the description is made from them.
+
+pub mod changes;
+pub mod floor;
+pub mod goal;
+pub mod locate;
+pub mod map;
+pub mod objects;
+
+pub use slag_common::frames::Geographic;
+
+/// Name of the frame of every position: the scene's world frame (`docs/api.md`).
+pub const FRAME: &str = "world";
+/// Units of positions and lengths: metres, or those of a world frame without a metric scale.
+pub const UNITS: [&str; 2] = ["m", "world"];
