@@ -54,6 +54,7 @@ fn robots_fetch_the_text_model_with_the_scene() {
     // A licence that forbids it is named before the work.
     let restricted = models(&at("restricted"), "apple-amlr");
     refused(&mut encode(&restricted, &at("refused"), &["--text-model"]), "apple-amlr");
+    assert!(!at("refused").exists(), "no empty store is left behind");
     assert!(!at("refused").join("manifest").exists());
 
     let models = models(&at("models"), "Apache-2.0 OR MIT");

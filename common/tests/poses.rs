@@ -257,6 +257,8 @@ fn photos_and_models_are_found_and_choices_are_said() {
             "{:?}",
             set.notes
         );
+        // The larger one is a choice, too.
+        assert!(set.notes.iter().any(|note| note.contains("0 beside it has 2: COLMAP made several models")));
     }
     let small = poses::read(&dir.path().join("sparse/0"), None).unwrap();
     assert!(small.notes.iter().any(|note| note.contains("several models")), "{:?}", small.notes);

@@ -269,6 +269,11 @@ fn geo_reference() {
     {
         assert!(matches!(read(json), Err(GeoError::Json { .. })), "{json}");
     }
+    assert!(read("\u{feff}{\"origin\": {\"lat\": 1, \"lon\": 2, \"alt\": 3}}").is_ok(), "a byte order mark");
+    let twice = read(r#"{"origin": {"lat": 8, "lat": 47, "lon": 8, "alt": 0}}"#).unwrap_err().to_string();
+    assert!(twice.contains("duplicate field `lat`"), "{twice}");
+    // Endless: no more than a limit is read.
+    assert!(matches!(read_geo_reference("/dev/zero".as_ref()), Err(GeoError::Json { .. })));
     let brighton = shared("scenes/brighton/geo.json");
     let origin = read_geo_reference(&brighton).unwrap().origin;
     assert_eq!(

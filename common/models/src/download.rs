@@ -331,6 +331,11 @@ impl<'a> Client<'a> {
                 part.discard()?;
                 return Err(refusal(&response).into());
             }
+            // Some proxies refuse ranges alone: the whole is asked for. One that is busy is asked again.
+            status if offset > 0 && !matches!(status.as_u16(), 408 | 429 | 502..=504) => {
+                *may_resume = false;
+                return self.receive(url, part, expected, may_resume);
+            }
             _ => return Err(refusal(&response).into()),
         };
         if total.is_none() && !content_range.is_empty() {
@@ -431,6 +436,7 @@ impl<'a> Client<'a> {
             let location = header_text(&response, header::LOCATION);
             match redirected(&uri, &location).filter(|_| n_followed < self.limits.redirects) {
                 Some(next) => uri = next,
+                None if location.is_empty() => return Ok(response),
                 None => return Err(DownloadFailure::Redirect { location }.into()),
             }
         }

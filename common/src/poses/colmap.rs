@@ -74,26 +74,35 @@ fn notes(model_dir: &Path, extension: &str, n_views: usize) -> Vec<String> {
             other.display()
         ));
     }
-    let beside = model_dir.parent().and_then(largest_model);
-    if let Some((larger, n)) = beside.filter(|(larger, n)| larger != model_dir && *n > n_views as u64) {
+    let beside = model_dir.parent().map(models).unwrap_or_default();
+    let others = beside.into_iter().filter(|(n, model)| *n > 0 && model != model_dir);
+    if let Some((n, other)) = largest(others) {
         notes.push(format!(
             "{} has {n_views} images; {} beside it has {n}: COLMAP made several models, one is read",
             model_dir.display(),
-            larger.display()
+            other.display()
         ));
     }
     notes
 }
 
-/// Returns the numbered COLMAP model (`0`, `1` ...) with most images in a folder, and their number.
-pub(super) fn largest_model(folder: &Path) -> Option<(PathBuf, u64)> {
+/// Returns the numbered COLMAP model (`0`, `1` ...) with most images in a folder.
+pub(super) fn largest_model(folder: &Path) -> Option<PathBuf> {
+    largest(models(folder).into_iter()).map(|(_, model)| model)
+}
+
+/// Returns the first of the models with most images.
+fn largest(models: impl Iterator<Item = (u64, PathBuf)>) -> Option<(u64, PathBuf)> {
+    models.reduce(|best, model| if model.0 > best.0 { model } else { best })
+}
+
+/// Returns the numbered models of a folder and how many images each has, by number.
+fn models(folder: &Path) -> Vec<(u64, PathBuf)> {
     let number = |path: &PathBuf| path.file_name()?.to_str()?.parse::<u32>().ok();
-    let entries = fs_err::read_dir(folder).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    let entries = fs_err::read_dir(folder).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path()));
     let mut models: Vec<(u32, PathBuf)> = entries.filter_map(|path| Some((number(&path)?, path))).collect();
     models.sort();
-    let counted = models.into_iter().filter_map(|(_, path)| Some((n_images(&path)?, path)));
-    let largest = counted.reduce(|best, model| if model.0 > best.0 { model } else { best });
-    largest.map(|(n, path)| (path, n))
+    models.into_iter().filter_map(|(_, path)| Some((n_images(&path)?, path))).collect()
 }
 
 /// Returns the number of images that a model states, or that its lines suggest; `None` without a model.

@@ -37,7 +37,7 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
             _ => Err(PoseError::NotFound { path: path.to_owned() }),
         };
     }
-    let numbered = |folder: &Path| colmap::largest_model(folder).map(|(model, _)| model);
+    let numbered = colmap::largest_model;
     let model_dirs =
         [Some(path.to_owned()), numbered(&path.join("sparse")), numbered(path), Some(path.join("sparse"))];
     for model_dir in model_dirs.into_iter().flatten() {

@@ -284,7 +284,10 @@ impl Camera {
             length.or_else(|| angle.filter(|a| *a > 0.0 && *a < PI).map(|a| 0.5 * side_px / (0.5 * a).tan()))
         };
         let focal_x_px = focal(self.fl_x, self.camera_angle_x, width_px).ok_or_else(|| {
-            PoseProblem::MissingIntrinsics { image: image.to_owned(), field: "fl_x or camera_angle_x" }
+            PoseProblem::MissingIntrinsics {
+                image: image.to_owned(),
+                field: "fl_x, or camera_angle_x within 0..pi radians,",
+            }
         })?;
         let focal_y_px = focal(self.fl_y, self.camera_angle_y, height_px).unwrap_or(focal_x_px);
         let centre_px = [self.cx.unwrap_or(0.5 * width_px), self.cy.unwrap_or(0.5 * height_px)];

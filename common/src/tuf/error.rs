@@ -17,7 +17,7 @@ pub enum TufError {
         "{role} metadata: version {found}, expected {expected}: files of different states are mixed; fetch again"
     )]
     Version { role: String, expected: u64, found: u64 },
-    #[error("{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder {}` there, and check its clock", if role == "root" { "keys renew" } else { "store refresh" })]
+    #[error("{role} metadata expired at {expired}, and it is {now} at least: the store was not refreshed, or something hides its news; run `slag-encoder {}` there, and check its clock and this machine's", if role == "root" { "keys renew" } else { "store refresh" })]
     Expired { role: String, expired: String, now: String },
     #[error("{what}: {fault}: it was changed, or files of different states are mixed; fetch again")]
     Content { what: String, fault: String },

@@ -132,6 +132,12 @@ pub(super) fn parse_radius(text: &str) -> Result<f64, String> {
     radius.ok_or_else(|| "expected world units, 0 or more".to_owned())
 }
 
+/// Reads the radius of a search, which finds nothing at 0.
+pub(super) fn parse_reach(text: &str) -> Result<f64, String> {
+    let radius = parse_radius(text).ok().filter(|radius| *radius > 0.0);
+    radius.ok_or_else(|| "expected world units, more than 0".to_owned())
+}
+
 /// Reads a number of bytes: 2GB, 2GiB or 2G.
 pub fn parse_bytes(text: &str) -> Result<u64, ByteSizeError> {
     text.parse::<ByteSize>().map(|size| size.0)

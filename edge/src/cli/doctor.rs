@@ -148,8 +148,7 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
     let mut findings =
         vec![Finding::new("scene", Verdict::Ok, scene), Finding::new("place", Verdict::Ok, place)];
     if let Some(signed) = accepted(cache).and_then(|accepted| accepted.signed_unix_secs) {
-        let hours = crate::now_unix_secs().saturating_sub(signed) as f64 / 3600.0;
-        findings.push(Finding::new("age", Verdict::Ok, format!("the store signed it {hours:.1} hours ago")));
+        findings.push(age(signed, crate::now_unix_secs()));
     }
     let mut note = |what, text: &str| findings.push(Finding::new(what, Verdict::Note, text));
     if !status.bad_cells.is_empty() {
@@ -162,6 +161,18 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
         note("goal", "no places to stand: the scene was encoded without --occupancy");
     }
     findings
+}
+
+fn age(signed_unix_secs: u64, now_unix_secs: u64) -> Finding {
+    let Some(secs) = (now_unix_secs + 3600).checked_sub(signed_unix_secs) else {
+        let [signed, now] = [signed_unix_secs, now_unix_secs].map(format_utc);
+        let text = format!(
+            "the store signed it at {signed}, this robot's clock says {now}: set the one that is wrong"
+        );
+        return Finding::new("age", Verdict::Note, text);
+    };
+    let hours = secs.saturating_sub(3600) as f64 / 3600.0;
+    Finding::new("age", Verdict::Ok, format!("the store signed it {hours:.1} hours ago"))
 }
 
 fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
@@ -178,5 +189,24 @@ fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
     match opened {
         Ok(text) => Finding::new("text model", Verdict::Ok, text),
         Err(failure) => Finding::new("text model", Verdict::Missing, failure.text()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A clock of robot or store that is wrong is not an age of no hours.
+    #[test]
+    fn a_signature_of_the_future_is_noted() {
+        let at = |signed: u64| age(signed, 1_800_000_000);
+        assert_eq!(at(1_800_000_000 - 5400).text, "the store signed it 1.5 hours ago");
+        assert_eq!(at(1_800_000_060).text, "the store signed it 0.0 hours ago");
+        let late = at(4_070_908_800);
+        assert!(
+            late.text.contains("2099-01-01") && late.text.contains("clock says 2027-01-15"),
+            "{}",
+            late.text
+        );
     }
 }

@@ -10,7 +10,7 @@ use serde::de::{DeserializeOwned, IntoDeserializer};
 use slag_api::objects::{Name, ObjectOnBoard, ObjectPage};
 use slag_common::frames::Aabb;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius};
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius, parse_reach};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
 use crate::query::{ListFormat, ObjectFilter, ObjectOrder, parse_box, parse_point};
@@ -34,7 +34,7 @@ pub struct ListArgs {
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true, requires = "radius")]
     pub near: Option<DVec3>,
     /// The radius, world units.
-    #[arg(long, requires = "near", value_parser = parse_radius, allow_negative_numbers = true)]
+    #[arg(long, requires = "near", value_parser = parse_reach, allow_negative_numbers = true)]
     pub radius: Option<f64>,
     /// List only within the box between two corners, world frame.
     #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]

@@ -82,6 +82,17 @@ impl<'a> Client<'a> {
         })
     }
 
+    /// Downloads a root that may not be there: some hosts of files say so with 403 or 410, and a 404 would hide a
+    /// newer root just as well.
+    pub fn next_root(&self, path: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, FetchError> {
+        match self.file(path, max_bytes) {
+            Err(FetchError::Download {
+                failure: DownloadFailure::Status { status: 403 | 410, .. }, ..
+            }) => Ok(None),
+            file => file,
+        }
+    }
+
     /// Downloads an object into a staged file, resuming an earlier attempt, and makes it durable. Checks its hash.
     pub fn object(
         &self,

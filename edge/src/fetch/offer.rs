@@ -90,7 +90,10 @@ struct StoreMetadata<'a> {
 
 impl Source for StoreMetadata<'_> {
     fn metadata(&mut self, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, String> {
-        self.client.file(&format!("metadata/{name}"), max_bytes).map_err(|failure| {
+        let path = format!("metadata/{name}");
+        let is_root = name.ends_with(".root.json");
+        let file = if is_root { Client::next_root } else { Client::file };
+        file(self.client, &path, max_bytes).map_err(|failure| {
             let what = failure.to_string();
             self.failure = Some(failure);
             what

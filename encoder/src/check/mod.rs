@@ -103,6 +103,15 @@ where
         flat_psnr_db: report.mean_flat_psnr_db,
         covered_share: report.mean_covered_share,
     };
+    let mut odd = report.views.iter().filter(|view| !view.fits());
+    if let (true, Some(first)) = (means.fit(), odd.next()) {
+        let (n, of) = (1 + odd.count(), report.views.len());
+        report.suspicions.push(format!(
+            "{n} of {of} views look less like their photos than a plain colour does, the first is {}: look at the \
+             poses of these photos, or leave them out",
+            first.name
+        ));
+    }
     let is_suspect = options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some());
     if means.psnr_db < FLAWLESS_DB || !means.fit() || is_suspect {
         let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;

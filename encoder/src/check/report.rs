@@ -19,6 +19,13 @@ pub struct ViewCheck {
     pub(crate) visible_gaussians: usize,
 }
 
+impl ViewCheck {
+    /// Returns whether the drawing looks more like the photo than its mean colour does.
+    pub fn fits(&self) -> bool {
+        self.psnr_db >= self.flat_psnr_db
+    }
+}
+
 /// Comparison of a scene with its photos.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {

@@ -1,5 +1,7 @@
 //! What the data alone say against the inputs, without a drawing.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
+
 use glam::DVec3;
 use slag_common::{Gaussians, Similarity, View};
 use slag_math::stats::{Rank, quantile};
@@ -71,6 +73,17 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
             ),
         );
     }
+    let n_doubled = doubled(scene, &usable);
+    if usable.len() >= MANY && 10 * n_doubled > usable.len() {
+        say(
+            None,
+            format!(
+                "{n_doubled} of {} Gaussians stand where another one alike stands: the splat was joined with itself, \
+                 and is drawn too dense; export it again",
+                scene.len()
+            ),
+        );
+    }
     if let Some(frame) = shifted(scene, views) {
         let [x, y, z] = frame.splat_from_poses.translation.to_array();
         let text = format!(
@@ -97,6 +110,19 @@ fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
     (usable.len() >= MANY && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
 }
 
+/// Returns how many Gaussians agree with another one in position, scales and opacity, beyond the first of a kind.
+fn doubled(scene: &Gaussians, usable: &[usize]) -> usize {
+    let key = |i: &usize| {
+        let mut hasher = DefaultHasher::new();
+        scene.means_in_world[*i].to_array().map(f64::to_bits).hash(&mut hasher);
+        (scene.scales[*i].map(f32::to_bits), scene.opacities[*i].to_bits()).hash(&mut hasher);
+        hasher.finish()
+    };
+    let mut keys: Vec<u64> = usable.iter().map(key).collect();
+    keys.sort_unstable();
+    keys.windows(2).filter(|pair| pair[0] == pair[1]).count()
+}
+
 /// Returns the rounding of coordinates that were stored in 32 bits and the size of small Gaussians, where the
 /// first is larger.
 fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<(f64, f64)> {
@@ -108,9 +134,11 @@ fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<(f64, f64)> {
     let mut farthest: Vec<f64> = means().map(|mean| mean.abs().max_element()).collect();
     let mut sizes: Vec<f32> =
         usable.iter().map(|i| scene.scales[*i].into_iter().fold(0.0, f32::max)).collect();
-    let rounding = quantile(&mut farthest, 500, Rank::After)? * f64::from(f32::EPSILON);
-    let size = f64::from(quantile(&mut sizes, 100, Rank::After)?);
-    (rounding > size && size > 0.0).then_some((rounding, size))
+    let farthest = quantile(&mut farthest, 500, Rank::After)?;
+    let (rounding, size) =
+        (farthest * f64::from(f32::EPSILON), f64::from(quantile(&mut sizes, 100, Rank::After)?));
+    // Without an offset, the Gaussians are small and not the coordinates large.
+    (rounding > size && size > 0.0 && farthest > scene_diagonal(scene)).then_some((rounding, size))
 }
 
 /// Returns the round offset between splat and cameras, where they are far apart.

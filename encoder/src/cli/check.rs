@@ -129,7 +129,10 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     report.notes = notes;
     let next = if report.diagnosis.is_none() { next::of_check(input) } else { String::new() };
     print(json, &report, format!("{report}{next}"))?;
-    let is_partial = !missing.is_empty() || !report.unreadable.is_empty() || n_left_out > 0;
+    let is_partial = !missing.is_empty()
+        || !report.unreadable.is_empty()
+        || n_left_out > 0
+        || report.views.iter().any(|view| !view.fits());
     Ok(match (&report.diagnosis, is_partial) {
         (Some(_), _) => Exit::Mismatch,
         (None, true) => Exit::Partly,

@@ -96,7 +96,11 @@ pub(crate) fn encode_by(
 ) -> Result<EncodeSummary, EncodeError> {
     settings.validate()?;
     let context = RunContext::new(settings.run.threads, progress, cancel)?;
-    // First of all, so that a second encode into the same store fails at once.
+    if settings.output.text_model {
+        // What cannot be carried is refused before a store is made.
+        engines.models.text_side()?;
+    }
+    // Before the work, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.output.store)?;
     if let Some(planned) = &settings.inputs.planned {
         drawings::make(settings, planned, engines, &context)?;

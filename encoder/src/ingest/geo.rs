@@ -1,11 +1,10 @@
 //! Geo-reference of the world frame, from a JSON file.
 
 use std::collections::HashMap;
-use std::io;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
-use serde::de::Error;
 use serde_json::Value;
 use slag_common::frames::{GeoReference, Geographic};
 
@@ -23,29 +22,42 @@ pub enum GeoError {
     Range { path: PathBuf, field: &'static str, value: f64, min: f64, max: f64 },
 }
 
-/// A map, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's.
 #[derive(Deserialize)]
 struct GeoFile {
-    origin: HashMap<String, Value>,
+    origin: Origin,
 }
+
+#[derive(Deserialize)]
+struct Origin {
+    lat: f64,
+    lon: f64,
+    alt: f64,
+}
+
+/// Most bytes of a file.
+const MAX_BYTES: u64 = 1 << 20;
 
 /// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; other fields are ignored.
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
-    let bytes = fs_err::read(path)?;
+    let mut bytes = Vec::new();
+    fs_err::File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
     let malformed = |source| GeoError::Json { path: path.to_owned(), source };
-    // A map first, for the same reason as above.
-    let file: HashMap<String, Value> = serde_json::from_slice(&bytes).map_err(malformed)?;
-    let file = GeoFile::deserialize(Value::from_iter(file)).map_err(malformed)?;
-    let field = |field: &'static str, min: f64, max: f64| {
-        let value = file.origin.get(field).and_then(Value::as_f64);
-        let value = value.ok_or_else(|| malformed(Error::missing_field(field)))?;
-        match (min..=max).contains(&value) {
-            true => Ok(value),
-            false => Err(GeoError::Range { path: path.to_owned(), field, value, min, max }),
-        }
+    // Maps, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's; then structs, since a map
+    // would take a name twice.
+    let maps: HashMap<String, Value> = serde_json::from_slice(text).map_err(malformed)?;
+    if let Some(origin) = maps.get("origin") {
+        HashMap::<String, Value>::deserialize(origin).map_err(malformed)?;
+    }
+    let GeoFile { origin } = serde_json::from_slice(text).map_err(malformed)?;
+    let range = |field: &'static str, value: f64, min: f64, max: f64| match (min..=max).contains(&value) {
+        true => Ok(value),
+        false => Err(GeoError::Range { path: path.to_owned(), field, value, min, max }),
     };
     // The range of heights is from the deepest trench to the edge of space.
-    let (latitude_deg, longitude_deg) = (field("lat", -90.0, 90.0)?, field("lon", -180.0, 180.0)?);
-    let origin = Geographic { latitude_deg, longitude_deg, height_m: field("alt", -12e3, 100e3)? };
+    let latitude_deg = range("lat", origin.lat, -90.0, 90.0)?;
+    let longitude_deg = range("lon", origin.lon, -180.0, 180.0)?;
+    let origin =
+        Geographic { latitude_deg, longitude_deg, height_m: range("alt", origin.alt, -12e3, 100e3)? };
     Ok(GeoReference { origin })
 }

@@ -20,7 +20,7 @@ use slag_common::durable;
 use slag_common::manifest::TARGET;
 use slag_common::tuf::{
     Body, FileMeta, Key, MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES, Root,
-    SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, sign,
+    SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, parse_utc, sign,
 };
 
 use super::error::StoreError;
@@ -88,6 +88,17 @@ impl MetadataReader {
         self.read::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)
     }
 
+    /// Returns when the timestamp was signed; `None` if that was not with a key of the newest root, which clients
+    /// forget with its key.
+    fn signed_unix_secs(&self) -> Result<Option<u64>, StoreError> {
+        let (Some(timestamp), Some(RootFile { root, .. })) = (self.timestamp()?, self.newest_root()?) else {
+            return Ok(None);
+        };
+        let role = &root.body.roles[Timestamp::TYPE];
+        let counts = timestamp.check_signatures(Timestamp::TYPE, &root.body.keys, role).is_ok();
+        Ok(timestamp.body.signed_at.as_deref().and_then(parse_utc).filter(|_| counts))
+    }
+
     /// Returns the newest root and its bytes; `None` before the first one.
     pub(super) fn newest_root(&self) -> Result<Option<RootFile>, StoreError> {
         let name = format!("{}.root.json", self.next_version(Root::TYPE)? - 1);
@@ -135,6 +146,15 @@ impl MetadataReader {
             warnings.push(format!(
                 "this machine's clock says {now}, before this program was made: {store} is signed as of {floor}; set \
                  the clock, then run `slag-encoder store refresh --store {store}`"
+            ));
+        } else if let Some(at) =
+            self.signed_unix_secs()?.filter(|at| *at > now_unix_secs.saturating_add(SECS_PER_DAY))
+        {
+            let (at, now) = (format_utc(at), format_utc(now_unix_secs));
+            warnings.push(format!(
+                "{store} was signed as of {at}, this machine's clock says {now}: robots believe the later one, so all \
+                 is signed as of it; set the clock, or, if it is right, run `slag-encoder keys rotate --store {store} \
+                 timestamp` once, by which robots forget it"
             ));
         }
         let root = self.newest_root()?.map(|root| root.root.expires_unix_secs);
@@ -233,8 +253,11 @@ impl Metadata {
         self.sign_timestamp(FileMeta::of(version, &bytes), now_unix_secs, TIMESTAMP_DAYS).map(drop)
     }
 
+    /// Never signs as of an earlier time than before with the same key: clients that saw the later one take it for
+    /// the time, and refuse what has expired by then.
     fn sign_timestamp(&self, snapshot: FileMeta, now: u64, days: u32) -> Result<Refreshed, StoreError> {
         let timestamp_version = self.timestamp()?.map_or(1, |before| before.head.version.saturating_add(1));
+        let now = now.max(self.signed_unix_secs()?.unwrap_or(0));
         let expires_unix_secs = now.saturating_add(u64::from(days) * SECS_PER_DAY);
         let snapshot_version = snapshot.version;
         let meta = BTreeMap::from([("snapshot.json".to_owned(), snapshot)]);

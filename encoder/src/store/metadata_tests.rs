@@ -139,6 +139,28 @@ fn an_expired_root_is_warned_of_and_renewed() {
     assert!(warnings.len() == 1 && warnings[0].contains("set the clock"), "{warnings:?}");
 }
 
+/// A store was made while its clock stood in 2079. Robots that saw it believe that time: what is signed afterwards is
+/// signed as of it, until a new key of the timestamp makes them forget it; warnings say so.
+#[test]
+fn a_clock_that_went_back_locks_no_robot_out() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    publish(&store, 1, NOW);
+    let mut kept = client(dir.path());
+    update(&mut kept, dir.path(), NOW).expect("fresh");
+    let now = NOW - 3650 * DAY;
+    let metadata = Metadata::open(dir.path()).expect("opens");
+    assert_eq!(metadata.refresh(now, 30).expect("signs").expires_unix_secs, NOW + 30 * DAY);
+    update(&mut kept, dir.path(), now).expect("no robot is locked out");
+    let warnings = MetadataReader::new(dir.path()).expiry_warnings(now).expect("reads");
+    assert!(warnings.len() == 1 && warnings[0].contains("keys rotate"), "{warnings:?}");
+    let rotate = Change::Roles(vec!["timestamp".to_owned()]);
+    metadata.change_keys(&rotate, &default_root_folder(dir.path()), now).expect("rotates");
+    let (trusted, _) = update(&mut kept, dir.path(), now).expect("follows");
+    assert_eq!(trusted.now_unix_secs(), now, "the later time is forgotten");
+    assert_eq!(MetadataReader::new(dir.path()).expiry_warnings(now).expect("reads"), [""; 0]);
+}
+
 /// What is signed by a machine whose clock stands at 1970 has not expired before robots see it.
 #[test]
 fn nothing_is_signed_as_of_1970() {

@@ -246,6 +246,20 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     let mut pale = scene.clone();
     pale.sh_dc.iter_mut().flatten().for_each(|c| *c = (0.5 + 0.282_094_8 * *c).clamp(0.0, 1.0));
     assert!(suspicions(&pale, &views(&photos))[0].text.contains("colours of 0 to 1"));
+    let all: Vec<u32> = (0..scene.len() as u32).collect();
+    let twice = suspicions(&scene.select(&[all.clone(), all].concat()), &views(&photos));
+    assert!(twice.len() == 1 && twice[0].text.contains("stand where another one alike stands"), "{twice:?}");
+    // Tiny Gaussians are no sign of large coordinates.
+    let mut tiny = scene.clone();
+    tiny.scales.iter_mut().flatten().for_each(|s| *s = 1e-9);
+    assert_eq!(suspicions(&tiny, &views(&photos)), []);
+    // Two photos under each other's poses: the others fit.
+    let mut swapped = photos.clone();
+    (swapped[0].view, swapped[1].view) = (photos[1].view, photos[0].view);
+    let others: Vec<CheckView> = photos.iter().cycle().take(6).cloned().collect();
+    let report = run(&scene, &[swapped[..2].to_vec(), others].concat(), &CheckOptions::default());
+    assert!(report.diagnosis.is_none() && report.suspicions.len() == 1, "{report}");
+    assert!(report.suspicions[0].starts_with("2 of 8 views look less like"), "{report}");
     let diagnosed = |scene: &Gaussians, photos: &[CheckView]| {
         let suspicions = suspicions(scene, &views(photos));
         assert_eq!(suspicions.len(), 1, "{suspicions:?}");
@@ -368,6 +382,25 @@ fn photos_are_loaded_one_at_a_time_and_the_scene_once() {
     assert_eq!(report.views.len(), 9);
     assert!(report.diagnosis.is_some() && counting.draws.load(Ordering::Relaxed) > 100);
     assert_eq!(counting.loads.load(Ordering::Relaxed), 1 + 5, "mirrored along three axes, rotations turned");
+}
+
+/// A correction that only takes Gaussians out of sight gains much, and explains nothing.
+#[test]
+fn black_is_no_explanation() {
+    let mut view = tiny_view();
+    view.image.put_pixel(1, 2, image::Rgb([255; 3]));
+    let before_the_camera = Gaussians {
+        means_in_world: vec![DVec3::new(0.0, 0.0, 2.0)],
+        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
+        scales: vec![[5.0; 3]],
+        opacities: vec![0.99],
+        sh_dc: vec![[1.77; 3]],
+        ..Gaussians::default()
+    };
+    let report = check(&before_the_camera, [Ok(view)], &CpuRasterizer, &CheckOptions::default()).unwrap();
+    let diagnosis = report.diagnosis.expect("white is not black");
+    assert!(diagnosis.tried[0].psnr_db > diagnosis.given_psnr_db + 6.0, "{diagnosis:?}");
+    assert_eq!(diagnosis.mistake, None);
 }
 
 /// Corrections that draw a heap of Gaussians everywhere are tried until 200 million pairs were drawn.
