@@ -85,6 +85,14 @@ fn the_robots_service_answers() {
     let robot = Service::start(&mut edge(&["serve", "--cache", text(&cache)]));
     let reply = robot.get("/query?text=sofa&near=3.5,2.7,0");
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");
+    assert_eq!(reply["asked_as"], Value::Null);
+    // A word that the model does not know, in every form of question.
+    let couch = robot.get("/query?text=couch&near=3.5,2.7,0");
+    assert_eq!((&couch["asked_as"], &couch["answers"]), (&json!({ "couch": "sofa" }), &reply["answers"]));
+    for text in ["where%20is%20the%20couch", "lamp%20near%20the%20couch"] {
+        let reply = robot.get(&format!("/v1/query?text={text}"));
+        assert_eq!(reply["results"][0]["asked_as"], json!({ "couch": "sofa" }), "{reply}");
+    }
     let reply = robot.get("/query?text=elephant");
     assert!(reply["answers"] == json!([]) && reply["reason"]["detail"].is_string(), "{reply}");
     assert_eq!(robot.get("/status")["scene"]["generation"], 1);

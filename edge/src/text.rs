@@ -12,7 +12,9 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_models::{InferenceError, ModelDir, ModelError, SessionOptions, TextEncoder, words_to_find};
+use slag_models::{
+    InferenceError, KnownPhrases, ModelDir, ModelError, SessionOptions, TextEncoder, words_to_find,
+};
 
 /// Longest query text; every text model here truncates far below.
 pub const MAX_TEXT_BYTES: usize = 512;
@@ -65,6 +67,7 @@ struct Job {
 pub struct TextService {
     info: EncoderInfo,
     nouns: Vec<String>,
+    known: Option<Arc<KnownPhrases>>,
     jobs: Option<SyncSender<Job>>,
     thread: Option<JoinHandle<()>>,
     cache: Mutex<Cache>,
@@ -98,11 +101,20 @@ impl TextService {
     ) -> io::Result<Self> {
         let (jobs, waiting) = sync_channel(MAX_WAITING);
         let nouns = encoder.nouns().unwrap_or_default().to_vec();
+        let known = encoder.known_phrases().cloned();
         let is_alive = Arc::new(AtomicBool::new(true));
         let told = Arc::clone(&is_alive);
         let run = move || run(encoder, reopen, &waiting, &told);
         let thread = std::thread::Builder::new().name("text-model".into()).spawn(run)?;
-        Ok(Self { info, nouns, jobs: Some(jobs), thread: Some(thread), cache: Mutex::default(), is_alive })
+        Ok(Self {
+            info,
+            nouns,
+            known,
+            jobs: Some(jobs),
+            thread: Some(thread),
+            cache: Mutex::default(),
+            is_alive,
+        })
     }
 
     pub fn info(&self) -> &EncoderInfo {
@@ -112,6 +124,11 @@ impl TextService {
     /// Returns the words that things can be called by; none if everyday nouns do.
     pub fn nouns(&self) -> &[String] {
         &self.nouns
+    }
+
+    /// Returns what is asked in place of a text with words that the model does not know.
+    pub(crate) fn asked_as(&self, text: &str) -> Option<String> {
+        self.known.as_ref()?.asked_as(&words_to_find(text).ok()?)
     }
 
     /// Returns whether the encoder runs.

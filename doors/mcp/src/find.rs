@@ -1,5 +1,7 @@
 //! What `find` takes and gives.
 
+use std::collections::BTreeMap;
+
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -44,6 +46,9 @@ pub struct Found {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<serde_json::Map<String, Value>>")]
     pub understood: Option<Value>,
+    /// What was asked in place of words that the robot's model does not know.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub asked_as: BTreeMap<String, String>,
     /// Best first. Empty: see `none`.
     pub things: Vec<Thing>,
     /// Whether there are more than were asked for.
@@ -128,13 +133,15 @@ impl Wanted {
 impl Found {
     /// Shortens the reply to one question.
     pub fn new(reply: Reply) -> Result<Self, String> {
-        let [Results { understood, none, next_offset, answers }] = <[Results; 1]>::try_from(reply.results)
-            .map_err(|results| format!("the robot gave {} results to one question", results.len()))?;
+        let [Results { understood, asked_as, none, next_offset, answers }] =
+            <[Results; 1]>::try_from(reply.results)
+                .map_err(|results| format!("the robot gave {} results to one question", results.len()))?;
         Ok(Self {
             scene: reply.scene,
             generation: reply.generation,
             unit: reply.unit,
             understood,
+            asked_as,
             things: answers.into_iter().map(Thing::from).collect(),
             more: next_offset.is_some(),
             none: none.map(|none| Nothing { kind: none.kind, detail: none.detail }),

@@ -1,5 +1,7 @@
 //! The reply to `/v1/query`.
 
+use std::collections::BTreeMap;
+
 use serde::Deserialize;
 use slag_api::Geographic;
 use slag_api::objects::OrientedBox;
@@ -21,6 +23,9 @@ pub struct Reply<A = Answer> {
 pub struct Results<A = Answer> {
     /// The phrase that a text with a relation was understood as.
     pub understood: Option<serde_json::Value>,
+    /// What was asked in place of words that the robot's model does not know.
+    #[serde(default)]
+    pub asked_as: BTreeMap<String, String>,
     /// Why there is no answer.
     pub none: Option<Nothing>,
     /// Offset of the next page, if there is one.

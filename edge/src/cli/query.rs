@@ -124,6 +124,9 @@ fn print_reply(reply: &Reply) -> Result<(), Failure> {
 }
 
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
+    for (word, asked) in &answers.asked_as {
+        writeln!(io::stderr(), "{word}: asked as {asked}")?;
+    }
     if let Some(reason) = &answers.reason {
         return Ok(writeln!(io::stderr(), "{}", reason.detail)?);
     }

@@ -1,5 +1,7 @@
 //! From a checked request to ranked answers.
 
+use std::collections::BTreeMap;
+
 use glam::DVec3;
 use rayon::prelude::*;
 use slag_api::objects::Evidence;
@@ -320,6 +322,7 @@ fn empty(
         generation: manifest.generation,
         unit: unit(manifest),
         searched,
+        asked_as: BTreeMap::new(),
         reason: None,
         answers: Found::Clusters(Vec::new()),
     }

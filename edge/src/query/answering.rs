@@ -1,5 +1,6 @@
 //! From questions to their answers.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use slag_service::params::RequestError;
@@ -74,6 +75,9 @@ impl Engine {
                 outcomes[at] = Some(Outcome::Plain(answers));
             }
         }
+        for (outcome, asked) in outcomes.iter_mut().flatten().zip(&request.asked) {
+            outcome.set_asked_as(asked_as(&on_board, asked, &request));
+        }
         let outcomes = outcomes.into_iter().flatten().collect();
         Ok(Reply { request, outcomes, snapshot: on_board.snapshot })
     }
@@ -101,6 +105,18 @@ impl Engine {
         budget.check().map_err(ScoreError::from)?;
         Ok(outcome)
     }
+}
+
+/// Returns what is asked in place of the things of a question, and of its negatives, that the model does not know.
+fn asked_as(on_board: &OnBoard, asked: &Asked, request: &QueryRequest) -> BTreeMap<String, String> {
+    let things: Vec<String> = match asked {
+        Asked::Text(text) => vec![relations::asked_thing(text).unwrap_or_else(|| text.clone())],
+        Asked::Phrase { phrase, .. } => phrase.things().into_iter().map(str::to_owned).collect(),
+        Asked::Vector { .. } => Vec::new(),
+    };
+    let negatives = request.negatives.phrases().into_iter().map(str::to_owned);
+    let asked_as = |thing: String| on_board.text.asked_as(&thing).map(|asked| (thing, asked));
+    things.into_iter().chain(negatives).filter_map(asked_as).collect()
 }
 
 /// Returns the vector of a question that is one, at unit length.
@@ -133,7 +149,14 @@ fn related(
         request.near.map(|position_in_world| Viewer { position_in_world, heading_rad: request.heading_rad });
     let found = match relations::relate(&things, phrase, viewer.as_ref(), metre) {
         Ok(found) => found,
-        Err(miss) => return Ok(RelatedAnswers { parts, miss: Some(miss), answers: Vec::new() }),
+        Err(miss) => {
+            return Ok(RelatedAnswers {
+                asked_as: BTreeMap::new(),
+                parts,
+                miss: Some(miss),
+                answers: Vec::new(),
+            });
+        }
     };
     let of = things.of(&phrase.thing);
     let described = found.into_iter().take(request.n_ranked()).enumerate().map(|(at, related)| {
@@ -148,7 +171,7 @@ fn related(
         let answer = object_answer(scene, ranked, candidate.score, &Region::default(), request.members);
         (answer, related.degree, related.to)
     });
-    Ok(RelatedAnswers { parts, miss: None, answers: described.collect() })
+    Ok(RelatedAnswers { asked_as: BTreeMap::new(), parts, miss: None, answers: described.collect() })
 }
 
 fn needs_up(phrase: &Phrase) -> bool {

@@ -1,5 +1,7 @@
 //! The contents of an answer.
 
+use std::collections::BTreeMap;
+
 use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -39,6 +41,9 @@ pub struct Answers {
     pub unit: &'static str,
     #[serde(flatten)]
     pub searched: Searched,
+    /// What was asked in place of words that the model does not know.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub asked_as: BTreeMap<String, String>,
     /// Reason for an empty answer.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<Reason>,

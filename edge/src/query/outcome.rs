@@ -1,5 +1,7 @@
 //! The answers to a question, of either sort.
 
+use std::collections::BTreeMap;
+
 use super::answers::{Answers, ClusterAnswer};
 use super::relations::{Found, Miss, Witness};
 
@@ -11,6 +13,8 @@ pub enum Outcome {
 }
 
 pub struct RelatedAnswers {
+    /// What was asked in place of words that the model does not know.
+    pub asked_as: BTreeMap<String, String>,
     /// What was found for each thing of the phrase.
     pub parts: Vec<Found>,
     /// The part that failed, if nothing was found.
@@ -20,6 +24,21 @@ pub struct RelatedAnswers {
 }
 
 impl Outcome {
+    /// Returns what was asked in place of words that the model does not know.
+    pub fn asked_as(&self) -> &BTreeMap<String, String> {
+        match self {
+            Self::Plain(answers) => &answers.asked_as,
+            Self::Related(related) => &related.asked_as,
+        }
+    }
+
+    pub(super) fn set_asked_as(&mut self, asked_as: BTreeMap<String, String>) {
+        match self {
+            Self::Plain(answers) => answers.asked_as = asked_as,
+            Self::Related(related) => related.asked_as = asked_as,
+        }
+    }
+
     /// Returns the number of answers.
     pub fn len(&self) -> usize {
         match self {

@@ -1,5 +1,7 @@
 //! A page of answers: the one shape of reply of version 1.
 
+use std::collections::BTreeMap;
+
 use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -38,6 +40,9 @@ struct Described<'a> {
     question: AskedFor<'a>,
     /// The phrase that a text was understood as, if it names a relation.
     understood: Option<&'a Phrase>,
+    /// What was asked in place of words that the model does not know.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    asked_as: &'a BTreeMap<String, String>,
     /// Kind of the answers.
     kind: AnswerKind,
     #[serde(flatten)]
@@ -162,6 +167,7 @@ impl<'a> Described<'a> {
         let page = Self {
             question,
             understood,
+            asked_as: outcome.asked_as(),
             kind: AnswerKind::Objects,
             searched: None,
             parts: None,

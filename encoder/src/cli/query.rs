@@ -59,7 +59,9 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
         return Err(anyhow!("--threshold is {threshold}, expected a cosine, -1 to 1"));
     }
     let mut encoder = text_encoder_of(&reader, &args.models)?;
-    let vector = encoder.encode(&words_to_find(&args.text)?)?;
+    let words = words_to_find(&args.text)?;
+    let asked_as = encoder.known_phrases().and_then(|known| known.asked_as(&words));
+    let vector = encoder.encode(&words)?;
     let scores = match args.profile {
         Some(profile) => query::scores_of_shards(&reader, &vector, profile)?,
         None => query::scores(&reader, &vector)?,
@@ -76,14 +78,15 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     }
     let n_matching = matching.len();
     let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
-    let mut lines = format!("{n_matching} of {n_scored} Gaussians reach {threshold}\n");
+    let mut lines = asked_as.as_ref().map_or(String::new(), |asked| format!("{words}: asked as {asked}\n"));
+    lines += &format!("{n_matching} of {n_scored} Gaussians reach {threshold}\n");
     for hit in &hits {
         let p = hit.position_in_world;
         lines +=
             &format!("{:.4}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z);
     }
     let value = json!({
-        "text": args.text, "threshold": threshold, "n_matching": n_matching, "n_scored": n_scored, "best": hits,
+        "text": args.text, "asked_as": asked_as, "threshold": threshold, "n_matching": n_matching, "n_scored": n_scored, "best": hits,
     });
     print(json, &value, lines)?;
     Ok(Exit::Done)

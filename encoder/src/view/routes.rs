@@ -1,5 +1,6 @@
 //! The routes of the page, with the limits of the service for robots around them.
 
+use std::iter;
 use std::sync::Arc;
 
 use axum::extract::rejection::QueryRejection;
@@ -7,7 +8,7 @@ use axum::extract::{Path, Query, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Json, Router};
-use serde_json::Value;
+use serde_json::{Value, json};
 use slag_service::problem::Problem;
 use slag_view::{Description, Step, Words};
 
@@ -81,9 +82,12 @@ async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Pro
     let limit = pairs.iter().find(|(name, _)| name == "limit");
     let limit = limit.map_or(Ok(DEFAULT_LIMIT), |(name, value)| number(name, value))?.min(MAX_LIMIT);
     let work = move |viewer: &Viewer| {
-        viewer.asked(&text, &negatives, |generation, vectors| {
+        let mut reply = viewer.asked(&text, &negatives, |generation, vectors| {
             Ok(generation.things.answers(generation.reader.manifest(), &text, vectors, limit))
-        })
+        })?;
+        let texts: Vec<String> = iter::once(text).chain(negatives).collect();
+        reply["results"][0]["asked_as"] = json!(viewer.asked_as(&texts)?);
+        Ok(reply)
     };
     blocking(viewer, work).await.map(Json)
 }

@@ -1,5 +1,6 @@
 //! Answers the page from what is shown.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -150,6 +151,15 @@ impl Viewer {
             let vectors =
                 texts.map(|text| encoder.encode(&words_to_find(text)?)).collect::<Result<Vec<_>, _>>()?;
             work(generation, &vectors)
+        })
+    }
+
+    /// Returns what is asked in place of texts with words that the model does not know.
+    pub(super) fn asked_as(&self, texts: &[String]) -> Result<BTreeMap<String, String>, ViewError> {
+        self.with_text_encoder(|_, OpenedText { encoder, .. }| {
+            let known = encoder.known_phrases();
+            let asked_as = |text: &String| known?.asked_as(&words_to_find(text).ok()?);
+            Ok(texts.iter().filter_map(|text| Some((text.clone(), asked_as(text)?))).collect())
         })
     }
 

@@ -116,7 +116,9 @@ export class Asking {
     const n = this.answers.length;
     const isGroups = n > 0 && this.answers.every(({ id }) => !id);
     const groups = n === 1 ? "1 place matches, which is not marked as an object." : `${n} places match, none marked as an object.`;
-    say(n === 0 ? `Not found. ${first.reply.none ?? ""}` : isGroups ? groups : `${n} found`);
+    const found = n === 0 ? `Not found. ${first.reply.none ?? ""}` : isGroups ? groups : `${n} found`;
+    const askedAs = Object.entries(first.reply.askedAs).map(([word, asked]) => `${word}: asked as ${asked}`);
+    say([...askedAs, found].join(" · "));
   }
 
   choose(index: number | null): void {

@@ -108,6 +108,8 @@ export interface Answers {
   none: string | null;
   /** Whether they answer words alone: groups of Gaussians may stand in for objects. */
   isPlain: boolean;
+  /** What was asked in place of words that the model does not know. */
+  askedAs: Record<string, string>;
 }
 
 export interface Question {
@@ -255,6 +257,7 @@ export async function fetchAnswers(question: Question, signal: AbortSignal): Pro
       threshold: result.threshold ?? result.parts?.[0]?.threshold ?? null,
       none: result.none?.detail ?? null,
       isPlain: !result.understood,
+      askedAs: result.asked_as ?? {},
     };
   } catch (error) {
     if (!(error instanceof NotFound)) throw error;
@@ -262,5 +265,5 @@ export async function fetchAnswers(question: Question, signal: AbortSignal): Pro
   const short = new URLSearchParams({ text: question.text, limit: String(MAX_ANSWERS) });
   if (question.negatives.length > 0) short.set("negatives", question.negatives.join(","));
   const reply = await (await get(`/query?${short}`, signal)).json();
-  return { thing: question.text, answers: reply.answers ?? [], threshold: reply.threshold ?? null, none: reply.none?.detail ?? null, isPlain: true };
+  return { thing: question.text, answers: reply.answers ?? [], threshold: reply.threshold ?? null, none: reply.none?.detail ?? null, isPlain: true, askedAs: reply.asked_as ?? {} };
 }
