@@ -55,11 +55,11 @@ pub use report::EncodeSummary;
 #[cfg(feature = "fleet")]
 pub(crate) use report::SkippedView;
 pub(crate) use report::{GpuReport, Phase, StageReport};
+#[cfg(feature = "fleet")]
+pub(crate) use settings::ViewSettings;
 pub use settings::{
     CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit,
 };
-#[cfg(feature = "fleet")]
-pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
 
 /// The parts of which a fleet makes its own encode.
