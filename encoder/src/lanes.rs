@@ -1,5 +1,5 @@
-//! Opened models that GPUs share out: each GPU has a few, its lanes, and work goes to the GPU with the most free
-//! ones.
+//! Things that are lent to one piece of work each, such as the opened models of GPUs: each GPU has a few, its lanes,
+//! and work goes to the GPU with the most free ones.
 //!
 //! While one lane of a GPU computes, another copies. The load of a GPU is the time in which any of its lanes is at
 //! work.
@@ -36,6 +36,7 @@ struct Gpu<T> {
     number: u32,
     n_lanes: usize,
     free: Vec<T>,
+    is_left_out: bool,
     busy_since: Option<Instant>,
     busy: Duration,
 }
@@ -56,6 +57,7 @@ impl<T> Lanes<T> {
             number,
             n_lanes: free.len(),
             free,
+            is_left_out: false,
             busy_since: None,
             busy: Duration::ZERO,
         };
@@ -71,15 +73,24 @@ impl<T> Lanes<T> {
         self.state().gpus.iter().map(|gpu| gpu.n_lanes).sum()
     }
 
-    /// Takes a lane, and waits for one where none is free. There must be one.
+    /// Takes a lane, and waits for one where none is free.
+    ///
+    /// # Panics
+    /// If there is none.
     pub fn take(&self) -> Lane<'_, T> {
+        self.take_if_any().expect("a lane")
+    }
+
+    /// Takes a lane, and waits for one where none is free; `None` once all GPUs are left out.
+    pub fn take_if_any(&self) -> Option<Lane<'_, T>> {
         let mut state = self.state();
-        loop {
+        while state.gpus.iter().any(|gpu| !gpu.is_left_out) {
             match self.take_of(&mut state) {
-                Some(lane) => return lane,
+                Some(lane) => return Some(lane),
                 None => state = self.freed.wait(state).unwrap_or_else(PoisonError::into_inner),
             }
         }
+        None
     }
 
     fn take_of(&self, state: &mut State<T>) -> Option<Lane<'_, T>> {
@@ -105,6 +116,18 @@ impl<T> Lane<'_, T> {
     pub fn gpu(&self) -> u32 {
         self.lanes.state().gpus[self.gpu].number
     }
+
+    /// Leaves the lane's GPU out from now on; returns how many others remain, the first time.
+    pub fn leave_out(self) -> Option<usize> {
+        let mut state = self.lanes.state();
+        state.gpus[self.gpu].free.clear();
+        let was_left_out = std::mem::replace(&mut state.gpus[self.gpu].is_left_out, true);
+        let n_others = state.gpus.iter().filter(|gpu| !gpu.is_left_out).count();
+        drop(state);
+        // Those that wait must see that there may be no GPU.
+        self.lanes.freed.notify_all();
+        (!was_left_out).then_some(n_others)
+    }
 }
 
 impl<T> Deref for Lane<'_, T> {
@@ -125,7 +148,7 @@ impl<T> Drop for Lane<'_, T> {
     fn drop(&mut self) {
         let mut state = self.lanes.state();
         let gpu = &mut state.gpus[self.gpu];
-        gpu.free.extend(self.held.take());
+        gpu.free.extend(self.held.take().filter(|_| !gpu.is_left_out));
         if gpu.free.len() == gpu.n_lanes {
             gpu.busy += gpu.busy_since.take().map_or(Duration::ZERO, |since| since.elapsed());
         }
@@ -158,7 +181,9 @@ mod tests {
         let [four, seven] = &lanes.loads()[..] else { panic!("two GPUs") };
         assert!(four.busy_secs > before[0].busy_secs && four.n_lanes == 2 && seven.busy_secs > 0.0);
         assert_eq!(lanes.loads()[1], *seven, "its time stands still");
-        drop(held);
-        assert_eq!(lanes.loads(), lanes.loads());
+        held.truncate(1);
+        assert_eq!(held.pop().and_then(Lane::leave_out), Some(1));
+        assert_eq!((lanes.take().gpu(), lanes.take().leave_out()), (7, Some(0)));
+        assert!(lanes.take_if_any().is_none());
     }
 }

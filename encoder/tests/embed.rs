@@ -5,7 +5,7 @@ use std::{num::NonZeroUsize, time::Instant};
 use image::{Rgb, RgbImage};
 use slag_encoder::{
     embed::{EmbedError, crop, embed_masks},
-    masks::{BoxPx, Mask},
+    masks::{BoxPx, Mask, masks_of_labels},
 };
 use slag_models::{Crop, ImageEncoder, InferenceError, ModelDir, SessionOptions};
 use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
@@ -23,27 +23,10 @@ fn view(name: &str) -> Labelled {
     let photo = image::open(scene.join(format!("images/{name}.jpg"))).expect("it decodes").to_rgb8();
     let labels = image::open(scene.join(format!("gt/masks/{name}.png"))).expect("it decodes").to_luma8();
     assert_eq!(photo.dimensions(), labels.dimensions());
-    let width = photo.width() as usize;
     let labels = labels.into_raw();
-    let masks = (0..=255u8).filter_map(|id| {
-        let pixels: Vec<_> = labels
-            .iter()
-            .enumerate()
-            .filter(|(_, l)| **l == id)
-            .map(|(i, _)| (i % width, i / width))
-            .collect();
-        if pixels.len() < 200 {
-            return None;
-        }
-        let range = |values: Vec<usize>| (*values.iter().min().unwrap(), *values.iter().max().unwrap() + 1);
-        let (x0, x1) = range(pixels.iter().map(|p| p.0).collect());
-        let (y0, y1) = range(pixels.iter().map(|p| p.1).collect());
-        let inside =
-            (y0..y1).flat_map(|y| labels[y * width + x0..y * width + x1].iter().map(|&l| l == id)).collect();
-        let box_px = BoxPx { x0: x0 as u32, y0: y0 as u32, x1: x1 as u32, y1: y1 as u32 };
-        Some((id, Mask { box_px, inside, area_px: pixels.len() as u32, level: 0 }))
-    });
-    let masks = masks.collect();
+    let ids: Vec<u32> = labels.iter().map(|label| u32::from(*label)).collect();
+    let masks = masks_of_labels(&ids, photo.width(), 256, u64::MAX).expect("no limit").into_iter();
+    let masks = masks.filter(|(_, mask)| mask.area_px >= 200).map(|(id, mask)| (id as u8, mask)).collect();
     Labelled { photo, labels, masks }
 }
 
@@ -109,8 +92,7 @@ impl ImageEncoder for Recorder {
 }
 
 fn rectangle(x0: u32, y0: u32, x1: u32, y1: u32) -> Mask {
-    let area_px = (x1 - x0) * (y1 - y0);
-    Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside: vec![true; area_px as usize], area_px, level: 0 }
+    Mask::whole(BoxPx { x0, y0, x1, y1 })
 }
 
 #[test]

@@ -10,8 +10,10 @@ use std::time::Duration;
 use anyhow::{Context, Result, anyhow, bail};
 use clap::ValueEnum;
 use serde_json::Value;
+use slag_encoder::progress::Progress;
 
 use crate::generate::compose::Walk;
+use crate::generate::grammar::SceneKind;
 
 /// Longest wait for an answer.
 const TIMEOUT: Duration = Duration::from_secs(60);
@@ -121,12 +123,12 @@ pub(crate) fn fetch_all(store: &Path, cache: &Path, profile: &str) -> Result<()>
     json_of(&mut fetch).map(|_| ())
 }
 
-/// A generated scene on a robot, in a folder: `scene`, `store` and `cache`.
+/// Generated scenes on robots, of each kind and seed in a folder of its own: `scene`, `store` and `cache`.
 pub(crate) struct Prepared<'a> {
-    pub(crate) dir: &'a Path,
-    /// Kind of scene, as `generate scene` names it.
-    pub(crate) kind: &'a str,
-    pub(crate) seed: u64,
+    /// Folder of the scenes' folders.
+    pub(crate) out: &'a Path,
+    pub(crate) kinds: &'a [SceneKind],
+    pub(crate) seeds: &'a [u64],
     pub(crate) n_views: u32,
     pub(crate) walk: Walk,
     /// Further flags of `encode`; `SCENE` in them stands for the scene's folder.
@@ -134,14 +136,36 @@ pub(crate) struct Prepared<'a> {
 }
 
 impl Prepared<'_> {
-    /// Generates, encodes and fetches the scene, as far as that was not done before.
-    pub(crate) fn make(&self) -> Result<()> {
-        let [scene, store, cache] = ["scene", "store", "cache"].map(|name| self.dir.join(name));
+    /// Judges each scene by its kind, seed and folder; returns their names.
+    pub(crate) fn judge(
+        &self,
+        progress: &dyn Progress,
+        mut judge: impl FnMut(SceneKind, u64, &Path) -> Result<()>,
+    ) -> Result<Vec<String>> {
+        let mut names = Vec::new();
+        progress.begin("judge", "scene", (self.kinds.len() * self.seeds.len()) as u64, 0);
+        for (kind, seed) in
+            self.kinds.iter().flat_map(|kind| self.seeds.iter().map(move |seed| (*kind, *seed)))
+        {
+            let name = format!("{}-{seed}", flag_value(&kind)?);
+            let dir = self.out.join(&name);
+            let judged = self.make(kind, seed, &dir).and_then(|()| judge(kind, seed, &dir));
+            judged.with_context(|| dir.display().to_string())?;
+            names.push(name);
+            progress.advance(1);
+        }
+        progress.end();
+        Ok(names)
+    }
+
+    /// Generates, encodes and fetches a scene, as far as that was not done before.
+    fn make(&self, kind: SceneKind, seed: u64, dir: &Path) -> Result<()> {
+        let [scene, store, cache] = ["scene", "store", "cache"].map(|name| dir.join(name));
         let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));
         if !poses.is_file() {
-            let (seed, n_views) = (self.seed.to_string(), self.n_views.to_string());
+            let (kind, seed, n_views) = (flag_value(&kind)?, seed.to_string(), self.n_views.to_string());
             let mut command = Command::new(sibling("slag-lab")?);
-            command.args(["generate", "scene", "--kind", self.kind, "--seed", &seed, "--n-views", &n_views]);
+            command.args(["generate", "scene", "--kind", &kind, "--seed", &seed, "--n-views", &n_views]);
             finish(command.args(["--walk", &flag_value(&self.walk)?, "--out"]).arg(&scene))?;
         }
         if !store.join("manifest").is_file() {

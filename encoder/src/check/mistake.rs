@@ -216,26 +216,16 @@ impl fmt::Display for Mistake {
                 write!(f, "the splat's rotations are inverted, world to Gaussian; convert it again")
             }
             Self::Activated { scales, opacities } => {
-                let what = match (scales, opacities) {
-                    (true, false) => "scales instead of their logarithms",
-                    (false, _) => "opacities instead of logits",
-                    (true, true) => "scales and opacities instead of logarithms and logits",
+                let (what, flag) = match (scales, opacities) {
+                    (true, false) => ("scales instead of their logarithms", "scales"),
+                    (false, _) => ("opacities instead of logits", "opacities"),
+                    (true, true) => {
+                        ("scales and opacities instead of logarithms and logits", "scales,opacities")
+                    }
                 };
-                write!(
-                    f,
-                    "the splat file has {what}; use --activated {}",
-                    activated_name(*scales, *opacities)
-                )
+                write!(f, "the splat file has {what}; use --activated {flag}")
             }
         }
-    }
-}
-
-fn activated_name(scales: bool, opacities: bool) -> &'static str {
-    match (scales, opacities) {
-        (true, false) => "scales",
-        (false, _) => "opacities",
-        (true, true) => "scales,opacities",
     }
 }
 

@@ -88,13 +88,9 @@ impl CheckView {
 /// Returns a PNG with the photo on the left and the drawing on the right.
 pub(super) fn picture(view: &CheckView, drawing: &Drawing) -> Result<Vec<u8>, CheckError> {
     let (width_px, height_px) = view.image.dimensions();
-    let picture = RgbImage::from_fn(width_px * 2, height_px, |x, y| {
-        if x < width_px {
-            return *view.image.get_pixel(x, y);
-        }
-        let start = ((y * width_px + x - width_px) * 3) as usize;
-        image::Rgb(std::array::from_fn(|c| (drawing.rgb[start + c].clamp(0.0, 1.0) * 255.0).round() as u8))
-    });
+    let mut picture = RgbImage::new(width_px * 2, height_px);
+    imageops::replace(&mut picture, &view.image, 0, 0);
+    imageops::replace(&mut picture, &drawing.image(), i64::from(width_px), 0);
     let mut png = Cursor::new(Vec::new());
     picture
         .write_to(&mut png, ImageFormat::Png)

@@ -12,7 +12,7 @@ use super::common::{Exit, InputArgs, print};
 use super::memory::free_memory_bytes;
 use super::next;
 use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
-use crate::ingest::{self, FoundFrame, LoadedImage, RotatedPhotos};
+use crate::ingest::{self, FoundFrame, IngestError, LoadedImage, RotatedPhotos};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -84,28 +84,13 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     };
     let all: Vec<View> = set.views.into_iter().map(in_splat).collect();
     let suspicions = check::suspicions(&scene, &all);
-    let (missing, there): (Vec<View>, Vec<View>) = all.into_iter().partition(|v| !v.image_path.is_file());
-    if let Some(first) = missing.first() {
-        let (n, of) = (missing.len(), missing.len() + there.len());
-        let message = format!("{n} of {of} photos are missing, the first is {}", first.image_path.display());
-        if input.strict || there.is_empty() {
-            return Err(anyhow!("{message}; give their folder with --images"));
-        }
-        notes.push(message);
-    }
+    let n_views = all.len();
+    let there = with_photos(all, input.strict, &mut notes)?;
+    let n_missing = n_views - there.len();
     let n = (args.samples as usize).min(there.len());
     // One at a time: a photo is loaded when the check reaches it.
     let rotated = RotatedPhotos::default();
-    let views = (0..n).map(|i| {
-        let view = &there[i * there.len() / n];
-        ingest::check_memory(view, free_memory_bytes().unwrap_or(u64::MAX))?;
-        let loaded = ingest::load_image(view)?;
-        rotated.add(&loaded);
-        let LoadedImage { view, image, valid, .. } = loaded;
-        let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());
-        let valid = bytes.and_then(|bytes| GrayImage::from_raw(image.width(), image.height(), bytes));
-        Ok(CheckView { view: RasterView::of(&view), name: view.name, image, valid })
-    });
+    let views = (0..n).map(|i| load(&there[i * there.len() / n], &rotated));
     let options = CheckOptions {
         width_px: args.raster_width,
         pictures_dir: args.out.clone(),
@@ -129,7 +114,7 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     report.notes = notes;
     let next = if report.diagnosis.is_none() { next::of_check(input) } else { String::new() };
     print(json, &report, format!("{report}{next}"))?;
-    let is_partial = !missing.is_empty()
+    let is_partial = n_missing > 0
         || !report.unreadable.is_empty()
         || n_left_out > 0
         || report.views.iter().any(|view| !view.fits());
@@ -138,6 +123,30 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         (None, true) => Exit::Partly,
         (None, false) => Exit::Done,
     })
+}
+
+/// Returns the views whose photos are there, and notes how many are not.
+fn with_photos(views: Vec<View>, is_strict: bool, notes: &mut Vec<String>) -> Result<Vec<View>> {
+    let (missing, there): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| !v.image_path.is_file());
+    if let Some(first) = missing.first() {
+        let (n, of) = (missing.len(), missing.len() + there.len());
+        let message = format!("{n} of {of} photos are missing, the first is {}", first.image_path.display());
+        if is_strict || there.is_empty() {
+            return Err(anyhow!("{message}; give their folder with --images"));
+        }
+        notes.push(message);
+    }
+    Ok(there)
+}
+
+fn load(view: &View, rotated: &RotatedPhotos) -> Result<CheckView, IngestError> {
+    ingest::check_memory(view, free_memory_bytes().unwrap_or(u64::MAX))?;
+    let loaded = ingest::load_image(view)?;
+    rotated.add(&loaded);
+    let LoadedImage { view, image, valid, .. } = loaded;
+    let bytes = valid.map(|valid| valid.into_iter().map(|valid| 255 * u8::from(valid)).collect());
+    let valid = bytes.and_then(|bytes| GrayImage::from_raw(image.width(), image.height(), bytes));
+    Ok(CheckView { view: RasterView::of(&view), name: view.name, image, valid })
 }
 
 /// Returns the similarities to try; all begin where `frame` leads, if there is one.

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
@@ -147,6 +148,13 @@ pub fn parse_frame(text: &str) -> Result<FrameChoice, String> {
         "none" => FrameChoice::None,
         path => FrameChoice::File(path.into()),
     })
+}
+
+/// Reads a time of any seconds above 0.
+pub(crate) fn parse_secs(text: &str) -> Result<Duration, String> {
+    let secs = text.parse().ok().filter(|secs: &f64| *secs > 0.0);
+    secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok())
+        .ok_or_else(|| "expected seconds above 0".into())
 }
 
 /// Prints the result: as one JSON object, or as lines for people.

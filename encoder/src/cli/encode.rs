@@ -11,7 +11,7 @@ use slag_models::gpus::GpuChoice;
 use super::choices::ChoiceArgs;
 use super::common::{
     Exit, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
-    print, profile_parser, warn_of_expiry,
+    parse_secs, print, profile_parser, warn_of_expiry,
 };
 use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
@@ -221,12 +221,6 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     output.models = args.models.models.as_deref().map(lasting_name);
     output.text_model = args.text_model;
     Ok(settings)
-}
-
-fn parse_secs(text: &str) -> Result<Duration, String> {
-    let secs = text.parse().ok().filter(|secs: &f64| *secs > 0.0);
-    secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok())
-        .ok_or_else(|| "expected seconds above 0".into())
 }
 
 /// Returns the settings of the flags, with the choices that a target picks, and what it expects.

@@ -10,7 +10,7 @@ use clap::Args;
 use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
-use super::common::{Exit, ModelArgs, available_threads, cancel_flag, open_models, print};
+use super::common::{Exit, ModelArgs, available_threads, cancel_flag, open_models, parse_secs, print};
 use super::memory::{default_memory_bytes, parse_memory};
 use crate::blobs::Bucket;
 use crate::encode::{self, EncodeSettings, EncodeSummary, Engines};
@@ -42,7 +42,7 @@ pub(crate) struct QueueArgs {
     #[arg(long, value_name = "FILE", requires = "fleet", hide_short_help = true)]
     nats_ca: Option<PathBuf>,
     /// Seconds without a sign of life after which a worker's view goes to another.
-    #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_secs, hide_short_help = true)]
+    #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_period, hide_short_help = true)]
     ack_wait: Duration,
     /// Times that a view is handed out; then it is left out.
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000), hide_short_help = true)]
@@ -107,7 +107,7 @@ pub struct WorkerArgs {
     #[arg(long, value_name = "N", env = "SLAG_WORKER_COUNT", value_parser = clap::value_parser!(u32).range(1..))]
     of: Option<u32>,
     /// Seconds without work after which a worker does what others have left of their shares.
-    #[arg(long, value_name = "SECS", default_value = "120", value_parser = parse_secs)]
+    #[arg(long, value_name = "SECS", default_value = "120", value_parser = parse_period)]
     help_after: Duration,
     #[command(flatten)]
     queue: QueueArgs,
@@ -133,7 +133,7 @@ pub struct WorkerArgs {
     #[arg(long, value_name = "DIR")]
     scratch: Option<PathBuf>,
     /// Seconds to wait for an encode to begin, and for a sign of life of the machine that began it.
-    #[arg(long, value_name = "SECS", default_value = "600", value_parser = parse_secs)]
+    #[arg(long, value_name = "SECS", default_value = "600", value_parser = parse_period)]
     wait: Duration,
     /// Goes on to the next encode when one is published.
     #[arg(long)]
@@ -183,8 +183,8 @@ pub(super) fn open_bucket(url: &str) -> Result<Arc<Bucket>> {
     Ok(Arc::new(Bucket::open(url, variables)?))
 }
 
-fn parse_secs(text: &str) -> Result<Duration, String> {
-    let secs = text.parse().ok().filter(|secs: &f64| *secs >= 0.1);
-    secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok())
-        .ok_or_else(|| "expected seconds, at least 0.1".into())
+/// Reads the times of a fleet.
+fn parse_period(text: &str) -> Result<Duration, String> {
+    let period = parse_secs(text).ok().filter(|period| period.as_millis() >= 100);
+    period.ok_or_else(|| "expected seconds, at least 0.1".into())
 }

@@ -73,7 +73,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             match CatalogueCopy::of(&at.store, &std::env::temp_dir())? {
                 Some(catalogue) => {
                     listed.history = catalogue.generations()?;
-                    listed.job = job_status(catalogue.db(), &at.store)?;
+                    listed.job = job_status(catalogue.db())?;
                 }
                 None => tracing::warn!(
                     "without the history: the catalogue db/ is not there, damaged, or being changed"

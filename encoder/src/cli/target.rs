@@ -1,12 +1,14 @@
 //! `encode --target-seconds S --target-bytes B`: the choices are picked from a measured front.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
 use clap::{Args, FromArgMatches};
 use slag_common::ByteSize;
 
 use super::choices::ChoiceArgs;
+use super::common::parse_secs;
 use crate::encode::front::{Expectation, Front, Target};
 use crate::encode::{InputSettings, count_inputs};
 
@@ -16,8 +18,8 @@ use crate::encode::{InputSettings, count_inputs};
 pub(crate) struct TargetArgs {
     /// Picks the most accurate measured setting that is expected to take at most this many seconds. The
     /// expectation holds for the machine, models and size of photos that the front was measured with.
-    #[arg(long, value_name = "S", value_parser = parse_seconds, requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]
-    target_seconds: Option<f64>,
+    #[arg(long, value_name = "S", value_parser = parse_secs, requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]
+    target_seconds: Option<Duration>,
     /// Picks the most accurate measured setting whose compact shards are expected to have at most this many bytes.
     #[arg(long, value_name = "BYTES", requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]
     target_bytes: Option<ByteSize>,
@@ -26,18 +28,12 @@ pub(crate) struct TargetArgs {
     front: Option<PathBuf>,
 }
 
-fn parse_seconds(text: &str) -> Result<f64, String> {
-    text.parse()
-        .ok()
-        .filter(|s: &f64| *s > 0.0 && s.is_finite())
-        .ok_or_else(|| "expected seconds above 0".into())
-}
-
 impl TargetArgs {
     /// Returns the choices that meet the target on the inputs, and what is expected of them; `None` without a
     /// target.
     pub(super) fn choose(&self, inputs: &InputSettings) -> Result<Option<(ChoiceArgs, Expectation)>> {
-        let target = Target { seconds: self.target_seconds, bytes: self.target_bytes.map(|bytes| bytes.0) };
+        let seconds = self.target_seconds.map(|seconds| seconds.as_secs_f64());
+        let target = Target { seconds, bytes: self.target_bytes.map(|bytes| bytes.0) };
         let Some(path) = &self.front else { return Ok(None) };
         if target == Target::default() {
             return Err(anyhow!("--front needs --target-seconds or --target-bytes"));

@@ -110,11 +110,8 @@ fn shown(args: &ViewArgs) -> Result<Viewed> {
         None => None,
         Some(path) => {
             let mut scene = splat::read(path, &ReadOptions { with_sh_rest: false })?;
-            if let Some(set) = &set
-                && let Some(frame) = ingest::find_frame(path, &args.splat_frame, set.source, set.applied)?
-            {
-                tracing::info!("{frame}; the splat is brought into the world of the poses");
-                frame.to_poses(&mut scene);
+            if let Some(set) = &set {
+                ingest::to_poses(&mut scene, path, &args.splat_frame, set.source, set.applied)?;
             }
             let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             Some(Splat::new(name, scene, args.store.is_none()))

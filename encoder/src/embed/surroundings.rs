@@ -68,8 +68,7 @@ mod tests {
     fn a_mask_takes_a_share_of_what_its_pixels_see() {
         let (size_px, per_side, dim) = ((30, 21), 4, 3);
         let box_px = BoxPx { x0: 3, y0: 2, x1: 23, y1: 20 };
-        let inside: Vec<bool> = (0..20 * 18).map(|k| k % 7 < 4).collect();
-        let mask = Mask { box_px, area_px: inside.iter().filter(|x| **x).count() as u32, inside, level: 0 };
+        let mask = Mask::within(box_px, |x, y| (x + 20 * y) % 7 < 4);
         let units = |n: usize| -> Vec<f32> {
             let component = |k: usize| (k * 37 % 101) as f32 - 50.3;
             (0..n)

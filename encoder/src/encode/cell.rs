@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use slag_common::landmarks::BuiltLandmarks;
 use slag_common::manifest::{CellRecord, ShardRecord};
@@ -14,6 +14,7 @@ use super::context::RunContext;
 use super::error::EncodeError;
 use crate::cells::CellSplit;
 use crate::codebook::ScoreMetricContext;
+use crate::lanes::Lanes;
 use crate::lift::published::extra_field;
 use crate::lift::refine::Refinement;
 use crate::lift::{CellField, ContributionError, ContributionIndex, PartContributions, RegionTable};
@@ -86,7 +87,13 @@ impl CellMaker<'_> {
         let context = self.context;
         // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
         let free = (0..budget.n_at_once).map(|_| CellInWork::empty(self.table.dim())).collect();
-        let free = FreeCells { cells: Mutex::new(free), given_back: Condvar::new() };
+        let lent = Lanes::new([(0, free)]);
+        let take_emptied = || {
+            let mut cell = lent.take();
+            cell.embeddings.has_evidence.clear();
+            cell.fields.clear();
+            cell
+        };
         let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
         let has_failed = AtomicBool::new(false);
         let is_stopped = || context.is_cancelled() || has_failed.load(Ordering::Relaxed);
@@ -95,7 +102,7 @@ impl CellMaker<'_> {
         std::thread::scope(|scope| -> Result<(), EncodeError> {
             let mut parts = context.install(|| index.transposed_parts(&self.table, budget.group_bytes));
             let mut next_part = || context.time("merge", || context.install(|| parts.next()));
-            let mut lent = free.take();
+            let mut cell = take_emptied();
             while let Some(contributions) = next_part() {
                 if is_stopped() {
                     break;
@@ -104,22 +111,22 @@ impl CellMaker<'_> {
                 let cell_id = contributions.part.cell_id;
                 if contributions.part.locals.end < self.split.cells[cell_id as usize].gaussians.len() {
                     // A large cell comes in parts, so that only one of them is held.
-                    context.install(|| self.add_part(contributions, &mut lent.cell))?;
+                    context.install(|| self.add_part(contributions, &mut cell))?;
                     continue;
                 }
                 let (finished, has_failed) = (&finished, &has_failed);
                 let work = move || {
                     if !is_stopped() {
-                        let added = self.add_part(contributions, &mut lent.cell);
-                        let result = added.and_then(|()| self.finish(cell_id, &mut lent.cell));
+                        let added = self.add_part(contributions, &mut cell);
+                        let result = added.and_then(|()| self.finish(cell_id, &mut cell));
                         has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
-                        locked(finished).insert(cell_id, result);
+                        finished.lock().unwrap_or_else(PoisonError::into_inner).insert(cell_id, result);
                         context.progress().advance(1);
                     }
-                    drop(lent);
+                    drop(cell);
                 };
                 scope.spawn(move || workers.run((cell_id as usize) < n_alone, work));
-                lent = free.take();
+                cell = take_emptied();
             }
             Ok(())
         })?;
@@ -193,42 +200,4 @@ impl CellMaker<'_> {
             score_sums: [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with],
         })
     }
-}
-
-struct FreeCells {
-    cells: Mutex<Vec<CellInWork>>,
-    given_back: Condvar,
-}
-
-impl FreeCells {
-    /// Waits until one is free.
-    fn take(&self) -> LentCell<'_> {
-        let mut cells = locked(&self.cells);
-        loop {
-            match cells.pop() {
-                Some(cell) => return LentCell { cell, owner: self },
-                None => cells = self.given_back.wait(cells).unwrap_or_else(PoisonError::into_inner),
-            }
-        }
-    }
-}
-
-/// A cell that goes back, emptied, whatever becomes of the work.
-struct LentCell<'a> {
-    cell: CellInWork,
-    owner: &'a FreeCells,
-}
-
-impl Drop for LentCell<'_> {
-    fn drop(&mut self) {
-        let mut cell = std::mem::replace(&mut self.cell, CellInWork::empty(0));
-        cell.embeddings.has_evidence.clear();
-        cell.fields.clear();
-        locked(&self.owner.cells).push(cell);
-        self.owner.given_back.notify_one();
-    }
-}
-
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

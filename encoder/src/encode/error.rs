@@ -59,8 +59,8 @@ pub enum EncodeError {
     Contributions(#[from] ContributionError),
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    #[error("{}: job records: {source}; start over with --restart", path.display())]
-    Records { path: PathBuf, source: sled::Error },
+    #[error("job records: {0}; start over with --restart")]
+    Records(#[from] sled::Error),
     #[error(
         "{}: holds an unfinished encode of another splat or with other settings ({n_done} views done); finish it with its own \
          splat and settings, or drop it with --restart", path.display()

@@ -16,6 +16,7 @@ use crate::segment::Segmenter;
 const REGIONS_VERSION: u32 = 4;
 
 /// Stands for the rasterisers of a fleet: its machines have different ones.
+#[cfg(feature = "fleet")]
 pub(crate) const OF_A_FLEET: &str = "fleet";
 
 pub(super) struct Identities {

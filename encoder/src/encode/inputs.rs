@@ -47,14 +47,9 @@ impl Inputs {
         inputs.activated.undo(&mut scene);
         let (set, n_drawn) = read_views(inputs)?;
         let damaged = set.damaged;
-        let frame = match ingest::drawn_from(&inputs.views) {
-            // Drawn where the splat is.
-            Some(_) => None,
-            None => ingest::find_frame(&inputs.scene, &inputs.splat_frame, set.source, set.applied)?,
-        };
-        if let Some(frame) = frame {
-            tracing::info!("{frame}; the splat is brought into the world of the poses");
-            frame.to_poses(&mut scene);
+        // Drawings are drawn where the splat is.
+        if ingest::drawn_from(&inputs.views).is_none() {
+            ingest::to_poses(&mut scene, &inputs.scene, &inputs.splat_frame, set.source, set.applied)?;
         }
         let (views, mut missing) = find_views(settings, set.views)?;
         if let (true, Some((view, reason))) = (settings.run.strict, damaged.first()) {

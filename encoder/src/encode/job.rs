@@ -1,7 +1,7 @@
 //! The state of an unfinished encode: which views are done, and their files of contributions.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::Serialize;
 use slag_common::{Hash32, View, durable};
@@ -35,23 +35,21 @@ pub(crate) struct JobStatus {
 
 /// Returns the state of the encode that a store keeps views of, if there is one. `db`: the store's catalogue, or a
 /// copy.
-pub(crate) fn job_status(db: &sled::Db, store: &Path) -> Result<Option<JobStatus>, EncodeError> {
-    let records = |source| EncodeError::Records { path: store.to_owned(), source };
-    let tree = db.open_tree(TREE).map_err(records)?;
-    if !tree.contains_key(IDENTITY_KEY).map_err(records)? {
+pub(crate) fn job_status(db: &sled::Db) -> Result<Option<JobStatus>, EncodeError> {
+    let tree = db.open_tree(TREE)?;
+    if !tree.contains_key(IDENTITY_KEY)? {
         return Ok(None);
     }
-    let step = tree.get(STEP_KEY).map_err(records)?;
+    let step = tree.get(STEP_KEY)?;
     Ok(Some(JobStatus {
         n_views: tree.scan_prefix(VIEW_PREFIX).count(),
-        is_published: tree.contains_key(PUBLISHED_KEY).map_err(records)?,
+        is_published: tree.contains_key(PUBLISHED_KEY)?,
         step: step.map(|name| String::from_utf8_lossy(&name).into_owned()),
     }))
 }
 
 /// The unfinished encode of a store.
-pub(crate) struct Job<'a> {
-    store: &'a Store,
+pub(crate) struct Job {
     records: sled::Tree,
     folder: PathBuf,
     #[cfg_attr(not(feature = "fleet"), expect(dead_code, reason = "for a fleet"))]
@@ -60,23 +58,22 @@ pub(crate) struct Job<'a> {
     id_of_view: BTreeMap<String, Hash32>,
 }
 
-impl<'a> Job<'a> {
+impl Job {
     /// Takes up what an encode of the same scene left, or begins one. Views that it has done are done here, too,
     /// where their identities are the same. `id_of_view`: by name.
     pub(super) fn open(
-        store: &'a Store,
+        store: &Store,
         of_scene: Hash32,
         id_of_view: BTreeMap<String, Hash32>,
         restart: bool,
     ) -> Result<Self, EncodeError> {
         let folder = store.job_dir()?;
-        let records = store.db().open_tree(TREE).map_err(|source| records_error(store, source))?;
-        let job = Self { store, records, folder, of_scene, id_of_view };
+        let records = store.db().open_tree(TREE)?;
+        let job = Self { records, folder, of_scene, id_of_view };
         job.adopt()?;
-        let found = job.records.get(IDENTITY_KEY).map_err(|source| records_error(store, source))?;
+        let found = job.records.get(IDENTITY_KEY)?;
         let same = found.as_deref() == Some(&of_scene.0);
-        let published =
-            job.records.contains_key(PUBLISHED_KEY).map_err(|source| records_error(store, source))?;
+        let published = job.records.contains_key(PUBLISHED_KEY)?;
         // A published job loses only its contributions, which the published generation does not need.
         if found.is_some() && !same && !restart && !published {
             return Err(EncodeError::OtherJob {
@@ -86,7 +83,7 @@ impl<'a> Job<'a> {
         }
         if !same {
             job.clear()?;
-            job.records.insert(IDENTITY_KEY, &of_scene.0).map_err(|source| records_error(store, source))?;
+            job.records.insert(IDENTITY_KEY, &of_scene.0)?;
             job.flush()?;
         }
         fs_err::create_dir_all(job.views_folder())?;
@@ -98,8 +95,7 @@ impl<'a> Job<'a> {
     pub(crate) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
         let mut done = BTreeMap::new();
         for (name, id) in &self.id_of_view {
-            let record = self.records.get(record_key(*id));
-            if let Some(value) = record.map_err(|source| records_error(self.store, source))? {
+            if let Some(value) = self.records.get(record_key(*id))? {
                 // The record feeds the report alone.
                 done.insert(name.clone(), serde_json::from_slice(&value).unwrap_or_default());
             }
@@ -143,7 +139,7 @@ impl<'a> Job<'a> {
         let mut batch = sled::Batch::default();
         batch.insert(record_key(self.id_of_view[view]), record);
         batch.remove(PUBLISHED_KEY);
-        self.records.apply_batch(batch).map_err(|source| records_error(self.store, source))?;
+        self.records.apply_batch(batch)?;
         self.flush()
     }
 
@@ -151,20 +147,19 @@ impl<'a> Job<'a> {
     /// none of this encode's go.
     pub(super) fn keep_published(self) -> Result<(), EncodeError> {
         self.forget_others()?;
-        self.records.insert(PUBLISHED_KEY, &[]).map_err(|source| records_error(self.store, source))?;
+        self.records.insert(PUBLISHED_KEY, &[])?;
         self.flush()
     }
 
     pub(super) fn begin(&self, step: &str) -> Result<(), EncodeError> {
-        self.records.insert(STEP_KEY, step).map_err(|source| records_error(self.store, source))?;
+        self.records.insert(STEP_KEY, step)?;
         self.flush()
     }
 
     /// Returns whether the store keeps views of an encode of this scene.
     pub(super) fn is_kept(store: &Store, of_scene: Hash32) -> Result<bool, EncodeError> {
-        let records = |source| records_error(store, source);
-        let tree = store.db().open_tree(TREE).map_err(records)?;
-        let found = tree.get(IDENTITY_KEY).map_err(records)?;
+        let tree = store.db().open_tree(TREE)?;
+        let found = tree.get(IDENTITY_KEY)?;
         Ok(found.as_deref() == Some(&of_scene.0) && tree.scan_prefix(VIEW_PREFIX).next().is_some())
     }
 
@@ -178,12 +173,12 @@ impl<'a> Job<'a> {
         let own: BTreeSet<String> = self.id_of_view.values().map(Hash32::to_string).collect();
         let mut batch = sled::Batch::default();
         for key in self.records.scan_prefix(VIEW_PREFIX).keys() {
-            let key = key.map_err(|source| records_error(self.store, source))?;
+            let key = key?;
             if !own.contains(&*String::from_utf8_lossy(&key[VIEW_PREFIX.len()..])) {
                 batch.remove(key);
             }
         }
-        self.records.apply_batch(batch).map_err(|source| records_error(self.store, source))?;
+        self.records.apply_batch(batch)?;
         self.flush()?;
         for entry in fs_err::read_dir(self.views_folder())? {
             let path = entry?.path();
@@ -197,8 +192,7 @@ impl<'a> Job<'a> {
     /// Takes up the files of a job whose records are lost: a catalogue that was made anew has none. A file of
     /// contributions is renamed into place when it and its outlines are whole.
     fn adopt(&self) -> Result<(), EncodeError> {
-        let records = |source| records_error(self.store, source);
-        if self.records.contains_key(IDENTITY_KEY).map_err(records)? {
+        if self.records.contains_key(IDENTITY_KEY)? {
             return Ok(());
         }
         let written = fs_err::read_to_string(self.identity_path()).ok();
@@ -218,7 +212,7 @@ impl<'a> Job<'a> {
                 batch.insert(record_key(id), record);
             }
         }
-        self.records.apply_batch(batch).map_err(records)?;
+        self.records.apply_batch(batch)?;
         self.flush()
     }
 
@@ -243,7 +237,7 @@ impl<'a> Job<'a> {
         }
         // A file without a record is redone, a record without a file would be an error.
         if n_steps > 1 {
-            self.records.clear().map_err(|source| records_error(self.store, source))?;
+            self.records.clear()?;
             self.flush()?;
         }
         if n_steps > 2 && self.folder.exists() {
@@ -253,12 +247,12 @@ impl<'a> Job<'a> {
     }
 
     fn flush(&self) -> Result<(), EncodeError> {
-        self.records.flush().map_err(|source| records_error(self.store, source))?;
+        self.records.flush()?;
         Ok(())
     }
 }
 
-impl ViewSink for Job<'_> {
+impl ViewSink for Job {
     fn n_at_once(&self) -> usize {
         1
     }
@@ -281,15 +275,11 @@ fn record_key(id: Hash32) -> Vec<u8> {
     format!("{VIEW_PREFIX}{id}").into_bytes()
 }
 
-fn records_error(store: &Store, source: sled::Error) -> EncodeError {
-    EncodeError::Records { path: store.dir().to_owned(), source }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn keep(job: &Job<'_>, view: &str) {
+    fn keep(job: &Job, view: &str) {
         let contributions = ViewContributions {
             dim: 1,
             mask_vectors: Vec::new(),
@@ -302,7 +292,7 @@ mod tests {
         job.keep(&view, &contributions, &[], ViewRecord::default()).expect("keeps");
     }
 
-    fn open_with<'a>(store: &'a Store, of_scene: u8, views: &[(&str, u8)]) -> Result<Job<'a>, EncodeError> {
+    fn open_with(store: &Store, of_scene: u8, views: &[(&str, u8)]) -> Result<Job, EncodeError> {
         let id_of_view = views.iter().map(|(name, id)| ((*name).to_owned(), Hash32([*id; 32]))).collect();
         Job::open(store, Hash32([of_scene; 32]), id_of_view, false)
     }
@@ -313,7 +303,7 @@ mod tests {
     fn views_are_known_by_their_identities() {
         let dir = tempfile::tempdir().expect("a folder");
         let store = Store::create_or_open(dir.path()).expect("opens");
-        let names = |job: &Job<'_>| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
+        let names = |job: &Job| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
         let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
         keep(&job, "a");
         keep(&job, "b");
@@ -342,14 +332,14 @@ mod tests {
         let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
         job.begin("views").expect("records");
         keep(&job, "a");
-        let status = job_status(store.db(), store.dir()).expect("reads").expect("a job");
+        let status = job_status(store.db()).expect("reads").expect("a job");
         assert_eq!((status.n_views, status.is_published, status.step.as_deref()), (1, false, Some("views")));
         drop(job);
         drop(store);
         fs_err::remove_dir_all(dir.path().join("db")).expect("there");
         let store = Store::create_or_open(dir.path()).expect("opens");
-        assert_eq!(job_status(store.db(), store.dir()).expect("reads"), None);
-        let done = |job: &Job<'_>| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
+        assert_eq!(job_status(store.db()).expect("reads"), None);
+        let done = |job: &Job| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
         assert_eq!(done(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
         assert!(matches!(open_with(&store, 2, &[("a", 1)]), Err(EncodeError::OtherJob { n_done: 1, .. })));
     }

@@ -52,13 +52,15 @@ pub(crate) use inputs::count_inputs;
 pub(crate) use job::{JobStatus, job_status};
 pub use preset::Preset;
 pub use report::EncodeSummary;
-pub(crate) use report::{GpuReport, Phase, SkippedView, StageReport};
+#[cfg(feature = "fleet")]
+pub(crate) use report::SkippedView;
+pub(crate) use report::{GpuReport, Phase, StageReport};
+#[cfg(feature = "fleet")]
+pub(crate) use settings::ViewSettings;
 pub use settings::{
     CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit,
 };
-pub(crate) use settings::{
-    DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth, ViewSettings,
-};
+pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
 
 /// The parts of which a fleet makes its own encode.
 #[cfg(feature = "fleet")]

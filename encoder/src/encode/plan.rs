@@ -37,7 +37,7 @@ pub(crate) struct Plan<'a> {
     pub(crate) store: &'a Store,
     pub(super) memory: MemoryPlan,
     pub(crate) segmenter: Box<dyn Segmenter>,
-    pub(crate) job: Job<'a>,
+    pub(crate) job: Job,
     /// Kept views that are done anew.
     pub(super) lost_views: Option<LostViews>,
     /// The encoder of the generation that this encode replaces, if it is another.
@@ -151,8 +151,7 @@ fn encoder_before(settings: &EncodeSettings, engines: &Engines<'_>) -> Option<St
 /// Returns which kept views cannot be taken over, and says so; an encode that is unfinished is refused later, not
 /// replaced.
 fn lost_views(store: &Store, of_scene: Hash32) -> Result<Option<LostViews>, EncodeError> {
-    let kept =
-        job_status(store.db(), store.dir())?.filter(|status| status.n_views > 0 && status.is_published);
+    let kept = job_status(store.db())?.filter(|status| status.n_views > 0 && status.is_published);
     let Some(JobStatus { n_views, .. }) = kept else { return Ok(None) };
     if Job::is_kept(store, of_scene)? {
         return Ok(None);

@@ -1,6 +1,5 @@
 //! Ingest: loads photos as ideal pinhole images of known size.
 
-mod drawn;
 mod geo;
 mod jpeg;
 mod splat_frame;
@@ -12,14 +11,14 @@ use std::sync::{Mutex, PoisonError};
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
+use serde::Deserialize;
 use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View};
 
 use jpeg::Damage;
 
-pub use drawn::drawn_from;
 pub use geo::{GeoError, read_geo_reference};
-pub(crate) use splat_frame::FoundFrame;
-pub use splat_frame::{Activated, FrameChoice, find_frame};
+pub use splat_frame::{Activated, FrameChoice, to_poses};
+pub(crate) use splat_frame::{FoundFrame, find_frame};
 pub use undistort::Undistorter;
 
 /// Largest factor between the size in the intrinsics and that of downscaled photos.
@@ -102,6 +101,22 @@ pub enum IngestError {
         path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1]
     )]
     Size { path: PathBuf, found_px: [u32; 2], expected_px: [u32; 2] },
+}
+
+#[derive(Deserialize)]
+struct Drawn {
+    drawn_from: String,
+}
+
+/// Returns the splat from which the images of a poses file were drawn; `None` where they are photos. Only
+/// transforms.json says so, of `plan` and `draw`.
+pub fn drawn_from(poses: &Path) -> Option<String> {
+    let inside = poses.join("transforms.json");
+    let path = if poses.is_dir() { &inside } else { poses };
+    let is_json = path.extension().is_some_and(|extension| extension == "json");
+    let text = is_json.then(|| fs_err::read(path).ok())??;
+    // What is malformed is told by the reader of poses.
+    serde_json::from_slice::<Drawn>(&text).ok().map(|drawn| drawn.drawn_from)
 }
 
 /// Returns the BLAKE3 hash of a file's content.

@@ -42,7 +42,7 @@ pub struct FoundFrame {
 
 /// Looks for the file that states the frame of the splat at `scene`; `source` and `applied` are those of the
 /// poses.
-pub fn find_frame(
+pub(crate) fn find_frame(
     scene: &Path,
     choice: &FrameChoice,
     source: PoseSource,
@@ -68,11 +68,22 @@ impl FoundFrame {
     pub fn splat_from_poses(&self) -> Similarity {
         self.stated.similarity
     }
+}
 
-    /// Brings a splat into the world of the poses. Harmonics above degree 0 are dropped.
-    pub fn to_poses(&self, scene: &mut Gaussians) {
-        self.stated.similarity.inverse().transform_gaussians(scene);
+/// Brings the splat at `path` into the world of the poses, if a file states its frame. Harmonics above degree 0 are
+/// dropped then. `source` and `applied` are those of the poses.
+pub fn to_poses(
+    scene: &mut Gaussians,
+    path: &Path,
+    choice: &FrameChoice,
+    source: PoseSource,
+    applied: Option<AppliedTransform>,
+) -> Result<(), PoseError> {
+    if let Some(frame) = find_frame(path, choice, source, applied)? {
+        tracing::info!("{frame}; the splat is brought into the world of the poses");
+        frame.stated.similarity.inverse().transform_gaussians(scene);
     }
+    Ok(())
 }
 
 impl fmt::Display for FoundFrame {

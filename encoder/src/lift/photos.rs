@@ -91,12 +91,8 @@ mod tests {
     use super::*;
 
     /// A mask that fills a box except for a hole.
-    fn mask(box_px: [u32; 4], hole: impl Fn(u32, u32) -> bool) -> Mask {
-        let [x0, y0, x1, y1] = box_px;
-        let inside: Vec<bool> =
-            (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))).map(|(x, y)| !hole(x, y)).collect();
-        let area_px = inside.iter().filter(|inside| **inside).count() as u32;
-        Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside, area_px, level: 2 }
+    fn mask([x0, y0, x1, y1]: [u32; 4], hole: impl Fn(u32, u32) -> bool) -> Mask {
+        Mask { level: 2, ..Mask::within(BoxPx { x0, y0, x1, y1 }, |x, y| !hole(x, y)) }
     }
 
     /// Computed by hand: outlines on the photo's edge, and along pixels that undistortion left empty.

@@ -41,6 +41,22 @@ impl Mask {
     /// nothing of things.
     pub(crate) const FILLER: u8 = u8::MAX;
 
+    /// Makes a mask of all pixels of a box, with level 0.
+    pub fn whole(box_px: BoxPx) -> Self {
+        let area_px = box_px.width_px() * box_px.height_px();
+        Self { box_px, inside: vec![true; area_px as usize], area_px, level: 0 }
+    }
+
+    /// Makes a mask of those pixels of a box that are inside, with level 0.
+    #[cfg(test)]
+    pub(crate) fn within(box_px: BoxPx, is_inside: impl Fn(u32, u32) -> bool) -> Self {
+        let BoxPx { x0, y0, x1, y1 } = box_px;
+        let pixels = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y)));
+        let inside: Vec<bool> = pixels.map(|(x, y)| is_inside(x, y)).collect();
+        let area_px = inside.iter().filter(|inside| **inside).count() as u32;
+        Self { box_px, inside, area_px, level: 0 }
+    }
+
     /// Returns whether the mask contains a pixel of the image.
     pub fn contains(&self, x: u32, y: u32) -> bool {
         let BoxPx { x0, y0, x1, y1 } = self.box_px;

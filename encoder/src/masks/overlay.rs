@@ -62,9 +62,7 @@ mod tests {
     fn masks_are_where_they_are_in_the_photo() {
         let photo = RgbImage::from_pixel(80, 40, Rgb([100; 3]));
         let box_px = BoxPx { x0: 20, y0: 8, x1: 60, y1: 32 };
-        let inside: Vec<bool> = (8..32).flat_map(|y| (20..60).map(move |x| !(x >= 40 && y >= 20))).collect();
-        let area_px = inside.iter().filter(|inside| **inside).count() as u32;
-        let picture = overlay(&photo, &[Mask { box_px, inside, area_px, level: 0 }], 40);
+        let picture = overlay(&photo, &[Mask::within(box_px, |x, y| x < 40 || y < 20)], 40);
         assert_eq!(picture.dimensions(), (40, 20));
         // The first colour is red. By hand, in pixels of half the size: inside, on the border, in the notch,
         // outside.

@@ -18,9 +18,7 @@ pub(crate) fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(
         for column in 0..per_side {
             let (x0, x1) = (first(column, width_px), first(column + 1, width_px));
             if x0 < x1 && y0 < y1 {
-                let box_px = BoxPx { x0, y0, x1, y1 };
-                let area_px = box_px.width_px() * box_px.height_px();
-                let mask = Mask { box_px, inside: vec![true; area_px as usize], area_px, level: 0 };
+                let mask = Mask::whole(BoxPx { x0, y0, x1, y1 });
                 patches.push(((row * per_side + column) as usize, mask));
             }
         }

@@ -31,8 +31,7 @@ impl Windows {
                     x1: edge(column + 2, self.width_px),
                     y1: edge(row + 2, self.height_px),
                 };
-                let area_px = box_px.width_px() * box_px.height_px();
-                masks.push(Mask { box_px, inside: vec![true; area_px as usize], area_px, level: 0 });
+                masks.push(Mask::whole(box_px));
             }
         }
         masks

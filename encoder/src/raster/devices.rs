@@ -3,7 +3,6 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use slag_common::Gaussians;
 
@@ -14,6 +13,7 @@ use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
 use super::rasterizer::{GpuSlots, LoadedScene, Rasterizer};
 use super::view::RasterView;
 use super::weights::{ViewWeights, WeightKind};
+use crate::lanes::Lanes;
 use crate::masks::RegionMap;
 
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -184,60 +184,30 @@ impl Rasterizer for Devices {
             }
             return Ok(cpu);
         }
-        let slots =
-            DeviceSlots { n_free: vec![self.views_in_flight; gpus.len()], is_usable: vec![true; gpus.len()] };
-        Ok(Box::new(SharedScene {
-            gpus,
-            views_in_flight: self.views_in_flight,
-            cpu,
-            slots: Mutex::new(slots),
-            freed: Condvar::new(),
-        }))
+        let lanes = (0..gpus.len() as u32).map(|gpu| (gpu, vec![(); self.views_in_flight]));
+        let lanes = Lanes::new(lanes);
+        Ok(Box::new(SharedScene { gpus, views_in_flight: self.views_in_flight, cpu, lanes }))
     }
 }
 
-/// A scene on several GPUs. Each GPU has one slot per view in flight. A view goes to the GPU with the most free
-/// slots, so a slow view occupies only its own slot.
+/// A scene on several GPUs. Each GPU has a lane per view in flight, so a slow view occupies only its own.
 struct SharedScene<'s> {
     gpus: Vec<Box<dyn LoadedScene + 's>>,
     views_in_flight: usize,
     cpu: Box<dyn LoadedScene + 's>,
-    slots: Mutex<DeviceSlots>,
-    freed: Condvar,
+    lanes: Lanes<()>,
 }
 
-struct DeviceSlots {
-    /// Free slots of each GPU.
-    n_free: Vec<usize>,
-    is_usable: Vec<bool>,
-}
-
-impl<'s> SharedScene<'s> {
-    fn slots(&self) -> MutexGuard<'_, DeviceSlots> {
-        self.slots.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Takes a slot of the GPU with the most free slots, and waits for one if necessary; `None` if no GPU is
-    /// usable.
-    fn take(&self) -> Option<Slot<'_, 's>> {
-        let mut slots = self.slots();
-        while slots.is_usable.contains(&true) {
-            let usable = (0..self.gpus.len()).filter(|gpu| slots.is_usable[*gpu] && slots.n_free[*gpu] > 0);
-            // The first of equals: `max_by_key` returns the last.
-            if let Some(gpu) = usable.rev().max_by_key(|gpu| slots.n_free[*gpu]) {
-                slots.n_free[gpu] -= 1;
-                return Some(Slot { scene: self, gpu });
-            }
-            slots = self.freed.wait(slots).unwrap_or_else(PoisonError::into_inner);
-        }
-        None
-    }
-
+impl SharedScene<'_> {
     /// Runs work on the next free GPU; if it fails, on another GPU, and finally on the CPU.
     fn run<T>(&self, work: impl Fn(&dyn LoadedScene) -> Result<T, RasterError>) -> Result<T, RasterError> {
-        while let Some(slot) = self.take() {
-            match work(self.gpus[slot.gpu].as_ref()) {
-                Err(error @ RasterError::Device { .. }) => slot.give_up(&error),
+        while let Some(lane) = self.lanes.take_if_any() {
+            match work(self.gpus[lane.gpu() as usize].as_ref()) {
+                Err(error @ RasterError::Device { .. }) => {
+                    if let Some(rest) = lane.leave_out() {
+                        tracing::warn!("ignoring a GPU: {error}; {rest} other GPUs remain");
+                    }
+                }
                 Err(error @ RasterError::DeviceCapacity { .. }) => {
                     tracing::warn!("rasterising a view on the CPU: {error}");
                     return work(self.cpu.as_ref());
@@ -246,32 +216,6 @@ impl<'s> SharedScene<'s> {
             }
         }
         work(self.cpu.as_ref())
-    }
-}
-
-/// A slot of a GPU, free again when this is dropped, whatever became of the view.
-struct Slot<'a, 's> {
-    scene: &'a SharedScene<'s>,
-    gpu: usize,
-}
-
-impl Slot<'_, '_> {
-    /// Leaves the GPU out from now on.
-    fn give_up(self, error: &RasterError) {
-        let mut slots = self.scene.slots();
-        if std::mem::replace(&mut slots.is_usable[self.gpu], false) {
-            let rest = slots.is_usable.iter().filter(|usable| **usable).count();
-            tracing::warn!("ignoring a GPU: {error}; {rest} other GPUs remain");
-            // Waiting threads must see that there may be no usable GPU.
-            self.scene.freed.notify_all();
-        }
-    }
-}
-
-impl Drop for Slot<'_, '_> {
-    fn drop(&mut self) {
-        self.scene.slots().n_free[self.gpu] += 1;
-        self.scene.freed.notify_one();
     }
 }
 
@@ -298,21 +242,19 @@ impl LoadedScene for SharedScene<'_> {
 mod tests {
     use super::*;
 
-    /// With one slot, the view after one that panicked waits for ever unless the slot is given back.
+    /// With one lane, the view after one that panicked waits for ever unless the lane is given back.
     #[test]
-    fn a_panic_gives_its_slot_back() {
+    fn a_panic_gives_its_lane_back() {
         let gaussians = Gaussians::default();
         let cpu = || CpuRasterizer.load(&gaussians).expect("loads");
         let scene = SharedScene {
             gpus: vec![cpu()],
             views_in_flight: 1,
             cpu: cpu(),
-            slots: Mutex::new(DeviceSlots { n_free: vec![1], is_usable: vec![true] }),
-            freed: Condvar::new(),
+            lanes: Lanes::new([(0, vec![()])]),
         };
         let panics = || scene.run(|_| -> Result<(), RasterError> { panic!("a broken view") });
         std::panic::catch_unwind(std::panic::AssertUnwindSafe(panics)).expect_err("it panics");
-        assert_eq!(scene.slots().n_free, [1]);
         scene.run(|_| Ok(())).expect("goes on");
     }
 }

@@ -1,6 +1,7 @@
 //! Drawing of colour, depth and coverage.
 
 use bytemuck::cast_slice_mut;
+use image::RgbImage;
 use rayon::prelude::*;
 use slag_math::simd::InstructionSet;
 
@@ -23,6 +24,17 @@ pub struct Drawing {
     /// Opacity of the scene at the pixel, 0..=1: one minus the transmittance.
     pub coverage: Vec<f32>,
     pub counters: ViewCounters,
+}
+
+impl Drawing {
+    /// Returns the colours as pixels, limited to 1.
+    ///
+    /// # Panics
+    /// If `rgb` has not three values per pixel.
+    pub fn image(&self) -> RgbImage {
+        let bytes = self.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+        RgbImage::from_raw(self.width_px, self.height_px, bytes).expect("three values per pixel")
+    }
 }
 
 /// Draws the Gaussians of all tiles. `colours` contains the RGB colour of each visible Gaussian.

@@ -10,8 +10,8 @@ use serde_json::Value;
 use crate::encode::EncodeSummary;
 use crate::html::Page;
 use crate::progress::FoundObject;
-use recorder::RecordedView;
 pub(crate) use recorder::Recorder;
+use recorder::{Recorded, RecordedView};
 
 /// Makes the page of an encode that was recorded.
 pub(crate) fn of_encode(
@@ -24,7 +24,7 @@ pub(crate) fn of_encode(
     let mut take = |name: &str| rest.as_object_mut().and_then(|members| members.remove(name));
     let lists = ["skipped_views", "views", "cells", "phases", "view_stages"].map(&mut take);
     let [skipped, views, cells, phases, stages] = lists.map(Option::unwrap_or_default);
-    let [objects, occupancy, bytes, busy] =
+    let [found_objects, occupancy, bytes, busy] =
         ["objects", "occupancy", "shard_bytes", "busy_secs"].map(&mut take).map(Option::unwrap_or_default);
     let mut page = Page::new(&format!("{scene}, generation {}", summary.generation));
     page.paragraph(&format!(
@@ -42,45 +42,15 @@ pub(crate) fn of_encode(
             summary.n_views_drawn
         ));
     }
-    page.heading("Left out");
-    match summary.skipped_views.len() {
-        0 => page.paragraph("No view was left out."),
-        n => {
-            page.paragraph(&format!("{n} views were left out."));
-            page.records(&skipped);
-        }
-    }
-    page.paragraph(&format!(
-        "{} views have no mask; {} Gaussians are seen by no mask and have no embedding; {} are unusable.",
-        summary.n_views_without_masks, summary.n_without_evidence, summary.n_rejected
-    ));
+    left_out(&mut page, summary, &skipped);
     if let Some(lost) = &summary.lost_views {
         page.heading("Kept views");
         page.paragraph(&lost.reason);
     }
     page.heading("Map");
     page.drawing(&map::svg(&recorded), "Seen from above: cells, and the cameras by their number of masks");
-    let mut drawn: Vec<_> = recorded.views.iter().filter(|view| view.picture.is_some()).collect();
-    drawn.sort_by(|a, b| a.name.cmp(&b.name));
-    if !drawn.is_empty() {
-        page.heading("Masks");
-    }
-    for RecordedView { name, picture, n_masks, .. } in drawn {
-        let n_masks = n_masks.unwrap_or_default();
-        page.picture(picture.as_deref().unwrap_or_default(), &format!("{name}: {n_masks} masks"));
-    }
-    page.heading("Objects");
-    match summary.objects.as_ref().map(|found| found.n_objects) {
-        None => page.paragraph("Objects were not looked for."),
-        Some(0) => page.paragraph("No object was found: no mask is shared by several views."),
-        Some(_) => {
-            let columns = ["id", "x, y, z", "size", "Gaussians", "masks", "best photo"];
-            page.table(&columns, &recorded.objects.iter().map(row_of).collect::<Vec<_>>());
-        }
-    }
-    if !objects.is_null() {
-        page.value(&objects);
-    }
+    masks(&mut page, &recorded);
+    objects(&mut page, summary, &recorded, &found_objects);
     if !occupancy.is_null() {
         page.heading("Free and occupied places");
         page.value(&occupancy);
@@ -104,6 +74,50 @@ pub(crate) fn of_encode(
     page.heading("All else");
     page.value(&rest);
     Ok(page.finish())
+}
+
+fn left_out(page: &mut Page, summary: &EncodeSummary, skipped: &Value) {
+    page.heading("Left out");
+    match summary.skipped_views.len() {
+        0 => page.paragraph("No view was left out."),
+        n => {
+            page.paragraph(&format!("{n} views were left out."));
+            page.records(skipped);
+        }
+    }
+    page.paragraph(&format!(
+        "{} views have no mask; {} Gaussians are seen by no mask and have no embedding; {} are unusable.",
+        summary.n_views_without_masks, summary.n_without_evidence, summary.n_rejected
+    ));
+}
+
+/// Adds the pictures of masks.
+fn masks(page: &mut Page, recorded: &Recorded) {
+    let mut drawn: Vec<_> = recorded.views.iter().filter(|view| view.picture.is_some()).collect();
+    drawn.sort_by(|a, b| a.name.cmp(&b.name));
+    if !drawn.is_empty() {
+        page.heading("Masks");
+    }
+    for RecordedView { name, picture, n_masks, .. } in drawn {
+        let n_masks = n_masks.unwrap_or_default();
+        page.picture(picture.as_deref().unwrap_or_default(), &format!("{name}: {n_masks} masks"));
+    }
+}
+
+/// `found`: what the summary's JSON says of them.
+fn objects(page: &mut Page, summary: &EncodeSummary, recorded: &Recorded, found: &Value) {
+    page.heading("Objects");
+    match summary.objects.as_ref().map(|found| found.n_objects) {
+        None => page.paragraph("Objects were not looked for."),
+        Some(0) => page.paragraph("No object was found: no mask is shared by several views."),
+        Some(_) => {
+            let columns = ["id", "x, y, z", "size", "Gaussians", "masks", "best photo"];
+            page.table(&columns, &recorded.objects.iter().map(row_of).collect::<Vec<_>>());
+        }
+    }
+    if !found.is_null() {
+        page.value(found);
+    }
 }
 
 fn row_of(object: &FoundObject) -> Vec<String> {

@@ -4,7 +4,7 @@ use std::io::{self, Cursor};
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec3};
-use image::{ImageFormat, RgbImage};
+use image::ImageFormat;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use slag_common::{Intrinsics, durable};
@@ -12,7 +12,7 @@ use slag_common::{Intrinsics, durable};
 use super::looks::pinhole;
 use super::plan::{Viewpoint, ViewpointPlan};
 use crate::progress::Progress;
-use crate::raster::{Drawing, LoadedScene, RasterError, RasterView};
+use crate::raster::{LoadedScene, RasterError, RasterView};
 
 /// Name of the poses file.
 pub const POSES_FILE: &str = "transforms.json";
@@ -67,7 +67,7 @@ pub fn draw(
         let path = folder.join("images").join(&view.name);
         path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
         let mut png = Cursor::new(Vec::new());
-        image_of(&drawing).write_to(&mut png, ImageFormat::Png).map_err(io::Error::other)?;
+        drawing.image().write_to(&mut png, ImageFormat::Png).map_err(io::Error::other)?;
         durable::write(&path, png.get_ref())?;
         progress.advance(1);
         Ok::<_, DrawError>(())
@@ -76,14 +76,6 @@ pub fn draw(
     progress.end();
     let text = serde_json::to_vec_pretty(&poses(views, drawn_from, about)).map_err(io::Error::from)?;
     Ok(durable::write(&folder.join(POSES_FILE), &text)?)
-}
-
-/// Returns the colours of a drawing as pixels.
-fn image_of(drawing: &Drawing) -> RgbImage {
-    RgbImage::from_fn(drawing.width_px, drawing.height_px, |x, y| {
-        let at = 3 * (y * drawing.width_px + x) as usize;
-        image::Rgb([0, 1, 2].map(|c| (drawing.rgb[at + c].clamp(0.0, 1.0) * 255.0).round() as u8))
-    })
 }
 
 /// Returns nerfstudio's `transforms.json` of views: world from camera, OpenGL axes.

@@ -6,7 +6,7 @@ use slag_common::Intrinsics;
 use super::plan::{SceneKind, Verdict};
 use super::space::{Space, WIDTH};
 use crate::masks::RegionMap;
-use crate::raster::{self, LoadedScene, RasterError, RasterView, WeightKind};
+use crate::raster::{self, LoadedScene, RasterError, RasterView, RegionWeight, WeightKind};
 
 /// Size of the drawings, pixels.
 const SIZE_PX: [u32; 2] = [40, 30];
@@ -95,22 +95,7 @@ pub(super) fn look(
     }
     layers.sort_by(|a, b| a.0.total_cmp(&b.0));
     let near = if kind == SceneKind::Object { 0.0 } else { NEAR };
-    let (mut n_covered, mut n_near, mut n_hazy) = (0u32, 0u32, 0u32);
-    let mut nearer = vec![0.0; n_px as usize];
-    for (depth, entries) in layers {
-        for entry in entries {
-            let ((weight, weighted), nearer) =
-                (sums[entry.region as usize], &mut nearer[entry.region as usize]);
-            let is_before = *nearer < 0.5 * weight;
-            *nearer += f64::from(entry.weight);
-            // The median depth of a pixel that is no hole.
-            if weight >= MIN_COVERED && is_before && *nearer >= 0.5 * weight {
-                n_covered += 1;
-                n_near += u32::from(depth < near);
-                n_hazy += u32::from((weighted / weight - depth).abs() > HAZY * depth);
-            }
-        }
-    }
+    let [n_covered, n_near, n_hazy] = count_pixels(&layers, &sums, near);
     let share = |n: u32, of: u32| n as f32 / of.max(1) as f32;
     let verdict = Verdict {
         holes: 1.0 - share(n_covered, n_px),
@@ -122,6 +107,27 @@ pub(super) fn look(
         seen = Vec::new();
     }
     Ok(Look { camera, verdict, seen })
+}
+
+/// Counts the pixels that are no holes, and those of them that are near or hazy, by their median depth. `layers`: the
+/// Gaussians from near to far, each with its depth; `sums`: the weight of each pixel, and its weighted depth.
+fn count_pixels(layers: &[(f64, &[RegionWeight])], sums: &[(f64, f64)], near: f64) -> [u32; 3] {
+    let [mut n_covered, mut n_near, mut n_hazy] = [0; 3];
+    let mut nearer = vec![0.0; sums.len()];
+    for (depth, entries) in layers {
+        for entry in *entries {
+            let ((weight, weighted), nearer) =
+                (sums[entry.region as usize], &mut nearer[entry.region as usize]);
+            let is_before = *nearer < 0.5 * weight;
+            *nearer += f64::from(entry.weight);
+            if weight >= MIN_COVERED && is_before && *nearer >= 0.5 * weight {
+                n_covered += 1;
+                n_near += u32::from(*depth < near);
+                n_hazy += u32::from((weighted / weight - depth).abs() > HAZY * depth);
+            }
+        }
+    }
+    [n_covered, n_near, n_hazy]
 }
 
 /// Returns the side from which a Gaussian is seen, by the direction to the camera.

@@ -8,7 +8,7 @@ use slag_encoder::cli::Exit;
 use slag_encoder::progress::Progress;
 
 use crate::generate::compose::Walk;
-use crate::generate::copies::{self, CopiesSettings};
+use crate::generate::copies;
 use crate::generate::crops::{self, Split};
 use crate::generate::grammar::{NOUNS, SceneKind};
 use crate::generate::{Scene, photos};
@@ -96,8 +96,7 @@ pub(super) fn run(command: &GenerateCommand, progress: &dyn Progress) -> Result<
     match command {
         GenerateCommand::Scene(args) => scene(args, progress)?,
         GenerateCommand::Copies(args) => {
-            let settings = CopiesSettings { n_copies: args.n_copies, n_views: args.n_views };
-            let written = copies::write(&args.scene, &args.out, settings, progress)?;
+            let written = copies::write(&args.scene, &args.out, args.n_copies, args.n_views, progress)?;
             let (n, dir) = (written.n_gaussians, args.out.display());
             println!("{n} Gaussians, {} photos in {dir}; copies {:.1} apart", args.n_views, written.spacing);
             let masks =

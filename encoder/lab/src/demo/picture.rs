@@ -37,10 +37,7 @@ fn draw_lit(
         let rest = coloured.sh_rest.len() / cosines.len();
         coloured.sh_rest[index * rest..][..rest].fill(0.0);
     }
-    let drawing = CpuRasterizer.draw(&coloured, view, BACKGROUND)?;
-    let bytes = drawing.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    Ok(RgbImage::from_raw(drawing.width_px, drawing.height_px, bytes)
-        .expect("a drawing has three values per pixel"))
+    Ok(CpuRasterizer.draw(&coloured, view, BACKGROUND)?.image())
 }
 
 /// Returns the brightness of a colour (BT.601).

@@ -184,15 +184,10 @@ fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
     sets.map(|(name, is_in)| (name.to_owned(), tally(is_in))).to_vec()
 }
 
-/// Returns the confusion matrix over whole things: answers by true noun.
-fn confusion(seen: &[Seen], n_nouns: usize) -> Vec<Vec<usize>> {
-    let mut counts = vec![vec![0; n_nouns]; n_nouns];
-    seen.iter().filter(|s| is_whole(&s.0)).for_each(|(label, noun, ..)| counts[label.noun][*noun] += 1);
-    counts
-}
-
 fn of_each_noun(seen: &[Seen], nouns: &[Noun]) -> Vec<NounReport> {
-    let counts = confusion(seen, nouns.len());
+    // The confusion matrix over whole things: answers by true noun.
+    let mut counts = vec![vec![0; nouns.len()]; nouns.len()];
+    seen.iter().filter(|s| is_whole(&s.0)).for_each(|(label, noun, ..)| counts[label.noun][*noun] += 1);
     let report = |(i, counts): (usize, &Vec<usize>)| {
         let mut others: Vec<usize> = (0..nouns.len()).filter(|j| *j != i && counts[*j] > 0).collect();
         others.sort_by_key(|j| (std::cmp::Reverse(counts[*j]), *j));

@@ -68,12 +68,8 @@ pub(crate) fn run(args: &LerfArgs) -> Result<LerfReport> {
     let reader = StoreReader::open(&args.store)?;
     let mut encoder = text_encoder_of(&reader, &args.models)?;
     let views = poses::read(&args.views, None)?;
-    let frame = ingest::find_frame(&args.scene, &args.splat_frame, views.source, views.applied)?;
     let mut scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
-    if let Some(frame) = frame {
-        tracing::info!("{frame}; the splat is brought into the world of the poses");
-        frame.to_poses(&mut scene);
-    }
+    ingest::to_poses(&mut scene, &args.scene, &args.splat_frame, views.source, views.applied)?;
     let labels = LerfLabels::read(&args.labels, &views.views)?;
     judge(&reader, &labels, &scene, &mut *encoder, &args.threshold)
 }

@@ -128,8 +128,7 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
     let files = SceneFiles::find_all(&args.scenes)?;
     progress.begin("locate", "scene", files.len() as u64, 0);
     let scenes = files.iter().map(|files| prepare(files, args)).collect::<Result<Vec<_>>>()?;
-    let mut report = LocateReport { all: Figures::default(), scenes: Vec::new() };
-    let (mut all_tries, mut all_foreign) = (Vec::new(), Vec::new());
+    let (mut of_scenes, mut all_tries, mut all_foreign) = (Vec::new(), Vec::new(), Vec::new());
     for (at, scene) in scenes.iter().enumerate() {
         let loaded = CpuRasterizer.load(&scene.gaussians)?;
         let renderer = SceneRenderer(loaded.as_ref());
@@ -150,14 +149,14 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         let others = scenes.iter().enumerate().filter(|(other, _)| *other != at);
         let others: Vec<&View> = others.flat_map(|(_, other)| &other.queries).collect();
         let foreign = others.par_iter().map(|view| attempt(view)).collect::<Result<Vec<_>>>()?;
-        report.scenes.push(Figures::of(&scene.name, &[scene], &tries, &foreign));
+        of_scenes.push(Figures::of(&scene.name, &[scene], &tries, &foreign));
         all_tries.extend(tries);
         all_foreign.extend(foreign);
         progress.advance(1);
     }
     progress.end();
-    report.all = Figures::of("all", &scenes.iter().collect::<Vec<_>>(), &all_tries, &all_foreign);
-    Ok(report)
+    let all = Figures::of("all", &scenes.iter().collect::<Vec<_>>(), &all_tries, &all_foreign);
+    Ok(LocateReport { all, scenes: of_scenes })
 }
 
 /// Makes the map of a scene.
@@ -250,12 +249,6 @@ fn changed(change: Change, grey: &mut Grey, intrinsics: &mut slag_common::Intrin
                 grey.values[y * width + width / 4..][..side(width)].fill(0.5);
             }
         }
-    }
-}
-
-impl Default for Figures {
-    fn default() -> Self {
-        Self::of("", &[], &[], &[])
     }
 }
 

@@ -49,23 +49,16 @@ impl Scan {
 
     /// Returns the segment of each vertex (`[N]`, numbers of the file) by ScanNet's Segmentator.
     pub(super) fn segments(&self) -> Result<Vec<u32>> {
-        read_segments(&segments_path(&self.dir, &self.name), self.vertices.len())
+        let path = self.dir.join(format!("{}_vh_clean_2.0.010000.segs.json", self.name));
+        let expected = || format!("{}: expected segIndices, one per vertex", path.display());
+        let segments: Segments = serde_json::from_slice(&fs_err::read(&path)?).with_context(expected)?;
+        let (n, n_vertices) = (segments.of_vertex.len(), self.vertices.len());
+        if n != n_vertices {
+            bail!(
+                "{}: {n} segments, expected one for each of {n_vertices} vertices; use both files of one release",
+                path.display()
+            );
+        }
+        Ok(segments.of_vertex)
     }
-}
-
-fn segments_path(dir: &Path, name: &str) -> PathBuf {
-    dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"))
-}
-
-fn read_segments(path: &Path, n_vertices: usize) -> Result<Vec<u32>> {
-    let expected = || format!("{}: expected segIndices, one per vertex", path.display());
-    let segments: Segments = serde_json::from_slice(&fs_err::read(path)?).with_context(expected)?;
-    let n = segments.of_vertex.len();
-    if n != n_vertices {
-        bail!(
-            "{}: {n} segments, expected one for each of {n_vertices} vertices; use both files of one release",
-            path.display()
-        );
-    }
-    Ok(segments.of_vertex)
 }

@@ -147,15 +147,11 @@ pub(crate) fn run(args: &ScannetArgs) -> Result<ScannetReport> {
         );
     }
     let mut scenes = Vec::new();
-    for ((scan, store), scene) in args.scan.iter().zip(&args.store).zip(&args.scene) {
+    for ((scan, store), path) in args.scan.iter().zip(&args.store).zip(&args.scene) {
         let reader = StoreReader::open(store)?;
         let mut encoder = text_encoder_of(&reader, &args.models)?;
-        let frame = ingest::find_frame(scene, &args.splat_frame, PoseSource::Scannet, None)?;
-        let mut scene = splat::read(scene, &splat::ReadOptions { with_sh_rest: false })?;
-        if let Some(frame) = frame {
-            tracing::info!("{frame}; the splat is brought into the world of the scan");
-            frame.to_poses(&mut scene);
-        }
+        let mut scene = splat::read(path, &splat::ReadOptions { with_sh_rest: false })?;
+        ingest::to_poses(&mut scene, path, &args.splat_frame, PoseSource::Scannet, None)?;
         let scan = Scan::read(scan)?;
         scenes.push(judge(&reader, &scan, &scene, &mut *encoder, args.judge)?);
     }

@@ -15,14 +15,6 @@ const TRIMMED: f64 = 0.005;
 /// Distance between copies, relative to their size.
 const SPACING: f64 = 1.1;
 
-/// The size of a scene of copies.
-#[derive(Clone, Copy, Debug)]
-pub struct CopiesSettings {
-    pub n_copies: u32,
-    /// Photos, spread over the copies.
-    pub n_views: u32,
-}
-
 #[derive(Clone, Debug)]
 pub struct WrittenCopies {
     pub scene: PathBuf,
@@ -41,10 +33,10 @@ pub struct WrittenCopies {
 pub fn write(
     source: &Path,
     folder: &Path,
-    settings: CopiesSettings,
+    n_copies: u32,
+    n_views: u32,
     progress: &dyn Progress,
 ) -> Result<WrittenCopies> {
-    let CopiesSettings { n_copies, n_views } = settings;
     let unfit = |what: String| anyhow!("{}: {what}", source.display());
     let splat =
         ["scene.ply", "point_cloud.ply"].map(|name| source.join(name)).into_iter().find(|p| p.exists());
@@ -157,8 +149,7 @@ mod tests {
         let dir = tempfile::tempdir().expect("a folder");
         let (source, copies) = (dir.path().join("source"), dir.path().join("copies"));
         Scene::new(&[SceneKind::Room], 5, 6).write(&source, &Silent).expect("writes");
-        let settings = CopiesSettings { n_copies: 5, n_views: 13 };
-        let written = write(&source, &copies, settings, &Silent).expect("writes");
+        let written = write(&source, &copies, 5, 13, &Silent).expect("writes");
         let read = |path: &Path| splat::read(path, &ReadOptions { with_sh_rest: true }).expect("reads");
         let (one, all) = (read(&source.join("scene.ply")), read(&written.scene));
         assert_eq!((all.len(), written.n_gaussians), (5 * one.len(), 5 * one.len() as u64));
@@ -189,8 +180,7 @@ mod tests {
     fn too_many_photos_are_refused() {
         let dir = tempfile::tempdir().expect("a folder");
         Scene::new(&[SceneKind::Room], 5, 2).write(dir.path(), &Silent).expect("writes");
-        let settings = CopiesSettings { n_copies: 2, n_views: 5 };
-        let error = write(dir.path(), &dir.path().join("out"), settings, &Silent).expect_err("too many");
+        let error = write(dir.path(), &dir.path().join("out"), 2, 5, &Silent).expect_err("too many");
         assert!(error.to_string().contains("it has 2 photos"), "{error}");
     }
 }

@@ -1,6 +1,5 @@
 //! Labelled crops of generated things: training data of the embedded encoder.
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
@@ -104,7 +103,6 @@ pub fn write(
     npy::write_file(&folder.join("crops.npy"), &[crops.len(), edge, edge, 3], &pixels)?;
     let labels: Vec<&Label> = crops.iter().map(|(_, label)| label).collect();
     fs_err::write(folder.join("labels.json"), serde_json::to_vec(&labels)?)?;
-    let mut out = fs_err::File::create(folder.join("nouns.json"))?;
     let words: Vec<_> = NOUNS
         .iter()
         .map(|noun| {
@@ -114,7 +112,7 @@ pub fn write(
             })
         })
         .collect();
-    out.write_all(&serde_json::to_vec_pretty(&words)?)?;
+    fs_err::write(folder.join("nouns.json"), serde_json::to_vec_pretty(&words)?)?;
     Ok(crops.len())
 }
 

@@ -26,6 +26,7 @@
 
 use std::sync::LazyLock;
 
+use clap::ValueEnum;
 use glam::{DAffine3, DQuat, DVec3, EulerRot};
 use include_dir::{Dir, include_dir};
 
@@ -50,7 +51,7 @@ pub(crate) static NOUNS: LazyLock<Vec<Noun>> = LazyLock::new(|| {
 });
 
 /// Kind of a scene.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum SceneKind {
     /// Indoors, furnished.
@@ -62,7 +63,7 @@ pub enum SceneKind {
 }
 
 /// Place of a thing in a scene.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Place {
     /// Anywhere on the ground.
     Floor,
@@ -353,20 +354,10 @@ impl Noun {
 
 fn found(text: &str) -> Result<(SceneKind, Place), String> {
     let (scene, place) = text.split_once(' ').ok_or_else(|| format!("`{text}`, expected SCENE PLACE"))?;
-    let scene = match scene {
-        "room" => SceneKind::Room,
-        "yard" => SceneKind::Yard,
-        "street" => SceneKind::Street,
-        _ => return Err(format!("`{scene}`, expected room, yard or street")),
-    };
-    let place = match place.trim() {
-        "floor" => Place::Floor,
-        "wall" => Place::Wall,
-        "hung" => Place::Hung,
-        "on" => Place::On,
-        "shell" => Place::Shell,
-        place => return Err(format!("`{place}`, expected floor, wall, hung, on or shell")),
-    };
+    let scene =
+        SceneKind::from_str(scene, false).map_err(|_| format!("`{scene}`, expected room, yard or street"))?;
+    let place = Place::from_str(place.trim(), false)
+        .map_err(|_| format!("`{place}`, expected floor, wall, hung, on or shell"))?;
     Ok((scene, place))
 }
 

@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 use slag_common::Gaussians;
 
-use super::shader::SUM_FRACTION_BITS;
+use super::shader::{Counter, Counts, SUM_FRACTION_BITS};
 use crate::raster::adapter::Precision;
 use crate::raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
 use crate::raster::project::reach2;
@@ -142,6 +142,32 @@ pub(crate) struct Capacities {
     pub pairs: u32,
     /// Contributions per tile, Gaussian and region.
     pub entries: u32,
+}
+
+impl Capacities {
+    /// Returns what a band needed, by its counts.
+    pub(crate) fn needed(counts: &Counts) -> Self {
+        let [visible, pairs, entries] =
+            [Counter::Visible, Counter::Pairs, Counter::Entries].map(|counter| counts[counter as usize]);
+        Self { visible, pairs, entries }
+    }
+
+    pub(crate) fn hold(&self, needed: &Self) -> bool {
+        needed.visible <= self.visible && needed.pairs <= self.pairs && needed.entries <= self.entries
+    }
+
+    /// Returns larger ones where more was needed, by a quarter more than that: an overflow truncates the counts of
+    /// later stages.
+    pub(crate) fn grown(&self, needed: &Self, max: &Self) -> Self {
+        let grown = |needed: u32, now: u32, max: u32| {
+            if needed > now { needed.saturating_add(needed / 4).min(max) } else { now }
+        };
+        Self {
+            visible: grown(needed.visible, self.visible, max.visible),
+            pairs: grown(needed.pairs, self.pairs, max.pairs),
+            entries: grown(needed.entries, self.entries, max.entries),
+        }
+    }
 }
 
 /// Parameters of the shaders for a band of a view.

@@ -44,8 +44,8 @@ use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
 pub(crate) use device::Adapter;
 pub use device::{Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
-use shader::{Counter, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
-use workspace::{Counts, PIXEL_BYTES, Workspace};
+use shader::{Counter, Counts, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
+use workspace::{PIXEL_BYTES, Workspace};
 
 pub struct GpuRasterizer {
     device: Arc<Device>,
@@ -295,8 +295,9 @@ impl<'s> GpuScene<'s> {
             let first_px = (first * tile * width_px) as usize;
             let rows = Rows { px: first_px..first_px + n_px as usize, is_whole: end - first == n_rows };
             let counts = work(&mut current, &band, rows)?;
-            let count = |counter: Counter| counts[counter as usize];
-            if current.fits(&counts) {
+            let needed = Capacities::needed(&counts);
+            if capacities.hold(&needed) {
+                let count = |counter: Counter| counts[counter as usize];
                 *workspace = Some(current);
                 counters.visible += count(Counter::FirstVisible) as usize;
                 counters.pairs += count(Counter::Pairs) as usize;
@@ -304,23 +305,8 @@ impl<'s> GpuScene<'s> {
                 continue;
             }
             drop(current);
-            let needed = Capacities {
-                visible: count(Counter::Visible),
-                pairs: count(Counter::Pairs),
-                entries: count(Counter::Entries),
-            };
-            if needed.visible <= max.visible && needed.pairs <= max.pairs && needed.entries <= max.entries {
-                // An overflow truncates the counts of later stages, so capacities grow by a quarter and the band
-                // repeats.
-                let grown = |needed: u32, now: u32, max: u32| {
-                    if needed > now { needed.saturating_add(needed / 4).min(max) } else { now }
-                };
-                let grown = Capacities {
-                    visible: grown(needed.visible, capacities.visible, max.visible),
-                    pairs: grown(needed.pairs, capacities.pairs, max.pairs),
-                    entries: grown(needed.entries, capacities.entries, max.entries),
-                };
-                self.pool().capacities = grown;
+            if max.hold(&needed) {
+                self.pool().capacities = capacities.grown(&needed, &max);
                 bands.push([first, end]);
             } else if end - first > 1 {
                 let middle = first.midpoint(end);

@@ -58,6 +58,9 @@ impl Counter {
     ];
 }
 
+/// The values of all counters after a band.
+pub(crate) type Counts = [u32; Counter::ALL.len()];
+
 /// The shaders of the stages, without the common part.
 pub(crate) const STAGES: [(&str, &str); 7] = [
     ("project", include_str!("../project.wgsl")),

@@ -10,13 +10,10 @@ use super::chunk::SceneChunk;
 use super::device::Device;
 use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
 use super::layout::{Background, Capacities, RegionSum};
-use super::shader::Counter;
+use super::shader::{Counter, Counts};
 use super::stages::Stages;
 use crate::raster::error::RasterError;
 use crate::raster::weights::WeightKind;
-
-/// The values of all counters after a band.
-pub type Counts = [u32; Counter::ALL.len()];
 
 /// Size of a drawn pixel, bytes.
 pub(crate) const PIXEL_BYTES: u64 = 20;
@@ -217,10 +214,8 @@ impl Workspace {
     }
 
     /// Returns whether the counts of a band are within the capacities.
-    pub fn fits(&self, counts: &Counts) -> bool {
-        counts[Counter::Visible as usize] <= self.capacities.visible
-            && counts[Counter::Pairs as usize] <= self.capacities.pairs
-            && counts[Counter::Entries as usize] <= self.capacities.entries
+    fn fits(&self, counts: &Counts) -> bool {
+        self.capacities.hold(&Capacities::needed(counts))
     }
 
     fn copy_back(&self, encoder: &mut wgpu::CommandEncoder) {

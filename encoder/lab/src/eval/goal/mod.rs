@@ -9,7 +9,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Result, anyhow};
 use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
@@ -24,7 +24,7 @@ use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
 use crate::generate::grammar::{NOUNS, SceneKind};
 use crate::harness::Times;
-use crate::programs::{Prepared, Service, flag_value, sibling};
+use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
 use truth::{HEIGHT_M, MIN_SHOWN, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
 use voxels::Voxels;
@@ -65,31 +65,28 @@ pub(crate) struct GoalArgs {
 /// Judges every scene.
 pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport> {
     let mut report = GoalReport::default();
-    progress.begin("goal", "scene", (args.kind.len() * args.seeds.len()) as u64, 0);
-    for (kind, seed) in args.kind.iter().flat_map(|kind| args.seeds.iter().map(move |seed| (kind, *seed))) {
-        let name = flag_value(kind)?;
-        let dir = args.out.join(format!("{name}-{seed}"));
+    let scenes = Prepared {
+        out: &args.out,
+        kinds: &args.kind,
+        seeds: &args.seeds,
+        n_views: args.n_views,
+        walk: args.walk,
         // The objects' outlines are the true ones: places are judged here, not segmentation.
-        let encode_flags = &["--occupancy", "--masks", "SCENE/gt/masks"];
-        let (n_views, walk) = (args.n_views, args.walk);
-        let scene = Prepared { dir: &dir, kind: &name, seed, n_views, walk, encode_flags };
-        let judged = scene.make().and_then(|()| judge(args, &scene, *kind, &mut report));
-        judged.with_context(|| dir.display().to_string())?;
-        report.scenes.push(format!("{name}-{seed}"));
-        progress.advance(1);
-    }
-    progress.end();
+        encode_flags: &["--occupancy", "--masks", "SCENE/gt/masks"],
+    };
+    report.scenes = scenes.judge(progress, |kind, seed, dir| {
+        judge(args, dir, &Layout::new(&[kind], seed, &|_, _| true), &mut report)
+    })?;
     Ok(report)
 }
 
-fn judge(args: &GoalArgs, at: &Prepared<'_>, kind: SceneKind, report: &mut GoalReport) -> Result<()> {
-    let layout = Layout::new(&[kind], at.seed, &|_, _| true);
-    report.voxels.add(voxels::compare(&layout, &at.dir.join("store"))?);
+fn judge(args: &GoalArgs, dir: &Path, layout: &Layout, report: &mut GoalReport) -> Result<()> {
+    report.voxels.add(voxels::compare(layout, &dir.join("store"))?);
     let views = layout.photos(args.walk, args.n_views);
     let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
-    let truth = Truth::new(&layout, args.radius_m, cameras)?;
-    let labels = labels(&at.dir.join("scene"), &at.dir.join("store"))?;
-    let service = Service::start(&sibling("slag-edge")?, "--cache", &at.dir.join("cache"))?;
+    let truth = Truth::new(layout, args.radius_m, cameras)?;
+    let labels = labels(&dir.join("scene"), &dir.join("store"))?;
+    let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
     let start = truth.start();
     for (index, placed) in layout.placed.iter().enumerate().filter(|(_, placed)| !placed.shell) {
         let Some(label) = labels.get(index).filter(|label| label.n_pixels >= MIN_PIXELS) else { continue };
@@ -110,7 +107,7 @@ fn judge(args: &GoalArgs, at: &Prepared<'_>, kind: SceneKind, report: &mut GoalR
         let noun = &NOUNS[placed.noun].name;
         if args.list && verdict.is_fault(is_reachable) {
             let id = label.object.as_deref().unwrap_or("no object");
-            tracing::warn!("{}-{} {noun} {id} (reachable: {is_reachable}): {verdict:?}", at.kind, at.seed);
+            tracing::warn!("{}: {noun} {id} (reachable: {is_reachable}): {verdict:?}", dir.display());
         }
         report.count(args.radius_m, is_reachable, &verdict);
     }

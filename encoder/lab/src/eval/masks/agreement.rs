@@ -96,12 +96,7 @@ mod tests {
     /// A wall 2 m away, by a camera at `x`, with masks of these columns over its height of 60 pixels.
     fn seen(x: f64, columns: &[(u32, u32)]) -> Seen {
         let intrinsics = pinhole([80, 60], std::f64::consts::FRAC_PI_2);
-        let mask = |(x0, x1): &(u32, u32)| Mask {
-            box_px: BoxPx { x0: *x0, y0: 0, x1: *x1, y1: 60 },
-            inside: vec![true; ((x1 - x0) * 60) as usize],
-            area_px: (x1 - x0) * 60,
-            level: 0,
-        };
+        let mask = |(x0, x1): &(u32, u32)| Mask::whole(BoxPx { x0: *x0, y0: 0, x1: *x1, y1: 60 });
         let masks: Vec<Mask> = columns.iter().map(mask).collect();
         let (regions, masks_of_region) = partition(&masks, 80, 60, 80, 60, None);
         let camera_from_world = DAffine3::from_translation(DVec3::new(-x, 0.0, 0.0));

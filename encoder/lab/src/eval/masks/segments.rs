@@ -95,8 +95,7 @@ mod tests {
     use super::*;
 
     fn rectangle(x0: u32, y0: u32, x1: u32, y1: u32) -> Mask {
-        let (box_px, area_px) = (BoxPx { x0, y0, x1, y1 }, (x1 - x0) * (y1 - y0));
-        Mask { box_px, inside: vec![true; area_px as usize], area_px, level: 0 }
+        Mask::whole(BoxPx { x0, y0, x1, y1 })
     }
 
     /// By hand, on 100 x 40 pixels in columns of 20: thing 1 is a mask's; thing 2 is two masks'; thing 3 is half

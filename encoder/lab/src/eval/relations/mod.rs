@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Result, anyhow};
 use clap::Args;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -17,7 +17,7 @@ use slag_encoder::progress::Progress;
 
 use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
-use crate::programs::{Prepared, Service, flag_value, sibling};
+use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
 use truth::{Asked, TrueThing};
 
@@ -65,18 +65,15 @@ struct Instances {
 /// Asks about every scene.
 pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<RelationsReport> {
     let mut report = RelationsReport::default();
-    progress.begin("relations", "scene", (args.kind.len() * args.seeds.len()) as u64, 0);
-    for (kind, seed) in args.kind.iter().flat_map(|kind| args.seeds.iter().map(move |seed| (kind, *seed))) {
-        let name = flag_value(kind)?;
-        let dir = args.out.join(format!("{name}-{seed}"));
-        let (n_views, walk, encode_flags) = (args.n_views, Walk::Oval, &[]);
-        let scene = Prepared { dir: &dir, kind: &name, seed, n_views, walk, encode_flags };
-        let judged = scene.make().and_then(|()| judge(&dir, &mut report));
-        judged.with_context(|| dir.display().to_string())?;
-        report.scenes.push(format!("{name}-{seed}"));
-        progress.advance(1);
-    }
-    progress.end();
+    let scenes = Prepared {
+        out: &args.out,
+        kinds: &args.kind,
+        seeds: &args.seeds,
+        n_views: args.n_views,
+        walk: Walk::Oval,
+        encode_flags: &[],
+    };
+    report.scenes = scenes.judge(progress, |_, _, dir| judge(dir, &mut report))?;
     Ok(report)
 }
 
