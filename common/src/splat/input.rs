@@ -19,7 +19,16 @@ pub(super) struct Input {
 impl Input {
     pub fn open(path: &Path) -> Result<Self, SplatError> {
         let file = fs_err::File::open(path)?;
-        let len_bytes = file.metadata()?.len();
+        let metadata = file.metadata()?;
+        if !metadata.is_file() {
+            let format = "what is no file, such as a pipe or a device,".to_owned();
+            return Err(SplatError::Unsupported {
+                path: path.into(),
+                format,
+                advice: "write it into a file first",
+            });
+        }
+        let len_bytes = metadata.len();
         Ok(Self {
             reader: BufReader::with_capacity(BUFFER_BYTES, file),
             path: path.into(),

@@ -273,6 +273,8 @@ fn files_of_other_kinds_are_read_or_named() {
         std::fs::write(&path, one_row(properties)).expect("writes");
         read_all(&path)
     };
+    let device = read_all(std::path::Path::new("/dev/zero")).expect_err("no file").to_string();
+    assert!(device.contains("write it into a file"), "{device}");
     let colours = [("float", "red", 1.0), ("float", "green", 0.5), ("float", "blue", 0.0)];
     let flat = read_back(&[&geometry("float")[..], &colours].concat()).expect("2DGS");
     assert_eq!(flat.scales[0], [1.0, 1.0, 0.0]);

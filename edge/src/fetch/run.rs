@@ -321,7 +321,8 @@ fn disk_full(error: FetchError, needed_bytes: u64) -> FetchError {
         |e: &io::Error| matches!(e.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded);
     match error {
         FetchError::Io(source) | FetchError::Records(RecordsError::Io(source)) if is_full(&source) => {
-            FetchError::DiskFull { needed_bytes, source }
+            // Records and manifests are written besides.
+            FetchError::DiskFull { needed_bytes: needed_bytes.max(1 << 20), source }
         }
         error => error,
     }

@@ -11,7 +11,10 @@ use crate::score::MAX_COORDINATE;
 
 /// A point of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(untagged, expecting = "[x, y, z] in the world frame, or lat, lon and perhaps height by their names")]
+#[serde(
+    untagged,
+    expecting = "expected [x, y, z] in the world frame, or lat, lon and perhaps height by their names"
+)]
 pub enum Point {
     /// In the world frame: x, y, z.
     World(#[schemars(inner(range(min = -MAX_COORDINATE, max = MAX_COORDINATE)))] [f64; 3]),
@@ -21,7 +24,7 @@ pub enum Point {
 
 /// A corner of a polygon.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(untagged, expecting = "[x, y] in the world frame, or lat and lon by their names")]
+#[serde(untagged, expecting = "expected [x, y] in the world frame, or lat and lon by their names")]
 pub enum Corner {
     /// In the world frame: x, y.
     World(#[schemars(inner(range(min = -MAX_COORDINATE, max = MAX_COORDINATE)))] [f64; 2]),

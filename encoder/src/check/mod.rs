@@ -31,6 +31,9 @@ pub(crate) use report::ViewCheck;
 pub use suspicion::suspicions;
 pub use view::{CheckView, psnr_db};
 
+/// PSNR against its mean colour from which a photo shows nothing, dB.
+const PLAIN_DB: f64 = 40.0;
+
 /// Draws the views of a scene and compares them with their photos.
 ///
 /// The scene is loaded once. Views are taken one at a time, so that one photo is in memory, plus `diagnosis_views`
@@ -87,9 +90,14 @@ where
     if checks.is_empty() {
         return Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) });
     }
+    // A photo of one colour, as under a lens cap, tells nothing of the others.
+    let mut told: Vec<&ViewCheck> = checks.iter().filter(|c| c.flat_psnr_db < PLAIN_DB).collect();
+    if told.is_empty() {
+        told = checks.iter().collect();
+    }
     let mut report = CheckReport {
-        mean_psnr_db: mean(checks.iter().map(|c| c.psnr_db)),
-        mean_flat_psnr_db: mean(checks.iter().map(|c| c.flat_psnr_db)),
+        mean_psnr_db: mean(told.iter().map(|c| c.psnr_db)),
+        mean_flat_psnr_db: mean(told.iter().map(|c| c.flat_psnr_db)),
         mean_covered_share: mean(checks.iter().map(|c| c.covered_share)),
         views: checks,
         unreadable: unreadable.iter().map(ToString::to_string).collect(),

@@ -97,28 +97,41 @@ pub(crate) fn encode_by(
     cancel: &AtomicBool,
 ) -> Result<EncodeSummary, EncodeError> {
     settings.validate()?;
+    let folder = &settings.output.store;
+    let is_new = !folder.exists();
     let context = RunContext::new(settings.run.threads, progress, cancel)?;
-    if settings.output.text_model {
-        // What cannot be carried is refused before a store is made.
-        engines.models.text_side()?;
+    let encoded = encode_into(executor, settings, engines, &context);
+    let is_begun = || ["job", "drawn", "manifest"].iter().any(|name| folder.join(name).exists());
+    if encoded.is_err() && is_new && folder.exists() && !is_begun() {
+        // What was refused before any work leaves no empty store behind.
+        fs_err::remove_dir_all(folder)?;
     }
-    // Before the work, so that a second encode into the same store fails at once.
+    encoded
+}
+
+fn encode_into(
+    executor: &dyn Executor,
+    settings: &EncodeSettings,
+    engines: &Engines<'_>,
+    context: &RunContext<'_>,
+) -> Result<EncodeSummary, EncodeError> {
+    // First of all, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.output.store)?;
     if let Some(planned) = &settings.inputs.planned {
-        drawings::make(settings, planned, engines, &context)?;
+        drawings::make(settings, planned, engines, context)?;
     }
-    let inputs = inputs::Inputs::read(settings, &context)?;
+    let inputs = inputs::Inputs::read(settings, context)?;
     context.begin_phase(Phase::Plan);
-    let plan = plan::plan(settings, engines, &store, &inputs, &executor.rasterizer(engines), &context)?;
+    let plan = plan::plan(settings, engines, &store, &inputs, &executor.rasterizer(engines), context)?;
     context.begin_phase(Phase::Views);
     plan.job.begin("views")?;
-    let views = views::run_views(&plan, executor, &context)?;
-    let occupancy = views::look_around(&plan, &views, &context)?;
-    let landmarks = views::find_landmarks(&plan, &views, &context)?;
+    let views = views::run_views(&plan, executor, context)?;
+    let occupancy = views::look_around(&plan, &views, context)?;
+    let landmarks = views::find_landmarks(&plan, &views, context)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
-    let built = cells::build_cells(&plan, &views, occupancy, landmarks, &context)?;
+    let built = cells::build_cells(&plan, &views, occupancy, landmarks, context)?;
     context.begin_phase(Phase::Publish);
     plan.job.begin("publish")?;
-    publish::publish(plan, views, built, executor, &context)
+    publish::publish(plan, views, built, executor, context)
 }

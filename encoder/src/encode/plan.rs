@@ -77,6 +77,10 @@ pub(super) fn plan<'a>(
 ) -> Result<Plan<'a>, EncodeError> {
     let memory = memory_plan(settings, inputs, engines);
     memory.rest(0)?;
+    if settings.output.text_model {
+        // What cannot be carried is refused before the work.
+        engines.models.text_side()?;
+    }
     let segmenter = segmenter_of(&settings.view, &settings.run.gpus, engines)?;
     if let Some(without) = segmenter.check_views(&inputs.views, settings.run.strict)? {
         tracing::warn!("{without}");
