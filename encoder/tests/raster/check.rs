@@ -264,7 +264,10 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     let mut capped = others;
     capped[0].image.fill(0);
     let report = run(&scene, &capped, &CheckOptions::default());
-    assert!(report.diagnosis.is_none() && report.suspicions[0].starts_with("1 of 6 views look less"), "{report}");
+    assert!(
+        report.diagnosis.is_none() && report.suspicions[0].starts_with("1 of 6 views look less"),
+        "{report}"
+    );
     let diagnosed = |scene: &Gaussians, photos: &[CheckView]| {
         let suspicions = suspicions(scene, &views(photos));
         assert_eq!(suspicions.len(), 1, "{suspicions:?}");
