@@ -26,6 +26,8 @@ const MIN_CONSENSUS: f64 = 0.3;
 const SAME_IOU: f64 = 0.5;
 /// An object needs a view whose mask shows it, of which the photo's edge cuts off at most a tenth of the outline.
 const WHOLE: f32 = 0.9;
+/// Least share of an object that such a view sees, in tenths: of ground a photo shows a patch and its mask outlines that.
+const WHOLE_TENTHS: u64 = 2;
 /// One of this many views that judge an object must show it whole: a park that one of 80 photos outlines is none.
 const JUDGES_PER_WHOLE: usize = 20;
 /// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
@@ -118,7 +120,8 @@ fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
         let weight = uncut * uncut;
         (sum, weights) = (sum + weight * view.agreement, weights + weight);
         n_judges += 1;
-        n_whole += usize::from(view.agreement > SAME_IOU && view.uncut >= WHOLE);
+        let sees_it = u64::from(view.n) * 10 >= u64::from(n) * WHOLE_TENTHS;
+        n_whole += usize::from(sees_it && view.agreement > SAME_IOU && view.uncut >= WHOLE);
     }
     let is_whole = n_whole > 0 && JUDGES_PER_WHOLE * n_whole >= n_judges;
     if n < min_gaussians || !is_whole || sum < MIN_CONSENSUS * weights {
@@ -225,10 +228,12 @@ mod tests {
 
     /// By hand: of 20 views one shows the node whole, and its edge cuts the others' masks; of 21 that is too few.
     #[test]
-    fn one_of_twenty_views_must_show_an_object_whole() {
+    fn one_of_twenty_views_must_show_an_object_whole_and_a_fifth_of_it() {
         let view = |uncut| NodeView { n: 10, masks: vec![(0, 10)], agreement: 0.9, uncut };
         let views = |n: u32| (0..n).map(|at| (at, view(if at == 0 { 1.0 } else { 0.5 }))).collect();
         assert!((worth(&views(20), 16, 1) - 0.9_f64.powi(8) * 2.0).abs() < 1e-6);
         assert_eq!(worth(&views(21), 16, 1), 0.0);
+        // Of 50 Gaussians it sees a fifth, of 51 less.
+        assert!(worth(&views(20), 50, 1) > 0.0 && worth(&views(20), 51, 1) == 0.0);
     }
 }
