@@ -4,7 +4,7 @@ use std::{collections::HashMap, path::Path, sync::Arc};
 
 use crate::encoder::TextEncoder;
 use crate::error::{InferenceError, ModelError, PhrasesError};
-use crate::synonyms::{KnownPhrases, singulars};
+use crate::synonyms::{KnownPhrases, key, singulars, without_hyphens};
 use crate::{tensors, text::centred};
 
 /// Number of suggestions for an unknown phrase.
@@ -137,18 +137,4 @@ impl TextEncoder for PhraseEncoder {
 fn other_keys(key: &str) -> impl Iterator<Item = String> {
     let bare = key.split(" (").next().unwrap_or(key);
     [key, bare].into_iter().chain(bare.split('/')).map(|key| without_hyphens(key.trim()))
-}
-
-fn without_hyphens(key: &str) -> String {
-    key.replace('-', " ")
-}
-
-/// Returns the lookup key of a phrase: lower case, single spaces, no leading article.
-pub(crate) fn key(text: &str) -> String {
-    let text = text.to_lowercase();
-    let mut words: Vec<&str> = text.split_whitespace().collect();
-    if words.len() > 1 && ["a", "an", "the"].contains(&words[0]) {
-        words.remove(0);
-    }
-    words.join(" ")
 }

@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use ort::{logging::LogLevel, session::builder::SessionBuilder};
 
 use crate::provider::Provider;
-use crate::runtime::forward_log;
 
 /// The providers that a model's nodes run on.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -74,6 +73,15 @@ impl Listener {
 
     pub(crate) fn placement(&self) -> Placement {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+/// Forwards the runtime's messages to `tracing`; by default it prints them.
+pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, message: &str) {
+    match level {
+        LogLevel::Error | LogLevel::Fatal => tracing::error!(category, "ONNX Runtime: {message}"),
+        LogLevel::Warning => tracing::warn!(category, "ONNX Runtime: {message}"),
+        LogLevel::Info | LogLevel::Verbose => tracing::debug!(category, "ONNX Runtime: {message}"),
     }
 }
 

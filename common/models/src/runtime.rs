@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use ort::environment::Environment;
 use ort::logging::LogLevel;
 
+use crate::placement::forward_log;
 use crate::session_error::SessionError;
 
 /// Returns the library's path: `explicit`, else in the first of the folders `beside` that has it, else its bare
@@ -53,13 +54,4 @@ pub(crate) fn environment(runtime: &Path) -> Result<Environment, SessionError> {
     environment.set_log_level(LogLevel::Warning);
     *loaded = Some((path, environment.clone()));
     Ok(environment)
-}
-
-/// Forwards the runtime's messages to `tracing`; by default it prints them.
-pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, message: &str) {
-    match level {
-        LogLevel::Error | LogLevel::Fatal => tracing::error!(category, "ONNX Runtime: {message}"),
-        LogLevel::Warning => tracing::warn!(category, "ONNX Runtime: {message}"),
-        LogLevel::Info | LogLevel::Verbose => tracing::debug!(category, "ONNX Runtime: {message}"),
-    }
 }

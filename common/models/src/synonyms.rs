@@ -2,8 +2,6 @@
 
 use std::collections::HashSet;
 
-use crate::phrases::key;
-
 /// Groups of words of nearly one meaning, one group a line.
 const GROUPS: &str = include_str!("synonyms.txt");
 /// Longest phrase that is looked for in a text, words.
@@ -14,6 +12,20 @@ const PLURALS: [(&str, &str); 5] = [("ies", "y"), ("ves", "f"), ("ves", "fe"), (
 /// Returns what a phrase in lower case may be the plural of, the longest ending first.
 pub(crate) fn singulars(phrase: &str) -> impl Iterator<Item = String> {
     PLURALS.iter().filter_map(move |(plural, end)| Some(phrase.strip_suffix(plural)?.to_owned() + end))
+}
+
+pub(crate) fn without_hyphens(key: &str) -> String {
+    key.replace('-', " ")
+}
+
+/// Returns the lookup key of a phrase: lower case, single spaces, no leading article.
+pub(crate) fn key(text: &str) -> String {
+    let text = text.to_lowercase();
+    let mut words: Vec<&str> = text.split_whitespace().collect();
+    if words.len() > 1 && ["a", "an", "the"].contains(&words[0]) {
+        words.remove(0);
+    }
+    words.join(" ")
 }
 
 /// The phrases that a model knows.
@@ -33,7 +45,7 @@ impl KnownPhrases {
     /// Returns how a text is asked of the model: with known phrases in place of unknown ones of nearly the same meaning,
     /// `sofa` for `couch`. `None` if there is nothing to replace.
     pub fn asked_as(&self, text: &str) -> Option<String> {
-        let text = if self.is_closed { key(text) } else { text.to_lowercase() }.replace('-', " ");
+        let text = without_hyphens(&if self.is_closed { key(text) } else { text.to_lowercase() });
         let words: Vec<&str> = text.split_whitespace().collect();
         let (mut asked, mut at, mut is_other) = (Vec::new(), 0, false);
         while at < words.len() {
