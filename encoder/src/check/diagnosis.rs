@@ -46,7 +46,7 @@ pub struct Trial {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Diagnosis {
     /// PSNR of the sampled views with the inputs as given, dB.
-    pub(crate) given_psnr_db: f64,
+    pub given_psnr_db: f64,
     /// The mistake whose correction explains the photos, if any does.
     pub mistake: Option<Mistake>,
     /// The similarity from the world of the poses to that of the splat, where the mistake is one.

@@ -52,7 +52,12 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
     if let Some(mistake @ Mistake::Activated { .. }) = activated(scene, &usable) {
         say(Some(mistake), mistake.to_string());
     }
-    if usable.len() >= MANY && share(&usable, |i| scene.opacities[i] > ACTIVATED_OPACITY) > MOST {
+    // Percents and bytes as logits saturate; surfaces may be opaque on purpose, of a logit that somebody chose.
+    let is_saturated = share(&usable, |i| scene.opacities[i] >= 1.0) > 0.5;
+    if usable.len() >= MANY
+        && is_saturated
+        && share(&usable, |i| scene.opacities[i] > ACTIVATED_OPACITY) > MOST
+    {
         say(
             None,
             "all Gaussians are nearly opaque: the file's opacities may be percents or bytes, not logits"

@@ -242,7 +242,8 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     };
     assert!(said(1e-3, scene.len()).contains("all Gaussians are transparent"));
     assert!(said(f32::NAN, scene.len() / 2 + 1).contains("cannot be drawn"));
-    assert!(said(0.99, scene.len()).contains("percents or bytes"));
+    assert!(said(1.0, scene.len()).contains("percents or bytes"));
+    assert_eq!(said(0.99, scene.len()), "");
     let mut pale = scene.clone();
     pale.sh_dc.iter_mut().flatten().for_each(|c| *c = (0.5 + 0.282_094_8 * *c).clamp(0.0, 1.0));
     assert!(suspicions(&pale, &views(&photos))[0].text.contains("colours of 0 to 1"));
