@@ -76,7 +76,8 @@ while read -r command; do
             grep -q '127.0.0.1\|listening' "$work/service" || { cat "$work/service" >&2; exit 1; }
             case $command in
             *"slag-edge serve")
-                inside "curl --silent --fail --show-error 'http://127.0.0.1:7734/query?text=chair&near=12.5,-3,0'" | grep -q results
+                reply=$(inside "curl --silent --fail --show-error 'http://127.0.0.1:7734/query?text=chair&near=12.5,-3,0'")
+                [[ $reply == *'"answers":[{'* ]] || { echo "newcomer: no answer in $reply" >&2; exit 1; }
                 kill %%
                 wait %% 2>/dev/null || true
                 ;;
