@@ -257,16 +257,16 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     // Two photos under each other's poses: the others fit.
     let mut swapped = photos.clone();
     (swapped[0].view, swapped[1].view) = (photos[1].view, photos[0].view);
-    let others: Vec<CheckView> = photos.iter().cycle().take(6).cloned().collect();
+    let others: Vec<CheckView> = photos.iter().cycle().take(30).cloned().collect();
     let report = run(&scene, &[swapped[..2].to_vec(), others.clone()].concat(), &CheckOptions::default());
     assert!(report.diagnosis.is_none() && report.suspicions.len() == 1, "{report}");
-    assert!(report.suspicions[0].starts_with("2 of 8 views look less like"), "{report}");
+    assert!(report.suspicions[0].starts_with("2 of 32 views look less like"), "{report}");
     // A photo under a lens cap says nothing against them.
     let mut capped = others;
     capped[0].image.fill(0);
     let report = run(&scene, &capped, &CheckOptions::default());
     assert!(
-        report.diagnosis.is_none() && report.suspicions[0].starts_with("1 of 6 views look less"),
+        report.diagnosis.is_none() && report.suspicions[0].starts_with("1 of 30 views look less"),
         "{report}"
     );
     let diagnosed = |scene: &Gaussians, photos: &[CheckView]| {
