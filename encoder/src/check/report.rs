@@ -86,3 +86,20 @@ impl fmt::Display for CheckReport {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: a bare wall drawn well, another place drawn, and a black photo, whose own colour is exact.
+    #[test]
+    fn a_view_fits_unless_a_plain_colour_is_clearly_more_like_the_photo() {
+        let fits = |psnr_db, flat_psnr_db| {
+            let (covered_share, visible_gaussians) = (1.0, 1);
+            let name = String::new();
+            ViewCheck { name, psnr_db, flat_psnr_db, covered_share, visible_gaussians }.fits()
+        };
+        assert!(fits(31.0, 40.0) && fits(18.0, 14.0));
+        assert!(!fits(11.0, 14.0) && !fits(5.0, f64::INFINITY));
+    }
+}
