@@ -113,6 +113,8 @@ class Result:
     """The answers, best first."""
     area_fetched: Optional[bool] = None
     """Whether the whole region asked for was fetched; absent without `radius` and `box`."""
+    asked_as: Optional[Mapping[str, Any]] = None
+    """What was asked in place of words that the model does not know."""
     bad_cells: Sequence[Mapping[str, Any]] = ()
     """Cells in the region asked for whose shards could not be fetched."""
     clustering: Optional[Mapping[str, Any]] = None
