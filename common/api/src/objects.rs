@@ -77,7 +77,7 @@ pub struct Name {
     /// The word.
     pub name: String,
     /// The chance that it is right, as measured on labelled scenes; a thing may have several right names.
-    pub confidence: f32,
+    pub confidence: f64,
 }
 
 /// The photo that shows an object best.

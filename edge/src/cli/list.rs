@@ -20,7 +20,7 @@ use crate::score::{Ball, Budget, Region};
 const NAMES_WAIT: Duration = Duration::from_secs(3600);
 
 /// Less likely names are not shown to people, beside the best one.
-const LEAST_SHOWN: f32 = 0.01;
+const LEAST_SHOWN: f64 = 0.01;
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-edge list\n\

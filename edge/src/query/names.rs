@@ -37,7 +37,8 @@ impl Names {
     }
 
     pub fn describe(&self, object: usize) -> Vec<Name> {
-        self.of(object).map(|(name, confidence)| Name { name: name.to_owned(), confidence }).collect()
+        let digits = |confidence: f32| (f64::from(confidence) * 1e4).round() / 1e4;
+        self.of(object).map(|(name, of)| Name { name: name.to_owned(), confidence: digits(of) }).collect()
     }
 
     /// Returns the number of objects.
