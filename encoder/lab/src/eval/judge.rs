@@ -219,10 +219,16 @@ struct Asker<'a> {
 impl Asker<'_> {
     /// Returns a word's scores of Gaussians and of objects; `None` for one that the encoder does not know.
     fn score(&mut self, word: &str) -> Result<Option<(Vec<f32>, Vec<f32>)>> {
-        let vector = match self.encoder.encode(word) {
+        // What another word finds says nothing of the model's own.
+        let asked_as = self.encoder.known_phrases().and_then(|known| known.asked_as(word));
+        let encoded = match asked_as {
+            Some(other) => Err(format!("asked as {other}")),
+            None => self.encoder.encode(word).map_err(|error| error.to_string()),
+        };
+        let vector = match encoded {
             Ok(vector) => vector,
-            Err(error) => {
-                self.unknown.insert(word.to_owned(), error.to_string());
+            Err(reason) => {
+                self.unknown.insert(word.to_owned(), reason);
                 return Ok(None);
             }
         };
