@@ -11,7 +11,7 @@ import { run, serve } from "../tests/page/programs.mjs";
 
 const [out, scene, posesName, question, second, ...flags] = process.argv.slice(2);
 const WIDTHS = { desk: { width: 1280, height: 800 }, phone: { width: 390, height: 844 } };
-const WAIT = { timeout: 300000 };
+const WAIT = { timeout: 120000 };
 const folder = mkdtempSync(join(tmpdir(), "slag-screenshots-"));
 let dir = scene;
 if (scene === "generate") {
@@ -47,7 +47,8 @@ const STATES = {
   },
   nothing: async (page) => {
     await page.locator("#second").fill("");
-    await ask(page, "submarine");
+    // A model that knows some words may refuse this one, which is a state to look at, too.
+    await ask(page, "elephant").catch(() => {});
   },
 };
 
