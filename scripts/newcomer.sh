@@ -44,10 +44,9 @@ sed -n '/^## With your own scene/,/^## Figures/p' README.md | sed -n 's/^    *//
 grep -q . "$work/commands" || { echo "newcomer: README has no commands" >&2; exit 1; }
 
 # Variables of this machine that name mirrors and proxies pass on.
-inside() {
-    chroot "$root" /usr/bin/env -u PIP_FIND_LINKS HOME=/root PATH=/root/.cargo/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
-        PIP_DISABLE_PIP_VERSION_CHECK=1 bash -euo pipefail -c "$1" </dev/null
-}
+run=(chroot "$root" /usr/bin/env -u PIP_FIND_LINKS HOME=/root PIP_DISABLE_PIP_VERSION_CHECK=1
+    PATH=/root/.cargo/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin bash -euo pipefail -c)
+inside() { "${run[@]}" "$1" </dev/null; }
 replaced=()
 before="cd /root/slag"
 while read -r command; do
@@ -68,7 +67,8 @@ while read -r command; do
         case $command in
         "slag-encoder serve"* | "slag-encoder view"* | "slag-edge serve"*)
             [[ $command != *view* ]] || command="$command --no-open"
-            inside "$before && exec $command" >"$work/service" 2>&1 &
+            # In place of the subshell, so that a signal to the job reaches the program.
+            (exec "${run[@]}" "$before && exec $command" </dev/null >"$work/service" 2>&1) &
             for _ in $(seq 120); do
                 grep -q '127.0.0.1\|listening' "$work/service" && break
                 sleep 0.5
