@@ -9,7 +9,7 @@ const MAX_WORDS: usize = 4;
 /// Endings of plurals, and what takes their place.
 const PLURALS: [(&str, &str); 5] = [("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")];
 
-/// Returns what a phrase in lower case may be the plural of, the longest ending first.
+/// Returns the singulars that a phrase in lower case may have, that of the longest ending first.
 pub(crate) fn singulars(phrase: &str) -> impl Iterator<Item = String> {
     PLURALS.iter().filter_map(move |(plural, end)| Some(phrase.strip_suffix(plural)?.to_owned() + end))
 }
@@ -32,7 +32,7 @@ pub(crate) fn key(text: &str) -> String {
 #[derive(Debug)]
 pub struct KnownPhrases {
     phrases: HashSet<String>,
-    /// Whether it takes nothing else; otherwise texts around them, too.
+    /// Whether the model takes these alone; otherwise they may stand within any text.
     is_closed: bool,
 }
 
@@ -77,7 +77,7 @@ impl KnownPhrases {
 mod tests {
     use super::*;
 
-    /// By hand: what is known stays, also in the plural and as part of a longer text; what nobody knows stays, too.
+    /// By hand: known words stay, also as plurals and within longer texts, and so do words of no group.
     #[test]
     fn unknown_words_are_asked_as_known_ones() {
         let phrases = ["sofa", "trash can", "street lamp", "table"].map(str::to_owned);

@@ -158,7 +158,7 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
 }
 
-/// Returns what is to be said about answers, in lines.
+/// Returns notes on an answer, a line each.
 fn notes(found: &Searched) -> String {
     let exactness = match found.score_error_likely.filter(|_| !found.is_exact) {
         Some(likely) => format!("; 99 of 100 scores within ±{likely:.3}"),
