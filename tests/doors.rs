@@ -64,6 +64,7 @@ fn cyclone_dds_asks_a_robot() {
 }
 
 /// The odometry of the robot is turned and moved against the scene; six photos that no landmark was made from tell how.
+#[nightly("encodes a room with landmarks")]
 #[test]
 fn cyclone_dds_tells_a_robot_where_it_is() {
     let python = python_with("doors/ros/tests");

@@ -98,6 +98,7 @@ fn places_by_the_sofa_are_on_the_floor() {
 
 /// The GPU's field equals the CPU's within the bound of docs/numerics.md: contributions differ only at pixels
 /// across a cut, together by less than a 50,000th. A machine without a GPU uses a software adapter.
+#[nightly("encodes the house on a software GPU")]
 #[needs_shared]
 #[test]
 fn a_gpu_gives_the_field_of_the_cpu() {

@@ -10,9 +10,11 @@ use slag_tests::root;
 use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
-const CRATES: [(&str, &str); 13] = [
+const CRATES: [(&str, &str); 15] = [
     ("slag_math", "common/math"),
     ("slag_common", "common"),
+    ("slag_raster", "common/raster"),
+    ("slag_locate", "common/locate"),
     ("slag_models", "common/models"),
     ("slag_service", "common/service"),
     ("slag_view", "common/view"),

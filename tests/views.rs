@@ -68,6 +68,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
 }
 
 /// The summary states the cost of views and cells. Threads and resuming change nothing.
+#[nightly("encodes a room three times")]
 #[test]
 fn what_was_spent_is_reported() {
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -3,7 +3,10 @@
 
 use std::f32::consts::PI;
 
+use glam::{DVec3, Vec3};
+
 use crate::Gaussians;
+use crate::gaussians::SH_C0;
 
 /// Bytes of a Gaussian's appearance.
 pub const BYTES: usize = 10;
@@ -26,6 +29,26 @@ pub struct Appearance<'a> {
     pub sizes: &'a [[u8; 3]],
     /// `[N]`: codes of the rotations, see [`rotation_code`].
     pub rotations: &'a [[u8; 3]],
+}
+
+impl Appearance<'_> {
+    /// Returns the largest standard deviation of a Gaussian along its own axes, world units.
+    pub fn max_size(&self, index: usize) -> f32 {
+        size_of_code(self.sizes[index].into_iter().fold(0, u8::max))
+    }
+
+    /// Adds the Gaussian at an index, as it looks from everywhere, to a scene without harmonics above degree 0.
+    ///
+    /// # Panics
+    /// If the index is not below the number of Gaussians.
+    pub fn add_to(&self, scene: &mut Gaussians, index: usize, mean_in_world: DVec3) {
+        let [r, g, b, opacity] = self.colours[index].map(|code| f32::from(code) / LARGEST);
+        scene.means_in_world.push(mean_in_world);
+        scene.rotations_wxyz.push(rotation_of_code(self.rotations[index]));
+        scene.scales.push(self.sizes[index].map(size_of_code));
+        scene.opacities.push(opacity);
+        scene.sh_dc.push([r, g, b].map(|c| (c - 0.5) / SH_C0));
+    }
 }
 
 /// The appearance of some Gaussians.
@@ -76,6 +99,14 @@ pub fn size_code(size: f32) -> u8 {
     (1.0 + step.round()).clamp(1.0, LARGEST) as u8
 }
 
+/// Returns the standard deviation of a byte, world units.
+fn size_of_code(code: u8) -> f32 {
+    if code == 0 {
+        return 0.0;
+    }
+    ((f32::from(code) - 1.0) / LAST_SIZE_STEP * (LN_SIZE_MAX - LN_SIZE_MIN) + LN_SIZE_MIN).exp()
+}
+
 /// Returns the byte of a standard deviation that is `times` as large as that of another byte, `times` at least 1.
 pub fn larger_size_code(code: u8, times: f32) -> u8 {
     if code == 0 {
@@ -99,6 +130,17 @@ pub fn rotation_code([w, x, y, z]: [f32; 4]) -> [u8; 3] {
     let outward = |of: f32, other: f32| (1.0 - other.abs()) * if of >= 0.0 { 1.0 } else { -1.0 };
     let (u, v) = if z < 0.0 { (outward(u, v), outward(v, u)) } else { (u, v) };
     [unit_code(u * 0.5 + 0.5), unit_code(v * 0.5 + 0.5), unit_code(angle / PI)]
+}
+
+/// Returns the rotation of bytes: see [`rotation_code`].
+fn rotation_of_code([u, v, angle]: [u8; 3]) -> [f32; 4] {
+    let [u, v] = [u, v].map(|code| f32::from(code) / LARGEST * 2.0 - 1.0);
+    let z = 1.0 - u.abs() - v.abs();
+    let inward = |of: f32| of - (-z).max(0.0).copysign(of);
+    let axis = Vec3::new(inward(u), inward(v), z).normalize();
+    let (sin, w) = (f32::from(angle) / LARGEST * 0.5 * PI).sin_cos();
+    let [x, y, z] = (axis * sin).to_array();
+    [w, x, y, z]
 }
 
 #[cfg(test)]

@@ -4,13 +4,17 @@ use std::io::Cursor;
 
 use glam::{DMat3, DQuat, DVec3};
 use image::{DynamicImage, ImageDecoder, ImageError, ImageReader};
-pub use slag_api::locate::{Answer, Pose};
+pub use slag_api::locate::{Answer, Pose, Verification};
 use slag_common::{Distortion, Intrinsics};
 use slag_locate::{
-    CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, locate, map_bytes, working_bytes,
+    CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, Renderer, locate, map_bytes, working_bytes,
 };
 
+use self::render::OnBoard;
+use crate::score::Budget;
 use crate::store::Snapshot;
+
+mod render;
 
 /// Longest file of a photo.
 pub const MAX_PHOTO_BYTES: usize = 32 << 20;
@@ -99,11 +103,17 @@ pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
     Ok(Map::new(all))
 }
 
-/// Finds the camera of a photo. Same photo, same answer.
+/// Finds the camera of a photo. Same photo, same answer. Where cells tell how their Gaussians look, and the budget
+/// allows it, pictures of them verify and improve the pose.
 ///
 /// # Errors
 /// [`LocateError`]. A photo that shows another place is no error: its answer is [`Answer::Lost`].
-pub fn answer(snapshot: &Snapshot, photo: PhotoFile<'_>, camera: &Camera) -> Result<Answer, LocateError> {
+pub fn answer(
+    snapshot: &Snapshot,
+    photo: PhotoFile<'_>,
+    camera: &Camera,
+    budget: &Budget,
+) -> Result<Answer, LocateError> {
     let map = map_on_board(snapshot)?;
     let grey = photo.grey()?;
     let (width, height) = (grey.width as f64, grey.height as f64);
@@ -120,7 +130,9 @@ pub fn answer(snapshot: &Snapshot, photo: PhotoFile<'_>, camera: &Camera) -> Res
     let (gravity_in_camera, prior) = (camera.gravity, camera.prior);
     let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera, prior };
     let pose = |located: &Located| pose_of(snapshot, located);
-    Ok(match locate(&map, &photo, None) {
+    let on_board = OnBoard::of(snapshot, budget);
+    let renderer = on_board.as_ref().map(|on_board| on_board as &dyn Renderer);
+    Ok(match locate(&map, &photo, renderer) {
         Outcome::Found(found) => Answer::Found(pose(&found)),
         Outcome::Unsure(candidates) => {
             let reason = match candidates.len() {
@@ -145,6 +157,10 @@ fn pose_of(snapshot: &Snapshot, located: &Located) -> Pose {
         optical_rotation_xyzw: rotation(world_from_camera.matrix3),
         covariance: located.covariance.to_vec(),
         n_inliers: located.n_inliers,
+        verified_by: match located.is_verified {
+            true => Verification::Rendering,
+            false => Verification::Landmarks,
+        },
         geographic: snapshot.manifest.geo_reference.map(|geo| geo.geographic_from_world(at)),
     }
 }

@@ -12,10 +12,6 @@ use crate::raster::{LoadedScene, RasterError, RasterView};
 
 /// Gaussians for which there is a landmark: at 24 bytes, 2 bytes a Gaussian.
 const GAUSSIANS_A_LANDMARK: usize = 12;
-/// Opacity of a pixel from which its depth is a surface's.
-const MIN_COVERAGE: f32 = 0.5;
-/// Widest rendering, pixels.
-const MAX_RENDERING_WIDTH_PX: u32 = 1600;
 
 /// Why a photo has no features.
 #[derive(Debug, thiserror::Error)]
@@ -32,13 +28,7 @@ pub struct SceneRenderer<'a>(pub &'a dyn LoadedScene);
 impl SceneRenderer<'_> {
     fn draw(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Result<Rendering, RasterError> {
         let view = RasterView { camera_from_world: *camera_from_world, intrinsics: *intrinsics };
-        let drawing = self.0.draw(&view, [0.5; 3])?;
-        let surface = drawing.depth.iter().zip(&drawing.coverage);
-        let depth =
-            surface.map(|(depth, coverage)| if *coverage >= MIN_COVERAGE { *depth } else { 0.0 }).collect();
-        let bytes: Vec<u8> = drawing.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
-        let grey = Grey::from_rgb8(drawing.width_px as usize, drawing.height_px as usize, &bytes);
-        Ok(Rendering { grey, depth })
+        Ok(Rendering::of(&self.0.draw(&view, [0.5; 3])?))
     }
 }
 

@@ -4,6 +4,9 @@ import assert from "node:assert/strict";
 import { mkdirSync, readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 
+/** Options of a test that is left to the nightly checks, which set this variable. */
+export const NIGHTLY = { skip: process.env.SLAG_NIGHTLY ? false : "nightly" };
+
 const fromPage = createRequire(new URL("../../common/view/web/package.json", import.meta.url));
 const { chromium } = fromPage("playwright-core");
 export const axe = readFileSync(fromPage.resolve("axe-core/axe.min.js"), "utf8");

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { closeBrowser, openBrowser, openedFile } from "./browser.mjs";
+import { closeBrowser, NIGHTLY, openBrowser, openedFile } from "./browser.mjs";
 import { generateRoom, run, serve } from "./programs.mjs";
 
 const N_VIEWS = 8;
@@ -31,7 +31,7 @@ function encode(flags) {
   throw new Error("no photo was left out");
 }
 
-test("slag-encoder encode: --report has the encode in one file; the bytes are those without it", async () => {
+test("slag-encoder encode: --report has the encode in one file; the bytes are those without it", NIGHTLY, async () => {
   const { frames } = JSON.parse(readFileSync(join(room.room, "transforms.json"), "utf8"));
   const broken = frames[N_VIEWS - 1].file_path;
   writeFileSync(join(room.room, broken), "not a photo");

@@ -5,7 +5,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { closeBrowser, keepPicture, layer, litPixels, openBrowser, opened as openedAt } from "./browser.mjs";
+import { closeBrowser, keepPicture, layer, litPixels, NIGHTLY, openBrowser, opened as openedAt } from "./browser.mjs";
 import { makeRoom, readGrey16, run, serve } from "./programs.mjs";
 
 /** Small: without a GPU, every pixel of a picture takes its time. */
@@ -137,7 +137,7 @@ test("slag-edge: cameras are where the poses say, without pictures", () => opene
   assert.ok(await page.locator("#photos-label").evaluate((label) => !label.hidden));
 }));
 
-test("slag-encoder view: the photo has the answer's box, and a second question is beside the first", async () => {
+test("slag-encoder view: the photo has the answer's box, and a second question is beside the first", NIGHTLY, async () => {
   const viewer = await serve("slag-encoder", ["view", "--store", room.store, "--scene", join(room.room, "scene.ply"),
     "--views", join(room.room, "transforms.json"), "--listen", "127.0.0.1:0", "--no-open"]);
   try {
@@ -175,7 +175,7 @@ function dropped() {
   return frames.filter((_, i) => i % 2 === 1).flatMap(({ file_path }) => ["--drop", file_path.replace(/^(.*\/)?images\//, "")]);
 }
 
-test("another generation is told while the page is open, and a robot that goes and comes back", () => opened(robot.url, async (page) => {
+test("another generation is told while the page is open, and a robot that goes and comes back", NIGHTLY, () => opened(robot.url, async (page) => {
   await drawn(page);
   // Without some photos, some things are other ones.
   room.encode(...dropped());

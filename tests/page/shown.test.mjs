@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { closeBrowser, layer, openBrowser, pixels } from "./browser.mjs";
+import { closeBrowser, layer, NIGHTLY, openBrowser, pixels } from "./browser.mjs";
 import { answered, CAMERA, cameraOf, drawn, opened, PANEL_PX, project } from "./scene.mjs";
 import { THINGS } from "./service.mjs";
 
@@ -144,7 +144,7 @@ test("fingers choose and turn", () => opened(async (page) => {
 /** A floor of so many Gaussians that the first picture has a part of them. */
 const LARGE = THINGS.map((thing) => (thing.name === "floor" ? { ...thing, n: [700, 700, 1] } : thing));
 
-test("of a large scene a part is drawn at first, then all, and fewer again where frames take long", () => opened(async (page, service) => {
+test("of a large scene a part is drawn at first, then all, and fewer again where frames take long", NIGHTLY, () => opened(async (page, service) => {
   const steps = () => service.behaviour.requests.filter((path) => path.startsWith("/v1/view/cells/")).map((path) => [Number(path.match(/cells\/(\d+)/)[1]), Number(path.match(/step=(\d+)/)[1])]);
   await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined, null, { timeout: 120000 });
   const [first, second] = [steps().slice(0, 3), steps().slice(3)];

@@ -36,11 +36,22 @@ pub struct Pose {
     pub optical_rotation_xyzw: [f64; 4],
     /// Of x, y, z and rotations about the world's x, y, z, row by row: 36 numbers, square world units and radians.
     pub covariance: Vec<f64>,
-    /// Landmarks that agree with the pose.
+    /// Points that agree with the pose.
     pub n_inliers: usize,
+    pub verified_by: Verification,
     /// The same on the earth, where the scene has a geo-reference.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub geographic: Option<Geographic>,
+}
+
+/// What agrees with a pose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Verification {
+    /// Landmarks alone.
+    Landmarks,
+    /// A picture of the scene at the pose, which looks like the photo.
+    Rendering,
 }
 
 impl Pose {

@@ -135,7 +135,7 @@ impl std::fmt::Display for Reason {
 
 /// Finds the camera of a photo. Same input, same answer.
 ///
-/// Without a renderer a pose needs more inliers. Where a rendering cannot be drawn its pose is not verified.
+/// A pose that no rendering verifies needs more inliers.
 pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> Outcome {
     if map.is_empty() {
         return Outcome::Lost(Reason::EmptyMap);
@@ -156,8 +156,9 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     if proposals.is_empty() {
         return Outcome::Lost(refused.unwrap_or(Reason::NoPose { inliers }));
     }
-    match renderer {
-        Some(renderer) => search.verified(&proposals, renderer, &found),
+    let verified = renderer.and_then(|renderer| search.verified(&proposals, renderer, &found));
+    match verified {
+        Some(located) => Outcome::Found(Box::new(located)),
         None => search.unverified(&proposals),
     }
 }
@@ -214,18 +215,16 @@ impl Search<'_> {
     }
 
     /// Returns the first proposed pose whose rendering matches the photo.
-    fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Outcome {
-        let mut most = 0;
+    fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Option<Located> {
         for one in proposals.iter().take(MAX_PROPOSALS) {
             let mut pose = self.guided(one).camera_from_world;
             for _ in 0..MAX_RENDERINGS {
                 let matches = match_rendering(renderer, &pose, self.photo.intrinsics, found, &self.query.at);
                 let Some(seen) = ransac(&self.camera, &matches, SEED) else { break };
                 let n = seen.inliers.len();
-                most = most.max(n);
                 if n >= MIN_RENDERED_INLIERS {
                     match self.located(&seen, true) {
-                        Ok(located) => return Outcome::Found(Box::new(located)),
+                        Ok(located) => return Some(located),
                         Err(_) => break,
                     }
                 }
@@ -235,7 +234,7 @@ impl Search<'_> {
                 pose = seen.camera_from_world;
             }
         }
-        Outcome::Lost(Reason::NoPose { inliers: most })
+        None
     }
 
     fn unverified(&self, proposals: &[Agreed]) -> Outcome {

@@ -26,5 +26,5 @@ pub use find::{Located, Outcome, Photo, Prior, Reason, locate};
 pub use grey::Grey;
 pub use map::{Map, map_bytes};
 pub use p3p::p3p;
-pub use render::{Renderer, Rendering, point_in_world};
+pub use render::{MAX_RENDERING_WIDTH_PX, Renderer, Rendering, point_in_world};
 pub use slag_common::landmarks::Landmark;

@@ -3,6 +3,7 @@
 use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
 use slag_math::dot;
+use slag_raster::Drawing;
 
 use crate::features::{Feature, MAX_FEATURES, features};
 use crate::grey::Grey;
@@ -13,6 +14,11 @@ use crate::pose::Match;
 const MAX_RATIO: f32 = 0.9;
 /// Largest step of the depth between neighbouring pixels of a surface, as a share of the depth.
 const MAX_DEPTH_STEP: f32 = 0.05;
+
+/// Opacity of a pixel from which its depth is a surface's.
+const MIN_COVERAGE: f32 = 0.5;
+/// Widest rendering, pixels: splats show no more of a photo than that.
+pub const MAX_RENDERING_WIDTH_PX: u32 = 1600;
 
 /// A picture of the scene, with the camera z of each pixel; 0 where there is no surface.
 pub struct Rendering {
@@ -27,6 +33,16 @@ pub trait Renderer {
 }
 
 impl Rendering {
+    /// Takes the picture and the surfaces of a drawing.
+    pub fn of(drawing: &Drawing) -> Self {
+        let surface = drawing.depth.iter().zip(&drawing.coverage);
+        let depth =
+            surface.map(|(depth, coverage)| if *coverage >= MIN_COVERAGE { *depth } else { 0.0 }).collect();
+        let bytes: Vec<u8> = drawing.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
+        let grey = Grey::from_rgb8(drawing.width_px as usize, drawing.height_px as usize, &bytes);
+        Self { grey, depth }
+    }
+
     /// Returns the camera z at a place; `None` beside the picture, without a surface and at the edge of one.
     pub fn depth_at(&self, at: DVec2) -> Option<f64> {
         let Grey { width, height, .. } = self.grey;
@@ -55,7 +71,8 @@ pub(crate) fn match_rendering(
     photo: &[Feature],
     at: &[DVec2],
 ) -> Vec<Match> {
-    let pinhole = intrinsics.without_distortion();
+    let width_px = intrinsics.width_px.min(MAX_RENDERING_WIDTH_PX);
+    let pinhole = intrinsics.without_distortion().scaled_to_width(width_px);
     let Some(rendering) = renderer.render(camera_from_world, &pinhole) else { return Vec::new() };
     let rendered = features(&rendering.grey, MAX_FEATURES);
     let n = rendered.len();

@@ -7,8 +7,9 @@ use clap::Args;
 use glam::DVec3;
 use slag_locate::Prior;
 
-use crate::locate::{Answer, Camera, LocateError, MAX_PHOTO_BYTES, PhotoFile, Pose, answer};
+use crate::locate::{Answer, Camera, LocateError, MAX_PHOTO_BYTES, PhotoFile, Pose, Verification, answer};
 use crate::query::parse_point;
+use crate::score::Budget;
 use crate::store::Snapshot;
 
 use super::args::CacheArgs;
@@ -91,7 +92,9 @@ fn located(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer,
             anyhow::anyhow!("{}: longer than {MAX_PHOTO_BYTES} bytes; make it smaller", photo.display());
         return Err(Failure::Failed("photo", error));
     }
-    PhotoFile::open(&bytes).and_then(|opened| answer(snapshot, opened, camera)).map_err(of_photo)
+    PhotoFile::open(&bytes)
+        .and_then(|opened| answer(snapshot, opened, camera, &Budget::default()))
+        .map_err(of_photo)
 }
 
 fn pairs(pose: &Pose) -> Vec<(&'static str, String)> {
@@ -100,7 +103,13 @@ fn pairs(pose: &Pose) -> Vec<(&'static str, String)> {
         ("position", numbers(&pose.position_in_world)),
         ("rotation_xyzw", numbers(&pose.rotation_xyzw)),
         ("sigma", format!("{:.4}", pose.position_sigma())),
-        ("landmarks", pose.n_inliers.to_string()),
+        (
+            "verified by",
+            match pose.verified_by {
+                Verification::Landmarks => format!("{} landmarks", pose.n_inliers),
+                Verification::Rendering => format!("{} points of a rendering", pose.n_inliers),
+            },
+        ),
     ];
     if let Some(at) = pose.geographic {
         let place = format!("{:.7},{:.7},{:.2}", at.latitude_deg, at.longitude_deg, at.height_m);

@@ -1,26 +1,42 @@
 use std::path::Path;
+use std::time::Duration;
 
+use glam::DAffine3;
+use slag_common::Gaussians;
+use slag_common::appearance::AppearanceColumns;
 use slag_common::container::AlignedBytes;
 use slag_common::landmarks::{BuiltLandmarks, Landmark};
 use slag_common::shard::{Additions, ShardLayout};
 use slag_locate::Reason;
+use slag_math::random::Random;
+use slag_math::simd::InstructionSet;
+use slag_raster::{PreparedScene, RasterView, pinhole};
 
 use super::*;
+use crate::score::Pool;
 use crate::store::EdgeCache;
 use crate::testing::{BuiltShard, Member, TestShard, write_cache};
 
 /// A cache whose one shard has landmarks of a version, or none.
 fn on_board(dir: &Path, version: Option<u32>) -> Snapshot {
-    let plain = TestShard::new(vec![vec![Member { steps: [0; 3], embedding: vec![1.0, 0.0] }]]).build(false);
+    let plain = TestShard::new(vec![vec![member([0; 3])]]).build(false);
     let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 3, view: 0 };
     let built = BuiltLandmarks::pack(version.unwrap_or_default(), &[landmark(1.0), landmark(2.0)]);
-    let additions =
-        Additions { landmarks: built.view().filter(|_| version.is_some()), ..Additions::default() };
+    let landmarks = built.view().filter(|_| version.is_some());
+    with(dir, &plain, Additions { landmarks, ..Additions::default() })
+}
+
+fn member(steps: [u16; 3]) -> Member {
+    Member { steps, embedding: vec![1.0, 0.0] }
+}
+
+/// A cache whose one shard has these sections, too.
+fn with(dir: &Path, plain: &BuiltShard, additions: Additions<'_>) -> Snapshot {
     let mut bytes = Vec::new();
     plain.view().write_with(&mut bytes, additions).expect("writes to memory");
     let bytes = AlignedBytes::copy_of(&bytes);
     let layout = ShardLayout::check(&bytes).expect("a valid shard");
-    write_cache(dir, &[BuiltShard { layout, bytes, embeddings: plain.embeddings }], 1);
+    write_cache(dir, &[BuiltShard { layout, bytes, embeddings: plain.embeddings.clone() }], 1);
     Snapshot::open(&EdgeCache::open(dir)).expect("opens")
 }
 
@@ -36,7 +52,9 @@ fn what_cannot_be_matched_is_told() {
     let dir = tempfile::tempdir().expect("a folder");
     let camera = Camera { focal_px: 500.0, centre_px: None, gravity: None, prior: None };
     let photo = png(64, 48);
-    let answer = |snapshot: &Snapshot, photo: &[u8]| answer(snapshot, PhotoFile::open(photo)?, &camera);
+    let answer = |snapshot: &Snapshot, photo: &[u8]| {
+        answer(snapshot, PhotoFile::open(photo)?, &camera, &Budget::default())
+    };
     let snapshot = on_board(&dir.path().join("other"), Some(CODE_VERSION + 1));
     let error = answer(&snapshot, &photo).expect_err("another version").to_string();
     assert!(error.contains("encode again"), "{error}");
@@ -112,4 +130,49 @@ fn the_body_of_a_level_camera_is_not_turned() {
     let forward = DQuat::from_array(optical_rotation_xyzw) * DVec3::Z;
     assert!(forward.distance(DVec3::X) < 1e-9, "{optical_rotation_xyzw:?}");
     assert_eq!(geographic, None);
+}
+
+/// A picture of what a camera may see is one of all Gaussians on board, to the bit; and there is none beyond the
+/// budget.
+#[test]
+fn what_is_beside_a_picture_is_not_drawn() {
+    let random = &mut Random::new(3);
+    let members = (0..2000).map(|_| member([0; 3].map(|_: i32| random.below(2000) as u16))).collect();
+    let plain = TestShard::new(vec![members]).build(false);
+    let means: Vec<DVec3> = (0..2000).map(|at| plain.view().position_in_world(at)).collect();
+    let unit = |random: &mut Random| random.unit_vector(4).try_into().expect("four components");
+    let scene = Gaussians {
+        rotations_wxyz: means.iter().map(|_| unit(random)).collect(),
+        scales: means.iter().map(|_| [0; 3].map(|_| (4.0 * random.unit() - 5.0).exp() as f32)).collect(),
+        opacities: means.iter().map(|_| random.unit() as f32).collect(),
+        sh_dc: means.iter().map(|_| [0; 3].map(|_| random.unit() as f32)).collect(),
+        means_in_world: means.clone(),
+        ..Gaussians::default()
+    };
+    let columns = AppearanceColumns::of(&scene, &(0..2000).collect::<Vec<_>>());
+    let dir = tempfile::tempdir().expect("a folder");
+    let appearance = Some(columns.view());
+    let snapshot = with(dir.path(), &plain, Additions { appearance, ..Additions::default() });
+    let mut all = Gaussians::default();
+    means.iter().enumerate().for_each(|(at, mean)| columns.view().add_to(&mut all, at, *mean));
+    // In the middle, along the world's x.
+    let world_from_camera = DAffine3 {
+        matrix3: DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X),
+        translation: DVec3::splat(10.0),
+    };
+    let view =
+        RasterView { camera_from_world: world_from_camera.inverse(), intrinsics: pinhole([64, 48], 60.0) };
+    let budget = Budget::default();
+    let on_board = OnBoard::of(&snapshot, &budget).expect("an appearance");
+    let seen = on_board.seen(&view).expect("no bounds");
+    assert!((100..1000).contains(&seen.len()), "{}", seen.len());
+    let drawn = |scene: &Gaussians| PreparedScene::new(scene).draw(InstructionSet::widest(), &view, [0.5; 3]);
+    let (seen, all) = (drawn(&seen), drawn(&all));
+    assert!(seen.coverage.iter().any(|coverage| *coverage > 0.9));
+    assert_eq!((seen.rgb, seen.depth, seen.coverage), (all.rgb, all.depth, all.coverage));
+
+    let budget = Budget::new(10_000, Duration::from_secs(60), &Pool::new(1 << 30));
+    let on_board = OnBoard::of(&snapshot, &budget).expect("an appearance");
+    assert!(on_board.render(&view.camera_from_world, &view.intrinsics).is_none());
+    assert_eq!(budget.check(), Ok(()));
 }

@@ -78,6 +78,14 @@ impl Budget {
         self.goes_on()
     }
 
+    /// Takes bytes where there is room for them and time. Returns whether it did.
+    pub fn try_take(&self, bytes: usize) -> bool {
+        let Some(account) = &self.0 else { return true };
+        let left = |limit: u64, used: &AtomicU64| limit.saturating_sub(used.load(Relaxed)) >= bytes as u64;
+        let has_room = left(account.bytes, &account.used) && left(account.pool.bytes, &account.pool.used);
+        has_room && self.take(bytes)
+    }
+
     /// Returns the bytes taken so far.
     pub fn used_bytes(&self) -> u64 {
         self.0.as_ref().map_or(0, |account| account.used.load(Relaxed))
@@ -135,6 +143,7 @@ mod tests {
         assert!(first.take(10));
         first.give_back_to(before, 3);
         assert_eq!((first.used_bytes(), pool.used_bytes()), (63, 63));
+        assert!(!first.try_take(8) && first.check().is_ok());
         assert!(!first.take(8));
         assert_eq!(first.check(), Err(OverBudget::Bytes { bytes: 70 }));
         first.give_back_to(0, 0);

@@ -21,8 +21,7 @@ use crate::embed::SharedEncoders;
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
 use crate::objects;
-use crate::raster::PreparedScene;
-use crate::raster::{LoadedScene, RasterView};
+use crate::raster::{self, LoadedScene, RasterView};
 use crate::segment::{
     GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter,
 };
@@ -175,7 +174,7 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>
     let mut memory = MemoryPlan::new(settings.run.memory_bytes);
     inputs::reserve(&mut memory, &inputs.scene);
     CellSplit::reserve(&mut memory, n_gaussians);
-    PreparedScene::reserve(&mut memory, n_gaussians);
+    raster::reserve(&mut memory, n_gaussians);
     shard::reserve(&mut memory, &inputs.split, engines.models.dim());
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {

@@ -16,7 +16,7 @@ use crate::cells::{self, CellSplit};
 use crate::encode::fleet_parts::{RunContext, ViewTools, of_scene};
 use crate::encode::{EncodeError, Engines, Masks, ViewSettings};
 use crate::memory::{MemoryPlan, Phase};
-use crate::raster::PreparedScene;
+use crate::raster;
 use crate::segment::Segmenter;
 
 pub(super) struct Prepared {
@@ -94,7 +94,7 @@ impl Prepared {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());
         CellSplit::reserve(&mut memory, self.scene.len());
-        PreparedScene::reserve(&mut memory, self.scene.len());
+        raster::reserve(&mut memory, self.scene.len());
         tools.reserve_photos(&mut memory, &self.views);
         memory.rest(0)?;
         Ok(())

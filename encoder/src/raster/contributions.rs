@@ -3,13 +3,9 @@
 use bytemuck::{Zeroable, cast, cast_slice, cast_slice_mut};
 use rayon::prelude::*;
 use slag_math::simd::InstructionSet;
+use slag_raster::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
+use slag_raster::{Buckets, Lanes, ScreenGaussian, TileRect, Tiles, WeightSink, concat, walk_tile};
 
-use super::bin::Tiles;
-use super::blend::{TileRect, WeightSink, walk_tile};
-use super::buckets::{Buckets, concat};
-use super::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
-use super::project::ScreenGaussian;
-use super::simd::Lanes;
 use super::weights::{RegionWeight, WeightKind};
 use crate::masks::{NO_REGION, RegionMap};
 
@@ -57,7 +53,7 @@ pub(crate) fn tile_contributions(
                 .filter_map(|(column, members)| {
                     let rect = TileRect::new(column, row, width_px, height_px);
                     let mut sink = RegionSink::new(regions, rect)?;
-                    walk_tile(instructions, visible, members, rect, kind, &mut sink);
+                    walk_tile(instructions, visible, members, rect, kind == WeightKind::Blend, &mut sink);
                     Some(sink.contributions)
                 })
                 .collect();
@@ -228,10 +224,9 @@ mod tests {
 
     use glam::DVec2;
     use slag_common::{Distortion, Intrinsics};
+    use slag_raster::{bin, draw};
 
     use super::*;
-    use crate::raster::bin::bin;
-    use crate::raster::draw::draw;
 
     const WIDTH_PX: u32 = 33;
     const HEIGHT_PX: u32 = 18;

@@ -2,18 +2,21 @@
 
 use slag_common::Gaussians;
 use slag_math::simd::InstructionSet;
+use slag_raster::{Drawing, PreparedScene, RasterView, ViewCounters, bin, check_scene, check_view};
 
-use super::bin::{Tiles, bin};
 use super::contributions::{merge, tile_contributions};
-use super::draw::{Drawing, draw};
 use super::error::RasterError;
-use super::project::{Prepared, Projection};
 use super::rasterizer::{LoadedScene, Rasterizer};
-use super::sh;
-use super::validate::{check_regions, check_scene, check_view};
-use super::view::RasterView;
-use super::weights::{ViewCounters, ViewWeights, WeightKind};
+use super::validate::check_regions;
+use super::weights::{ViewWeights, WeightKind};
 use crate::masks::RegionMap;
+use crate::memory::{MemoryPlan, Phase};
+
+/// Reserves what a loaded scene keeps besides its Gaussians.
+pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
+    let bytes = n_gaussians * PreparedScene::BYTES_PER_GAUSSIAN;
+    memory.reserve(Phase::Views, "the size of each Gaussian", bytes as u64);
+}
 
 /// The reference backend. It runs on the current rayon pool, with the widest instruction set available.
 #[derive(Clone, Copy, Debug, Default)]
@@ -26,13 +29,13 @@ impl Rasterizer for CpuRasterizer {
 
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         check_scene(scene)?;
-        Ok(Box::new(CpuScene { prepared: Prepared::new(scene), instructions: InstructionSet::widest() }))
+        Ok(Box::new(CpuScene { prepared: PreparedScene::new(scene), instructions: InstructionSet::widest() }))
     }
 }
 
 /// A validated scene and the instruction set for its pixels.
 struct CpuScene<'s> {
-    prepared: Prepared<'s>,
+    prepared: PreparedScene<'s>,
     instructions: InstructionSet,
 }
 
@@ -50,25 +53,11 @@ impl LoadedScene for CpuScene<'_> {
         let tiles = bin(visible, &view.intrinsics);
         let by_tile = tile_contributions(visible, &tiles, regions, kind, self.instructions);
         let entries = merge(visible, &by_tile);
-        Ok(ViewWeights { entries, counters: counters(&projection, &tiles) })
+        Ok(ViewWeights { entries, counters: ViewCounters::of(&projection, &tiles) })
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
         check_view(view)?;
-        let projection = self.prepared.project(view);
-        let tiles = bin(&projection.visible, &view.intrinsics);
-        let position_in_world = view.camera_from_world.inverse().translation;
-        let colours = sh::colours(self.prepared.scene, &projection.visible, position_in_world);
-        let mut drawing = draw(self.instructions, &projection.visible, &colours, &tiles, background);
-        drawing.counters = counters(&projection, &tiles);
-        Ok(drawing)
-    }
-}
-
-fn counters(projection: &Projection, tiles: &Tiles) -> ViewCounters {
-    ViewCounters {
-        visible: projection.visible.len(),
-        pairs: tiles.rows.iter().map(|row| row.n_items()).sum(),
-        unusable: projection.unusable,
+        Ok(self.prepared.draw(self.instructions, view, background))
     }
 }

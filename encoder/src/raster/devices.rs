@@ -5,13 +5,12 @@ use std::fmt;
 use std::str::FromStr;
 
 use slag_common::Gaussians;
+use slag_raster::{Drawing, RasterView};
 
 use super::cpu::CpuRasterizer;
-use super::draw::Drawing;
 use super::error::RasterError;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
 use super::rasterizer::{GpuSlots, LoadedScene, Rasterizer};
-use super::view::RasterView;
 use super::weights::{ViewWeights, WeightKind};
 use crate::lanes::Lanes;
 use crate::masks::RegionMap;

@@ -1,10 +1,9 @@
 //! The interface of all backends.
 
 use slag_common::Gaussians;
+use slag_raster::{Drawing, RasterView};
 
-use super::draw::Drawing;
 use super::error::RasterError;
-use super::view::RasterView;
 use super::weights::{ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 

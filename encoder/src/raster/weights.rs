@@ -1,5 +1,7 @@
 //! The result of rasterising a view: the weight of each Gaussian in each region.
 
+use slag_raster::ViewCounters;
+
 /// Quantity that is summed over the pixels of a region.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, clap::ValueEnum)]
 pub enum WeightKind {
@@ -18,17 +20,6 @@ pub struct RegionWeight {
     pub region: u32,
     /// Weight, pixels; above 0.
     pub weight: f32,
-}
-
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ViewCounters {
-    /// Gaussians with a pixel of the image in their footprint; they may be occluded.
-    pub visible: usize,
-    /// Number of (Gaussian, tile) pairs.
-    pub pairs: usize,
-    /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once
-    /// projected.
-    pub unusable: usize,
 }
 
 #[derive(Clone, Debug, Default, PartialEq)]

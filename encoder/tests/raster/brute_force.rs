@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 use slag_common::{Distortion, Gaussians};
 use slag_encoder::masks::{NO_REGION, RegionMap};
-use slag_encoder::raster::{Drawing, RasterError, RasterView, ViewWeights, WeightKind};
+use slag_encoder::raster::{Drawing, InputError, RasterError, RasterView, ViewWeights, WeightKind};
 
 use super::backends::{Backend, backends};
 use super::oracle;
@@ -196,35 +196,42 @@ fn contradictions_are_errors() {
         let error = |scene: &Gaussians, view: &RasterView, regions: &RegionMap| {
             rasterizer.weights(scene, view, regions, WeightKind::Blend).unwrap_err()
         };
+        let of_input = |error: RasterError| match error {
+            RasterError::Input(error) => error,
+            other => panic!("{other}"),
+        };
         let short = Gaussians { sh_rest: vec![0.0; 44], ..scene.clone() };
         assert_eq!(
-            error(&short, &view, &regions),
-            RasterError::ColumnLength { column: "sh_rest", expected: 45, found: 44 }
+            of_input(error(&short, &view, &regions)),
+            InputError::ColumnLength { column: "sh_rest", expected: 45, found: 44 }
         );
         let of_degree_4 = Gaussians { sh_degree: 4, ..scene.clone() };
-        assert_eq!(error(&of_degree_4, &view, &regions), RasterError::ShDegree { found: 4 });
+        assert_eq!(of_input(error(&of_degree_4, &view, &regions)), InputError::ShDegree { found: 4 });
 
         let with = |change: fn(&mut RasterView)| {
             let mut view = view;
             change(&mut view);
             error(&scene, &view, &regions)
         };
-        assert!(matches!(with(|v| v.intrinsics.width_px = 0), RasterError::ImageSize { .. }));
-        assert!(matches!(with(|v| v.intrinsics.height_px = u32::MAX), RasterError::ImageSize { .. }));
-        assert!(matches!(with(|v| v.intrinsics.focal_x_px = 0.0), RasterError::Camera { .. }));
-        assert!(matches!(with(|v| v.intrinsics.centre_y_px = f64::NAN), RasterError::Camera { .. }));
+        assert!(matches!(of_input(with(|v| v.intrinsics.width_px = 0)), InputError::ImageSize { .. }));
+        assert!(matches!(
+            of_input(with(|v| v.intrinsics.height_px = u32::MAX)),
+            InputError::ImageSize { .. }
+        ));
+        assert!(matches!(of_input(with(|v| v.intrinsics.focal_x_px = 0.0)), InputError::Camera { .. }));
+        assert!(matches!(of_input(with(|v| v.intrinsics.centre_y_px = f64::NAN)), InputError::Camera { .. }));
         assert!(
-            matches!(with(|v| v.camera_from_world.matrix3 *= 2.0), RasterError::Pose { off } if off > 2.9)
+            matches!(of_input(with(|v| v.camera_from_world.matrix3 *= 2.0)), InputError::Pose { off } if off > 2.9)
         );
         assert!(
-            matches!(with(|v| v.camera_from_world.matrix3 *= -1.0), RasterError::Pose { off } if off.is_infinite())
+            matches!(of_input(with(|v| v.camera_from_world.matrix3 *= -1.0)), InputError::Pose { off } if off.is_infinite())
         );
         assert!(
-            matches!(with(|v| v.camera_from_world.translation.x = f64::NAN), RasterError::Pose { off } if off.is_nan())
+            matches!(of_input(with(|v| v.camera_from_world.translation.x = f64::NAN)), InputError::Pose { off } if off.is_nan())
         );
         assert!(matches!(with(|v| v.intrinsics.width_px = 21), RasterError::RegionMapSize { .. }));
         let fisheye = with(|v| v.intrinsics.distortion = Distortion::Fisheye { k: [0.0; 4] });
-        assert_eq!(fisheye, RasterError::Distorted);
+        assert_eq!(of_input(fisheye), InputError::Distorted);
 
         let mut wrong = regions.clone();
         wrong.region_of_pixel[33] = 3;

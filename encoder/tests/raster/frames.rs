@@ -100,6 +100,7 @@ fn moved_splats_are_brought_back() {
     assert_eq!(house.check(&stated, Vec::new()).diagnosis.expect("a diagnosis").splat_from_poses, None);
 }
 
+#[nightly("checks a scene many times")]
 #[needs_shared]
 #[test]
 fn other_axes_and_scales_are_named() {

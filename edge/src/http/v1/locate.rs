@@ -89,7 +89,7 @@ pub async fn locate(
         let over_budget = |spent| query_problem(QueryError::Score(ScoreError::OverBudget(spent)));
         budget.take(opened.working_bytes() + map_working_bytes(&snapshot));
         budget.check().map_err(over_budget)?;
-        answer(&snapshot, opened, &camera).map(Json).map_err(problem)
+        answer(&snapshot, opened, &camera, budget).map(Json).map_err(problem)
     })
     .await
 }

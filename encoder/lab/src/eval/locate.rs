@@ -12,6 +12,7 @@ use clap::builder::RangedU64ValueParser;
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 use serde::Serialize;
+use slag_common::appearance::AppearanceColumns;
 use slag_common::landmarks::BuiltLandmarks;
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Gaussians, View, poses};
@@ -30,6 +31,8 @@ const HELD_OUT: usize = 4;
 const FOCAL_FACTOR: f64 = 1.03;
 /// Light of [`Change::Dark`].
 const DARK_FACTOR: f32 = 0.4;
+/// Steps of a robot's positions where the scene is metric, metres.
+const POSITION_STEP_M: f64 = 0.02;
 /// Width of the square of [`Change::Covered`], as a share of each side: 20 % of the area.
 const COVERED_SIDE: f64 = 0.447;
 
@@ -39,7 +42,7 @@ pub(crate) struct LocateArgs {
     /// Folders of scenes: a splat, poses, photos, and optionally test/transforms.json.
     #[arg(long = "scene", value_name = "DIR", num_args = 1.., required = true)]
     scenes: Vec<PathBuf>,
-    /// Decides by landmarks alone, as a robot does: no rendering verifies a pose.
+    /// Decides by landmarks alone, as a robot does whose cells do not tell how their Gaussians look.
     #[arg(long)]
     unverified: bool,
     /// Changes each query.
@@ -74,6 +77,7 @@ enum Change {
 /// A scene, its map and its queries.
 struct Located {
     name: String,
+    /// The scene as a robot has it.
     gaussians: Gaussians,
     map: Map,
     len_bytes: u64,
@@ -187,9 +191,20 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
         map: Map::new(built.view().map(|view| view.iter().collect()).unwrap_or_default()),
         len_bytes: built.len_bytes(),
         map_secs: start.elapsed().as_secs_f64(),
-        gaussians,
+        gaussians: on_board(&gaussians),
         queries,
     })
+}
+
+/// Returns a scene as a robot has it, without harmonics and rounded.
+fn on_board(scene: &Gaussians) -> Gaussians {
+    let indices: Vec<u32> = (0..scene.len() as u32).collect();
+    let columns = AppearanceColumns::of(scene, &indices);
+    let mut on_board = Gaussians::default();
+    for (index, mean) in scene.means_in_world.iter().enumerate() {
+        columns.view().add_to(&mut on_board, index, (mean / POSITION_STEP_M).round() * POSITION_STEP_M);
+    }
+    on_board
 }
 
 /// Locates a photo in a scene's map.

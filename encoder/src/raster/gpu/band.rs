@@ -1,9 +1,10 @@
 //! Bands: the rows of tiles of a view that are processed together.
 
+use slag_raster::constants::TILE_SIZE_PX;
+
 use super::chunk::SceneChunk;
 use super::device::Device;
 use super::layout::ViewBlock;
-use crate::raster::constants::TILE_SIZE_PX;
 use crate::raster::error::RasterError;
 
 pub(crate) struct Band<'a> {

@@ -1,9 +1,10 @@
 //! The parameters of all scans and sorts.
 
+use slag_raster::constants::{FAR_Z, NEAR_Z};
+
 use super::device::Device;
 use super::layout::{Capacities, ScanJob, SortPass, screen_layout};
 use super::shader::{Counter, NONE, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZE};
-use crate::raster::constants::{FAR_Z, NEAR_Z};
 
 /// Distance between records, bytes; bindings must be aligned.
 pub(crate) const JOB_STRIDE_BYTES: u64 = 256;

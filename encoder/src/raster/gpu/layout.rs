@@ -3,12 +3,11 @@
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 use slag_common::Gaussians;
+use slag_raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
+use slag_raster::{RasterView, reach2};
 
 use super::shader::{Counter, Counts, SUM_FRACTION_BITS};
 use crate::raster::adapter::Precision;
-use crate::raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
-use crate::raster::project::reach2;
-use crate::raster::view::RasterView;
 use crate::raster::weights::RegionWeight;
 
 /// A Gaussian in device memory.
@@ -21,7 +20,7 @@ pub(crate) struct SceneGaussian {
     pub opacity: f32,
     /// Rounding error of `mean_high`.
     pub(crate) mean_low: [f32; 3],
-    /// See [`crate::raster::project::ScreenGaussian::reach2`].
+    /// See [`slag_raster::ScreenGaussian::reach2`].
     pub(crate) reach2: f32,
     pub(crate) rotation_wxyz: [f32; 4],
     /// Standard deviations, world units.

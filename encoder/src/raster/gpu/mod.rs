@@ -25,18 +25,16 @@ use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_math::stats::{Rank, quantile};
+use slag_raster::constants::TILE_SIZE_PX;
+use slag_raster::{Drawing, RasterView, check_scene, check_view, colour};
 
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
-use super::constants::TILE_SIZE_PX;
 use super::cpu::CpuRasterizer;
-use super::draw::Drawing;
 use super::error::RasterError;
 use super::rasterizer::{LoadedScene, Rasterizer};
-use super::sh;
-use super::validate::{check_regions, check_scene, check_view};
-use super::view::RasterView;
-use super::weights::{RegionWeight, ViewCounters, ViewWeights, WeightKind};
+use super::validate::check_regions;
+use super::weights::{RegionWeight, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 use band::{Band, band_size};
 use buffers::{REGION_BYTES, Size};
@@ -335,7 +333,7 @@ impl<'s> GpuScene<'s> {
         let position_in_world = view.camera_from_world.inverse().translation;
         let colours: Vec<[f32; 3]> = (0..self.scene.len())
             .into_par_iter()
-            .map(|index| sh::colour(self.scene, index, position_in_world))
+            .map(|index| colour(self.scene, index, position_in_world))
             .collect();
         let no_memory = || self.device.capacity_error("out of memory for the colours of the scene".into());
         let bytes: &[u8] = bytemuck::cast_slice(&colours);

@@ -3,12 +3,13 @@
 use std::borrow::Cow;
 use std::fmt::Write;
 
-use crate::raster::adapter::Precision;
-use crate::raster::blend::{EXP_OF_MINUS_C, MAX_POWER};
-use crate::raster::constants::{
+use slag_raster::constants::{
     COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_ALPHA, MAX_VARIANCE_PX2, MIN_ALPHA, MIN_TRANSMITTANCE,
     NEAR_Z, TILE_SIZE_PX,
 };
+use slag_raster::{EXP_OF_MINUS_C, MAX_POWER};
+
+use crate::raster::adapter::Precision;
 use crate::raster::weights::WeightKind;
 
 /// Threads of a workgroup, equal to the pixels of a tile.

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::gaussians::SH_C0;
 
-use super::project::ScreenGaussian;
+use crate::project::ScreenGaussian;
 
 /// Factors of the real spherical harmonics of degree 1, 2 and 3, in the order and with the signs of 3DGS (Kerbl et
 /// al. 2023), which follows the polynomials of Ramamoorthi and Hanrahan.

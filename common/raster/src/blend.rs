@@ -4,20 +4,19 @@ use bytemuck::{cast, cast_slice, cast_slice_mut};
 use pulp::Simd;
 use slag_math::simd::{InstructionSet, Work};
 
-use super::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE_PX};
-use super::project::ScreenGaussian;
-use super::simd::Lanes;
-use super::weights::WeightKind;
+use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE_PX};
+use crate::project::ScreenGaussian;
+use crate::simd::Lanes;
 
 /// Gaussians that are fetched and prepared at once. Between batches, rows with only opaque pixels are identified,
 /// to skip them.
 const BATCH: usize = 32;
 
 /// Largest exponent that matters: `exp(-6)` is below 1/255, so no alpha beyond it counts.
-pub(crate) const MAX_POWER: f32 = 6.0;
+pub const MAX_POWER: f32 = 6.0;
 /// Polynomial for `exp(t - 3/4)` with `|t| <= 3/4`, interpolated at the Chebyshev nodes. Its fourth power has a
 /// relative error of at most 1.6e-7.
-pub(crate) const EXP_OF_MINUS_C: [f32; 8] = [
+pub const EXP_OF_MINUS_C: [f32; 8] = [
     0.472_366_54,
     0.472_366_55,
     0.236_183_8,
@@ -28,11 +27,11 @@ pub(crate) const EXP_OF_MINUS_C: [f32; 8] = [
     0.000_095_198_29,
 ];
 
-pub(crate) type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
+pub type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
 
 /// Position of a tile, and its pixels inside the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct TileRect {
+pub struct TileRect {
     /// Left edge, pixels.
     pub x_px: usize,
     /// Top edge, pixels.
@@ -58,7 +57,7 @@ impl TileRect {
 
 /// Consumes the weights of the Gaussians of a tile, from near to far. `member` is an index into the visible
 /// Gaussians.
-pub(crate) trait WeightSink {
+pub trait WeightSink {
     /// Consumes the weights at the pixels of vector `v` in row `y`; 0 at pixels without weight.
     fn add<S: Lanes>(&mut self, simd: S, member: u32, y: usize, v: usize, weights: S::f32s);
     fn end<S: Lanes>(&mut self, simd: S, member: u32);
@@ -66,18 +65,18 @@ pub(crate) trait WeightSink {
 
 /// Blends the Gaussians of a tile and returns the remaining transmittance at each pixel.
 ///
-/// With [`WeightKind::Falloff`] there is no occlusion, and the transmittance stays 1.
-pub(crate) fn walk_tile(
+/// Without `occlusion` the weights are falloffs, and the transmittance stays 1.
+pub fn walk_tile(
     instructions: InstructionSet,
     visible: &[ScreenGaussian],
     members: &[u32],
     rect: TileRect,
-    kind: WeightKind,
+    occlusion: bool,
     sink: &mut impl WeightSink,
 ) -> PerPixel<f32> {
-    match kind {
-        WeightKind::Blend => instructions.dispatch(Walk::<_, true> { visible, members, rect, sink }),
-        WeightKind::Falloff => instructions.dispatch(Walk::<_, false> { visible, members, rect, sink }),
+    match occlusion {
+        true => instructions.dispatch(Walk::<_, true> { visible, members, rect, sink }),
+        false => instructions.dispatch(Walk::<_, false> { visible, members, rect, sink }),
     }
 }
 
@@ -266,7 +265,7 @@ fn exp_of_minus<S: Simd>(simd: S, power: S::f32s) -> S::f32s {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use crate::*;
 
     struct Exp<'a>(&'a mut [f32]);
 

@@ -5,12 +5,11 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use slag_common::{Gaussians, Intrinsics};
 
-use super::buckets::concat;
-use super::constants::{
+use crate::buckets::concat;
+use crate::constants::{
     COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_VARIANCE_PX2, MIN_ALPHA, NEAR_Z, REACH2_MARGIN,
 };
-use super::view::RasterView;
-use crate::memory::{MemoryPlan, Phase};
+use crate::view::RasterView;
 
 /// A Gaussian on the screen.
 ///
@@ -19,41 +18,41 @@ use crate::memory::{MemoryPlan, Phase};
 /// loses no digits, whereas the terms of `a dx^2 + 2 b dx dy + c dy^2` cancel for needles. The size is 56 bytes,
 /// because tiles access Gaussians at random and a cache line has 64.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Zeroable)]
-pub(crate) struct ScreenGaussian {
+pub struct ScreenGaussian {
     /// Index in the scene.
     pub gaussian: u32,
     /// Camera z, world units.
     pub depth: f32,
     pub opacity: f32,
     /// Largest `u^2 + v^2` at which alpha may count.
-    pub(crate) reach2: f32,
+    pub reach2: f32,
     /// Centre on the screen, pixels.
     pub mean_px: DVec2,
     /// 1 / standard deviation along x at fixed y, 1/px.
-    pub(crate) inv_width: f64,
+    pub inv_width: f64,
     /// Shift of the centre of the ellipse per row, pixels of x per pixel of y.
     pub slope: f64,
     /// 1 / standard deviation along y, 1/px.
-    pub(crate) inv_height: f64,
+    pub inv_height: f64,
 }
 
 impl ScreenGaussian {
     /// Returns half the size of the bounding box of the footprint, pixels.
-    pub(crate) fn extent_px(&self) -> DVec2 {
+    pub fn extent_px(&self) -> DVec2 {
         let cov_yy = self.inv_height.powi(-2);
         let cov_xx = self.inv_width.powi(-2) + self.slope * self.slope * cov_yy;
         DVec2::new(cov_xx, cov_yy).map(|v| (f64::from(self.reach2) * v).sqrt())
     }
 
     /// Returns the highest and lowest y of the footprint, pixels.
-    pub(crate) fn y_range_px(&self) -> [f64; 2] {
+    pub fn y_range_px(&self) -> [f64; 2] {
         let extent = f64::from(self.reach2).sqrt() / self.inv_height;
         [self.mean_px.y - extent, self.mean_px.y + extent]
     }
 
     /// Returns the pixels `first..=last` of an axis with centres in `[low, high]` and in the image; `None` if
     /// there are none.
-    pub(crate) fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
+    pub fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
         let first = (low - 0.5).max(0.0);
         let last = (high - 0.5).min(f64::from(size_px) - 1.0);
         if first > last {
@@ -68,7 +67,7 @@ impl ScreenGaussian {
 
 /// The Gaussians of a scene that a view can see.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Projection {
+pub struct Projection {
     /// Gaussians with at least one pixel centre of the image in the bounding box of their footprint, in scene
     /// order.
     pub visible: Vec<ScreenGaussian>,
@@ -80,7 +79,7 @@ pub(crate) struct Projection {
 const CHUNK: usize = 4096;
 
 /// A scene with precomputed sizes, to exclude invisible Gaussians quickly.
-pub struct Prepared<'s> {
+pub struct PreparedScene<'s> {
     /// The scene, with columns of matching lengths.
     pub scene: &'s Gaussians,
     sizes: Vec<Size>,
@@ -96,11 +95,9 @@ struct Size {
     reach2: f32,
 }
 
-impl<'s> Prepared<'s> {
-    /// Reserves the sizes of a scene's Gaussians.
-    pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
-        memory.reserve(Phase::Views, "the size of each Gaussian", (n_gaussians * size_of::<Size>()) as u64);
-    }
+impl<'s> PreparedScene<'s> {
+    /// Bytes that it keeps for each Gaussian.
+    pub const BYTES_PER_GAUSSIAN: usize = size_of::<Size>();
 
     /// Prepares a scene with columns of matching lengths.
     pub fn new(scene: &'s Gaussians) -> Self {
@@ -206,7 +203,7 @@ impl Bounds {
 }
 
 /// Returns the squared Mahalanobis distance within which the alpha of a Gaussian may reach 1/255.
-pub(crate) fn reach2(opacity: f32) -> f32 {
+pub fn reach2(opacity: f32) -> f32 {
     ((2.0 * (255.0 * f64::from(opacity)).ln()).max(0.0) + REACH2_MARGIN) as f32
 }
 

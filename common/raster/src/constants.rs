@@ -1,28 +1,28 @@
 //! Constants of the rasteriser, equal to those of gsplat 1.5.3; all backends take them from here.
 
 /// Edge of a screen tile, pixels.
-pub(crate) const TILE_SIZE_PX: usize = 16;
+pub const TILE_SIZE_PX: usize = 16;
 /// Camera z below which a Gaussian is not drawn, world units.
-pub(crate) const NEAR_Z: f64 = 0.01;
+pub const NEAR_Z: f64 = 0.01;
 /// Camera z above which a Gaussian is not drawn, world units.
-pub(crate) const FAR_Z: f64 = 1e10;
+pub const FAR_Z: f64 = 1e10;
 /// Added to the diagonal of a projected covariance, px^2: the reconstruction filter of the pixel grid.
-pub(crate) const COVARIANCE_BLUR_PX2: f64 = 0.3;
+pub const COVARIANCE_BLUR_PX2: f64 = 0.3;
 /// Largest alpha of a Gaussian at a pixel, so that the transmittance never reaches 0.
-pub(crate) const MAX_ALPHA: f32 = 0.999;
+pub const MAX_ALPHA: f32 = 0.999;
 /// Smallest alpha that counts: the footprint of a Gaussian ends where its alpha falls below.
-pub(crate) const MIN_ALPHA: f32 = 1.0 / 255.0;
+pub const MIN_ALPHA: f32 = 1.0 / 255.0;
 /// Transmittance at which a pixel is opaque. The first Gaussian that would reach it ends the pixel and is not
 /// blended.
-pub(crate) const MIN_TRANSMITTANCE: f32 = 1e-4;
+pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Margin around the image within which the Jacobian of the projection is exact, as a share of the tangent of half
 /// the field of view. Beyond it, the Jacobian is evaluated at the limit.
-pub(crate) const FOV_MARGIN: f64 = 0.3;
+pub const FOV_MARGIN: f64 = 0.3;
 /// Added to the squared Mahalanobis reach of a footprint before culling. The rounding error of `f32` is below 5e-5
 /// there, so no pixel with a sufficient alpha is culled.
-pub(crate) const REACH2_MARGIN: f64 = 2e-4;
+pub const REACH2_MARGIN: f64 = 2e-4;
 /// Largest projected variance, px^2; above it, the `f32` arithmetic of the pixels loses its meaning.
-pub(crate) const MAX_VARIANCE_PX2: f64 = 1e24;
+pub const MAX_VARIANCE_PX2: f64 = 1e24;
 /// Most pixels of one view (16k x 16k).
 pub const MAX_IMAGE_PX: u64 = 1 << 28;
 /// Fraction bits of the fixed-point weights that are summed over tiles.

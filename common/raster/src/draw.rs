@@ -5,12 +5,13 @@ use image::RgbImage;
 use rayon::prelude::*;
 use slag_math::simd::InstructionSet;
 
-use super::bin::Tiles;
-use super::blend::{PerPixel, TileRect, WeightSink, walk_tile};
-use super::constants::TILE_SIZE_PX;
-use super::project::ScreenGaussian;
-use super::simd::Lanes;
-use super::weights::{ViewCounters, WeightKind};
+use crate::bin::{Tiles, bin};
+use crate::blend::{PerPixel, TileRect, WeightSink, walk_tile};
+use crate::constants::TILE_SIZE_PX;
+use crate::project::{PreparedScene, ScreenGaussian};
+use crate::sh;
+use crate::simd::Lanes;
+use crate::view::{RasterView, ViewCounters};
 
 /// The picture of a scene in one view; all arrays are row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -37,6 +38,18 @@ impl Drawing {
     }
 }
 
+impl PreparedScene<'_> {
+    /// Draws a checked view of a checked scene over a background, on the current rayon pool.
+    pub fn draw(&self, instructions: InstructionSet, view: &RasterView, background: [f32; 3]) -> Drawing {
+        let projection = self.project(view);
+        let tiles = bin(&projection.visible, &view.intrinsics);
+        let position_in_world = view.camera_from_world.inverse().translation;
+        let colours = sh::colours(self.scene, &projection.visible, position_in_world);
+        let drawing = draw(instructions, &projection.visible, &colours, &tiles, background);
+        Drawing { counters: ViewCounters::of(&projection, &tiles), ..drawing }
+    }
+}
+
 /// Draws the Gaussians of all tiles. `colours` contains the RGB colour of each visible Gaussian.
 pub fn draw(
     instructions: InstructionSet,
@@ -59,8 +72,7 @@ pub fn draw(
             for (column, members) in tile_row.iter().enumerate() {
                 let rect = TileRect::new(column, row, width_px, height_px);
                 let mut sink = PixelSink::new(visible, colours);
-                let transmittance =
-                    walk_tile(instructions, visible, members, rect, WeightKind::Blend, &mut sink);
+                let transmittance = walk_tile(instructions, visible, members, rect, true, &mut sink);
                 for (y, light) in transmittance.iter().enumerate().take(rect.height_px) {
                     for (x, &light) in light.iter().enumerate().take(rect.width_px) {
                         let pixel = y * width_px + rect.x_px + x;

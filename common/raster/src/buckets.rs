@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 /// Items grouped in buckets, in one contiguous array.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Buckets<T> {
+pub struct Buckets<T> {
     /// Bucket `b` contains `items[starts[b]..starts[b + 1]]`; the length is the number of buckets plus one.
     starts: Vec<usize>,
     items: Vec<T>,
@@ -32,7 +32,7 @@ fn starts_of(n_buckets: usize, spans: impl Iterator<Item = (u32, u32)>) -> Vec<u
 
 impl<T: Copy + Zeroable> Buckets<T> {
     /// Copies each item to its buckets `first..=last`, in order.
-    pub(super) fn new(n_buckets: usize, spanned: &[(T, (u32, u32))]) -> Self {
+    pub fn new(n_buckets: usize, spanned: &[(T, (u32, u32))]) -> Self {
         let starts = starts_of(n_buckets, spanned.iter().map(|(_, span)| *span));
         let mut items = bytemuck::zeroed_vec(starts[n_buckets]);
         let mut next = starts.clone();
@@ -47,17 +47,17 @@ impl<T: Copy + Zeroable> Buckets<T> {
 }
 
 impl<T> Buckets<T> {
-    pub(super) fn of(&self, bucket: usize) -> &[T] {
+    pub fn of(&self, bucket: usize) -> &[T] {
         &self.items[self.starts[bucket]..self.starts[bucket + 1]]
     }
 
     /// Iterates over the items of each bucket.
-    pub(super) fn iter(&self) -> impl Iterator<Item = &[T]> {
+    pub fn iter(&self) -> impl Iterator<Item = &[T]> {
         self.starts.windows(2).map(|ends| &self.items[ends[0]..ends[1]])
     }
 
     /// Iterates over the items of each bucket, mutably.
-    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
         let mut rest = self.items.as_mut_slice();
         self.starts.windows(2).map(move |ends| {
             let (bucket, after) = std::mem::take(&mut rest).split_at_mut(ends[1] - ends[0]);
@@ -66,18 +66,18 @@ impl<T> Buckets<T> {
         })
     }
 
-    pub(super) fn n_items(&self) -> usize {
+    pub fn n_items(&self) -> usize {
         self.items.len()
     }
 
     /// Converts each item.
-    pub(super) fn map<U>(self, f: impl FnMut(T) -> U) -> Buckets<U> {
+    pub fn map<U>(self, f: impl FnMut(T) -> U) -> Buckets<U> {
         Buckets { starts: self.starts, items: self.items.into_iter().map(f).collect() }
     }
 }
 
 /// Concatenates parts. All threads copy, so that page faults are spread over them.
-pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
+pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
     let mut joined: Vec<T> = bytemuck::zeroed_vec(parts.iter().map(Vec::len).sum());
     let mut rest = joined.as_mut_slice();
     let mut places = Vec::with_capacity(parts.len());
@@ -92,7 +92,7 @@ pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use crate::*;
 
     /// By hand; then more than 2^32 items, of which only the places are computed.
     #[test]

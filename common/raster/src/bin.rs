@@ -3,9 +3,9 @@
 use rayon::prelude::*;
 use slag_common::Intrinsics;
 
-use super::buckets::Buckets;
-use super::constants::TILE_SIZE_PX;
-use super::project::ScreenGaussian;
+use crate::buckets::Buckets;
+use crate::constants::TILE_SIZE_PX;
+use crate::project::ScreenGaussian;
 
 /// Edge of a tile, pixels.
 const TILE: u32 = TILE_SIZE_PX as u32;
@@ -16,7 +16,7 @@ const MANY: usize = 1 << 16;
 
 /// The Gaussians of every tile of an image.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Tiles {
+pub struct Tiles {
     /// Rows of tiles, top to bottom. Each has one bucket per tile, left to right, with indices into the visible
     /// Gaussians, from near to far.
     pub rows: Vec<Buckets<u32>>,

@@ -1,0 +1,103 @@
+//! Pictures of what is on board, with which the pose of a photo is verified.
+
+use glam::{DAffine3, DVec3};
+use rayon::prelude::*;
+use slag_common::appearance::Appearance;
+use slag_common::shard::ShardView;
+use slag_common::{Gaussians, Intrinsics};
+use slag_locate::{Renderer, Rendering};
+use slag_math::simd::InstructionSet;
+use slag_raster::{PreparedScene, RasterView, check_view};
+
+use crate::score::Budget;
+use crate::store::Snapshot;
+
+/// Bytes for each Gaussian that is drawn: as one of a scene and on the screen, and its places in tiles.
+const BYTES_PER_GAUSSIAN: usize = 320;
+/// Bytes for each pixel: colour, depth and coverage, then grey and its features.
+const BYTES_PER_PX: usize = 160;
+/// Standard deviations of a Gaussian within which it may be seen.
+const REACH_SIGMAS: f64 = 3.4;
+/// Where a Gaussian's centre may lie beside the picture, as a share of its size, besides its own reach.
+const MARGIN: f64 = 0.1;
+
+/// The cells on board that tell how their Gaussians look.
+pub(super) struct OnBoard<'a> {
+    cells: Vec<(ShardView<'a>, Appearance<'a>)>,
+    budget: &'a Budget,
+}
+
+impl<'a> OnBoard<'a> {
+    /// Returns them if there are any. Drawing takes from the budget what it has left.
+    pub(super) fn of(snapshot: &'a Snapshot, budget: &'a Budget) -> Option<Self> {
+        let cells = snapshot.shards.iter().filter_map(|shard| Some((shard.view(), shard.appearance()?)));
+        let cells: Vec<_> = cells.collect();
+        (!cells.is_empty()).then_some(Self { cells, budget })
+    }
+
+    /// Returns the Gaussians that a camera may see; `None` where the budget does not allow them.
+    fn seen(&self, view: &RasterView) -> Option<Gaussians> {
+        let camera = Frustum::new(view);
+        let of_cell = |(shard, appearance): &(ShardView<'_>, Appearance<'_>)| -> Vec<(u32, DVec3)> {
+            let all = (0..shard.header.n_gaussians).map(|at| (at, shard.position_in_world(at as usize)));
+            all.filter(|(at, mean)| camera.may_see(*mean, appearance.max_size(*at as usize))).collect()
+        };
+        let seen: Vec<Vec<(u32, DVec3)>> = self.cells.par_iter().map(of_cell).collect();
+        let n: usize = seen.iter().map(Vec::len).sum();
+        let n_px = view.intrinsics.width_px as usize * view.intrinsics.height_px as usize;
+        if !self.budget.try_take(n * BYTES_PER_GAUSSIAN + n_px * BYTES_PER_PX) {
+            return None;
+        }
+        let mut scene = Gaussians::default();
+        for ((_, appearance), seen) in self.cells.iter().zip(&seen) {
+            seen.iter().for_each(|(at, mean)| appearance.add_to(&mut scene, *at as usize, *mean));
+        }
+        Some(scene)
+    }
+}
+
+impl Renderer for OnBoard<'_> {
+    fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering> {
+        let view = RasterView { camera_from_world: *camera_from_world, intrinsics: *intrinsics };
+        check_view(&view).ok()?;
+        let used_bytes = self.budget.used_bytes();
+        let scene = self.seen(&view)?;
+        let drawing = PreparedScene::new(&scene).draw(InstructionSet::widest(), &view, [0.5; 3]);
+        self.budget.give_back_to(used_bytes, 0);
+        Some(Rendering::of(&drawing))
+    }
+}
+
+/// What a camera may see.
+struct Frustum<'a> {
+    view: &'a RasterView,
+    /// Lowest and highest x / z and y / z.
+    tangents: [[f64; 2]; 2],
+}
+
+impl<'a> Frustum<'a> {
+    fn new(view: &'a RasterView) -> Self {
+        let camera = &view.intrinsics;
+        let along = |size_px: u32, centre_px: f64, focal_px: f64| {
+            let size_px = f64::from(size_px);
+            [-MARGIN * size_px, (1.0 + MARGIN) * size_px].map(|at| (at - centre_px) / focal_px)
+        };
+        let tangents = [
+            along(camera.width_px, camera.centre_x_px, camera.focal_x_px),
+            along(camera.height_px, camera.centre_y_px, camera.focal_y_px),
+        ];
+        Self { view, tangents }
+    }
+
+    /// Returns whether a Gaussian may reach into the picture: its centre is before the camera, and beside the
+    /// picture by no more than its reach.
+    fn may_see(&self, mean_in_world: DVec3, max_size: f32) -> bool {
+        let DVec3 { x, y, z } = self.view.camera_from_world.transform_point3(mean_in_world);
+        let reach = REACH_SIGMAS * f64::from(max_size);
+        let within = |at: f64, [low, high]: [f64; 2]| {
+            let slack = |tangent: f64| reach * tangent.hypot(1.0);
+            at >= low * z - slack(low) && at <= high * z + slack(high)
+        };
+        z > 0.0 && within(x, self.tangents[0]) && within(y, self.tangents[1])
+    }
+}
