@@ -13,6 +13,7 @@ mod house;
 mod keys;
 mod kill;
 mod layers;
+mod locate;
 mod manual;
 mod page;
 mod poison;
