@@ -4,7 +4,8 @@
 use glam::{DAffine3, DVec2};
 use slag_common::{Intrinsics, View};
 use slag_locate::{
-    Grey, Landmark, MAX_FEATURES, MappingView, Observation, Renderer, Rendering, build, code, features,
+    Grey, Landmark, MAX_FEATURES, MAX_RENDERING_WIDTH_PX, MappingView, Observation, Renderer, Rendering,
+    build, code, features,
 };
 
 use crate::ingest::{self, IngestError, LoadedImage};

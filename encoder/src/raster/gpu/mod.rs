@@ -26,7 +26,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_math::stats::{Rank, quantile};
 use slag_raster::constants::TILE_SIZE_PX;
-use slag_raster::{Drawing, RasterView, check_scene, check_view, colour};
+use slag_raster::{Drawing, RasterView, ViewCounters, check_scene, check_view, colour};
 
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
