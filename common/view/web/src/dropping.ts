@@ -71,6 +71,6 @@ export class Dropping {
     const photo: Photo = { name: file.name, position_m: located.position_in_world, rotation_xyzw: located.optical_rotation_xyzw, width_px: width, height_px: height, focal_px: focalPx, has_picture: true };
     this.drawing.standAt(photo);
     await this.asking.layOver(photo, Promise.resolve(URL.createObjectURL(file)), null);
-    say(`Found by ${located.n_inliers} landmarks.`);
+    say(located.verified_by === "rendering" ? "Found: the scene looks like the photo from here." : `Found by ${located.n_inliers} landmarks.`);
   }
 }

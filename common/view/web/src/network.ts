@@ -188,7 +188,7 @@ export async function fetchObjectAt(point: Vector): Promise<Answer | null> {
 
 /** Where a robot says that a photo was taken; axes of the camera as in `Photo`. */
 export type Located =
-  | { state: "found"; position_in_world: Vector; optical_rotation_xyzw: Photo["rotation_xyzw"]; n_inliers: number }
+  | { state: "found"; position_in_world: Vector; optical_rotation_xyzw: Photo["rotation_xyzw"]; n_inliers: number; verified_by: "landmarks" | "rendering" }
   | { state: "unsure" | "lost"; reason: string };
 
 /** Asks a robot where a JPEG or PNG was taken by a camera without lens distortion. */
