@@ -48,12 +48,17 @@ export function generateRoom(nViews) {
 export function makeRoom() {
   const { folder, room, close } = generateRoom(24);
   const [store, cache] = ["store", "cache"].map((name) => join(folder, name));
-  // Kept views make the next generation quick.
-  const encode = (...flags) => run("slag-encoder", ["encode", "--scene", join(room, "scene.ply"), "--views", join(room, "transforms.json"),
-    "--masks", join(room, "gt/masks"), "--metric", "--store", store, "--appearance", "--photo-poses", "--occupancy", "--keep-views", "--quiet", ...flags]);
-  encode();
+  const encode = (from) => run("slag-encoder", ["encode", "--scene", join(from, "scene.ply"), "--views", join(from, "transforms.json"),
+    "--masks", join(from, "gt/masks"), "--metric", "--store", store, "--appearance", "--photo-poses", "--occupancy", "--quiet"]);
+  encode(room);
+  /** Encodes a room with other things as the next generation. */
+  const encodeAnother = () => {
+    const other = join(folder, "other");
+    run("slag-lab", ["generate", "scene", "--out", other, "--n-views", "8", "--seed", "2"]);
+    encode(other);
+  };
   const fetch = (url) => run("slag-edge", ["fetch", "--trust-first", "--from", url, "--at", "0,0,0", "--radius", "100", "--cache", cache, "--quiet"]);
-  return { room, store, cache, encode, fetch, close };
+  return { room, store, cache, encodeAnother, fetch, close };
 }
 
 /** Reads a grey PNG of 16 bits that is not interlaced (PNG, third edition, section 9 has the filters). */

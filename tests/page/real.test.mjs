@@ -169,16 +169,9 @@ test("slag-encoder view: a splat alone is drawn and not asked", async () => {
   }
 });
 
-/** Flags that leave out every other photo. */
-function dropped() {
-  const { frames } = JSON.parse(readFileSync(join(room.room, "transforms.json"), "utf8"));
-  return frames.filter((_, i) => i % 2 === 1).flatMap(({ file_path }) => ["--drop", file_path.replace(/^(.*\/)?images\//, "")]);
-}
-
 test("another generation is told while the page is open, and a robot that goes and comes back", NIGHTLY, () => opened(robot.url, async (page) => {
   await drawn(page);
-  // Without some photos, some things are other ones.
-  room.encode(...dropped());
+  room.encodeAnother();
   room.fetch(store.url);
   await page.getByText("generation 2 now").waitFor({ timeout: 30000 });
   await answered(page, THING);

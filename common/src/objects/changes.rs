@@ -4,7 +4,7 @@
 //! then, of the rest, those that look alike and have the same size, nearest first. A thing is matched once.
 
 use glam::DVec3;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::thing::Thing;
 use crate::frames::Aabb;
@@ -24,6 +24,21 @@ const MARGIN: f64 = 0.05;
 /// thousands are alike.
 const MAX_CANDIDATES: usize = 32;
 
+/// A cell of a generation.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Place {
+    pub bounds: Aabb,
+    /// See [`ShardView::splat_digest`](crate::shard::ShardView::splat_digest).
+    pub splat: u64,
+}
+
+/// Returns whether the splat is the same around a thing: another generation has every cell that the thing's box
+/// touches. Such a thing may be outlined in another way, but has neither come nor gone.
+pub fn is_unchanged(thing: &Thing, own: &[Place], other: &[Place]) -> bool {
+    let mut here = own.iter().filter(|place| place.bounds.touches(&thing.box_in_world)).peekable();
+    here.peek().is_some() && here.all(|place| other.iter().any(|known| known.splat == place.splat))
+}
+
 /// A thing that lies elsewhere.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Moved {
@@ -40,7 +55,7 @@ pub struct Changes {
     pub n_same: usize,
     /// Things at the same place whose Gaussians changed.
     pub n_stayed: usize,
-    /// Things whose place only one of the lists knows.
+    /// Things whose place only one of the lists knows, or where the splat is the same.
     pub n_not_compared: usize,
     /// Things of the later list alone, by id.
     pub appeared: Vec<Thing>,
@@ -52,13 +67,13 @@ pub struct Changes {
 
 /// Returns the changes between two lists, each ascending by id.
 ///
-/// `new_knows` says whether the later list would have a thing of the earlier one if it were still there,
-/// `old_knows` the reverse; other things are matched where they lie, and not compared otherwise.
+/// `new_tells` says whether the later list tells that a thing of the earlier one is gone by not having it,
+/// `old_tells` the reverse; other things are matched where they lie, and not compared otherwise.
 pub fn changes(
     old: Vec<Thing>,
     new: Vec<Thing>,
-    new_knows: impl Fn(&Thing) -> bool,
-    old_knows: impl Fn(&Thing) -> bool,
+    new_tells: impl Fn(&Thing) -> bool,
+    old_tells: impl Fn(&Thing) -> bool,
 ) -> Changes {
     let is_in = |things: &[Thing], id: u64| things.binary_search_by_key(&id, |thing| thing.id).is_ok();
     let n_same = new.iter().filter(|thing| is_in(&old, thing.id)).count();
@@ -70,8 +85,8 @@ pub fn changes(
     });
     let [mut went, mut appeared] = without(went, appeared, &stayed);
     let n_rest = went.len() + appeared.len();
-    went.retain(new_knows);
-    appeared.retain(old_knows);
+    went.retain(new_tells);
+    appeared.retain(old_tells);
     let n_not_compared = n_rest - went.len() - appeared.len();
     let moved = pairs(&went, &appeared, |old, new| {
         let distance = old.position_in_world.distance(new.position_in_world);

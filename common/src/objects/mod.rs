@@ -12,7 +12,7 @@ mod layout;
 mod thing;
 
 pub use build::{collect_runs, quantise_vectors};
-pub use changes::{Changes, Moved, changes};
+pub use changes::{Changes, Moved, Place, changes, is_unchanged};
 pub use columns::{
     MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, object_score, section,
 };

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use glam::DVec3;
 use half::f16;
+use slag_math::random::mix64;
 
 use super::format::{BLOCK, ScoreErrors, ShardHeader};
 use super::indices::PackedIndices;
@@ -132,6 +133,19 @@ impl ShardView<'_> {
     pub fn position_in_world(&self, index: usize) -> DVec3 {
         let steps = self.positions.steps(index, self.header.position_bits).map(f64::from);
         DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
+    }
+
+    /// Returns a digest of where its Gaussians are, in whatever order: equal for shards of a cell whose splat is the
+    /// same.
+    pub fn splat_digest(&self) -> u64 {
+        let chained = |digest: u64, bits: u64| mix64(digest ^ bits);
+        let grid = self.header.origin_in_world.iter().chain(&self.header.position_step);
+        let grid = grid.fold(0, |digest, v| chained(digest, v.to_bits()));
+        let gaussian = |index: usize| {
+            let steps = self.positions.steps(index, self.header.position_bits);
+            steps.into_iter().fold(grid, |digest, step| chained(digest, step.into()))
+        };
+        (0..self.header.n_gaussians as usize).fold(0, |sum: u64, index| sum.wrapping_add(gaussian(index)))
     }
 
     /// Returns whether the shard knows the Gaussians' indices in the input splat file.

@@ -67,7 +67,7 @@ fn lines(reply: &ChangesReply) -> String {
     }
     let (n_alike, n_same) = (reply.n_same + reply.n_stayed, reply.n_same);
     text.push_str(&format!(
-        "things    {n_alike} stayed, {n_same} of them unchanged; {} not compared: one generation alone knows their place\n",
+        "things    {n_alike} stayed, {n_same} of them unchanged; {} not compared: one generation alone knows their place, or the splat there is the same\n",
         reply.n_not_compared
     ));
     text
@@ -118,7 +118,7 @@ mod tests {
             appeared  o1 at 1.00, 2.00, 0.50, like \"box\" (0.50)\n\
             went      o2 at -2.00, 2.00, 0.50\n\
             moved     2.50 m: o4 at 5.50, 2.00, 0.50, like \"chair\" (0.50); was o3 at 3.00, 2.00, 0.50\n\
-            things    7 stayed, 3 of them unchanged; 5 not compared: one generation alone knows their place\n";
+            things    7 stayed, 3 of them unchanged; 5 not compared: one generation alone knows their place, or the splat there is the same\n";
         assert_eq!(lines(&reply), expected);
         reply.unit = "world".into();
         assert!(lines(&reply).contains("moved     2.50: o4"), "{}", lines(&reply));

@@ -172,7 +172,9 @@ fn reply(
     };
     let mut to = to;
     let (old, new) = (std::mem::take(&mut from.things), std::mem::take(&mut to.things));
-    let found = objects::changes(old, new, |thing| to.knows(thing), |thing| from.knows(thing));
+    let new_tells = |thing: &Thing| to.tells_of(thing, from.places());
+    let old_tells = |thing: &Thing| from.tells_of(thing, to.places());
+    let found = objects::changes(old, new, new_tells, old_tells);
     let is_asked = |thing: &Thing| {
         request.ball.is_none_or(|(centre, radius)| thing.position_in_world.distance(centre) <= radius)
     };

@@ -14,7 +14,7 @@ use slag_common::Hash32;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 use slag_common::frames::Aabb;
 use slag_common::manifest::Manifest;
-use slag_common::objects::{Thing, quantise_vectors};
+use slag_common::objects::{Place, Thing, is_unchanged, quantise_vectors};
 
 use super::cache::EdgeCache;
 use super::shard::OpenShard;
@@ -23,8 +23,8 @@ use super::shard::OpenShard;
 pub const MAX_GENERATIONS: usize = 8;
 /// Things of a generation that are remembered: those of the cells nearest to the fetch's centre.
 const MAX_THINGS: usize = 4096;
-/// Cells without a shard that are listed; a generation with more is not remembered.
-const MAX_MISSING: usize = 16_384;
+/// Cells that are listed, those with a shard and those without; a generation with more is not remembered.
+const MAX_CELLS: usize = 16_384;
 /// A longer record is not read: 4096 things with 1,024 components and long names take less.
 const MAX_BYTES: u64 = 8 << 20;
 const MAGIC: [u8; 8] = *b"SLAGHIST";
@@ -46,6 +46,9 @@ pub struct Record {
     pub encoder_id: Hash32,
     /// Cells of the generation whose objects are not known, by id. Where no cell is, nothing is.
     missing: Vec<Missing>,
+    /// Cells whose objects are known.
+    #[serde(default)]
+    places: Vec<Place>,
     /// The objects, by id.
     pub things: Vec<Thing>,
     /// Components of a vector.
@@ -74,7 +77,7 @@ impl Record {
             let by_distance = distance(&a.cell.bounds).total_cmp(&distance(&b.cell.bounds));
             by_distance.then(a.cell.cell_id.cmp(&b.cell.cell_id))
         });
-        let (mut things, mut known) = (BTreeMap::new(), Vec::new());
+        let (mut things, mut known, mut places) = (BTreeMap::new(), Vec::new(), Vec::new());
         for shard in shards {
             let Some(objects) = shard.objects() else { continue };
             if things.len() + objects.records.len() > MAX_THINGS {
@@ -82,6 +85,7 @@ impl Record {
             }
             Thing::add_all(&mut things, &shard.view(), &objects);
             known.push(shard.cell.cell_id);
+            places.push(Place { bounds: shard.cell.bounds, splat: shard.view().splat_digest() });
         }
         known.sort_unstable();
         let missing = manifest.cells.iter().filter(|cell| known.binary_search(&cell.cell_id).is_err());
@@ -91,11 +95,13 @@ impl Record {
             generation: manifest.generation,
             created_unix_secs: manifest.created_unix_secs,
             encoder_id: manifest.encoder.id,
-            missing: missing.take(MAX_MISSING + 1).collect(),
+            missing: missing.take(MAX_CELLS + 1).collect(),
+            places,
             things: things.into_values().collect(),
             dim: manifest.encoder.dim,
         };
-        (!known.is_empty() && record.missing.len() <= MAX_MISSING).then_some(record)
+        let is_small = record.missing.len().max(known.len()) <= MAX_CELLS;
+        (!known.is_empty() && is_small).then_some(record)
     }
 
     /// Adds a record of the same generation, made elsewhere. If both are too much together, the newer one is kept.
@@ -109,17 +115,22 @@ impl Record {
         let is_in_both =
             |of: &Missing| newer.missing.binary_search_by_key(&of.cell_id, |other| other.cell_id).is_ok();
         let missing = self.missing.into_iter().filter(is_in_both).collect();
-        Self { missing, things: things.into_values().collect(), ..newer }
+        let mut places = self.places;
+        places
+            .extend(newer.places.iter().filter(|place| !places.contains(place)).copied().collect::<Vec<_>>());
+        Self { missing, places, things: things.into_values().collect(), ..newer }
     }
 
-    /// Returns whether a thing's box touches no cell whose objects are not known: were it in this generation, it
-    /// would be listed.
-    pub fn knows(&self, thing: &Thing) -> bool {
-        let touches = |of: &Aabb| {
-            let Aabb { min, max } = thing.box_in_world;
-            min.cmple(of.max).all() && of.min.cmple(max).all()
-        };
-        !self.missing.iter().any(|cell| touches(&cell.bounds))
+    /// Returns whether a thing of another generation that is not in this one is not there: its box touches no cell
+    /// whose objects are not known, and the splat there is not the other's.
+    pub fn tells_of(&self, thing: &Thing, other: &[Place]) -> bool {
+        !self.missing.iter().any(|cell| cell.bounds.touches(&thing.box_in_world))
+            && !is_unchanged(thing, other, &self.places)
+    }
+
+    /// Returns the cells whose objects are known.
+    pub fn places(&self) -> &[Place] {
+        &self.places
     }
 
     /// Returns the record as a file.

@@ -20,7 +20,8 @@ fn thing(id: u64, x: f64, axis: usize) -> TestThing {
 
 /// Seven cells, of which the robot at x = 5 holds three.
 fn published(generation: u64, things: &[TestThing]) -> Published {
-    Published::new(generation, &[0; 7], 20).with_things(things)
+    // Another splat each time.
+    Published::new(generation, &[generation; 7], 20).with_things(things)
 }
 
 fn before() -> Published {
@@ -108,6 +109,20 @@ fn what_is_left_behind_has_not_gone() {
     let reply = changes(&robot, None).expect("a reply");
     assert_eq!(ids(&reply), (vec![], vec![], vec![]), "{reply:?}");
     assert_eq!(reply.n_not_compared, 4, "{reply:?}");
+}
+
+/// Of the same splat: another outline is neither a thing that came nor one that went.
+#[test]
+fn where_the_splat_is_the_same_nothing_changed() {
+    let of = |generation, things: &[TestThing]| Published::new(generation, &[0; 7], 20).with_things(things);
+    let server = Server::start(of(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1)]));
+    let mut robot = Robot::of(&server);
+    robot.fetch().expect("works");
+    server.publish(of(2, &[thing(1, 2.0, 0), thing(5, 18.0, 3)]));
+    robot.fetch().expect("works");
+    let reply = changes(&robot, None).expect("a reply");
+    assert_eq!(ids(&reply), (vec![], vec![], vec![]), "{reply:?}");
+    assert_eq!((reply.n_same, reply.n_not_compared), (1, 2), "{reply:?}");
 }
 
 /// The records are written before anything goes: at whatever step the power fails, they are there after the next

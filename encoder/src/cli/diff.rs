@@ -116,6 +116,13 @@ impl fmt::Display for Lines<'_> {
         }
         let n_alike = diff.n_same + diff.n_stayed;
         writeln!(f, "things    {n_alike} stayed, {} of them unchanged", diff.n_same)?;
+        if diff.n_not_compared > 0 {
+            writeln!(
+                f,
+                "          {} are outlined in another way where the splat is the same",
+                diff.n_not_compared
+            )?;
+        }
         let bytes = diff.fetch_bytes.iter().map(|(profile, n)| format!("{profile} {}", ByteSize(*n)));
         let bytes = bytes.collect::<Vec<_>>().join(", ");
         writeln!(f, "to fetch  {} of {} cells: {bytes}", diff.n_cells_changed, diff.n_cells)

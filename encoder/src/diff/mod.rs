@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_common::objects::{Moved, Thing, changes};
+use slag_common::objects::{Moved, Thing, changes, is_unchanged};
 
 pub(crate) use things::{DiffError, Generation};
 
@@ -25,6 +25,8 @@ pub(crate) struct Diff {
     pub(crate) n_same: usize,
     /// Things at the same place whose Gaussians changed.
     pub(crate) n_stayed: usize,
+    /// Things that one generation alone has, where the splat is the same.
+    pub(crate) n_not_compared: usize,
     /// Things of the later generation alone, by their ids.
     pub(crate) appeared: Vec<Thing>,
     /// Things of the earlier generation alone, by their ids.
@@ -46,8 +48,10 @@ pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, Dif
         let [old, new] = [old_manifest, manifest].map(|m| format!("{} ({})", m.encoder.name, m.encoder.id));
         return Err(DiffError::Encoders { old, new });
     }
-    // A store has every cell of both.
-    let changes = changes(things::read(old)?, things::read(new)?, |_| true, |_| true);
+    let ((old_things, old_places), (things, places)) = (things::read(old)?, things::read(new)?);
+    let new_tells = |thing: &Thing| !is_unchanged(thing, &old_places, &places);
+    let old_tells = |thing: &Thing| !is_unchanged(thing, &places, &old_places);
+    let changes = changes(old_things, things, new_tells, old_tells);
     let known: BTreeSet<Hash32> = old.published.shard_lens().into_keys().collect();
     let mut fetch_bytes: BTreeMap<String, u64> = BTreeMap::new();
     let mut n_cells_changed = 0;
@@ -64,6 +68,7 @@ pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, Dif
         metric: manifest.metric && old_manifest.metric,
         n_same: changes.n_same,
         n_stayed: changes.n_stayed,
+        n_not_compared: changes.n_not_compared,
         appeared: changes.appeared,
         went: changes.went,
         moved: changes.moved,

@@ -103,6 +103,19 @@ fn two_generations_of_a_store_by_hand() {
     assert_eq!(found.fetch_bytes, fetched);
 }
 
+/// Of the same splat: another outline is neither a thing that came nor one that went.
+#[test]
+fn where_the_splat_is_the_same_nothing_changed() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let wide = |manifest: &mut Manifest| manifest.cells[0].bounds.max = DVec3::splat(66.0);
+    publish(&store, 1, &[&[(Profile::Compact, shard(1, &[3, 10]))]], wide);
+    publish(&store, 2, &[&[(Profile::Compact, shard(1, &[3, 14]))]], wide);
+    let found = compare(&store.reader().expect("published")).expect("compares");
+    assert_eq!((found.n_same, found.n_stayed, found.n_not_compared), (1, 0, 2), "{found:?}");
+    assert!(found.appeared.is_empty() && found.went.is_empty() && found.moved.is_empty(), "{found:?}");
+}
+
 /// The finest shards decide; a cell without any has no things; units count only if both generations have them.
 #[test]
 fn things_come_from_the_finest_shards() {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use slag_common::objects::Thing;
+use slag_common::objects::{Place, Thing};
 
 use crate::store::{Published, StoreError, StoreReader};
 
@@ -26,9 +26,10 @@ pub(crate) enum DiffError {
     Encoders { old: String, new: String },
 }
 
-/// Reads the objects of a generation from the finest shards of each cell, by id.
-pub(super) fn read(generation: Generation<'_>) -> Result<Vec<Thing>, DiffError> {
+/// Reads the objects of a generation, by id, and its cells, from the finest shards of each.
+pub(super) fn read(generation: Generation<'_>) -> Result<(Vec<Thing>, Vec<Place>), DiffError> {
     let manifest = &generation.published.manifest;
+    let mut places = Vec::new();
     let mut things: BTreeMap<u64, Thing> = BTreeMap::new();
     for cell in &manifest.cells {
         let Some(shard) = cell.shards.values().next_back() else { continue };
@@ -36,6 +37,7 @@ pub(super) fn read(generation: Generation<'_>) -> Result<Vec<Thing>, DiffError> 
         let no_objects = DiffError::NoObjects { generation: manifest.generation };
         let objects = shard.objects().ok_or(no_objects)?;
         Thing::add_all(&mut things, &shard.view(), &objects);
+        places.push(Place { bounds: cell.bounds, splat: shard.view().splat_digest() });
     }
-    Ok(things.into_values().collect())
+    Ok((things.into_values().collect(), places))
 }

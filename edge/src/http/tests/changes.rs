@@ -9,9 +9,10 @@ use crate::query::MAX_TEXTS;
 use crate::store::{BadCell, CellFault, OldShard, Snapshot, history};
 use crate::testing::{TestObject, manifest_of, write_manifest};
 
-/// 20 Gaussians at x = 3, and objects at x = their ids, each along the axis of its id modulo 3.
+/// 20 Gaussians at x = 3, and objects at x = their ids, each along the axis of its id modulo 3. Other things are of
+/// another splat.
 fn shards(ids: &[u64]) -> [BuiltShard; 1] {
-    [with_things(&chair(None)[0], ids, |id| (0..3).map(|axis| f32::from(axis == id % 3)).collect())]
+    [with_things(&cell(1, 3.0, ids), ids, |id| (0..3).map(|axis| f32::from(axis == id % 3)).collect())]
 }
 
 fn with_things(shard: &BuiltShard, ids: &[u64], vector: impl Fn(u64) -> Vec<f32>) -> BuiltShard {
@@ -25,11 +26,16 @@ fn with_things(shard: &BuiltShard, ids: &[u64], vector: impl Fn(u64) -> Vec<f32>
     shard.with_objects(&objects.collect::<Vec<_>>(), calibration)
 }
 
-/// 20 Gaussians of axis 0 in a cell of 656 units from x on.
-fn cell(cell_id: u32, x: f64) -> BuiltShard {
-    let member = |i: u16| Member { steps: [i, 0, 0], embedding: vec![1.0, 0.0, 0.0] };
+/// 20 Gaussians of axis 0 in a cell of 656 units from x on, elsewhere for other things.
+fn cell(cell_id: u32, x: f64, ids: &[u64]) -> BuiltShard {
+    at(cell_id, x, ids).build(false)
+}
+
+fn at(cell_id: u32, x: f64, ids: &[u64]) -> TestShard {
+    let y = ids.iter().sum::<u64>() as u16;
+    let member = |i: u16| Member { steps: [i, y, 0], embedding: vec![1.0, 0.0, 0.0] };
     let shard = TestShard::new(vec![(0..20).map(member).collect()]);
-    TestShard { cell_id, origin: DVec3::new(x, 0.0, 0.0), ..shard }.build(false)
+    TestShard { cell_id, origin: DVec3::new(x, 0.0, 0.0), ..shard }
 }
 
 /// Records the generation on board as an earlier one, as fetching the next generation does.
@@ -122,7 +128,8 @@ async fn generations_are_compared_over_http() {
 async fn shards_that_stand_in_say_nothing_of_their_generation() {
     let axis_0 = |_| vec![1.0, 0.0, 0.0];
     let things = |cell_1: &[u64], cell_2: &[u64]| {
-        [with_things(&cell(1, 3.0), cell_1, axis_0), with_things(&cell(2, 1000.0), cell_2, axis_0)]
+        let made = |cell_id, x, ids: &[u64]| with_things(&cell(cell_id, x, ids), ids, axis_0);
+        [made(1, 3.0, cell_1), made(2, 1000.0, cell_2)]
     };
     let old = things(&[6, 10], &[1002]);
     let service = Service::new(Some(&old), Settings::default());
@@ -181,12 +188,8 @@ async fn changes_are_placed_on_the_earth() {
 /// A vector longer than 1 along the diagonal of axes 0 and 1 has the cosine of 45 degrees with both.
 #[tokio::test]
 async fn likeness_is_a_cosine_whatever_the_lengths() {
-    let of =
-        |ids: &[u64]| {
-            [with_things(&chair(None)[0], ids, |id| {
-                if id == 10 { vec![1.5, 1.5, 0.0] } else { vec![0.0, 0.0, 3.0] }
-            })]
-        };
+    let vector = |id| if id == 10 { vec![1.5, 1.5, 0.0] } else { vec![0.0, 0.0, 3.0] };
+    let of = |ids: &[u64]| [with_things(&cell(1, 3.0, ids), ids, vector)];
     let service = Service::new(Some(&of(&[6])), Settings::default());
     remember(service.app.engine.cache());
     write_cache(service.dir.path(), &of(&[6, 10]), 2);
@@ -200,7 +203,10 @@ async fn likeness_is_a_cosine_whatever_the_lengths() {
 /// Vectors of another encoder do not compare with a text's; things alone still compare.
 #[tokio::test]
 async fn texts_need_the_encoder_of_the_scene() {
-    let of = |ids: &[u64]| [with_things(&chair(Some(Hash32([9; 32])))[0], ids, |_| vec![1.0, 0.0, 0.0])];
+    let of = |ids: &[u64]| {
+        let shard = TestShard { encoder_id: Hash32([9; 32]), ..at(1, 3.0, ids) }.build(false);
+        [with_things(&shard, ids, |_| vec![1.0, 0.0, 0.0])]
+    };
     let service = Service::new(Some(&of(&[6])), Settings::default());
     remember(service.app.engine.cache());
     write_cache(service.dir.path(), &of(&[6, 10]), 2);
