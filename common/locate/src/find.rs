@@ -13,15 +13,15 @@ use crate::ransac::{Agreed, locally_refined, ransac};
 use crate::render::{Renderer, match_rendering};
 
 /// Fewest features with which a place can be recognised.
-const MIN_FEATURES: usize = 30;
-/// Fewest inliers of a pose that no rendering verifies: twice what photos of other scenes reach.
-const MIN_INLIERS: usize = 24;
+const MIN_FEATURES: usize = 20;
+/// Fewest inliers of a pose that no rendering verifies; of photos of other scenes 15 agree at most.
+const MIN_INLIERS: usize = 20;
 /// Fewest inliers of a pose that is told as a candidate.
 const MIN_UNSURE_INLIERS: usize = 12;
 /// Share of the best pose's inliers from which a pose elsewhere is its rival.
 const RIVAL_SHARE: f64 = 0.7;
-/// Fewest inliers among matches with a rendering at the pose.
-const MIN_RENDERED_INLIERS: usize = 20;
+/// Fewest inliers among matches with a rendering at the pose; of photos of other scenes 7 agree at most.
+const MIN_RENDERED_INLIERS: usize = 12;
 /// Fewest inliers among them for which another rendering, at the pose that they give, is tried.
 const MIN_NEARER_INLIERS: usize = 8;
 /// Renderings for one proposed pose, and proposed poses for which there are renderings.
@@ -156,8 +156,7 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     if proposals.is_empty() {
         return Outcome::Lost(refused.unwrap_or(Reason::NoPose { inliers }));
     }
-    let verified = renderer.and_then(|renderer| search.verified(&proposals, renderer, &found));
-    match verified {
+    match renderer.and_then(|renderer| search.verified(&proposals, renderer, &found)) {
         Some(located) => Outcome::Found(Box::new(located)),
         None => search.unverified(&proposals),
     }
@@ -216,23 +215,26 @@ impl Search<'_> {
 
     /// Returns the first proposed pose whose rendering matches the photo.
     fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Option<Located> {
-        for one in proposals.iter().take(MAX_PROPOSALS) {
-            let mut pose = self.guided(one).camera_from_world;
-            for _ in 0..MAX_RENDERINGS {
-                let matches = match_rendering(renderer, &pose, self.photo.intrinsics, found, &self.query.at);
-                let Some(seen) = ransac(&self.camera, &matches, SEED) else { break };
-                let n = seen.inliers.len();
-                if n >= MIN_RENDERED_INLIERS {
-                    match self.located(&seen, true) {
-                        Ok(located) => return Some(located),
-                        Err(_) => break,
-                    }
-                }
-                if n < MIN_NEARER_INLIERS {
-                    break;
-                }
-                pose = seen.camera_from_world;
+        proposals.iter().take(MAX_PROPOSALS).find_map(|one| self.rendered(one, renderer, found))
+    }
+
+    /// Returns the pose by matches with renderings, each at the pose that the one before gives.
+    fn rendered(&self, one: &Agreed, renderer: &dyn Renderer, found: &[Feature]) -> Option<Located> {
+        let mut pose = self.guided(one).camera_from_world;
+        for _ in 0..MAX_RENDERINGS {
+            let matches = match_rendering(renderer, &pose, self.photo.intrinsics, found, &self.query.at);
+            let seen = ransac(&self.camera, &matches, SEED)?;
+            let n = seen.inliers.len();
+            if n >= MIN_RENDERED_INLIERS {
+                // Where the splat lacks the texture of photos, landmarks are more, and better.
+                let guided = self.guided(&seen);
+                let is_better = guided.inliers.len() > 2 * n && self.is_same(&guided, &seen);
+                return self.located(if is_better { &guided } else { &seen }, true).ok();
             }
+            if n < MIN_NEARER_INLIERS {
+                return None;
+            }
+            pose = seen.camera_from_world;
         }
         None
     }
