@@ -36,7 +36,7 @@ impl<'a> OnBoard<'a> {
     }
 
     /// Returns the Gaussians that a camera may see; `None` where the budget does not allow them.
-    fn seen(&self, view: &RasterView) -> Option<Gaussians> {
+    pub(super) fn seen(&self, view: &RasterView) -> Option<Gaussians> {
         let camera = Frustum::new(view);
         let of_cell = |(shard, appearance): &(ShardView<'_>, Appearance<'_>)| -> Vec<(u32, DVec3)> {
             let all = (0..shard.header.n_gaussians).map(|at| (at, shard.position_in_world(at as usize)));

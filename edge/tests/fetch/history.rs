@@ -116,7 +116,7 @@ fn what_is_left_behind_has_not_gone() {
 fn where_the_splat_is_the_same_nothing_changed() {
     let of = |generation, things: &[TestThing]| Published::new(generation, &[0; 7], 20).with_things(things);
     let server = Server::start(of(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1)]));
-    let mut robot = Robot::of(&server);
+    let robot = Robot::of(&server);
     robot.fetch().expect("works");
     server.publish(of(2, &[thing(1, 2.0, 0), thing(5, 18.0, 3)]));
     robot.fetch().expect("works");

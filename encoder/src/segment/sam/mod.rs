@@ -16,6 +16,7 @@ mod settings;
 mod tests;
 mod upsample;
 
+use std::panic::resume_unwind;
 use std::path::Path;
 use std::sync::{Arc, mpsc};
 
@@ -59,19 +60,22 @@ impl SamSegmenter {
     ) -> Result<Self, ModelError> {
         let is_on_gpus = !session.is_on_cpu();
         let (gpus, n_models) = if is_on_gpus { (gpus, MODELS_PER_GPU) } else { (&[0][..], 1) };
-        let mut id = String::new();
-        let mut of_gpus = Vec::new();
-        for &gpu in gpus {
-            let mut models = Vec::new();
-            for _ in 0..n_models {
-                let session = SessionOptions { gpu, ..session.clone() };
-                let sam =
-                    Sam::open_for(dir, &session, is_on_gpus.then_some(settings.points_per_batch as usize))?;
-                sam.id().clone_into(&mut id);
-                models.push(Arc::new(sam));
-            }
+        let n_points = is_on_gpus.then_some(settings.points_per_batch as usize);
+        let open_on = |gpu: u32| -> Result<Vec<Arc<Sam>>, ModelError> {
+            let session = SessionOptions { gpu, ..session.clone() };
+            (0..n_models).map(|_| Sam::open_for(dir, &session, n_points).map(Arc::new)).collect()
+        };
+        // A GPU takes two seconds to begin, and does not wait for another.
+        let opened: Vec<_> = std::thread::scope(|scope| {
+            let opening: Vec<_> = gpus.iter().map(|gpu| scope.spawn(|| open_on(*gpu))).collect();
+            opening.into_iter().map(|one| one.join().unwrap_or_else(|panic| resume_unwind(panic))).collect()
+        });
+        let (mut id, mut of_gpus) = (String::new(), Vec::new());
+        for (gpu, models) in gpus.iter().zip(opened) {
+            let models = models?;
+            models[0].id().clone_into(&mut id);
             // The first of each model, then the second.
-            of_gpus.push((gpu, models.iter().cloned().cycle().take(n_models * PHOTOS_PER_MODEL).collect()));
+            of_gpus.push((*gpu, models.iter().cloned().cycle().take(n_models * PHOTOS_PER_MODEL).collect()));
         }
         // The number of threads may change the order of sums in matrix products.
         let identity = format!("{id} {settings:?} on {} threads", session.intra_op_threads);
