@@ -30,7 +30,7 @@ use looks::Look;
 use space::Space;
 
 pub(crate) use draw::{DrawError, DrawnView, views_of};
-pub use draw::{POSES_FILE, draw};
+pub use draw::{POSES_FILE, draw, draw_sharpened};
 pub(crate) use plan::{Fault, Viewpoint};
 pub use plan::{SceneKind, Verdict, ViewpointError, ViewpointPlan, ViewpointSettings};
 
@@ -137,12 +137,12 @@ fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
     looked.iter().filter(|look| look.verdict.fault(kind) == fault).count()
 }
 
-/// Returns whether a scene is a thing with nothing around it: from within, one looks past it, and it is tall, or
-/// there is no other way to look at it.
+/// Returns whether a scene is a thing with nothing around it: there is no place within it, or one looks past it from
+/// there, and it is tall, or there is no other way to look at it.
 fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
     let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
-    2 * n_with(looked, kind, Some(Fault::Holes)) > looked.len()
-        && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
+    let is_within = looked.len() >= MIN_GOOD && 2 * n_with(looked, kind, Some(Fault::Holes)) <= looked.len();
+    !is_within && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
 }
 
 /// Returns how many views fail for which reason.
