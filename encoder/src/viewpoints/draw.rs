@@ -32,7 +32,7 @@ pub enum DrawError {
     Scene(#[from] RasterError),
     #[error(transparent)]
     Io(#[from] io::Error),
-    #[error("a drawing cannot be read again: {0}")]
+    #[error("a drawing as PNG: {0}")]
     Image(#[from] ImageError),
 }
 
