@@ -144,16 +144,17 @@ fn splats_that_tell_too_little_are_refused() {
     let message = refused(&Gaussians::default(), None);
     assert!(message.contains("--views"), "{message}");
     let mut random = Random::new(7);
-    let mut fog = Gaussians::default();
+    // A round cave of round Gaussians.
+    let mut cave = Gaussians::default();
     for _ in 0..6000 {
         let at = [0; 3].map(|_| random.between(-1.0, 1.0));
-        fog.means_in_world.push(DVec3::from(at).normalize_or_zero() * random.unit());
-        fog.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        fog.scales.push([0.03; 3]);
-        fog.opacities.push(0.4);
-        fog.sh_dc.push([0.0; 3]);
+        cave.means_in_world.push(DVec3::from(at).normalize_or_zero());
+        cave.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        cave.scales.push([0.03; 3]);
+        cave.opacities.push(0.97);
+        cave.sh_dc.push([0.0; 3]);
     }
-    assert!(refused(&fog, None).contains("--up"));
+    assert!(refused(&cave, None).contains("which way is up"));
     // Floaters in all free places of the room.
     let mut floaters = room();
     for _ in 0..3000 {
