@@ -7,7 +7,7 @@
 //! | candidates | the kind of scene; cameras in free places, by kind | `candidates.rs` |
 //! | looks | a small drawing of each candidate: can it be trusted, and which Gaussians does it show? | `looks.rs` |
 //! | choice | those that together show most, greedily | here |
-//! | draw | images, and the poses file that says that they are drawings | `draw.rs` |
+//! | draw | images, sharpened, and the poses file that says that they are drawings | `draw.rs` |
 
 mod candidates;
 mod draw;
