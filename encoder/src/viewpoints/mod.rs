@@ -85,7 +85,9 @@ pub fn plan(
     }
     let mut kind = candidates::kind_of(&space);
     let mut looked = look_at_all(&space, rasterizer, kind, cancel)?;
-    if is_object(&looked, &space, kind) {
+    // A ball has no floor, and no place within; a room full of floaters has a floor.
+    let is_solid = up.sign == up::Sign::Assumed && looked.len() < MIN_GOOD;
+    if is_solid || is_object(&looked, &space, kind) {
         if up.sign != up::Sign::Known {
             space = Space::new(&thin, up::OF_FILES);
         }
@@ -137,12 +139,12 @@ fn n_with(looked: &[Look], kind: SceneKind, fault: Option<Fault>) -> usize {
     looked.iter().filter(|look| look.verdict.fault(kind) == fault).count()
 }
 
-/// Returns whether a scene is a thing with nothing around it: there is no place within it, or one looks past it from
-/// there, and it is tall, or there is no other way to look at it.
+/// Returns whether a scene is a thing with nothing around it: from within, one looks past it, and it is tall, or
+/// there is no other way to look at it.
 fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
     let is_tall = 2.0 * space.half.z > TALL * space::WIDTH;
-    let is_within = looked.len() >= MIN_GOOD && 2 * n_with(looked, kind, Some(Fault::Holes)) <= looked.len();
-    !is_within && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
+    2 * n_with(looked, kind, Some(Fault::Holes)) > looked.len()
+        && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
 }
 
 /// Returns how many views fail for which reason.
