@@ -109,6 +109,34 @@ fn plans_follow_the_scene() {
     }
 }
 
+/// A ball with nothing around it tells no direction: it is seen from all sides, with the upward direction of files.
+#[test]
+fn a_thing_by_itself_is_seen_from_around() {
+    let mut random = Random::new(9);
+    let mut ball = Gaussians::default();
+    while ball.len() < 6000 {
+        let at = DVec3::from([0; 3].map(|_| random.between(-1.0, 1.0)));
+        if at.length() <= 1.0 {
+            ball.means_in_world.push(at);
+            ball.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            ball.scales.push([0.06; 3]);
+            ball.opacities.push(0.97);
+            ball.sh_dc.push([0.1; 3]);
+        }
+    }
+    let plan = plan_of(&ball, None).unwrap();
+    assert_eq!((plan.kind, plan.views.len()), (SceneKind::Object, 16));
+    assert!(plan.up_in_world.dot(DVec3::NEG_Y) > 0.9999, "{:?}", plan.up_in_world);
+    let mut sides = [false; 8];
+    for view in &plan.views {
+        let eye = view.camera_from_world.inverse().translation;
+        let forward = view.camera_from_world.matrix3.row(2);
+        assert!(eye.length() > 1.2 && forward.dot(-eye.normalize()) > 0.9, "{eye:?} {forward:?}");
+        sides[((eye.z.atan2(eye.x) / std::f64::consts::TAU + 0.5) * 8.0) as usize % 8] = true;
+    }
+    assert_eq!(sides, [true; 8]);
+}
+
 /// What cannot be planned is refused, and the message says what to give.
 #[test]
 fn splats_that_tell_too_little_are_refused() {
@@ -116,16 +144,17 @@ fn splats_that_tell_too_little_are_refused() {
     let message = refused(&Gaussians::default(), None);
     assert!(message.contains("--views"), "{message}");
     let mut random = Random::new(7);
-    let mut fog = Gaussians::default();
+    // A round cave of round Gaussians.
+    let mut cave = Gaussians::default();
     for _ in 0..6000 {
         let at = [0; 3].map(|_| random.between(-1.0, 1.0));
-        fog.means_in_world.push(DVec3::from(at).normalize_or_zero() * random.unit());
-        fog.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        fog.scales.push([0.03; 3]);
-        fog.opacities.push(0.4);
-        fog.sh_dc.push([0.0; 3]);
+        cave.means_in_world.push(DVec3::from(at).normalize_or_zero());
+        cave.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        cave.scales.push([0.03; 3]);
+        cave.opacities.push(0.97);
+        cave.sh_dc.push([0.0; 3]);
     }
-    assert!(refused(&fog, None).contains("--up"));
+    assert!(refused(&cave, None).contains("which way is up"));
     // Floaters in all free places of the room.
     let mut floaters = room();
     for _ in 0..3000 {

@@ -88,13 +88,12 @@ impl DrawingArgs {
 }
 
 pub(super) fn plan(args: &PlanArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let (scene, devices, name) = args.drawing.open()?;
+    let (mut scene, devices, name) = args.drawing.open()?;
     let settings = ViewpointSettings { n_views: args.views_limit as usize, up: args.up.up };
     let plan = viewpoints::plan(&scene, &devices, &settings, default_memory_bytes(), &false.into())?;
     let views = viewpoints::views_of(&plan);
     let about = json!({ "kind": plan.kind, "up": plan.up_in_world });
-    let loaded = devices.load(&scene)?;
-    viewpoints::draw(&args.drawing.out, &views, loaded.as_ref(), &name, about, progress)?;
+    viewpoints::draw_sharpened(&args.drawing.out, &views, &mut scene, &devices, &name, about, progress)?;
     let poses = args.drawing.out.join(viewpoints::POSES_FILE);
     print(json, &json!({ "plan": plan, "poses": poses }), format!("{plan}\n{}\n", poses.display()))?;
     Ok(Exit::Done)

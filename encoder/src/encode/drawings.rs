@@ -13,7 +13,7 @@ use super::settings::EncodeSettings;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};
 
 /// Version of plan and drawing; another number is another plan.
-const PLAN_VERSION: u32 = 2;
+const PLAN_VERSION: u32 = 3;
 
 /// Draws the planned views of a splat beside the poses file of the settings, unless they are there.
 pub(super) fn make(
@@ -46,13 +46,11 @@ pub(super) fn make(
         // Drawings of another plan.
         fs_err::remove_dir_all(folder)?;
     }
-    let loaded = context.install(|| engines.rasterizer.load(&scene))?;
     let name = inputs.scene.file_name().unwrap_or_default().to_string_lossy();
     let (views, about) = (viewpoints::views_of(&plan), json!({ "plan": id.to_string() }));
-    context.time("draw", || {
-        context
-            .install(|| viewpoints::draw(folder, &views, loaded.as_ref(), &name, about, context.progress()))
-    })?;
+    let (rasterizer, progress) = (engines.rasterizer, context.progress());
+    let draw = || viewpoints::draw_sharpened(folder, &views, &mut scene, rasterizer, &name, about, progress);
+    context.time("draw", || context.install(draw))?;
     Ok(())
 }
 

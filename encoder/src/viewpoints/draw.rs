@@ -1,18 +1,19 @@
 //! Images of a splat, and the poses file that says that they are drawings.
 
+use std::f32::consts::SQRT_2;
 use std::io::{self, Cursor};
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec3};
-use image::ImageFormat;
+use image::{ImageError, ImageFormat, Rgb, RgbImage};
 use rayon::prelude::*;
 use serde_json::{Value, json};
-use slag_common::{Intrinsics, durable};
+use slag_common::{Gaussians, Intrinsics, durable};
 
 use super::looks::pinhole;
 use super::plan::{Viewpoint, ViewpointPlan};
 use crate::progress::Progress;
-use crate::raster::{LoadedScene, RasterError, RasterView};
+use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
 
 /// Name of the poses file.
 pub const POSES_FILE: &str = "transforms.json";
@@ -20,13 +21,19 @@ pub const POSES_FILE: &str = "transforms.json";
 const SIZE_PX: [u32; 2] = [800, 600];
 /// What shows through holes: grey is no thing's outline.
 const BACKGROUND: [f32; 3] = [0.5; 3];
+/// Distance of the pixels among whose colours a sharpened pixel's remains.
+const REACH_PX: i64 = 3;
 
 #[derive(Debug, thiserror::Error)]
 pub enum DrawError {
     #[error("view {view}: {source}")]
     Raster { view: String, source: RasterError },
     #[error(transparent)]
+    Scene(#[from] RasterError),
+    #[error(transparent)]
     Io(#[from] io::Error),
+    #[error("a drawing as PNG: {0}")]
+    Image(#[from] ImageError),
 }
 
 /// A view to draw, with its file's name below `images/`.
@@ -60,6 +67,42 @@ pub fn draw(
     about: Value,
     progress: &dyn Progress,
 ) -> Result<(), DrawError> {
+    draw_images(folder, views, scene, progress, |drawn, _| Ok(drawn))?;
+    write_poses(folder, views, drawn_from, about)
+}
+
+/// Draws views as [`draw`] does, sharpened by how much they blur as the Gaussians grow: where those are small, little
+/// changes.
+pub fn draw_sharpened(
+    folder: &Path,
+    views: &[DrawnView],
+    scene: &mut Gaussians,
+    rasterizer: &dyn Rasterizer,
+    drawn_from: &str,
+    about: Value,
+    progress: &dyn Progress,
+) -> Result<(), DrawError> {
+    let scales = scene.scales.clone();
+    scene.scales.iter_mut().flatten().for_each(|scale| *scale *= SQRT_2);
+    let blurred = rasterizer.load(scene)?;
+    draw_images(folder, views, blurred.as_ref(), progress, |drawn, _| Ok(drawn))?;
+    drop(blurred);
+    scene.scales = scales;
+    let loaded = rasterizer.load(scene)?;
+    draw_images(folder, views, loaded.as_ref(), progress, |drawn, path| {
+        Ok(sharpened(&drawn, &image::open(path)?.into_rgb8()))
+    })?;
+    write_poses(folder, views, drawn_from, about)
+}
+
+/// Writes the drawing of each view as `finish` makes it, which gets the file that it replaces.
+fn draw_images(
+    folder: &Path,
+    views: &[DrawnView],
+    scene: &dyn LoadedScene,
+    progress: &dyn Progress,
+    finish: impl Fn(RgbImage, &Path) -> Result<RgbImage, DrawError> + Sync,
+) -> Result<(), DrawError> {
     progress.begin("draw", "view", views.len() as u64, 0);
     let draw_one = |view: &DrawnView| {
         let failed = |source| DrawError::Raster { view: view.name.clone(), source };
@@ -67,13 +110,47 @@ pub fn draw(
         let path = folder.join("images").join(&view.name);
         path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
         let mut png = Cursor::new(Vec::new());
-        drawing.image().write_to(&mut png, ImageFormat::Png).map_err(io::Error::other)?;
+        finish(drawing.image(), &path)?.write_to(&mut png, ImageFormat::Png)?;
         durable::write(&path, png.get_ref())?;
         progress.advance(1);
-        Ok::<_, DrawError>(())
+        Ok(())
     };
-    views.par_iter().map(draw_one).collect::<Vec<_>>().into_iter().collect::<Result<Vec<()>, _>>()?;
+    views.par_iter().map(draw_one).collect::<Vec<_>>().into_iter().collect::<Result<Vec<()>, DrawError>>()?;
     progress.end();
+    Ok(())
+}
+
+/// Returns a drawing as Gaussians without extent would make it, nearly: blur grows with the square of their size, so
+/// what twice that square adds is taken away once (Richardson 1911). No colour is one that is not near: edges get no
+/// halos.
+fn sharpened(drawn: &RgbImage, blurred: &RgbImage) -> RgbImage {
+    let [low, high] = [u8::min, u8::max].map(|of| extreme(drawn, of));
+    let mut sharp = drawn.clone();
+    for (((value, blurred), low), high) in
+        sharp.iter_mut().zip(blurred.iter()).zip(low.iter()).zip(high.iter())
+    {
+        let straight = 2 * i16::from(*value) - i16::from(*blurred);
+        *value = straight.clamp(i16::from(*low), i16::from(*high)) as u8;
+    }
+    sharp
+}
+
+/// Returns the least or greatest of each colour around each pixel.
+fn extreme(image: &RgbImage, of: fn(u8, u8) -> u8) -> RgbImage {
+    let along = |from: &RgbImage, [dx, dy]: [i64; 2]| {
+        let (width, height) = from.dimensions();
+        RgbImage::from_fn(width, height, |x, y| {
+            let at =
+                |x: u32, step: i64, size: u32| (i64::from(x) + step).clamp(0, i64::from(size) - 1) as u32;
+            let around =
+                (-REACH_PX..=REACH_PX).map(|k| *from.get_pixel(at(x, k * dx, width), at(y, k * dy, height)));
+            around.fold(*from.get_pixel(x, y), |a, b| Rgb([0, 1, 2].map(|c| of(a.0[c], b.0[c]))))
+        })
+    };
+    along(&along(image, [1, 0]), [0, 1])
+}
+
+fn write_poses(folder: &Path, views: &[DrawnView], drawn_from: &str, about: Value) -> Result<(), DrawError> {
     let text = serde_json::to_vec_pretty(&poses(views, drawn_from, about)).map_err(io::Error::from)?;
     Ok(durable::write(&folder.join(POSES_FILE), &text)?)
 }
@@ -120,4 +197,59 @@ fn opengl_rows(camera_from_world: DAffine3) -> [[f64; 4]; 4] {
     let DAffine3 { matrix3: m, translation: t } = camera_from_world.inverse() * opencv_from_opengl;
     let row = |i: usize| [m.x_axis[i], m.y_axis[i], m.z_axis[i], t[i]];
     [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slag_math::random::Random;
+
+    /// Oracle: the blurred edges of Gaussians of one size, and of twice its square, in closed form.
+    #[test]
+    fn edges_are_sharpened_without_halos() {
+        let sigma_px = 2.0;
+        // A logistic curve is within 1 % of a blurred edge.
+        let edge = |sigma_px: f64| {
+            RgbImage::from_fn(41, 8, |x, _| {
+                let share = 1.0 / (1.0 + (-1.702 * (f64::from(x) - 20.0) / sigma_px).exp());
+                Rgb([(40.0 + 160.0 * share).round() as u8, (200.0 - 160.0 * share).round() as u8, 90])
+            })
+        };
+        let (drawn, blurred) = (edge(sigma_px), edge(sigma_px * std::f64::consts::SQRT_2));
+        let sharp = sharpened(&drawn, &blurred);
+        let slope = |image: &RgbImage| {
+            i32::from(image.get_pixel(21, 4).0[0]) - i32::from(image.get_pixel(19, 4).0[0])
+        };
+        assert!(
+            f64::from(slope(&sharp)) > 1.2 * f64::from(slope(&drawn)),
+            "{} {}",
+            slope(&sharp),
+            slope(&drawn)
+        );
+        for (pixel, [red, green, blue]) in sharp.pixels().map(|pixel| pixel.0).enumerate() {
+            assert!((40..=200).contains(&red) && (40..=200).contains(&green) && blue == 90, "{pixel}");
+        }
+    }
+
+    /// Oracle: the definition, pixel by pixel.
+    #[test]
+    fn a_sharpened_colour_is_one_that_is_near() {
+        let mut random = Random::new(48);
+        let mut noise =
+            || RgbImage::from_fn(19, 11, |_, _| Rgb([0; 3].map(|_| random.between(0.0, 255.0) as u8)));
+        let (drawn, blurred) = (noise(), noise());
+        let sharp = sharpened(&drawn, &blurred);
+        for (x, y, pixel) in sharp.enumerate_pixels() {
+            for c in 0..3 {
+                let near =
+                    drawn.enumerate_pixels().filter(|(u, v, _)| u.abs_diff(x) <= 3 && v.abs_diff(y) <= 3);
+                let near: Vec<u8> = near.map(|(.., pixel)| pixel.0[c]).collect();
+                let straight =
+                    2 * i32::from(drawn.get_pixel(x, y).0[c]) - i32::from(blurred.get_pixel(x, y).0[c]);
+                let limits =
+                    [near.iter().min(), near.iter().max()].map(|limit| i32::from(*limit.expect("itself")));
+                assert_eq!(i32::from(pixel.0[c]), straight.clamp(limits[0], limits[1]), "{x} {y} {c}");
+            }
+        }
+    }
 }

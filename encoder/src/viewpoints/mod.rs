@@ -7,7 +7,7 @@
 //! | candidates | the kind of scene; cameras in free places, by kind | `candidates.rs` |
 //! | looks | a small drawing of each candidate: can it be trusted, and which Gaussians does it show? | `looks.rs` |
 //! | choice | those that together show most, greedily | here |
-//! | draw | images, and the poses file that says that they are drawings | `draw.rs` |
+//! | draw | images, sharpened, and the poses file that says that they are drawings | `draw.rs` |
 
 mod candidates;
 mod draw;
@@ -30,7 +30,7 @@ use looks::Look;
 use space::Space;
 
 pub(crate) use draw::{DrawError, DrawnView, views_of};
-pub use draw::{POSES_FILE, draw};
+pub use draw::{POSES_FILE, draw, draw_sharpened};
 pub(crate) use plan::{Fault, Viewpoint};
 pub use plan::{SceneKind, Verdict, ViewpointError, ViewpointPlan, ViewpointSettings};
 
@@ -85,7 +85,9 @@ pub fn plan(
     }
     let mut kind = candidates::kind_of(&space);
     let mut looked = look_at_all(&space, rasterizer, kind, cancel)?;
-    if is_object(&looked, &space, kind) {
+    // A ball has no floor, and no place within; a room full of floaters has a floor.
+    let is_solid = up.sign == up::Sign::Assumed && looked.len() < MIN_GOOD;
+    if is_solid || is_object(&looked, &space, kind) {
         if up.sign != up::Sign::Known {
             space = Space::new(&thin, up::OF_FILES);
         }
