@@ -1,6 +1,6 @@
 //! The bytes of a store: shards of every profile, region tables and fields equal those that were recorded.
 //!
-//! `golden/store_bytes.txt` was recorded when an object came to need a photo that shows it whole and a fifth of it. To
+//! `golden/store_bytes.txt` was recorded when an object came to need one of eleven photos that shows it whole. To
 //! record a change that is meant: `SLAG_RECORD=1 cargo test --workspace --test system store_bytes::`, and say in the
 //! commit why.
 
