@@ -265,7 +265,7 @@ fn exp_of_minus<S: Simd>(simd: S, power: S::f32s) -> S::f32s {
 
 #[cfg(test)]
 mod tests {
-    use crate::*;
+    use super::*;
 
     struct Exp<'a>(&'a mut [f32]);
 

@@ -92,7 +92,7 @@ pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
 
 #[cfg(test)]
 mod tests {
-    use crate::*;
+    use super::*;
 
     /// By hand; then more than 2^32 items, of which only the places are computed.
     #[test]
