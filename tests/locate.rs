@@ -18,7 +18,7 @@ fn a_photo_leads_to_a_place_to_stand() {
     let frames = poses["frames"].as_array().expect("frames");
     for frame in frames {
         let photo = photos.join(frame["file_path"].as_str().expect("a name"));
-        let command = ["locate", text(&photo), "--focal-px", &focal_px, "--json", "--cache"];
+        let command = ["locate", text(&photo), "--focal-px", &focal_px, "--cache"];
         let found = run_json(edge(&command).arg(site.cache()));
         println!("{} {found}", photo.display());
         if found["state"] != "found" {

@@ -8,10 +8,11 @@ use slag_math::simd::InstructionSet;
 use crate::bin::{Tiles, bin};
 use crate::blend::{PerPixel, TileRect, WeightSink, walk_tile};
 use crate::constants::TILE_SIZE_PX;
+use crate::counters::ViewCounters;
 use crate::project::{PreparedScene, ScreenGaussian};
 use crate::sh;
 use crate::simd::Lanes;
-use crate::view::{RasterView, ViewCounters};
+use crate::view::RasterView;
 
 /// The picture of a scene in one view; all arrays are row-major.
 #[derive(Clone, Debug, Default, PartialEq)]

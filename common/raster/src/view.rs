@@ -1,11 +1,7 @@
-//! The camera of a view, and what was drawn in it.
+//! The camera of a view.
 
 use glam::DAffine3;
 use slag_common::{Distortion, Intrinsics, View};
-
-use crate::bin::Tiles;
-use crate::buckets::Buckets;
-use crate::project::Projection;
 
 /// A posed pinhole camera at raster resolution.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,26 +29,5 @@ pub fn pinhole([width_px, height_px]: [u32; 2], focal_px: f64) -> Intrinsics {
         centre_x_px: f64::from(width_px) / 2.0,
         centre_y_px: f64::from(height_px) / 2.0,
         distortion: Distortion::None,
-    }
-}
-
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ViewCounters {
-    /// Gaussians with a pixel of the image in their footprint; they may be occluded.
-    pub visible: usize,
-    /// Number of (Gaussian, tile) pairs.
-    pub pairs: usize,
-    /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once
-    /// projected.
-    pub unusable: usize,
-}
-
-impl ViewCounters {
-    pub fn of(projection: &Projection, tiles: &Tiles) -> Self {
-        Self {
-            visible: projection.visible.len(),
-            pairs: tiles.rows.iter().map(Buckets::n_items).sum(),
-            unusable: projection.unusable,
-        }
     }
 }
