@@ -78,7 +78,7 @@ fn two_generations_of_a_store_by_hand() {
     let (kept, exact) = (shard(1, &[3]), shard(7, &[20]));
     let first = [
         &[(Profile::Compact, kept.clone())][..],
-        &[(Profile::Compact, shard(1, &[10]))],
+        &[(Profile::Compact, shard(4, &[10]))],
         &[(Profile::Compact, shard(1, &[20]))],
     ];
     publish(&store, 1, &first, |_| {});
