@@ -28,14 +28,13 @@ fn a_photo_leads_to_a_place_to_stand() {
         n_drawn += usize::from(found["verified_by"] == "rendering");
         let at: [f64; 3] = serde_json::from_value(found["position_in_world"].clone()).expect("a position");
         assert!(DVec3::from(at).distance(position(&frame["transform_matrix"])) < 0.05, "{found}");
-        let goal = robot.get(&format!("/v1/goal?text=red&near={},{},0", at[0], at[1]));
+        let goal = robot.get(&format!("/v1/goal?text=yellow&near={},{},0", at[0], at[1]));
         n_stood += usize::from(goal["goals"].as_array().is_some_and(|goals| !goals.is_empty()));
     }
-    assert!(
-        n_found >= 5 && n_stood >= 5,
-        "{n_found} of {} found, {n_stood} with a place to stand",
-        frames.len()
-    );
+    let n = frames.len();
+    // The splat lacks some of what photos show.
+    assert!(n_drawn >= 3, "{n_drawn} of {n} verified by a drawing");
+    assert!(n_found >= 5 && n_stood >= 5, "{n_found} of {n} found, {n_stood} with a place to stand");
 }
 
 /// Returns where a camera is, by its row-major matrix.
