@@ -55,7 +55,8 @@ pub struct Changes {
     pub n_same: usize,
     /// Things at the same place whose Gaussians changed.
     pub n_stayed: usize,
-    /// Things whose place only one of the lists knows, or where the splat is the same.
+    /// Things of one list alone that are not compared: the other does not know their place, or the splat there is
+    /// the same.
     pub n_not_compared: usize,
     /// Things of the later list alone, by id.
     pub appeared: Vec<Thing>,
@@ -67,8 +68,8 @@ pub struct Changes {
 
 /// Returns the changes between two lists, each ascending by id.
 ///
-/// `new_tells` says whether the later list tells that a thing of the earlier one is gone by not having it,
-/// `old_tells` the reverse; other things are matched where they lie, and not compared otherwise.
+/// `new_tells`: whether a thing of the earlier list that is absent from the later one is gone; `old_tells`: the
+/// reverse; other things are matched where they lie, and not compared otherwise.
 pub fn changes(
     old: Vec<Thing>,
     new: Vec<Thing>,

@@ -135,8 +135,8 @@ impl ShardView<'_> {
         DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
     }
 
-    /// Returns a digest of where its Gaussians are, in whatever order: equal for shards of a cell whose splat is the
-    /// same.
+    /// Returns a digest of the Gaussians' positions that does not depend on their order. Shards of one cell have the
+    /// same digest while the splat is unchanged.
     pub fn splat_digest(&self) -> u64 {
         let chained = |digest: u64, bits: u64| mix64(digest ^ bits);
         let grid = self.header.origin_in_world.iter().chain(&self.header.position_step);

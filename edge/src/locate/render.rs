@@ -1,4 +1,4 @@
-//! Pictures of what is on board, with which the pose of a photo is verified.
+//! Draws the cells on board, to verify the pose of a photo.
 
 use glam::{DAffine3, DVec3};
 use rayon::prelude::*;
@@ -28,7 +28,7 @@ pub(super) struct OnBoard<'a> {
 }
 
 impl<'a> OnBoard<'a> {
-    /// Returns them if there are any. Drawing takes from the budget what it has left.
+    /// Returns the cells with an appearance, if there are any. Drawings are charged to the budget.
     pub(super) fn of(snapshot: &'a Snapshot, budget: &'a Budget) -> Option<Self> {
         let cells = snapshot.shards.iter().filter_map(|shard| Some((shard.view(), shard.appearance()?)));
         let cells: Vec<_> = cells.collect();

@@ -30,7 +30,7 @@ fn member(steps: [u16; 3]) -> Member {
     Member { steps, embedding: vec![1.0, 0.0] }
 }
 
-/// A cache whose one shard has these sections, too.
+/// A cache of one shard, with additional sections.
 fn with(dir: &Path, plain: &BuiltShard, additions: Additions<'_>) -> Snapshot {
     let mut bytes = Vec::new();
     plain.view().write_with(&mut bytes, additions).expect("writes to memory");
@@ -132,8 +132,7 @@ fn the_body_of_a_level_camera_is_not_turned() {
     assert_eq!(geographic, None);
 }
 
-/// A picture of what a camera may see is one of all Gaussians on board, to the bit; and there is none beyond the
-/// budget.
+/// Culling changes no bit of a drawing, and nothing is drawn beyond the budget.
 #[test]
 fn what_is_beside_a_picture_is_not_drawn() {
     let random = &mut Random::new(3);
