@@ -14,6 +14,8 @@ use crate::store::Snapshot;
 
 /// Bytes for each Gaussian that is drawn: as one of a scene and on the screen, and its places in tiles.
 const BYTES_PER_GAUSSIAN: usize = 320;
+/// Bytes for each Gaussian on board: its place in the list of those that are seen, which grows by doubling.
+const BYTES_PER_GAUSSIAN_ON_BOARD: usize = 2 * size_of::<u32>();
 /// Bytes for each pixel: colour, depth and coverage, then grey and its features.
 const BYTES_PER_PX: usize = 160;
 /// Standard deviations of a Gaussian within which it may be seen.
@@ -37,20 +39,29 @@ impl<'a> OnBoard<'a> {
 
     /// Returns the Gaussians that a camera may see; `None` where the budget does not allow them.
     pub(super) fn seen(&self, view: &RasterView) -> Option<Gaussians> {
-        let camera = Frustum::new(view);
-        let of_cell = |(shard, appearance): &(ShardView<'_>, Appearance<'_>)| -> Vec<(u32, DVec3)> {
-            let all = (0..shard.header.n_gaussians).map(|at| (at, shard.position_in_world(at as usize)));
-            all.filter(|(at, mean)| camera.may_see(*mean, appearance.max_size(*at as usize))).collect()
-        };
-        let seen: Vec<Vec<(u32, DVec3)>> = self.cells.par_iter().map(of_cell).collect();
-        let n: usize = seen.iter().map(Vec::len).sum();
+        let n_on_board: usize = self.cells.iter().map(|(shard, _)| shard.header.n_gaussians as usize).sum();
         let n_px = view.intrinsics.width_px as usize * view.intrinsics.height_px as usize;
-        if !self.budget.try_take(n * BYTES_PER_GAUSSIAN + n_px * BYTES_PER_PX) {
+        if !self.budget.try_take(n_on_board * BYTES_PER_GAUSSIAN_ON_BOARD + n_px * BYTES_PER_PX) {
+            return None;
+        }
+        let camera = Frustum::new(view);
+        let of_cell = |(shard, appearance): &(ShardView<'_>, Appearance<'_>)| -> Vec<u32> {
+            let may_see = |at: &u32| {
+                let at = *at as usize;
+                camera.may_see(shard.position_in_world(at), appearance.max_size(at))
+            };
+            (0..shard.header.n_gaussians).filter(may_see).collect()
+        };
+        let seen: Vec<Vec<u32>> = self.cells.par_iter().map(of_cell).collect();
+        let n_seen: usize = seen.iter().map(Vec::len).sum();
+        if !self.budget.try_take(n_seen * BYTES_PER_GAUSSIAN) {
             return None;
         }
         let mut scene = Gaussians::default();
-        for ((_, appearance), seen) in self.cells.iter().zip(&seen) {
-            seen.iter().for_each(|(at, mean)| appearance.add_to(&mut scene, *at as usize, *mean));
+        for ((shard, appearance), seen) in self.cells.iter().zip(&seen) {
+            for at in seen.iter().map(|at| *at as usize) {
+                appearance.add_to(&mut scene, at, shard.position_in_world(at));
+            }
         }
         Some(scene)
     }
@@ -61,10 +72,11 @@ impl Renderer for OnBoard<'_> {
         let view = RasterView { camera_from_world: *camera_from_world, intrinsics: *intrinsics };
         check_view(&view).ok()?;
         let used_bytes = self.budget.used_bytes();
-        let scene = self.seen(&view)?;
-        let drawing = PreparedScene::new(&scene).draw(InstructionSet::widest(), &view, [0.5; 3]);
+        let draw =
+            |scene: Gaussians| PreparedScene::new(&scene).draw(InstructionSet::widest(), &view, [0.5; 3]);
+        let drawing = self.seen(&view).map(draw);
         self.budget.give_back_to(used_bytes, 0);
-        Some(Rendering::of(&drawing))
+        drawing.as_ref().map(Rendering::of)
     }
 }
 

@@ -170,8 +170,11 @@ fn what_is_beside_a_picture_is_not_drawn() {
     assert!(seen.coverage.iter().any(|coverage| *coverage > 0.9));
     assert_eq!((seen.rgb, seen.depth, seen.coverage), (all.rgb, all.depth, all.coverage));
 
-    let budget = Budget::new(10_000, Duration::from_secs(60), &Pool::new(1 << 30));
-    let on_board = OnBoard::of(&snapshot, &budget).expect("an appearance");
-    assert!(on_board.render(&view.camera_from_world, &view.intrinsics).is_none());
-    assert_eq!(budget.check(), Ok(()));
+    // Refused before the list of what is seen, and after it.
+    for bytes in [10_000, 2000 * 8 + 64 * 48 * 160] {
+        let budget = Budget::new(bytes, Duration::from_secs(60), &Pool::new(1 << 30));
+        let on_board = OnBoard::of(&snapshot, &budget).expect("an appearance");
+        assert!(on_board.render(&view.camera_from_world, &view.intrinsics).is_none());
+        assert_eq!((budget.check(), budget.used_bytes()), (Ok(()), 0));
+    }
 }

@@ -7,6 +7,7 @@ mod sam2;
 
 use std::path::Path;
 
+use slag_math::random::Random;
 use slag_models::SessionOptions;
 use slag_models::sam::{Decoded, Letterbox};
 use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
@@ -379,6 +380,40 @@ fn stability_equals_a_plain_recomputation() {
 
 /// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
 #[needs_shared]
+/// Outlines, holes and rough places lie along blocks of pixels that are enlarged, beside others that are not. Logits
+/// may be no numbers; such pixels are outside.
+#[test]
+fn rough_masks_equal_a_plain_recomputation() {
+    let letterbox = Letterbox::new(SIZE_PX, [300, 200]);
+    let upsampler = Upsampler::new(&letterbox, [LOGITS_PX; 2]);
+    let random = &mut Random::new(8);
+    let mut n_inside = 0;
+    for (n, blob) in blobs(20, 17, [256.0, 170.0]).iter().enumerate() {
+        let rough = [0.0, 2.0, 40.0][n % 3];
+        let mut logits = logits(blob);
+        logits.iter_mut().for_each(|logit| *logit += (rough * (random.unit() - 0.5)) as f32);
+        logits[random.below(1000)] = f32::NAN;
+        let values = enlarged(&logits, &letterbox, [LOGITS_PX; 2]);
+        let n_above = |limit: f64| values.iter().filter(|value| **value > limit).count() as f64;
+        let Some(cut) = upsampler.cut(&logits, 1.0, [0, 0]) else {
+            assert_eq!(n_above(1e-4), 0.0);
+            continue;
+        };
+        assert!((cut.stability - n_above(1.0) / n_above(-1.0)).abs() < 1e-3, "{n}: {}", cut.stability);
+        let mask = cut.mask.to_mask(0);
+        let mut inside = vec![false; values.len()];
+        for (y, row) in mask.inside.chunks_exact(mask.box_px.width_px() as usize).enumerate() {
+            let start = (mask.box_px.y0 as usize + y) * 300 + mask.box_px.x0 as usize;
+            inside[start..start + row.len()].copy_from_slice(row);
+        }
+        for (at, (inside, value)) in inside.iter().zip(&values).enumerate() {
+            assert!(*inside == (*value > 0.0) || value.abs() < 1e-4, "{n}: pixel {at} has {value}");
+        }
+        n_inside += mask.area_px;
+    }
+    assert!(n_inside > 100_000, "{n_inside}");
+}
+
 #[test]
 fn the_identity_holds_model_and_settings() {
     let segmenter = tiny(SamSettings::default());

@@ -4,7 +4,13 @@
 //! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step
 //! with at most three taps per axis, without the intermediate square. SAM 2 enlarges the logits to the image at
 //! once.
+//!
+//! A block is the pixels that depend on the same three by three logits. Where these agree on all thresholds, so do
+//! its pixels, and only the blocks along outlines are enlarged. This gives the same bits as enlarging all.
 
+use std::ops::Range;
+
+use slag_math::simd::{InstructionSet, Work};
 use slag_models::sam::Letterbox;
 
 use super::runs::{Run, RunMask};
@@ -47,10 +53,9 @@ impl Axis {
         axis
     }
 
-    /// Returns the pixels that depend on any of the logits `first..=last`.
-    fn pixels(&self, first: usize, last: usize) -> std::ops::Range<usize> {
-        let start = self.first.partition_point(|&tap| tap + 2 < first);
-        start..self.first.partition_point(|&tap| tap <= last).max(start)
+    /// Returns the pixels whose first logit is `first`.
+    fn pixels(&self, first: usize) -> Range<usize> {
+        self.first.partition_point(|&tap| tap < first)..self.first.partition_point(|&tap| tap <= first)
     }
 }
 
@@ -59,6 +64,8 @@ pub(super) struct Upsampler {
     n_columns: usize,
     x: Axis,
     y: Axis,
+    /// The columns of pixels of the blocks that begin at each logit.
+    columns: Vec<Range<usize>>,
 }
 
 /// A mask from thresholded logits.
@@ -68,6 +75,15 @@ pub(super) struct Cut {
     /// IoU between the masks above `+offset` and above `-offset`.
     pub(super) stability: f64,
 }
+
+/// What the logits of a block say of its pixels; as flags, so that those of neighbours combine with `&`.
+const ABOVE: u8 = 1;
+const BELOW: u8 = 2;
+const MIXED: u8 = 0;
+
+/// How far, relatively, logits lie beyond a threshold whose weighted means do too: the rounding of nine products
+/// and their sum, tenfold.
+const ROUNDING: f32 = 1e-5;
 
 impl Upsampler {
     /// Creates the upsampling for `logits_px` columns and rows of logits: at least 3, at most the size of the
@@ -81,58 +97,167 @@ impl Upsampler {
             };
             Axis::new(logits_px[k], square_px, resized_px, image_px)
         };
-        Self { n_columns: logits_px[0] as usize, x: axis(0), y: axis(1) }
+        let (x, n_columns) = (axis(0), logits_px[0] as usize);
+        let columns = (0..n_columns - 2).map(|first| x.pixels(first)).collect();
+        Self { n_columns, x, y: axis(1), columns }
     }
 
     /// Enlarges `logits`, `[rows][columns]`, and thresholds them at 0; `None` if the mask is empty. `origin_px` is
     /// added to the coordinates of the pixels.
     pub(super) fn cut(&self, logits: &[f32], offset: f32, origin_px: [u32; 2]) -> Option<Cut> {
-        // Weighted means of logits below -offset are below it too, so only the rest must be enlarged.
-        let (mut rows, mut columns) = ((usize::MAX, 0), (usize::MAX, 0));
-        for (y, row) in logits.chunks_exact(self.n_columns).enumerate() {
-            let mut above = row.iter().enumerate().filter(|(_, logit)| **logit > -offset).map(|(x, _)| x);
-            if let Some(first) = above.next() {
-                rows = (rows.0.min(y), y);
-                columns = (columns.0.min(first), columns.1.max(above.next_back().unwrap_or(first)));
+        InstructionSet::widest().dispatch(Cutting { upsampler: self, logits, offset, origin_px })
+    }
+
+    /// Returns what each block says, `[rows][blocks]`.
+    #[inline(always)]
+    fn blocks(&self, logits: &[f32], offset: f32) -> Vec<u8> {
+        let limit = offset.abs() * (1.0 + ROUNDING) + f32::MIN_POSITIVE;
+        let flag = |logit: &f32| (u8::from(*logit > limit) * ABOVE) | (u8::from(*logit < -limit) * BELOW);
+        let flags: Vec<u8> = logits.iter().map(flag).collect();
+        let n = self.n_columns;
+        let mut blocks = Vec::with_capacity(logits.len());
+        let mut of_rows = vec![0; n];
+        for rows in flags.windows(3 * n).step_by(n) {
+            let (a, b, c) = (&rows[..n], &rows[n..2 * n], &rows[2 * n..]);
+            of_rows.iter_mut().zip(a).zip(b).zip(c).for_each(|(((of, a), b), c)| *of = a & b & c);
+            blocks.extend(of_rows.iter().zip(&of_rows[1..]).zip(&of_rows[2..]).map(|((a, b), c)| a & b & c));
+        }
+        blocks
+    }
+
+    /// Enlarges a row of logits along x, where one of the three rows of blocks that it belongs to is mixed.
+    #[inline(always)]
+    fn widen(&self, logits: &[f32], rows_of_blocks: &[u8], widened: &mut [f32]) {
+        let n_blocks = self.columns.len();
+        for (at, columns) in self.columns.iter().enumerate() {
+            if rows_of_blocks.chunks_exact(n_blocks).all(|row| row[at] != MIXED) {
+                continue;
+            }
+            let taps = &logits[at..at + 3];
+            for (out, weights) in widened[columns.clone()].iter_mut().zip(&self.x.weights[columns.clone()]) {
+                *out = taps[0] * weights[0] + taps[1] * weights[1] + taps[2] * weights[2];
             }
         }
-        if rows.0 == usize::MAX {
+    }
+
+    /// Splits a row of blocks into pixels in a row whose blocks say the same.
+    #[inline(always)]
+    fn stretches(&self, blocks: &[u8], found: &mut Vec<(u8, Range<usize>)>) {
+        found.clear();
+        for (block, pixels) in blocks.iter().zip(&self.columns) {
+            match found.last_mut() {
+                Some((last, stretch)) if last == block => stretch.end = pixels.end,
+                _ => found.push((*block, pixels.clone())),
+            }
+        }
+    }
+}
+
+/// The cut of one mask.
+struct Cutting<'a> {
+    upsampler: &'a Upsampler,
+    logits: &'a [f32],
+    offset: f32,
+    origin_px: [u32; 2],
+}
+
+impl<S> Work<S> for Cutting<'_> {
+    type Output = Option<Cut>;
+
+    #[inline(always)]
+    fn run(self, _: S) -> Option<Cut> {
+        let Self { upsampler, logits, offset, origin_px } = self;
+        let Upsampler { n_columns, x, y: rows, columns } = upsampler;
+        let blocks = upsampler.blocks(logits, offset);
+        if blocks.iter().all(|block| *block == BELOW) {
             return None;
         }
-        let (ys, xs) = (self.y.pixels(rows.0, rows.1), self.x.pixels(columns.0, columns.1));
-        let first_row = self.y.first[ys.clone()].iter().copied().min()?;
-        let end_row = self.y.first[ys.clone()].iter().copied().max()? + 3;
-        let width = xs.len();
-        let mut widened = Vec::with_capacity((end_row - first_row) * width);
-        for row in logits.chunks_exact(self.n_columns).take(end_row).skip(first_row) {
-            for x in xs.clone() {
-                let (taps, weights) = (&row[self.x.first[x]..self.x.first[x] + 3], self.x.weights[x]);
-                widened.push(taps[0] * weights[0] + taps[1] * weights[1] + taps[2] * weights[2]);
+        let (width, n_blocks, n_rows) = (x.first.len(), columns.len(), logits.len() / n_columns);
+        let mut widened = vec![0.0; n_rows * width];
+        for (at, (row, out)) in
+            logits.chunks_exact(*n_columns).zip(widened.chunks_exact_mut(width)).enumerate()
+        {
+            let of_row = at.saturating_sub(2) * n_blocks..(at + 1).min(n_rows - 2) * n_blocks;
+            upsampler.widen(row, &blocks[of_row], out);
+        }
+        let mut outline = Outline { line: vec![0.0; width], runs: Vec::new(), n_high: 0, n_low: 0, offset };
+        let (mut stretches, mut first_of_stretches) = (Vec::new(), None);
+        for (y, (&first, weights)) in rows.first.iter().zip(&rows.weights).enumerate() {
+            if first_of_stretches != Some(first) {
+                upsampler.stretches(&blocks[first * n_blocks..(first + 1) * n_blocks], &mut stretches);
+                first_of_stretches = Some(first);
+            }
+            let taps = [0, 1, 2].map(|tap| &widened[(first + tap) * width..(first + tap + 1) * width]);
+            let y = origin_px[1] + y as u32;
+            for (block, pixels) in &stretches {
+                match *block {
+                    ABOVE => outline.fill(y, pixels.clone()),
+                    BELOW => (),
+                    _ => outline.threshold(y, pixels.clone(), taps, *weights),
+                }
             }
         }
-        let is_inside = |logit: &f32| *logit > 0.0;
-        let mut runs = Vec::new();
-        let (mut n_high, mut n_low) = (0_u64, 0_u64);
-        let mut line = vec![0.0_f32; width];
-        for y in ys {
-            let weights = self.y.weights[y];
-            let at = (self.y.first[y] - first_row) * width;
-            let [a, b, c] = [0, 1, 2].map(|tap| &widened[at + tap * width..at + (tap + 1) * width]);
-            for (k, logit) in line.iter_mut().enumerate() {
-                *logit = a[k] * weights[0] + b[k] * weights[1] + c[k] * weights[2];
-            }
-            n_high += line.iter().filter(|logit| **logit > offset).count() as u64;
-            n_low += line.iter().filter(|logit| **logit > -offset).count() as u64;
-            let mut from = 0;
-            while let Some(start) = line[from..].iter().position(is_inside).map(|k| from + k) {
-                let end =
-                    line[start..].iter().position(|logit| !is_inside(logit)).map_or(width, |k| start + k);
-                let at = |k: usize| origin_px[0] + (xs.start + k) as u32;
-                runs.push(Run { y: origin_px[1] + y as u32, x0: at(start), x1: at(end) });
-                from = end;
-            }
-        }
-        let stability = n_high as f64 / n_low as f64;
+        let stability = outline.n_high as f64 / outline.n_low as f64;
+        let to_image = |run: Run| Run { x0: origin_px[0] + run.x0, x1: origin_px[0] + run.x1, ..run };
+        let runs = outline.runs.into_iter().map(to_image).collect();
         RunMask::new(runs).map(|mask| Cut { mask, stability })
+    }
+}
+
+/// The pixels above 0 as they are found, row by row.
+struct Outline {
+    /// Logits of a row, for reuse.
+    line: Vec<f32>,
+    runs: Vec<Run>,
+    /// Pixels above `offset`, and above `-offset`.
+    n_high: u64,
+    n_low: u64,
+    offset: f32,
+}
+
+impl Outline {
+    /// Adds pixels that are above all thresholds.
+    #[inline(always)]
+    fn fill(&mut self, y: u32, pixels: Range<usize>) {
+        self.n_high += pixels.len() as u64;
+        self.n_low += pixels.len() as u64;
+        self.extend(y, pixels);
+    }
+
+    /// Enlarges three rows along y and adds the pixels that are above 0.
+    #[inline(always)]
+    fn threshold(&mut self, y: u32, pixels: Range<usize>, taps: [&[f32]; 3], weights: [f32; 3]) {
+        let [a, b, c] = taps.map(|row| &row[pixels.clone()]);
+        let mut line = std::mem::take(&mut self.line);
+        let logits = &mut line[..pixels.len()];
+        for (((logit, a), b), c) in logits.iter_mut().zip(a).zip(b).zip(c) {
+            *logit = a * weights[0] + b * weights[1] + c * weights[2];
+        }
+        let n_above =
+            |limit: f32| u64::from(logits.iter().map(|logit| u32::from(*logit > limit)).sum::<u32>());
+        self.n_high += n_above(self.offset);
+        self.n_low += n_above(-self.offset);
+        for (n, chunk) in logits.chunks(64).enumerate() {
+            let bit = |(k, logit): (usize, &f32)| u64::from(*logit > 0.0) << k;
+            let mut inside = chunk.iter().enumerate().map(bit).fold(0, |bits, bit| bits | bit);
+            while inside != 0 {
+                let from = inside.trailing_zeros();
+                let to = from + (inside >> from).trailing_ones();
+                let x0 = pixels.start + 64 * n;
+                self.extend(y, x0 + from as usize..x0 + to as usize);
+                inside &= u64::MAX.checked_shl(to).unwrap_or(0);
+            }
+        }
+        self.line = line;
+    }
+
+    /// Adds pixels to the last run, if they follow it, else as a run.
+    #[inline(always)]
+    fn extend(&mut self, y: u32, pixels: Range<usize>) {
+        let (x0, x1) = (pixels.start as u32, pixels.end as u32);
+        match self.runs.last_mut() {
+            Some(run) if run.y == y && run.x1 == x0 => run.x1 = x1,
+            _ => self.runs.push(Run { y, x0, x1 }),
+        }
     }
 }
