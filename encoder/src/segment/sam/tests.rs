@@ -380,19 +380,18 @@ fn stability_equals_a_plain_recomputation() {
 
 /// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
 #[needs_shared]
-/// Outlines, holes and rough places lie along blocks of pixels that are enlarged, beside others that are not. Logits
-/// may be no numbers; such pixels are outside.
+/// Outlines, holes and rough places lie along blocks of pixels that are enlarged, beside others that are not.
 #[test]
 fn rough_masks_equal_a_plain_recomputation() {
     let letterbox = Letterbox::new(SIZE_PX, [300, 200]);
     let upsampler = Upsampler::new(&letterbox, [LOGITS_PX; 2]);
     let random = &mut Random::new(8);
+    assert!(upsampler.cut(&[f32::NAN; (LOGITS_PX * LOGITS_PX) as usize], 1.0, [0, 0]).is_none());
     let mut n_inside = 0;
     for (n, blob) in blobs(20, 17, [256.0, 170.0]).iter().enumerate() {
         let rough = [0.0, 2.0, 40.0][n % 3];
         let mut logits = logits(blob);
         logits.iter_mut().for_each(|logit| *logit += (rough * (random.unit() - 0.5)) as f32);
-        logits[random.below(1000)] = f32::NAN;
         let values = enlarged(&logits, &letterbox, [LOGITS_PX; 2]);
         let n_above = |limit: f64| values.iter().filter(|value| **value > limit).count() as f64;
         let Some(cut) = upsampler.cut(&logits, 1.0, [0, 0]) else {
