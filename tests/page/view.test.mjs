@@ -3,7 +3,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { closeBrowser, layer, openBrowser, pixels } from "./browser.mjs";
+import { closeBrowser, layer, openBrowser, picture, pixels } from "./browser.mjs";
 import { answered, CAMERA, cameraOf, drawn, isInside, litPixels, minus, opened, PANEL_PX, project, WIDTH } from "./scene.mjs";
 import { THINGS } from "./service.mjs";
 
@@ -113,7 +113,7 @@ test("lit and unlit differ by 3 to 1 in lightness in every theme, and for eyes t
     assert.equal(await page.evaluate(() => document.documentElement.dataset.theme), theme);
     for (const type of ["none", "protanopia", "deuteranopia", "tritanopia"]) {
       await devtools.send("Emulation.setEmulatedVisionDeficiency", { type });
-      const colours = await page.screenshot().then((png) => meanColours(page, png.toString("base64"), [CHAIR, FLOOR]));
+      const colours = await picture(page).then((png) => meanColours(page, png.toString("base64"), [CHAIR, FLOOR]));
       const [lit, unlit] = colours.map(luminance);
       const ratio = (Math.max(lit, unlit) + 0.05) / (Math.min(lit, unlit) + 0.05);
       console.log(`${theme}, ${type}: ${ratio.toFixed(1)} to 1`);
