@@ -4,8 +4,7 @@
 use glam::{DAffine3, DVec2};
 use slag_common::{Intrinsics, View};
 use slag_locate::{
-    Grey, Landmark, MAX_FEATURES, MAX_RENDERING_WIDTH_PX, MappingView, Observation, Renderer, Rendering,
-    build, code, features,
+    Grey, Landmark, MAX_FEATURES, MappingView, Observation, Renderer, Rendering, build, code, features,
 };
 
 use crate::ingest::{self, IngestError, LoadedImage};
@@ -13,6 +12,8 @@ use crate::raster::{LoadedScene, RasterError, RasterView};
 
 /// Gaussians for which there is a landmark: at 24 bytes, 2 bytes a Gaussian.
 const GAUSSIANS_A_LANDMARK: usize = 12;
+/// Widest drawing, pixels: splats show no more of a photo than that.
+const MAX_DRAWING_WIDTH_PX: u32 = 1600;
 
 /// Why a photo has no features.
 #[derive(Debug, thiserror::Error)]
@@ -44,7 +45,7 @@ impl Renderer for SceneRenderer<'_> {
 pub fn observe(scene: &dyn LoadedScene, number: u16, view: &View) -> Result<MappingView, LandmarkError> {
     let LoadedImage { view, image, .. } = ingest::load_image(view)?;
     let grey = Grey::from_rgb8(image.width() as usize, image.height() as usize, image.as_raw());
-    let width_px = view.intrinsics.width_px.min(MAX_RENDERING_WIDTH_PX);
+    let width_px = view.intrinsics.width_px.min(MAX_DRAWING_WIDTH_PX);
     let (intrinsics, pose) = (view.intrinsics.scaled_to_width(width_px), view.camera_from_world);
     let (found, drawn) =
         rayon::join(|| features(&grey, MAX_FEATURES), || SceneRenderer(scene).draw(&pose, &intrinsics));

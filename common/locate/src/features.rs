@@ -21,7 +21,7 @@ const MAX_CURVATURE_RATIO: f32 = 10.0;
 const BORDER: usize = 5;
 const MAX_STEPS: usize = 5;
 /// Pixels up to which a photo keeps its size: see [`working_bytes`].
-const MAX_PX: usize = 1_500_000;
+pub(crate) const MAX_PX: usize = 1_500_000;
 /// Shortest side of an octave, pixels.
 const MIN_SIDE: usize = 16;
 

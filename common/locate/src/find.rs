@@ -9,8 +9,8 @@ use crate::grey::Grey;
 use crate::map::Map;
 use crate::matching::Query;
 use crate::pose::{Match, Pinhole, covariance};
-use crate::ransac::{Agreed, locally_refined, ransac};
-use crate::render::{Renderer, match_rendering};
+use crate::ransac::{Agreed, INLIER_PX, locally_refined, ransac};
+use crate::render::{Compared, Renderer};
 
 /// Fewest features with which a place can be recognised.
 const MIN_FEATURES: usize = 20;
@@ -24,6 +24,12 @@ const RIVAL_SHARE: f64 = 0.7;
 const MIN_RENDERED_INLIERS: usize = 12;
 /// Fewest inliers among them for which another rendering, at the pose that they give, is tried.
 const MIN_NEARER_INLIERS: usize = 8;
+/// Error of a patch that agrees with a pose, pixels.
+const PATCH_INLIER_PX: f64 = 2.0;
+/// Fewest patches that verify a pose, and their share of those that were tried: of photos of other scenes 22 agree
+/// at most, those less than 3 %.
+const MIN_PATCHES: usize = 20;
+const MIN_PATCH_SHARE: f64 = 0.04;
 /// Renderings for one proposed pose, and proposed poses for which there are renderings.
 const MAX_RENDERINGS: usize = 2;
 const MAX_PROPOSALS: usize = 4;
@@ -215,28 +221,54 @@ impl Search<'_> {
 
     /// Returns the first proposed pose whose rendering matches the photo.
     fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Option<Located> {
-        proposals.iter().take(MAX_PROPOSALS).find_map(|one| self.rendered(one, renderer, found))
+        let compared = Compared::new(self.photo.grey, self.photo.intrinsics, found, &self.query.at);
+        proposals.iter().take(MAX_PROPOSALS).find_map(|one| self.rendered(one, renderer, &compared))
     }
 
     /// Returns the pose by matches with renderings, each at the pose that the one before gives.
-    fn rendered(&self, one: &Agreed, renderer: &dyn Renderer, found: &[Feature]) -> Option<Located> {
-        let mut pose = self.guided(one).camera_from_world;
+    fn rendered(&self, one: &Agreed, renderer: &dyn Renderer, compared: &Compared<'_>) -> Option<Located> {
+        let landmarks = self.guided(one);
+        let mut pose = landmarks.camera_from_world;
         for _ in 0..MAX_RENDERINGS {
-            let matches = match_rendering(renderer, &pose, self.photo.intrinsics, found, &self.query.at);
-            let seen = ransac(&self.camera, &matches, SEED)?;
-            let n = seen.inliers.len();
-            if n >= MIN_RENDERED_INLIERS {
-                // Where the splat lacks the texture of photos, landmarks are more, and better.
-                let guided = self.guided(&seen);
-                let is_better = guided.inliers.len() > 2 * n && self.is_same(&guided, &seen);
-                return self.located(if is_better { &guided } else { &seen }, true).ok();
+            let rendered = compared.render(renderer, &pose)?;
+            let seen = ransac(&self.camera, &compared.match_features(&rendered), SEED);
+            let n = seen.as_ref().map_or(0, |seen| seen.inliers.len());
+            let verified = match seen {
+                Some(ref seen) if n >= MIN_RENDERED_INLIERS => Some(seen.clone()),
+                _ => self.agreed_patches(&compared.match_patches(&rendered)),
+            };
+            if let Some(verified) = verified {
+                return self.located(&self.with_landmarks(&landmarks, verified), true).ok();
             }
             if n < MIN_NEARER_INLIERS {
                 return None;
             }
-            pose = seen.camera_from_world;
+            pose = seen?.camera_from_world;
         }
         None
+    }
+
+    /// Returns the pose on which patches agree, if they are enough to verify it.
+    fn agreed_patches(&self, (matches, n_tried): &(Vec<Match>, usize)) -> Option<Agreed> {
+        let mut agreed = ransac(&self.camera, matches, SEED)?;
+        agreed.inliers.retain(|one| self.camera.error(&agreed.camera_from_world, one) < PATCH_INLIER_PX);
+        let n = agreed.inliers.len();
+        (n >= MIN_PATCHES && n as f64 >= MIN_PATCH_SHARE * *n_tried as f64).then_some(agreed)
+    }
+
+    /// Returns a pose that a rendering verified, refined on landmarks, too: those of the proposed pose, or those
+    /// that it shows itself. Where the splat lacks the texture of photos, landmarks are more, and better.
+    fn with_landmarks(&self, proposed: &Agreed, verified: Agreed) -> Agreed {
+        let own = self.guided(&verified);
+        let landmarks = if own.inliers.len() > proposed.inliers.len() { &own } else { proposed };
+        let all: Vec<Match> = landmarks.inliers.iter().chain(&verified.inliers).copied().collect();
+        let from = |start: &Agreed| locally_refined(&self.camera, start.camera_from_world, &all);
+        let refined = [from(landmarks), from(&verified)].into_iter().min_by(|a, b| a.cost.total_cmp(&b.cost));
+        let agrees = |pose: &Agreed| {
+            let is_inlier = |one: &&Match| self.camera.error(&pose.camera_from_world, one) < INLIER_PX;
+            2 * verified.inliers.iter().filter(is_inlier).count() > verified.inliers.len()
+        };
+        refined.filter(agrees).unwrap_or(verified)
     }
 
     fn unverified(&self, proposals: &[Agreed]) -> Outcome {

@@ -2,7 +2,8 @@
 //!
 //! [`features`] (SIFT) become codes of 128 bits ([`code`]). Those of mapping photos, whose depth the splat gives,
 //! make the map ([`build()`]); those of a photo are matched with it, and the pose on which most matches agree is
-//! the answer ([`locate`]). A rendering of the scene at that pose verifies and improves it ([`Renderer`]).
+//! the answer ([`locate`]). A rendering of the scene at that pose verifies and improves it ([`Renderer`]): by its
+//! features, or by patches of the photo that are found in it.
 #![forbid(unsafe_code)]
 
 mod build;
@@ -14,6 +15,7 @@ mod grey;
 mod map;
 mod matching;
 mod p3p;
+mod patches;
 mod pose;
 mod ransac;
 mod render;
@@ -26,5 +28,5 @@ pub use find::{Located, Outcome, Photo, Prior, Reason, locate};
 pub use grey::Grey;
 pub use map::{Map, map_bytes};
 pub use p3p::p3p;
-pub use render::{MAX_RENDERING_WIDTH_PX, Renderer, Rendering, point_in_world};
+pub use render::{Renderer, Rendering, point_in_world};
 pub use slag_common::landmarks::Landmark;

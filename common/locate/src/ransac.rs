@@ -23,7 +23,8 @@ pub(crate) const SOFT_PX: f64 = 2.0;
 pub(crate) struct Agreed {
     pub(crate) camera_from_world: DAffine3,
     pub(crate) inliers: Vec<Match>,
-    cost: f64,
+    /// Sum of squared errors of all matches, each at most that of an inlier's bound.
+    pub(crate) cost: f64,
 }
 
 impl Agreed {

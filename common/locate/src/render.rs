@@ -1,12 +1,15 @@
 //! A photo matched with a rendering of the scene.
 
+use std::borrow::Cow;
+
 use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
 use slag_math::dot;
 use slag_raster::Drawing;
 
-use crate::features::{Feature, MAX_FEATURES, features};
+use crate::features::{Feature, MAX_FEATURES, MAX_PX, features};
 use crate::grey::Grey;
+use crate::patches;
 use crate::pose::Match;
 
 /// Largest distance of descriptors, as a share of the second best's (Lowe 2004, 7.1): poses are near, so most
@@ -17,9 +20,6 @@ const MAX_DEPTH_STEP: f32 = 0.05;
 
 /// Opacity of a pixel from which its depth is a surface's.
 const MIN_COVERAGE: f32 = 0.5;
-/// Widest rendering, pixels: splats show no more of a photo than that.
-pub const MAX_RENDERING_WIDTH_PX: u32 = 1600;
-
 /// A picture of the scene, with the camera z of each pixel; 0 where there is no surface.
 pub struct Rendering {
     pub grey: Grey,
@@ -63,41 +63,91 @@ pub fn point_in_world(camera_from_world: &DAffine3, intrinsics: &Intrinsics, at:
     camera_from_world.inverse().transform_point3(DVec3::new(x, y, 1.0) * depth)
 }
 
-/// Matches the features of a photo with those of a rendering at a pose, each the other's best.
-pub(crate) fn match_rendering(
-    renderer: &dyn Renderer,
-    camera_from_world: &DAffine3,
-    intrinsics: &Intrinsics,
-    photo: &[Feature],
-    at: &[DVec2],
-) -> Vec<Match> {
-    let width_px = intrinsics.width_px.min(MAX_RENDERING_WIDTH_PX);
-    let pinhole = intrinsics.without_distortion().scaled_to_width(width_px);
-    let Some(rendering) = renderer.render(camera_from_world, &pinhole) else { return Vec::new() };
-    let rendered = features(&rendering.grey, MAX_FEATURES);
-    let n = rendered.len();
-    let mut products = vec![0.0; photo.len() * n];
-    for (row, feature) in products.chunks_exact_mut(n.max(1)).zip(photo) {
-        row.iter_mut().zip(&rendered).for_each(|(p, r)| *p = dot(&feature.descriptor, &r.descriptor));
+/// A photo, in the size in which it is compared with renderings.
+pub(crate) struct Compared<'a> {
+    photo: Cow<'a, Grey>,
+    /// Width of its pixels, in the photo's.
+    px: f64,
+    /// Of renderings at its pose.
+    pinhole: Intrinsics,
+    /// Of the photo: its features, and where an ideal pinhole shows them, the photo's pixels.
+    features: &'a [Feature],
+    at: &'a [DVec2],
+}
+
+impl<'a> Compared<'a> {
+    pub(crate) fn new(
+        photo: &'a Grey,
+        intrinsics: &Intrinsics,
+        features: &'a [Feature],
+        at: &'a [DVec2],
+    ) -> Self {
+        let (photo, px) = photo.limited(MAX_PX);
+        let pinhole = intrinsics.without_distortion().scaled_to_width(photo.width as u32);
+        Self { photo, px: f64::from(px), pinhole, features, at }
     }
-    let best_of_rendered: Vec<usize> = (0..n)
-        .map(|r| {
-            (0..photo.len())
-                .fold(0, |best, f| if products[f * n + r] > products[best * n + r] { f } else { best })
-        })
-        .collect();
-    let one = |feature: usize| {
-        let row = &products[feature * n..][..n];
-        let best = (0..n).max_by(|a, b| row[*a].total_cmp(&row[*b]))?;
-        // Another orientation of the same keypoint is no rival.
-        let place = rendered[best].at;
-        let second = (0..n).filter(|r| rendered[*r].at != place).map(|r| row[r]).fold(-1.0, f32::max);
-        let length = |product: f32| (2.0 - 2.0 * product).max(0.0).sqrt();
-        let is_match = best_of_rendered[best] == feature && length(row[best]) < MAX_RATIO * length(second);
-        let pixel = DVec2::from(place);
-        let depth = is_match.then(|| rendering.depth_at(pixel)).flatten()?;
-        let point_in_world = point_in_world(camera_from_world, &pinhole, pixel, depth);
-        Some(Match { feature, landmark: best, at: at[feature], point_in_world })
-    };
-    (0..photo.len()).filter_map(one).collect()
+
+    pub(crate) fn render(&self, renderer: &dyn Renderer, camera_from_world: &DAffine3) -> Option<Rendered> {
+        let rendering = renderer.render(camera_from_world, &self.pinhole)?;
+        Some(Rendered { rendering, camera_from_world: *camera_from_world, pinhole: self.pinhole })
+    }
+
+    fn matched(&self, rendered: &Rendered, feature: usize, landmark: usize, pixel: DVec2) -> Option<Match> {
+        let point_in_world = rendered.point_at(pixel)?;
+        Some(Match { feature, landmark, at: self.at[feature], point_in_world })
+    }
+
+    /// Matches features of the photo with those of a rendering, each the other's best.
+    pub(crate) fn match_features(&self, rendered: &Rendered) -> Vec<Match> {
+        let photo = self.features;
+        let in_rendering = features(&rendered.rendering.grey, MAX_FEATURES);
+        let n = in_rendering.len();
+        let mut products = vec![0.0; photo.len() * n];
+        for (row, feature) in products.chunks_exact_mut(n.max(1)).zip(photo) {
+            let of_row = row.iter_mut().zip(&in_rendering);
+            of_row.for_each(|(p, r)| *p = dot(&feature.descriptor, &r.descriptor));
+        }
+        let best_of_rendered: Vec<usize> = (0..n)
+            .map(|r| {
+                (0..photo.len())
+                    .fold(0, |best, f| if products[f * n + r] > products[best * n + r] { f } else { best })
+            })
+            .collect();
+        let one = |feature: usize| {
+            let row = &products[feature * n..][..n];
+            let best = (0..n).max_by(|a, b| row[*a].total_cmp(&row[*b]))?;
+            // Another orientation of the same keypoint is no rival.
+            let place = in_rendering[best].at;
+            let second = (0..n).filter(|r| in_rendering[*r].at != place).map(|r| row[r]).fold(-1.0, f32::max);
+            let length = |product: f32| (2.0 - 2.0 * product).max(0.0).sqrt();
+            let is_match =
+                best_of_rendered[best] == feature && length(row[best]) < MAX_RATIO * length(second);
+            is_match.then(|| self.matched(rendered, feature, best, DVec2::from(place))).flatten()
+        };
+        (0..photo.len()).filter_map(one).collect()
+    }
+
+    /// Matches patches of the photo with a rendering; returns how many were tried, too.
+    pub(crate) fn match_patches(&self, rendered: &Rendered) -> (Vec<Match>, usize) {
+        let scale = f64::from(self.pinhole.width_px) / (self.photo.width as f64 * self.px);
+        let at: Vec<DVec2> = self.at.iter().map(|at| *at * scale).collect();
+        let found = patches::find(&self.photo, self.px, self.features, &at, &rendered.rendering.grey);
+        let matched =
+            found.matches.iter().filter_map(|(feature, pixel)| self.matched(rendered, *feature, 0, *pixel));
+        (matched.collect(), found.n_tried)
+    }
+}
+
+/// A rendering and its camera.
+pub(crate) struct Rendered {
+    rendering: Rendering,
+    camera_from_world: DAffine3,
+    pinhole: Intrinsics,
+}
+
+impl Rendered {
+    fn point_at(&self, pixel: DVec2) -> Option<DVec3> {
+        let depth = self.rendering.depth_at(pixel)?;
+        Some(point_in_world(&self.camera_from_world, &self.pinhole, pixel, depth))
+    }
 }
