@@ -91,6 +91,8 @@ class Nothing:
     """Where the best score is."""
     best_score: Optional[float] = None
     """Best score found."""
+    seen_share: Optional[float] = None
+    """Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none."""
     thing: Optional[str] = None
     """The part of a phrase that failed."""
 

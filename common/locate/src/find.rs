@@ -16,6 +16,8 @@ use crate::render::{Compared, Renderer};
 const MIN_FEATURES: usize = 20;
 /// Fewest inliers of a pose that no rendering verifies; of photos of other scenes 15 agree at most.
 const MIN_INLIERS: usize = 20;
+/// The same where a rendering shows something else: 33 agree on a car that stands in two scenes.
+const MIN_INLIERS_AGAINST_RENDERING: usize = 40;
 /// Fewest inliers of a pose that is told as a candidate.
 const MIN_UNSURE_INLIERS: usize = 12;
 /// Share of the best pose's inliers from which a pose elsewhere is its rival.
@@ -162,14 +164,22 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     if proposals.is_empty() {
         return Outcome::Lost(refused.unwrap_or(Reason::NoPose { inliers }));
     }
-    match renderer.and_then(|renderer| search.verified(&proposals, renderer, &found)) {
-        Some(located) => Outcome::Found(Box::new(located)),
-        None => search.unverified(&proposals),
+    match renderer.map_or(Verified::NotDrawn, |renderer| search.verified(&proposals, renderer, &found)) {
+        Verified::Yes(located) => Outcome::Found(located),
+        Verified::No => search.unverified(&proposals, MIN_INLIERS_AGAINST_RENDERING),
+        Verified::NotDrawn => search.unverified(&proposals, MIN_INLIERS),
     }
 }
 
 /// Seed of all random choices.
 const SEED: u64 = 47;
+
+/// What renderings at proposed poses say.
+enum Verified {
+    Yes(Box<Located>),
+    No,
+    NotDrawn,
+}
 
 /// A photo that is being located.
 struct Search<'a> {
@@ -220,32 +230,43 @@ impl Search<'_> {
     }
 
     /// Returns the first proposed pose whose rendering matches the photo.
-    fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Option<Located> {
+    fn verified(&self, proposals: &[Agreed], renderer: &dyn Renderer, found: &[Feature]) -> Verified {
         let compared = Compared::new(self.photo.grey, self.photo.intrinsics, found, &self.query.at);
-        proposals.iter().take(MAX_PROPOSALS).find_map(|one| self.rendered(one, renderer, &compared))
+        let mut verified = Verified::NotDrawn;
+        for one in proposals.iter().take(MAX_PROPOSALS) {
+            match self.rendered(one, renderer, &compared) {
+                Verified::NotDrawn => {}
+                Verified::No => verified = Verified::No,
+                yes @ Verified::Yes(_) => return yes,
+            }
+        }
+        verified
     }
 
     /// Returns the pose by matches with renderings, each at the pose that the one before gives.
-    fn rendered(&self, one: &Agreed, renderer: &dyn Renderer, compared: &Compared<'_>) -> Option<Located> {
+    fn rendered(&self, one: &Agreed, renderer: &dyn Renderer, compared: &Compared<'_>) -> Verified {
         let landmarks = self.guided(one);
         let mut pose = landmarks.camera_from_world;
+        let mut verified = Verified::NotDrawn;
         for _ in 0..MAX_RENDERINGS {
-            let rendered = compared.render(renderer, &pose)?;
+            let Some(rendered) = compared.render(renderer, &pose) else { break };
+            verified = Verified::No;
             let seen = ransac(&self.camera, &compared.match_features(&rendered), SEED);
             let n = seen.as_ref().map_or(0, |seen| seen.inliers.len());
-            let verified = match seen {
+            let enough = match seen {
                 Some(ref seen) if n >= MIN_RENDERED_INLIERS => Some(seen.clone()),
                 _ => self.agreed_patches(&compared.match_patches(&rendered)),
             };
-            if let Some(verified) = verified {
-                return self.located(&self.with_landmarks(&landmarks, verified), true).ok();
+            if let Some(enough) = enough {
+                let located = self.located(&self.with_landmarks(&landmarks, enough), true);
+                return located.map_or(verified, |located| Verified::Yes(Box::new(located)));
             }
-            if n < MIN_NEARER_INLIERS {
-                return None;
+            match seen {
+                Some(seen) if n >= MIN_NEARER_INLIERS => pose = seen.camera_from_world,
+                _ => break,
             }
-            pose = seen?.camera_from_world;
         }
-        None
+        verified
     }
 
     /// Returns the pose on which patches agree, if they are enough to verify it.
@@ -271,7 +292,7 @@ impl Search<'_> {
         refined.filter(agrees).unwrap_or(verified)
     }
 
-    fn unverified(&self, proposals: &[Agreed]) -> Outcome {
+    fn unverified(&self, proposals: &[Agreed], min_inliers: usize) -> Outcome {
         let n = |one: &Agreed| one.inliers.len();
         let most = n(&proposals[0]);
         let enough = |one: &&Agreed| n(one) >= MIN_UNSURE_INLIERS.max((RIVAL_SHARE * most as f64) as usize);
@@ -285,7 +306,7 @@ impl Search<'_> {
         }
         match told.as_slice() {
             [] => Outcome::Lost(refused.unwrap_or(Reason::NoPose { inliers: most })),
-            [one] if candidates.len() == 1 && most >= MIN_INLIERS => Outcome::Found(Box::new(one.clone())),
+            [one] if candidates.len() == 1 && most >= min_inliers => Outcome::Found(Box::new(one.clone())),
             _ => Outcome::Unsure(told),
         }
     }

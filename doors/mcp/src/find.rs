@@ -99,7 +99,7 @@ pub struct Related {
 /// Why nothing was found.
 #[derive(Debug, Serialize, JsonSchema)]
 pub struct Nothing {
-    /// "below-threshold", "no-such-thing", "no-such-pair", "too-few", "not-in-region" or others.
+    /// "below-threshold", "no-such-thing", "no-such-pair", "too-few", "not-in-region", "not-looked-there" or others.
     pub kind: String,
     /// The same in a sentence.
     pub detail: String,

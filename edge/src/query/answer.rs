@@ -152,7 +152,7 @@ fn answer_objects(
             score_error_bound: scale.error_bound(scored.error_bound),
             ..empty.searched
         },
-        reason: found.is_empty().then(|| reason::of_objects(request, threshold.0, best)),
+        reason: found.is_empty().then(|| reason::of_objects(scene.shards, request, threshold.0, best)),
         answers: found,
         ..empty
     }
@@ -266,6 +266,7 @@ pub(super) fn of_related(
     let best_score = |thing: &str| related.parts.iter().find(|part| part.thing == thing)?.best_score;
     let reason = related.miss.map(|miss| Reason {
         kind: miss.kind,
+        seen_share: miss.seen_share,
         best_score: best_score(&miss.thing),
         best_position_in_world: None,
         detail: miss.detail,

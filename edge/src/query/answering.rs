@@ -10,6 +10,7 @@ use super::ask::Ask;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::outcome::{Outcome, RelatedAnswers};
 use super::rank::Ranked;
+use super::reason;
 use super::relations::{self, Phrase, Things, Viewer};
 use super::reply::Reply;
 use super::request::{Asked, QueryRequest, unit_vector};
@@ -149,7 +150,9 @@ fn related(
         request.near.map(|position_in_world| Viewer { position_in_world, heading_rad: request.heading_rad });
     let found = match relations::relate(&things, phrase, viewer.as_ref(), metre) {
         Ok(found) => found,
-        Err(miss) => {
+        Err(mut miss) => {
+            (miss.kind, miss.detail, miss.seen_share) =
+                reason::looked(scene.shards, &request.region, (miss.kind, miss.detail));
             return Ok(RelatedAnswers {
                 asked_as: BTreeMap::new(),
                 parts,

@@ -289,6 +289,8 @@ pub enum ReasonKind {
     ClustersTooSmall,
     /// The region asked for holds nothing that could match.
     NothingThere,
+    /// Views saw less than half of the region asked for.
+    NotLookedThere,
     /// Of a phrase: nothing on board is such a thing.
     NoSuchThing,
     /// Of a phrase: such things are on board, but none is so placed.
@@ -306,6 +308,9 @@ pub struct Reason {
     pub kind: ReasonKind,
     /// The reason in words.
     pub detail: String,
+    /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seen_share: Option<f64>,
     /// Best score found.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best_score: Option<f32>,

@@ -81,6 +81,9 @@ struct Nothing<'a> {
     kind: ReasonKind,
     /// The same in words.
     detail: &'a str,
+    /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    seen_share: Option<f64>,
     /// The part of a phrase that failed.
     thing: Option<&'a str>,
     /// Best score found.
@@ -211,6 +214,7 @@ impl<'a> Nothing<'a> {
         Some(Self {
             kind: reason.kind,
             detail: &reason.detail,
+            seen_share: reason.seen_share,
             thing: None,
             best_score: reason.best_score,
             best_degree: None,
@@ -224,6 +228,7 @@ impl<'a> Nothing<'a> {
         Some(Self {
             kind: miss.kind,
             detail: &miss.detail,
+            seen_share: miss.seen_share,
             thing: Some(&miss.thing),
             best_score: part.and_then(|part| part.best_score),
             best_degree: miss.best_degree,

@@ -1,15 +1,59 @@
 //! Reasons for empty answers, with the nearest miss.
 
+use std::ops::Range;
+
 use glam::DVec3;
 use slag_common::shard::ShardView;
 
 use super::answers::{Reason, ReasonKind};
 use super::request::QueryRequest;
 use super::scale::Scale;
-use crate::score::Search;
+use crate::score::{Region, Search};
+
+/// Share of a region's Gaussians that views must have seen before an answer says that nothing is there.
+const MIN_SEEN: f64 = 0.5;
+
+/// Returns the share of the Gaussians on board in a region that a used view saw; `None` where there are none.
+fn seen_share(shards: &[ShardView<'_>], region: &Region) -> Option<f64> {
+    let (mut n_seen, mut n_all) = (0, 0);
+    for shard in shards.iter().filter(|shard| region.touches(&shard.position_box())) {
+        // Those without evidence come last.
+        let (n_with_evidence, n) = (shard.n_with_evidence(), shard.header.n_gaussians as usize);
+        let in_region = |range: Range<usize>| match region.covers(&shard.position_box()) {
+            true => range.len(),
+            false => range.filter(|at| region.contains(shard.position_in_world(*at))).count(),
+        };
+        n_seen += in_region(0..n_with_evidence);
+        n_all += in_region(0..n);
+    }
+    (n_all > 0).then(|| n_seen as f64 / n_all as f64)
+}
+
+/// Returns the share of a region that views saw and, where that is too little for a no, what is said instead.
+pub fn looked(
+    shards: &[ShardView<'_>],
+    region: &Region,
+    (kind, detail): (ReasonKind, String),
+) -> (ReasonKind, String, Option<f64>) {
+    let seen = seen_share(shards, region);
+    match seen.filter(|seen| *seen < MIN_SEEN && kind != ReasonKind::ClustersTooSmall) {
+        None => (kind, detail, seen),
+        Some(share) => {
+            let percent = 100.0 * share;
+            let told =
+                format!("not looked there: photos saw {percent:.0} % of what is on board{region}; {detail}");
+            (ReasonKind::NotLookedThere, told, seen)
+        }
+    }
+}
 
 /// Returns why no object was found. `best`: score and position of the best object on board.
-pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVec3)>) -> Reason {
+pub fn of_objects(
+    shards: &[ShardView<'_>],
+    request: &QueryRequest,
+    threshold: f32,
+    best: Option<(f32, DVec3)>,
+) -> Reason {
     let place = &request.region;
     let (kind, detail) = match best {
         None => (
@@ -29,9 +73,11 @@ pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVe
             ),
         ),
     };
+    let (kind, detail, seen_share) = looked(shards, place, (kind, detail));
     Reason {
         kind,
         detail,
+        seen_share,
         best_score: best.map(|(score, _)| score),
         best_position_in_world: best.map(|(_, at)| at),
     }
@@ -71,9 +117,11 @@ pub fn of_gaussians(
             )
         }
     };
+    let (kind, detail, seen_share) = looked(search.shards(), place, (kind, detail));
     Reason {
         kind,
         detail,
+        seen_share,
         best_score: best.map(|(score, _)| score),
         best_position_in_world: best.map(|(_, at)| at),
     }

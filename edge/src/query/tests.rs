@@ -195,6 +195,37 @@ fn empty_answers_say_why() {
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
 }
 
+/// Ten Gaussians that views saw, and six, five metres away, that none saw: counted by hand.
+#[test]
+fn no_is_said_only_where_views_looked() {
+    let unseen = (0..6).map(|i| [500 + i, 0, 0]).collect();
+    let shard = TestShard { without_evidence: unseen, ..thing(3, DVec3::ZERO, 10, 0.3) };
+    let scene = [shard.build(false)];
+    let around = |x: f64, radius: f64| {
+        let centre_in_world = DVec3::new(x, 0.0, 0.0);
+        let answers = ask(&scene, |request, _| {
+            request.threshold = Some(0.9);
+            (request.near, request.region.ball) =
+                (Some(centre_in_world), Some(Ball { centre_in_world, radius }));
+        });
+        answers.reason.expect("nothing found")
+    };
+    let cases = [
+        (around(0.0, 60.0), ReasonKind::BelowThreshold, Some(10.0 / 16.0)),
+        (around(0.0, 1.0), ReasonKind::BelowThreshold, Some(1.0)),
+        (around(5.0, 1.0), ReasonKind::NotLookedThere, Some(0.0)),
+        // Two of those that were seen, and all others.
+        (around(5.0, 4.925), ReasonKind::NotLookedThere, Some(2.0 / 8.0)),
+        (around(30.0, 1.0), ReasonKind::NothingThere, None),
+    ];
+    for (reason, kind, seen_share) in cases {
+        assert_eq!((reason.kind, reason.seen_share), (kind, seen_share), "{}", reason.detail);
+        let is_told = reason.detail.starts_with("not looked there: photos saw ");
+        assert_eq!(is_told, kind == ReasonKind::NotLookedThere, "{}", reason.detail);
+    }
+    assert!(around(5.0, 4.925).detail.contains("saw 25 % of what is on board within 4.925 of"));
+}
+
 #[test]
 fn gaussians_come_best_then_nearest_first() {
     let near = DVec3::new(20.355, 0.0, 0.0);

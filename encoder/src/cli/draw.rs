@@ -70,6 +70,10 @@ pub struct DrawArgs {
     /// pose/, intrinsic/). Lenses are drawn without their distortion.
     #[arg(long, value_name = "PATH", help_heading = "Inputs")]
     pub views: PathBuf,
+    /// Writes what is drawn as arrays, too, see docs/inputs.md: the camera z of each pixel into depth/, the splat's
+    /// opacity into coverage/.
+    #[arg(long, help_heading = "Output")]
+    pub depth: bool,
 }
 
 fn parse_up(text: &str) -> Result<DVec3, String> {
@@ -103,13 +107,14 @@ pub(super) fn draw(args: &DrawArgs, progress: &dyn Progress, json: bool) -> Resu
     let (scene, devices, name) = args.drawing.open()?;
     let set = poses::read(&args.views, None)?;
     set.notes.iter().chain(&set.left_out()).for_each(|note| tracing::warn!("{note}"));
-    let views: Vec<DrawnView> = set.views.iter().map(drawn_view).collect();
+    let mut views: Vec<DrawnView> = set.views.iter().map(drawn_view).collect();
     let mut names = HashSet::new();
     if let Some(twice) = views.iter().find(|view| !names.insert(&view.name)) {
         return Err(anyhow!("two views would be drawn into {}; rename one of them", twice.name));
     }
     let out = &args.drawing.out;
-    viewpoints::draw(out, &views, devices.load(&scene)?.as_ref(), &name, json!({}), progress)?;
+    let scene = devices.load(&scene)?;
+    viewpoints::draw(out, &mut views, scene.as_ref(), &name, args.depth, progress)?;
     let poses = out.join(viewpoints::POSES_FILE);
     let report = json!({ "n_views": views.len(), "poses": poses });
     print(json, &report, format!("{} views in {}\n", views.len(), poses.display()))?;

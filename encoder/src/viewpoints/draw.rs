@@ -2,18 +2,19 @@
 
 use std::f32::consts::SQRT_2;
 use std::io::{self, Cursor};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DVec3};
 use image::{ImageError, ImageFormat, Rgb, RgbImage};
 use rayon::prelude::*;
+use serde::Serialize;
 use serde_json::{Value, json};
-use slag_common::{Gaussians, Intrinsics, durable};
+use slag_common::{Gaussians, Intrinsics, durable, npy};
 
 use super::looks::pinhole;
 use super::plan::{Viewpoint, ViewpointPlan};
 use crate::progress::Progress;
-use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
+use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer};
 
 /// Name of the poses file.
 pub const POSES_FILE: &str = "transforms.json";
@@ -57,22 +58,64 @@ pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
     plan.views.iter().enumerate().map(view).collect()
 }
 
-/// Draws views into a folder: `images/` and, when all are there, the poses file. `drawn_from`: the splat, as the
-/// poses file names it; `about`: further members of that file.
+/// Draws views into a folder: `images/`, the files of [`Measured`] if they are wanted and, when all are there, the
+/// poses file. `drawn_from`: the splat, as the poses file names it.
 pub fn draw(
     folder: &Path,
-    views: &[DrawnView],
+    views: &mut [DrawnView],
     scene: &dyn LoadedScene,
     drawn_from: &str,
-    about: Value,
+    with_depth: bool,
     progress: &dyn Progress,
 ) -> Result<(), DrawError> {
-    draw_images(folder, views, scene, progress, |drawn, _| Ok(drawn))?;
-    write_poses(folder, views, drawn_from, about)
+    draw_images(folder, views, scene, progress, |view, drawing, _| {
+        if with_depth {
+            Measured::of(view).write(folder, &drawing)?;
+        }
+        Ok(drawing.image())
+    })?;
+    if with_depth {
+        for view in &mut *views {
+            let measured = json!(Measured::of(view));
+            extend(&mut view.about, measured);
+        }
+    }
+    write_poses(folder, views, drawn_from, json!({}))
+}
+
+/// Files of what a drawing measures, arrays `[height][width]` of 32-bit floats (`.npy`), by the members of the poses
+/// file that name them.
+#[derive(Serialize)]
+struct Measured {
+    /// Camera z in the splat's units (nerfstudio's name); 0 where no Gaussian is.
+    depth_file_path: PathBuf,
+    /// Opacity of the splat, 0 to 1.
+    coverage_file_path: PathBuf,
+}
+
+impl Measured {
+    fn of(view: &DrawnView) -> Self {
+        let name = Path::new(&view.name).with_extension("npy");
+        Self {
+            depth_file_path: Path::new("depth").join(&name),
+            coverage_file_path: Path::new("coverage").join(&name),
+        }
+    }
+
+    fn write(&self, folder: &Path, drawing: &Drawing) -> Result<(), DrawError> {
+        let shape = [drawing.height_px as usize, drawing.width_px as usize];
+        let files = [(&self.depth_file_path, &drawing.depth), (&self.coverage_file_path, &drawing.coverage)];
+        for (path, values) in files {
+            let path = folder.join(path);
+            path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
+            npy::write_file(&path, &shape, values)?;
+        }
+        Ok(())
+    }
 }
 
 /// Draws views as [`draw`] does, sharpened by how much they blur as the Gaussians grow: where those are small, little
-/// changes.
+/// changes. `about`: further members of the poses file.
 pub fn draw_sharpened(
     folder: &Path,
     views: &[DrawnView],
@@ -85,12 +128,12 @@ pub fn draw_sharpened(
     let scales = scene.scales.clone();
     scene.scales.iter_mut().flatten().for_each(|scale| *scale *= SQRT_2);
     let blurred = rasterizer.load(scene)?;
-    draw_images(folder, views, blurred.as_ref(), progress, |drawn, _| Ok(drawn))?;
+    draw_images(folder, views, blurred.as_ref(), progress, |_, drawing, _| Ok(drawing.image()))?;
     drop(blurred);
     scene.scales = scales;
     let loaded = rasterizer.load(scene)?;
-    draw_images(folder, views, loaded.as_ref(), progress, |drawn, path| {
-        Ok(sharpened(&drawn, &image::open(path)?.into_rgb8()))
+    draw_images(folder, views, loaded.as_ref(), progress, |_, drawing, path| {
+        Ok(sharpened(&drawing.image(), &image::open(path)?.into_rgb8()))
     })?;
     write_poses(folder, views, drawn_from, about)
 }
@@ -101,7 +144,7 @@ fn draw_images(
     views: &[DrawnView],
     scene: &dyn LoadedScene,
     progress: &dyn Progress,
-    finish: impl Fn(RgbImage, &Path) -> Result<RgbImage, DrawError> + Sync,
+    finish: impl Fn(&DrawnView, Drawing, &Path) -> Result<RgbImage, DrawError> + Sync,
 ) -> Result<(), DrawError> {
     progress.begin("draw", "view", views.len() as u64, 0);
     let draw_one = |view: &DrawnView| {
@@ -110,7 +153,7 @@ fn draw_images(
         let path = folder.join("images").join(&view.name);
         path.parent().map_or(Ok(()), fs_err::create_dir_all)?;
         let mut png = Cursor::new(Vec::new());
-        finish(drawing.image(), &path)?.write_to(&mut png, ImageFormat::Png)?;
+        finish(view, drawing, &path)?.write_to(&mut png, ImageFormat::Png)?;
         durable::write(&path, png.get_ref())?;
         progress.advance(1);
         Ok(())

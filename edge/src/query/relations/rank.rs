@@ -48,6 +48,9 @@ pub struct Miss {
     pub kind: ReasonKind,
     /// The same in words.
     pub detail: String,
+    /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seen_share: Option<f64>,
     /// The thing that is missing, or not so placed.
     pub thing: String,
     /// Greatest degree of the relation among all pairs.
@@ -57,7 +60,7 @@ pub struct Miss {
 
 impl Miss {
     fn new(kind: ReasonKind, thing: &str, detail: String) -> Self {
-        Self { kind, detail, thing: thing.to_owned(), best_degree: None }
+        Self { kind, detail, seen_share: None, thing: thing.to_owned(), best_degree: None }
     }
 }
 
