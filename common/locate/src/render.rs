@@ -68,6 +68,8 @@ pub(crate) struct Compared<'a> {
     photo: Cow<'a, Grey>,
     /// Width of its pixels, in the photo's.
     px: f64,
+    /// Pixels of a rendering for one of the photo.
+    scale: f64,
     /// Of renderings at its pose.
     pinhole: Intrinsics,
     /// Of the photo: its features, and where an ideal pinhole shows them, the photo's pixels.
@@ -84,7 +86,8 @@ impl<'a> Compared<'a> {
     ) -> Self {
         let (photo, px) = photo.limited(MAX_PX);
         let pinhole = intrinsics.without_distortion().scaled_to_width(photo.width as u32);
-        Self { photo, px: f64::from(px), pinhole, features, at }
+        let scale = f64::from(pinhole.width_px) / f64::from(intrinsics.width_px);
+        Self { photo, px: f64::from(px), scale, pinhole, features, at }
     }
 
     pub(crate) fn render(&self, renderer: &dyn Renderer, camera_from_world: &DAffine3) -> Option<Rendered> {
@@ -129,8 +132,7 @@ impl<'a> Compared<'a> {
 
     /// Matches patches of the photo with a rendering; returns how many were tried, too.
     pub(crate) fn match_patches(&self, rendered: &Rendered) -> (Vec<Match>, usize) {
-        let scale = f64::from(self.pinhole.width_px) / (self.photo.width as f64 * self.px);
-        let at: Vec<DVec2> = self.at.iter().map(|at| *at * scale).collect();
+        let at: Vec<DVec2> = self.at.iter().map(|at| *at * self.scale).collect();
         let found = patches::find(&self.photo, self.px, self.features, &at, &rendered.rendering.grey);
         let matched =
             found.matches.iter().filter_map(|(feature, pixel)| self.matched(rendered, *feature, 0, *pixel));

@@ -27,6 +27,8 @@ use crate::table::{Table, figure};
 
 /// Of so many photos one is a query.
 const HELD_OUT: usize = 4;
+/// Foreign photos that are tried in a scene at most, evenly among all.
+const MAX_FOREIGN: usize = 48;
 /// Error of the focal length of [`Change::Focal`].
 const FOCAL_FACTOR: f64 = 1.03;
 /// Light of [`Change::Dark`].
@@ -152,6 +154,8 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         }
         let others = scenes.iter().enumerate().filter(|(other, _)| *other != at);
         let others: Vec<&View> = others.flat_map(|(_, other)| &other.queries).collect();
+        let others: Vec<&View> =
+            others.iter().step_by(others.len().div_ceil(MAX_FOREIGN).max(1)).copied().collect();
         let foreign = others.par_iter().map(|view| attempt(view)).collect::<Result<Vec<_>>>()?;
         of_scenes.push(Figures::of(&scene.name, &[scene], &tries, &foreign));
         all_tries.extend(tries);
