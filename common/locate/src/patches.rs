@@ -103,7 +103,7 @@ impl Patch {
         Some(DVec2::new(step(x), step(y)) + top(around))
     }
 
-    /// Returns the correlation with the part of a rendering whose first pixel is given, -1 to 1.
+    /// Returns the correlation, -1 to 1, with the part of a rendering that starts at a pixel.
     fn score(&self, rendering: &Grey, [x, y]: [usize; 2]) -> f32 {
         let (mut sum, mut squares, mut product) = (0.0, 0.0, 0.0);
         for (row, patch) in self.0.iter().enumerate() {

@@ -10,12 +10,12 @@ use super::request::QueryRequest;
 use super::scale::Scale;
 use crate::score::{Region, Search};
 
-/// Share of a region's Gaussians that views must have seen before an answer says that nothing is there.
+/// A region was looked at if views saw at least this share of its Gaussians.
 const MIN_SEEN: f64 = 0.5;
 
 /// Returns the share of the Gaussians on board in a region that a used view saw; `None` where there are none.
 fn seen_share(shards: &[ShardView<'_>], region: &Region) -> Option<f64> {
-    let (mut n_seen, mut n_all) = (0, 0);
+    let (mut n_seen, mut n_unseen) = (0, 0);
     for shard in shards.iter().filter(|shard| region.touches(&shard.position_box())) {
         // Those without evidence come last.
         let (n_with_evidence, n) = (shard.n_with_evidence(), shard.header.n_gaussians as usize);
@@ -24,12 +24,14 @@ fn seen_share(shards: &[ShardView<'_>], region: &Region) -> Option<f64> {
             false => range.filter(|at| region.contains(shard.position_in_world(*at))).count(),
         };
         n_seen += in_region(0..n_with_evidence);
-        n_all += in_region(0..n);
+        n_unseen += in_region(n_with_evidence..n);
     }
-    (n_all > 0).then(|| n_seen as f64 / n_all as f64)
+    let n = n_seen + n_unseen;
+    (n > 0).then(|| n_seen as f64 / n as f64)
 }
 
-/// Returns the share of a region that views saw and, where that is too little for a no, what is said instead.
+/// Returns the kind and the detail of an empty answer, and the share of the region that views saw. Where that is too
+/// little for a no, kind and detail say so.
 pub fn looked(
     shards: &[ShardView<'_>],
     region: &Region,

@@ -58,8 +58,8 @@ pub(crate) fn views_of(plan: &ViewpointPlan) -> Vec<DrawnView> {
     plan.views.iter().enumerate().map(view).collect()
 }
 
-/// Draws views into a folder: `images/`, the files of [`Measured`] if they are wanted and, when all are there, the
-/// poses file. `drawn_from`: the splat, as the poses file names it.
+/// Draws views into `images/` of a folder, `with_depth` also into the files of [`Measured`], then writes the poses
+/// file. `drawn_from`: the splat, as the poses file names it.
 pub fn draw(
     folder: &Path,
     views: &mut [DrawnView],
@@ -83,8 +83,7 @@ pub fn draw(
     write_poses(folder, views, drawn_from, json!({}))
 }
 
-/// Files of what a drawing measures, arrays `[height][width]` of 32-bit floats (`.npy`), by the members of the poses
-/// file that name them.
+/// The arrays of a drawing: `.npy` files of 32-bit floats, `[height][width]`. The poses file has these members.
 #[derive(Serialize)]
 struct Measured {
     /// Camera z in the splat's units (nerfstudio's name); 0 where no Gaussian is.
