@@ -37,6 +37,7 @@ pub mod embed;
 pub mod encode;
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet;
+pub(crate) mod ground;
 pub mod html;
 pub mod ingest;
 pub mod landmarks;

@@ -102,6 +102,7 @@ fn build(
         index: &index,
         gaussians: &inputs.scene,
         split: &inputs.split,
+        standing: &inputs.standing,
         photos: &photos,
         group_bytes: pass_bytes,
         cancel: context.cancel(),

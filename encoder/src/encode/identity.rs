@@ -167,6 +167,7 @@ mod tests {
         Inputs {
             scene: Gaussians::default(),
             split: CellSplit::default(),
+            standing: std::sync::Arc::default(),
             views: vec![view],
             missing: Vec::new(),
             geo_reference: None,

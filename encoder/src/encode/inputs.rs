@@ -2,6 +2,7 @@
 
 use std::collections::HashSet;
 use std::path::Path;
+use std::sync::Arc;
 
 use slag_common::frames::GeoReference;
 use slag_common::poses::ViewSet;
@@ -13,6 +14,7 @@ use super::error::EncodeError;
 use super::report::SkippedView;
 use super::settings::{EncodeSettings, InputSettings};
 use crate::cells::{self, CellSplit, PositionError};
+use crate::ground::Standing;
 use crate::memory::{MemoryPlan, Phase};
 use crate::{check, ingest};
 
@@ -28,6 +30,7 @@ const WAITING_BYTES_PER_PX: u64 = 3 + 1 + 4;
 pub(crate) struct Inputs {
     pub(crate) scene: Gaussians,
     pub(crate) split: CellSplit,
+    pub(crate) standing: Arc<Standing>,
     /// The views whose photo exists, in the order of their names.
     pub(crate) views: Vec<View>,
     /// The views whose photo is missing, in the same order.
@@ -78,7 +81,9 @@ impl Inputs {
             );
             return Err(EncodeError::Setting { setting: "position_error", problem });
         }
-        Ok(Self { scene, split, views, missing, geo_reference, n_drawn })
+        let stands = || context.install(|| Standing::find(&scene, &views));
+        let standing = Arc::new(context.time("ground", stands));
+        Ok(Self { scene, split, standing, views, missing, geo_reference, n_drawn })
     }
 }
 

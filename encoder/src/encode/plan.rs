@@ -1,6 +1,7 @@
 //! The first step: everything that is read, checked and decided before the first view.
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 
 use slag_common::Hash32;
@@ -18,12 +19,13 @@ use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSetting
 use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::embed::SharedEncoders;
+use crate::ground::{self, Standing};
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
 use crate::objects;
 use crate::raster::{self, LoadedScene, RasterView};
 use crate::segment::{
-    GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter,
+    GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter, WithStanding,
 };
 use crate::shard;
 use crate::store::{Store, StoreReader};
@@ -80,7 +82,7 @@ pub(super) fn plan<'a>(
         // What cannot be carried is refused before the work.
         engines.models.text_side()?;
     }
-    let segmenter = segmenter_of(&settings.view, &settings.run.gpus, engines)?;
+    let segmenter = segmenter_of(&settings.view, &settings.run.gpus, engines, &inputs.standing)?;
     if let Some(without) = segmenter.check_views(&inputs.views, settings.run.strict)? {
         tracing::warn!("{without}");
     }
@@ -174,6 +176,7 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>
     let mut memory = MemoryPlan::new(settings.run.memory_bytes);
     inputs::reserve(&mut memory, &inputs.scene);
     CellSplit::reserve(&mut memory, n_gaussians);
+    ground::reserve(&mut memory, n_gaussians);
     raster::reserve(&mut memory, n_gaussians);
     shard::reserve(&mut memory, &inputs.split, engines.models.dim());
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
@@ -188,14 +191,15 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>
     memory
 }
 
-/// Opens the segmenter of some settings, on some GPUs.
+/// Opens the segmenter of some settings, on some GPUs; `standing`: what stands on the scene's ground.
 pub(crate) fn segmenter_of(
     settings: &ViewSettings,
     gpus: &[u32],
     engines: &Engines<'_>,
+    standing: &Arc<Standing>,
 ) -> Result<Box<dyn Segmenter>, EncodeError> {
     if settings.regions.have_masks() {
-        open_segmenter(&settings.masks, engines.session, gpus)
+        open_segmenter(&settings.masks, engines.session, gpus, standing)
     } else if engines.models.patches_per_side().is_some() {
         Ok(Box::new(NoMasks))
     } else {
@@ -207,13 +211,16 @@ fn open_segmenter(
     masks: &Masks,
     session: &SessionOptions,
     gpus: &[u32],
+    standing: &Arc<Standing>,
 ) -> Result<Box<dyn Segmenter>, EncodeError> {
+    let standing = Arc::clone(standing);
     Ok(match masks {
         Masks::Auto { n_levels } => {
             let settings = GraphSettings::learnt(*n_levels);
-            Box::new(GraphSegmenter::learnt(settings, session, gpus).map_err(SegmentError::from)?)
+            let other = GraphSegmenter::learnt(settings, session, gpus).map_err(SegmentError::from)?;
+            Box::new(WithStanding { other, standing })
         }
-        Masks::Graph => Box::new(GraphSegmenter::default()),
+        Masks::Graph => Box::new(WithStanding { other: GraphSegmenter::default(), standing }),
         Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
         Masks::Sam { dir, settings, n_model_threads } => {
             let session = SessionOptions { intra_op_threads: *n_model_threads, ..session.clone() };
@@ -271,8 +278,15 @@ mod tests {
         settings.run.memory_bytes = 100_000 * 204;
         let scene = Gaussians { means_in_world: vec![glam::DVec3::ZERO; 100_000], ..Gaussians::default() };
         let split = CellSplit::default();
-        let inputs =
-            Inputs { scene, split, views: Vec::new(), missing: Vec::new(), geo_reference: None, n_drawn: 0 };
+        let inputs = Inputs {
+            scene,
+            split,
+            standing: Arc::default(),
+            views: Vec::new(),
+            missing: Vec::new(),
+            geo_reference: None,
+            n_drawn: 0,
+        };
         let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
         let engines = Engines::new(&models, &session, &CpuRasterizer);
         let refused =

@@ -78,7 +78,7 @@ pub struct InputSettings {
 pub struct ViewSettings {
     /// Where masks come from.
     pub masks: Masks,
-    /// Masks with fewer pixels are left out.
+    /// Masks with fewer pixels are left out, but for those of what stands on the ground.
     pub min_mask_px: u32,
     /// Width at which weights are rasterised.
     pub(crate) raster_width: RasterWidth,

@@ -303,7 +303,8 @@ impl<'a> ViewStages<'a> {
         let pool = Some(self.context.pool());
         let input = SegmentInput { pool, ..SegmentInput::new(&loaded, depth.as_deref()) };
         let mut masks = self.tools.segmenter.segment(&input)?;
-        masks.retain(|mask| mask.area_px >= self.tools.settings.min_mask_px);
+        let min_mask_px = self.tools.settings.min_mask_px;
+        masks.retain(|mask| mask.level == Mask::STANDING || mask.area_px >= min_mask_px);
         let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
         self.context.progress().segmented(&view.name, masks.len(), &draw);
         Ok(Segmented { loaded, masks })

@@ -15,6 +15,7 @@ use crate::blobs::Bucket;
 use crate::cells::{self, CellSplit};
 use crate::encode::fleet_parts::{RunContext, ViewTools, of_scene};
 use crate::encode::{EncodeError, Engines, Masks, ViewSettings};
+use crate::ground::{self, Standing};
 use crate::memory::{MemoryPlan, Phase};
 use crate::raster;
 use crate::segment::Segmenter;
@@ -25,6 +26,7 @@ pub(super) struct Prepared {
     pub(super) settings: ViewSettings,
     pub(super) scene: Gaussians,
     pub(super) split: CellSplit,
+    pub(super) standing: Arc<Standing>,
     /// The views, by their numbers in the plan.
     pub(super) views: Vec<View>,
     pub(super) number_of: HashMap<String, usize>,
@@ -66,8 +68,9 @@ impl Prepared {
             (Masks::Auto { .. } | Masks::Graph, _) => {}
         }
         let views = files.views()?;
+        let standing = Arc::new(context.install(|| Standing::find(&scene, &views)));
         let number_of = views.iter().enumerate().map(|(i, view)| (view.name.clone(), i)).collect();
-        Ok(Self { run, plan, settings, scene, split, views, number_of, files })
+        Ok(Self { run, plan, settings, scene, split, standing, views, number_of, files })
     }
 
     /// Refuses to work where the contributions would be others than the coordinator expects.
@@ -94,6 +97,7 @@ impl Prepared {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());
         CellSplit::reserve(&mut memory, self.scene.len());
+        ground::reserve(&mut memory, self.scene.len());
         raster::reserve(&mut memory, self.scene.len());
         tools.reserve_photos(&mut memory, &self.views);
         memory.rest(0)?;

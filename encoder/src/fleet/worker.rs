@@ -107,7 +107,7 @@ fn work_for(
     let folder = RunFolder::make(&settings.folder)?;
     let of_scene = plan.of_scene;
     let prepared = Prepared::fetch(bucket, (run, plan), folder.path(), settings.segmenter.as_ref(), context)?;
-    let segmenter = segmenter_of(&prepared.settings, &settings.gpus, engines)?;
+    let segmenter = segmenter_of(&prepared.settings, &settings.gpus, engines, &prepared.standing)?;
     prepared.check(engines, segmenter.as_ref(), context)?;
     let dispatcher: Box<dyn Dispatcher> = match &settings.dispatch {
         Dispatch::Share { index, of, help_after } => Box::new(Share::new(*index, *of, *help_after)),

@@ -13,6 +13,7 @@ use super::part::PartContributions;
 use super::photos::Photo;
 use super::table::RegionTable;
 use crate::cells::CellSplit;
+use crate::ground::Standing;
 
 /// The contributions of all views to a scene, and how passes go over them.
 #[derive(Clone, Copy)]
@@ -20,6 +21,7 @@ pub(crate) struct SceneContributions<'a> {
     pub index: &'a ContributionIndex,
     pub gaussians: &'a Gaussians,
     pub split: &'a CellSplit,
+    pub standing: &'a Standing,
     /// Each view's masks, in the order of the index.
     pub photos: &'a [Photo],
     /// Bytes for the contributions of a group of parts.

@@ -3,11 +3,13 @@
 //! graph.
 //!
 //! The length of an edge is the difference of its ends in colour, in the direction of their thinnest axes and, if
-//! known, in their embeddings. Distance only decides which Gaussians are neighbours.
+//! known, in their embeddings. Distance only decides which Gaussians are neighbours. What stands on the ground has no
+//! edge to it, nor to other things: a cone of ten Gaussians would be joined to the road.
 
 use rayon::prelude::*;
 use slag_common::Gaussians;
 
+use crate::ground::Standing;
 use slag_math::dot;
 use slag_math::graph_segmentation::Components;
 use slag_math::nearest::{self, Neighbours};
@@ -99,7 +101,12 @@ pub struct Graph {
 
 impl Graph {
     /// Finds and measures the edges of a scene.
-    pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
+    pub fn new(
+        scene: &Gaussians,
+        standing: &Standing,
+        sketches: Option<Sketches<'_>>,
+        settings: &SuperpointSettings,
+    ) -> Self {
         let usable: Vec<u32> =
             (0..scene.len() as u32).into_par_iter().filter(|i| scene.is_usable(*i as usize)).collect();
         let means: Vec<[f64; 3]> =
@@ -107,6 +114,8 @@ impl Graph {
         let neighbours = Neighbours::new(&means, settings.n_neighbours);
         drop(means);
         let looks: Vec<Look> = usable.par_iter().map(|i| Look::of(scene, *i as usize)).collect();
+        let things: Vec<u32> =
+            usable.par_iter().map(|i| standing.at(scene.means_in_world[*i as usize])).collect();
         let edge = |i: u32, j: u32| -> Edge {
             let (i, j) = (i.min(j) as usize, i.max(j) as usize);
             let (a, b) = (usable[i], usable[j]);
@@ -122,7 +131,9 @@ impl Graph {
             for i in (first as u32..).take(chunk.len()) {
                 // Two that are each other's neighbours have one edge.
                 let is_new = |j: &&u32| i < **j || !neighbours.of(**j).contains(&i);
-                edges.extend(neighbours.of(i).iter().filter(is_new).map(|j| edge(i, *j)));
+                let is_of_thing = |j: &&u32| things[i as usize] == things[**j as usize];
+                let new = neighbours.of(i).iter().filter(is_new).filter(is_of_thing);
+                edges.extend(new.map(|j| edge(i, *j)));
             }
             edges
         };
@@ -158,9 +169,9 @@ impl Superpoints {
         sizes
     }
 
-    /// Partitions a scene. The result does not depend on threads.
-    pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
-        Graph::new(scene, sketches, settings).superpoints(settings)
+    /// Partitions a scene by colour and shape. The result does not depend on threads.
+    pub fn new(scene: &Gaussians, standing: &Standing, settings: &SuperpointSettings) -> Self {
+        Graph::new(scene, standing, None, settings).superpoints(settings)
     }
 
     /// Returns the bytes that partitioning `n_gaussians` takes, at `n_scales` at once: neighbours while they are

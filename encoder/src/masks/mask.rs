@@ -40,6 +40,8 @@ impl Mask {
     /// The level of a mask that only gives pixels without any other a place: its outline is nobody's, so it says
     /// nothing of things.
     pub(crate) const FILLER: u8 = u8::MAX;
+    /// The level of a mask of what stands on the ground: the splat's shape tells it, not the photo.
+    pub(crate) const STANDING: u8 = u8::MAX - 1;
 
     /// Makes a mask of all pixels of a box, with level 0.
     pub fn whole(box_px: BoxPx) -> Self {

@@ -30,6 +30,8 @@ const WHOLE: f32 = 0.9;
 const WHOLE_TENTHS: u64 = 2;
 /// One of this many views that judge an object must show it whole: a car park that 2 of 39 photos outline is none.
 const JUDGES_PER_WHOLE: usize = 11;
+/// Agreement counts as much with a mask of what stands on the ground: all views agree on it, also where things touch.
+const STANDING_TRUST: f64 = 0.75;
 /// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
 const LEAST_UNCUT: f32 = 0.05;
 
@@ -56,6 +58,8 @@ pub(super) struct Sizes<'a> {
     pub(super) of_masks: &'a [u32],
     /// `[n_masks]`: 1 - truncation.
     pub(super) uncut_shares: &'a [f32],
+    /// `[n_masks]`: whether a mask shows what stands on the ground.
+    pub(super) is_standing: &'a [bool],
     /// `[n]`: Gaussians of each superpoint.
     pub(super) of_superpoints: &'a [u32],
     /// Fewest Gaussians of an object.
@@ -91,8 +95,9 @@ impl NodeView {
     }
 
     fn judge(&mut self, sizes: Sizes<'_>) {
-        let best =
-            self.ious(sizes.of_masks).reduce(|best, other| if other.1 > best.1 { other } else { best });
+        let trust = |mask: u32| if sizes.is_standing[mask as usize] { STANDING_TRUST } else { 1.0 };
+        let trusted = self.ious(sizes.of_masks).map(|(mask, iou)| (mask, iou * trust(mask)));
+        let best = trusted.reduce(|best, other| if other.1 > best.1 { other } else { best });
         (self.agreement, self.uncut) =
             best.map_or((0.0, 1.0), |(mask, iou)| (iou, sizes.uncut_shares[mask as usize]));
     }

@@ -17,6 +17,7 @@ use crate::lift::photos::MaskOutline;
 use crate::lift::refine::PendingRefinement;
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
 use crate::lift::{ContributionError, RegionTable, SceneContributions};
+use crate::masks::Mask;
 
 /// Smaller objects are dropped, as the robot drops smaller clusters.
 const MIN_GAUSSIANS: u32 = 10;
@@ -42,7 +43,7 @@ pub(super) fn find_among(
 ) -> Result<SceneObjects, ContributionError> {
     let superpoints = match superpoints {
         Some(superpoints) => Cow::Borrowed(superpoints),
-        None => Cow::Owned(Superpoints::new(scene.gaussians, None, &SuperpointSettings::default())),
+        None => Cow::Owned(Superpoints::new(scene.gaussians, scene.standing, &SuperpointSettings::default())),
     };
     let sightings = Sightings::gather(scene, table, &superpoints)?;
     let pairs = affinity::of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
@@ -53,11 +54,13 @@ pub(super) fn find_among(
     let mut n_of_mask = vec![0; table.n_masks()];
     sightings.masks().for_each(|(_, of_mask)| n_of_mask[of_mask.mask as usize] += of_mask.n);
     let n_of_superpoint = superpoints.sizes();
-    let outlines = scene.photos.iter().flat_map(|photo| &photo.outlines);
-    let uncut_shares: Vec<f32> = outlines.map(MaskOutline::uncut_share).collect();
+    let outlines = || scene.photos.iter().flat_map(|photo| &photo.outlines);
+    let uncut_shares: Vec<f32> = outlines().map(MaskOutline::uncut_share).collect();
+    let is_standing: Vec<bool> = outlines().map(|of| of.level == u32::from(Mask::STANDING)).collect();
     let sizes = Sizes {
         of_masks: &n_of_mask,
         uncut_shares: &uncut_shares,
+        is_standing: &is_standing,
         of_superpoints: &n_of_superpoint,
         min_gaussians: MIN_GAUSSIANS,
     };

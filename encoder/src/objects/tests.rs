@@ -13,6 +13,7 @@ use super::shards::{CellObjects, CentroidBasis};
 use super::*;
 use crate::cells::{CellLimits, CellSplit, split};
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
+use crate::ground::Standing;
 use crate::lift::photos::{MaskOutline, Photo};
 use crate::lift::superpoint::Superpoints;
 use crate::lift::{
@@ -120,7 +121,15 @@ impl World {
     ) -> Result<SceneObjects, ContributionError> {
         let Self { gaussians, split, index, photos, .. } = self;
         let cancel = &AtomicBool::new(is_cancelled);
-        let scene = SceneContributions { index, gaussians, split, photos, group_bytes, cancel };
+        let scene = SceneContributions {
+            index,
+            gaussians,
+            split,
+            standing: &Standing::default(),
+            photos,
+            group_bytes,
+            cancel,
+        };
         find_among(&scene, &self.table, superpoints, &self.score_context)
     }
 }

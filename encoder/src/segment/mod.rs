@@ -7,6 +7,7 @@ mod graph;
 mod none;
 mod sam;
 mod segmenter;
+mod standing;
 mod support;
 
 pub use error::SegmentError;
@@ -15,3 +16,4 @@ pub use graph::{GraphSegmenter, GraphSettings};
 pub use none::NoMasks;
 pub use sam::{SamLevels, SamSegmenter, SamSettings, ScoreFilter};
 pub use segmenter::{SegmentInput, Segmenter};
+pub(crate) use standing::WithStanding;

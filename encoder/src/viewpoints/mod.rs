@@ -2,7 +2,6 @@
 //!
 //! | step | result | file |
 //! |---|---|---|
-//! | up | the upward direction, from the normals of flat Gaussians | `up.rs` |
 //! | space | the scene turned, centred and scaled to a width of 10; its occupied voxels | `space.rs` |
 //! | candidates | the kind of scene; cameras in free places, by kind | `candidates.rs` |
 //! | looks | a small drawing of each candidate: can it be trusted, and which Gaussians does it show? | `looks.rs` |
@@ -14,7 +13,6 @@ mod draw;
 mod looks;
 mod plan;
 mod space;
-mod up;
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -24,6 +22,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::Gaussians;
 
+use crate::ground::up;
 use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{RasterError, Rasterizer};
 use looks::Look;

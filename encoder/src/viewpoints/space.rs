@@ -5,7 +5,7 @@ use slag_common::Gaussians;
 use slag_math::eigen::eigen_symmetric;
 
 use super::plan::ViewpointError;
-use super::up::{self, TRIMMED};
+use crate::ground::up::{self, TRIMMED};
 
 /// Widest side of the scene without strays: far more than the rasteriser's near plane.
 pub(super) const WIDTH: f64 = 10.0;

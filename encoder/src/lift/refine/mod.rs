@@ -67,11 +67,17 @@ pub(crate) struct PendingRefinement {
 
 /// Weight of a filler beside other masks: where a view outlines a thing, another that does not says little.
 const FILLER_WEIGHT: f32 = 0.1;
+/// Weight of a mask of what stands on the ground: it shows a thing alone, where others show its parts or more.
+const STANDING_WEIGHT: f32 = 2.0;
 
-/// Returns the weight of each mask of some photos: (1 - truncation)^power, less for fillers.
+/// Returns the weight of each mask of some photos: (1 - truncation)^power, by its kind.
 fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
     let weight = |outline: &MaskOutline| {
-        let of_kind = if outline.level == u32::from(Mask::FILLER) { FILLER_WEIGHT } else { 1.0 };
+        let of_kind = match outline.level as u8 {
+            Mask::FILLER => FILLER_WEIGHT,
+            Mask::STANDING => STANDING_WEIGHT,
+            _ => 1.0,
+        };
         of_kind * outline.uncut_share().max(LEAST_MASK_WEIGHT).powf(power)
     };
     photos.iter().flat_map(|photo| &photo.outlines).map(weight).collect()
@@ -170,7 +176,8 @@ impl Refinement {
         // The parts of the pass are gone; without this the graph would come on top of them.
         memory::give_back();
         let sketches = Sketches { width: AXES, values: &sketches };
-        let graph = Graph::new(scene.gaussians, Some(sketches), &SuperpointSettings::default());
+        let graph =
+            Graph::new(scene.gaussians, scene.standing, Some(sketches), &SuperpointSettings::default());
         let Aggregation { superpoint, coarse, .. } = self.settings;
         let partition = |weight: f32, is_needed: bool, settings: SuperpointSettings| {
             is_needed.then(|| (weight, graph.superpoints(&settings)))

@@ -8,6 +8,7 @@ use slag_math::random::mix64;
 
 use super::*;
 use crate::cells::{Cell, CellSplit, PositionGrid};
+use crate::ground::Standing;
 use crate::lift::photos::MaskOutline;
 use crate::lift::tests::{Scene, open};
 use crate::lift::{CellField, Contribution, ViewContributions};
@@ -122,7 +123,15 @@ fn lift(
 ) -> Lifted {
     let Scene { index, table, .. } = &open(views, dim, &[N], u64::MAX);
     let (gaussians, split, cancel) = (&gaussians(), &split(), &AtomicBool::new(false));
-    let scene = SceneContributions { index, gaussians, split, photos, group_bytes, cancel };
+    let scene = SceneContributions {
+        index,
+        gaussians,
+        split,
+        standing: &Standing::default(),
+        photos,
+        group_bytes,
+        cancel,
+    };
     let pending = PendingRefinement::begin(settings, &scene, table.clone()).expect("reads");
     let (table, refinement) = pending.finish(&scene, &object_of()).expect("reads");
     let raw = index.read(0..1).expect("reads");

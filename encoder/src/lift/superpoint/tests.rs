@@ -26,7 +26,7 @@ fn scene() -> Gaussians {
 #[test]
 fn pieces_end_where_colour_or_direction_changes() {
     let settings = SuperpointSettings { scale: 1.0, ..SuperpointSettings::default() };
-    let found = Superpoints::new(&scene(), None, &settings);
+    let found = Superpoints::new(&scene(), &Standing::default(), &settings);
     assert_eq!(found.n, 3);
     for kind in 0..3 {
         assert!((0..400).all(|i| found.of_gaussian[i * 3 + kind] == found.of_gaussian[kind]), "{kind}");
@@ -39,7 +39,9 @@ fn sketches_separate_what_looks_alike_and_unknown_ones_do_not() {
     scene.sh_dc.fill([0.0; 3]);
     let settings = SuperpointSettings { normal: 0.0, scale: 1.0, ..SuperpointSettings::default() };
     let n_with = |sketches: &[i8]| {
-        Superpoints::new(&scene, Some(Sketches { width: 2, values: sketches }), &settings).n
+        Graph::new(&scene, &Standing::default(), Some(Sketches { width: 2, values: sketches }), &settings)
+            .superpoints(&settings)
+            .n
     };
     let of = |left: [i8; 2], right: [i8; 2]| -> Vec<i8> {
         (0..1200).flat_map(|i| if i % 3 == 1 { right } else { left }).collect()
@@ -54,7 +56,7 @@ fn small_pieces_are_joined_and_unusable_gaussians_have_none() {
     let mut scene = scene();
     scene.sh_dc[10] = [3.0; 3];
     scene.means_in_world[700].x = f64::NAN;
-    let found = Superpoints::new(&scene, None, &SuperpointSettings::default());
+    let found = Superpoints::new(&scene, &Standing::default(), &SuperpointSettings::default());
     assert_eq!(found.of_gaussian[700], NO_SUPERPOINT);
     let mut sizes = vec![0; found.n];
     found.of_gaussian.iter().filter(|s| **s != NO_SUPERPOINT).for_each(|s| sizes[*s as usize] += 1);
@@ -65,7 +67,27 @@ fn small_pieces_are_joined_and_unusable_gaussians_have_none() {
 fn threads_do_not_show() {
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-        pool.install(|| Superpoints::new(&scene(), None, &SuperpointSettings::default()))
+        pool.install(|| Superpoints::new(&scene(), &Standing::default(), &SuperpointSettings::default()))
     };
     assert_eq!(run(1), run(3));
+}
+
+/// Twelve Gaussians of the ground's colour and direction stay a thing of their own, though superpoints have twenty.
+#[test]
+fn what_stands_on_the_ground_is_no_part_of_it() {
+    let mut scene = Gaussians::default();
+    let ground = (0..10_000).map(|i| [f64::from(i % 100) * 0.02, f64::from(i / 100) * 0.02, 0.0]);
+    let cone = (0..12).map(|i| [1.0 + f64::from(i % 4) * 0.02, 1.0 + f64::from(i / 4) * 0.02, 0.06]);
+    for position in ground.chain(cone) {
+        scene.means_in_world.push(position.into());
+        scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        scene.scales.push([0.01, 0.01, 0.001]);
+        scene.opacities.push(0.9);
+        scene.sh_dc.push([0.0; 3]);
+    }
+    let standing = Standing::find(&scene, &[]);
+    let found = Superpoints::new(&scene, &standing, &SuperpointSettings::default());
+    let cone = found.of_gaussian[10_000];
+    assert!(found.of_gaussian[10_000..].iter().all(|superpoint| *superpoint == cone));
+    assert_eq!(found.sizes()[cone as usize], 12);
 }

@@ -8,6 +8,8 @@ use slag_math::stats::{median, trimmed_range};
 
 /// Directions that are tried, on a half of the sphere: the nearest is within 3 degrees.
 const N_DIRECTIONS: usize = 1000;
+/// Most Gaussians whose normals are counted.
+const MAX_NORMALS: usize = 1 << 20;
 /// Cosine of the angle within which normals agree, 8 degrees.
 const AGREE: f64 = 0.990;
 /// Shortest of the axes of a flat Gaussian, relative to the next: 0.3 leaves those of surfaces.
@@ -23,12 +25,12 @@ const MIN_OPACITY: f32 = 0.3;
 /// How far the median height lies below the middle, relative to the height, before it tells up from down.
 const MIN_SKEW: f64 = 0.03;
 /// Share that is trimmed at either end of an extent.
-pub(super) const TRIMMED: f64 = 0.02;
+pub(crate) const TRIMMED: f64 = 0.02;
 /// Where nothing tells the vertical: cameras of photos have y down, and so have most files.
-pub(super) const OF_FILES: DVec3 = DVec3::NEG_Y;
+pub(crate) const OF_FILES: DVec3 = DVec3::NEG_Y;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Sign {
+pub(crate) enum Sign {
     Known,
     /// The axis may point down.
     Unknown,
@@ -37,15 +39,15 @@ pub(super) enum Sign {
 }
 
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Up {
+pub(crate) struct Up {
     /// Unit.
-    pub(super) axis: DVec3,
-    pub(super) sign: Sign,
+    pub(crate) axis: DVec3,
+    pub(crate) sign: Sign,
 }
 
 /// Finds the vertical: the direction that most normals have; of several alike, as those of walls and floors, the one
 /// along which the scene extends least. Without any, the axis of least spread; without that, the files' own.
-pub(super) fn find(scene: &Gaussians) -> Up {
+pub(crate) fn find(scene: &Gaussians) -> Up {
     let normals = normals(scene);
     let total: f64 = normals.iter().map(|(_, weight)| weight).sum();
     let peaks = if total > 0.0 { peaks(&normals, total) } else { Vec::new() };
@@ -62,13 +64,14 @@ pub(super) fn find(scene: &Gaussians) -> Up {
 }
 
 /// Returns the Gaussians that belong to surfaces.
-pub(super) fn solid(scene: &Gaussians) -> impl Iterator<Item = usize> {
+pub(crate) fn solid(scene: &Gaussians) -> impl Iterator<Item = usize> {
     (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY)
 }
 
 /// Returns normals of flat Gaussians, with weights that the largest do not rule.
 fn normals(scene: &Gaussians) -> Vec<(DVec3, f64)> {
-    let flat = solid(scene).filter_map(|i| {
+    let stride = scene.len().div_ceil(MAX_NORMALS).max(1);
+    let flat = solid(scene).step_by(stride).filter_map(|i| {
         let scales = scene.scales[i].map(f64::from);
         let mut axes = [0, 1, 2];
         axes.sort_by(|a, b| scales[*a].total_cmp(&scales[*b]));
@@ -142,7 +145,7 @@ fn along(scene: &Gaussians, axis: DVec3) -> Vec<f64> {
 }
 
 /// Returns the range of solid Gaussians along an axis, without strays.
-pub(super) fn extent(scene: &Gaussians, axis: DVec3) -> Option<(f64, f64)> {
+pub(crate) fn extent(scene: &Gaussians, axis: DVec3) -> Option<(f64, f64)> {
     trimmed_range(&mut along(scene, axis), TRIMMED)
 }
 

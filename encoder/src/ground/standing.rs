@@ -1,0 +1,184 @@
+//! What stands on the ground: voxels above it that touch each other.
+
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+use slag_common::{Gaussians, View};
+use slag_math::stats::median;
+use slag_math::union_find::UnionFind;
+
+use super::height::Ground;
+use super::up;
+use crate::memory::{MemoryPlan, Phase};
+
+/// The thing at a place where none stands.
+pub(crate) const NO_THING: u32 = u32::MAX;
+
+/// Gaussians below this opacity are no surface.
+const MIN_OPACITY: f32 = 0.1;
+/// Larger ones are sky and haze, resolutions.
+const MAX_SCALE: f64 = 30.0;
+/// Side of a voxel, resolutions.
+const VOXEL: f64 = 4.0;
+/// Height from which a place is above the ground, resolutions.
+const MIN_HEIGHT: f64 = 2.0;
+/// Fewest Gaussians of a thing.
+const MIN_GAUSSIANS: u32 = 10;
+/// A thing is narrower than this share of the ground: of walls and what touches them a room consists.
+const MAX_WIDTH: f64 = 0.25;
+/// Most Gaussians that the ground is measured by.
+const SAMPLE: usize = 1 << 22;
+/// Bits of a voxel's coordinate.
+const BITS: u32 = 21;
+
+/// The things that stand on a scene's ground; none by default.
+#[derive(Debug, Default)]
+pub(crate) struct Standing(Option<Things>);
+
+#[derive(Debug)]
+struct Things {
+    /// Rotation from the world to axes with z up.
+    upright_from_world: DMat3,
+    ground: Ground,
+    /// World units: the median size of a Gaussian.
+    resolution: f64,
+    /// Voxels of things, ascending.
+    voxels: Vec<u64>,
+    /// The thing of each.
+    of_voxel: Vec<u32>,
+    /// Of each thing, whether it is less wide than what the scene consists of.
+    is_narrow: Vec<bool>,
+}
+
+/// Reserves the voxels of a scene's things.
+pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
+    let bytes_per_voxel = size_of::<u64>() + size_of::<u32>();
+    memory.reserve(Phase::Always, "what stands on the ground", (n_gaussians * bytes_per_voxel) as u64);
+}
+
+impl Standing {
+    /// Finds what stands on the ground. Most `views` have the sky above them or the ground before them.
+    pub(crate) fn find(scene: &Gaussians, views: &[View]) -> Self {
+        Self(Things::find(scene, up_by(scene, views)))
+    }
+
+    /// Returns whether nothing does.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.0.as_ref().is_none_or(|things| things.voxels.is_empty())
+    }
+
+    pub(crate) fn n_things(&self) -> usize {
+        self.0.as_ref().map_or(0, |things| things.is_narrow.len())
+    }
+
+    /// Returns the thing that a point belongs to, or [`NO_THING`].
+    pub(crate) fn at(&self, point_in_world: DVec3) -> u32 {
+        let thing = |things: &Things| {
+            let voxel = things.voxel_of(things.upright_from_world * point_in_world)?;
+            things.of(voxel)
+        };
+        self.0.as_ref().and_then(thing).unwrap_or(NO_THING)
+    }
+
+    /// Returns the narrow thing at a point, or beside it as far as a voxel, where a drawing's depth is that exact; or
+    /// [`NO_THING`].
+    pub(crate) fn shown_at(&self, point_in_world: DVec3) -> u32 {
+        let thing = |things: &Things| {
+            let voxel = things.voxel_of(things.upright_from_world * point_in_world)?;
+            let beside = steps().flat_map(|step| [voxel.wrapping_add(step), voxel.wrapping_sub(step)]);
+            let thing = std::iter::once(voxel).chain(beside).find_map(|voxel| things.of(voxel))?;
+            things.is_narrow[thing as usize].then_some(thing)
+        };
+        self.0.as_ref().and_then(thing).unwrap_or(NO_THING)
+    }
+}
+
+impl Things {
+    fn find(scene: &Gaussians, up: DVec3) -> Option<Self> {
+        let x_axis = up.any_orthonormal_vector();
+        let upright_from_world = DMat3::from_cols(x_axis, up.cross(x_axis), up).transpose();
+        let is_surface = |i: &usize| scene.opacities[*i] >= MIN_OPACITY && scene.is_usable(*i);
+        // The two larger axes.
+        let axes = |i: usize| {
+            let [mut a, mut b, c] = scene.scales[i].map(f64::from);
+            if a > b {
+                std::mem::swap(&mut a, &mut b);
+            }
+            [a.max(b.min(c)), b.max(c)]
+        };
+        let sample = || (0..scene.len()).step_by(scene.len().div_ceil(SAMPLE).max(1)).filter(is_surface);
+        let resolution = median(&mut sample().map(|i| axes(i)[0]).collect::<Vec<f64>>())?;
+        let is_fine = |i: &usize| axes(*i)[1] < MAX_SCALE * resolution;
+        let upright = |i: usize| upright_from_world * scene.means_in_world[i];
+        let area = |i: usize| axes(i)[0] * axes(i)[1] * f64::from(scene.opacities[i]);
+        let points: Vec<(DVec3, f64)> = sample().filter(is_fine).map(|i| (upright(i), area(i))).collect();
+        let ground = Ground::find(&points, resolution)?;
+        let (voxels, of_voxel, is_narrow) = (Vec::new(), Vec::new(), Vec::new());
+        let mut things = Self { upright_from_world, ground, resolution, voxels, of_voxel, is_narrow };
+        let solid = (0..scene.len()).into_par_iter().filter(|i| is_surface(i) && is_fine(i));
+        let mut voxels: Vec<u64> = solid.filter_map(|i| things.voxel_of(upright(i))).collect();
+        voxels.par_sort_unstable();
+        things.join(&voxels);
+        Some(things)
+    }
+
+    /// Returns the voxel of a point in upright axes; `None` on the ground, below it, and far from the scene.
+    fn voxel_of(&self, point: DVec3) -> Option<u64> {
+        let half = f64::from(1_u32 << (BITS - 1));
+        let at = (point / (VOXEL * self.resolution)).floor() + half;
+        let is_within = at.min_element() >= 1.0 && at.max_element() < 2.0 * half - 1.0;
+        let is_above = self.ground.height_of(point) >= MIN_HEIGHT * self.resolution;
+        (is_within && is_above).then(|| at.to_array().into_iter().fold(0, |key, at| key << BITS | at as u64))
+    }
+
+    fn of(&self, voxel: u64) -> Option<u32> {
+        self.voxels.binary_search(&voxel).ok().map(|at| self.of_voxel[at])
+    }
+
+    /// Joins the voxels of all Gaussians, ascending, that touch each other.
+    fn join(&mut self, of_gaussians: &[u64]) {
+        let (voxels, n_gaussians): (Vec<u64>, Vec<u32>) =
+            of_gaussians.chunk_by(|a, b| a == b).map(|same| (same[0], same.len() as u32)).unzip();
+        let mut sets = UnionFind::new(voxels.len());
+        for (i, voxel) in (0u32..).zip(&voxels) {
+            for other in steps().filter_map(|step| voxels.binary_search(&(voxel + step)).ok()) {
+                let (a, b) = (sets.root(i), sets.root(other as u32));
+                sets.attach(a.max(b), a.min(b));
+            }
+        }
+        let numbering = sets.number(0..voxels.len() as u32);
+        let mut n_of_set = vec![0; numbering.sizes.len()];
+        for (set, n) in numbering.of_item.iter().zip(&n_gaussians) {
+            n_of_set[*set as usize] += n;
+        }
+        let is_thing = |at: &u32| n_of_set[numbering.of_item[*at as usize] as usize] >= MIN_GAUSSIANS;
+        let of_things = sets.number((0..voxels.len() as u32).filter(is_thing));
+        let mut sides = vec![[[u64::MAX, 0]; 2]; of_things.sizes.len()];
+        for (voxel, thing) in voxels.iter().zip(&of_things.of_item).filter(|(_, thing)| **thing != NO_THING) {
+            let at = [voxel >> (2 * BITS), voxel >> BITS & ((1 << BITS) - 1)];
+            for ([low, high], at) in sides[*thing as usize].iter_mut().zip(at) {
+                (*low, *high) = ((*low).min(at), (*high).max(at));
+            }
+        }
+        let most = MAX_WIDTH * self.ground.width / (VOXEL * self.resolution);
+        self.is_narrow =
+            sides.iter().map(|sides| sides.iter().all(|[low, high]| ((high - low) as f64) < most)).collect();
+        (self.voxels, self.of_voxel) =
+            voxels.into_iter().zip(of_things.of_item).filter(|(_, thing)| *thing != NO_THING).unzip();
+    }
+}
+
+/// Returns the steps from a voxel to those after it that share a face or an edge: half of 18.
+fn steps() -> impl Iterator<Item = u64> {
+    let [x, y, z] = [1 << (2 * BITS), 1 << BITS, 1];
+    [x, y, z, x + y, x - y, x + z, x - z, y + z, y - z].into_iter()
+}
+
+/// Returns the upward direction, unit. The Gaussians tell the axis; views have it above them or the ground before them.
+fn up_by(scene: &Gaussians, views: &[View]) -> DVec3 {
+    let axis = up::find(scene).axis;
+    let away = |view: &View| {
+        let world_from_camera = view.camera_from_world.inverse().matrix3;
+        -(world_from_camera.y_axis + world_from_camera.z_axis).dot(axis)
+    };
+    if views.iter().map(away).sum::<f64>() < 0.0 { -axis } else { axis }
+}
