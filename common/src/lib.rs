@@ -10,6 +10,7 @@ pub mod camera;
 pub mod container;
 pub mod durable;
 mod error_line;
+pub mod files;
 pub mod frames;
 pub mod gaussians;
 pub mod hash;

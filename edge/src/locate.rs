@@ -31,6 +31,8 @@ pub enum LocateError {
         "the photo has {width} x {height} pixels, expected at most {MAX_SIDE_PX} a side and {MAX_PX} in all"
     )]
     TooLarge { width: u32, height: u32 },
+    #[error("{parameter}: found {found}, expected {expected}")]
+    Camera { parameter: &'static str, found: String, expected: String },
     #[error(
         "cell {cell_id} has landmarks of version {found}, this program matches version {CODE_VERSION}; use a program of the matching version, or encode again"
     )]
@@ -118,6 +120,16 @@ pub fn answer(
     let grey = photo.grey()?;
     let (width, height) = (grey.width as f64, grey.height as f64);
     let [centre_x_px, centre_y_px] = camera.centre_px.unwrap_or([width / 2.0, height / 2.0]);
+    // With a centre that is no camera's, a pose far away may agree with the photo.
+    if !((0.0..=width).contains(&centre_x_px) && (0.0..=height).contains(&centre_y_px)) {
+        let expected = format!("a point of the photo, which has {width} x {height} pixels");
+        let found = format!("{centre_x_px},{centre_y_px}");
+        return Err(LocateError::Camera { parameter: "centre_px", found, expected });
+    }
+    if camera.gravity == Some(DVec3::ZERO) {
+        let (found, expected) = ("0,0,0".into(), "a direction".into());
+        return Err(LocateError::Camera { parameter: "gravity", found, expected });
+    }
     let intrinsics = Intrinsics {
         width_px: grey.width as u32,
         height_px: grey.height as u32,

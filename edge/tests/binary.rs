@@ -154,6 +154,9 @@ fn a_robot_fetches_asks_and_serves() {
     assert_eq!((code, &json(&out)["error"]["kind"]), (Some(1), &"unknown-words".into()));
     assert_eq!(run(&cache, &["query", " "]).0, Some(2));
     assert_eq!(run(&cache, &["query", "red", "--limit", "0"]).0, Some(2));
+    assert_eq!(run(&cache, &["list", "--limit", "0"]).0, Some(2));
+    let centre = run(&cache, &["locate", "absent.jpg", "--focal-px", "500", "--centre-px", "320,240"]);
+    assert!(centre.0 == Some(1) && centre.2.contains("absent.jpg"), "{}", centre.2);
 
     let (serving, url) = serve(&cache, &[]);
     let (code, answers) = get(&format!("{url}/query?text=blue"));

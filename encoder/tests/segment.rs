@@ -218,6 +218,23 @@ fn run_length_files_of_every_form() {
     let given = GivenMasks::open(&whole, Vec::new()).unwrap();
     assert!(given.covers(&view("b.jpg", 8, 6)) && !given.covers(&view("c.jpg", 8, 6)));
 
+    // Masks that would be lost, or end at another photo.
+    for (images, id, expected) in [
+        (r#"{"id": 8, "file_name": "left/a.jpg"}"#, "9", "mask 0 has image_id 9, which no image has"),
+        (r#"{"id": 8, "file_name": "left/a.jpg"}"#, "null", "mask 0 has image_id none"),
+        (
+            r#"{"id": 8, "file_name": "left/a.jpg"}, {"id": 8, "file_name": "b"}"#,
+            "8",
+            "two images have the id 8",
+        ),
+        (r#"{"id": 8, "file_name": "b"}, {"id": 7, "file_name": "b"}"#, "8", "two images have the file_name"),
+    ] {
+        let mask = format!(r#"{{"segmentation": {{"size": [6, 8], "counts": [48]}}, "image_id": {id}}}"#);
+        fs_err::write(&whole, format!(r#"{{"images": [{images}], "annotations": [{mask}]}}"#)).unwrap();
+        let error = load(&whole, &[], None).unwrap_err().to_string();
+        assert!(error.contains(expected) && error.contains("coco.json"), "{error}");
+    }
+
     for (json, expected) in [
         (r#"[{"segmentation": [[1, 2, 3, 4, 5, 6]]}]"#, "polygons"),
         (r#"[{"segmentation": {"size": [6, 8], "counts": [47]}}]"#, "mask 0: runs add up to 47"),
@@ -518,6 +535,11 @@ fn masks_are_matched_with_their_photos() {
         fs_err::write(&path, format!(r#"{{"images": [{}], "annotations": []}}"#, images.join(","))).unwrap();
         assert_eq!(check(&path, true).is_ok(), covered, "{names:?}");
     }
+    for ending in ["png", "json"] {
+        fs_err::write(dir.path().join("b").with_extension(ending), "").unwrap();
+    }
+    let said = check(dir.path(), true).unwrap().unwrap();
+    assert!(said.contains("b.png is read") && said.ends_with("b.json beside it is not"), "{said}");
 }
 
 fn write_png_sized(path: &Path, width: u32, height: u32, pixels: &[u8]) {

@@ -315,9 +315,8 @@ pub fn query(data: &[u8]) -> bool {
 pub fn grammar(data: &[u8]) -> bool {
     let text = String::from_utf8_lossy(data).into_owned();
     let read = std::thread::Builder::new().stack_size(2 << 20).spawn(move || {
-        let understood = relations::understand(&text);
-        let phrase = serde_json::from_str::<Phrase>(&text).ok().filter(|phrase| phrase.check().is_ok());
-        let phrases = [understood, phrase].into_iter().flatten();
+        let phrases = [relations::understand(&text), serde_json::from_str::<Phrase>(&text).ok()];
+        let phrases = phrases.into_iter().flatten().filter(|phrase| phrase.check().is_ok());
         phrases.inspect(|phrase| assert!(phrase.things().len() <= relations::MAX_THINGS)).count() > 0
     });
     read.expect("a thread").join().expect("no panic")

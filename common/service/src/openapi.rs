@@ -123,8 +123,8 @@ fn operation(route: &Route, of_all: &[(u16, &'static str)], problem: &Value, sch
         }
         let of_bodies = OF_BODIES.iter().filter(|(status, _)| *status != 401 || !route.reads);
         of_bodies.for_each(|(status, description)| refuse(*status, description));
-    } else if takes_query || route.parameters.iter().any(|parameter| parameter.place == "path") {
-        refuse(400, "A parameter is invalid.");
+    } else {
+        refuse(400, "A parameter is invalid, or none of this resource.");
     }
     if takes_query {
         // It is refused before anything can write a problem.

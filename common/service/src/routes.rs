@@ -13,6 +13,8 @@ use schemars::{JsonSchema, SchemaGenerator};
 use serde_json::{Map, Value};
 
 use crate::body;
+use crate::params::RequestError;
+use crate::problem::Problem;
 use crate::replies::{Answering, Binary, Described, Reply, SchemaOf};
 
 /// A part of the path, or a header that counts.
@@ -92,6 +94,8 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         summary: &'static str,
         handler: MethodRouter<S, Infallible>,
     ) -> Self {
+        // Where no handler reads the query string, what it says would be ignored in silence.
+        let handler = if H::query().is_some() { handler } else { handler.route_layer(from_fn(no_query)) };
         self.router = self.router.route(path, handler);
         self.table.push(Route {
             method,
@@ -195,6 +199,18 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
 
     pub(crate) fn into_parts(self) -> (Router<S>, Vec<Route>) {
         (self.router, self.table)
+    }
+}
+
+/// Hands a request on that has no query string.
+async fn no_query(request: Request, next: Next) -> Response {
+    match request.uri().query() {
+        None | Some("") => next.run(request).await,
+        Some(query) => {
+            let error =
+                RequestError::new("query string", query, "none, since this resource has no parameters");
+            Problem::from(error).into_response()
+        }
     }
 }
 

@@ -18,7 +18,6 @@ use std::fmt;
 use std::io::Read;
 use std::path::Path;
 
-use fs_err::File;
 use glam::{DAffine3, DMat3, DQuat};
 use serde::{Deserialize, Serialize};
 
@@ -26,6 +25,7 @@ use super::checks::affine_from_rows;
 use super::error::{Place, PoseError, PoseProblem};
 use super::transforms::COLMAP_AXES;
 use super::view_set::{AppliedTransform, PoseSource};
+use crate::files;
 use crate::similarity::Similarity;
 
 /// Nerfstudio's name of the file.
@@ -56,7 +56,7 @@ impl SplatFrame {
     /// Reads a `dataparser_transforms.json`.
     pub fn read(path: &Path) -> Result<Self, PoseError> {
         let mut bytes = Vec::new();
-        File::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
+        files::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
         let fail = |problem: PoseProblem| problem.at(path, Place::File);
         if bytes.len() as u64 > MAX_BYTES {
             let bytes = fs_err::metadata(path)?.len();

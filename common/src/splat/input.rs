@@ -4,6 +4,7 @@ use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use super::error::{Place, SplatError};
+use crate::files;
 
 /// Large enough to make system calls negligible, small compared with the columns.
 const BUFFER_BYTES: usize = 1 << 18;
@@ -18,7 +19,7 @@ pub(super) struct Input {
 
 impl Input {
     pub fn open(path: &Path) -> Result<Self, SplatError> {
-        let file = fs_err::File::open(path)?;
+        let file = files::open(path)?;
         let metadata = file.metadata()?;
         if !metadata.is_file() {
             let format = "what is no file, such as a pipe or a device,".to_owned();
@@ -86,6 +87,22 @@ impl Input {
             format_args!("{n} bytes of {what}"),
             format_args!("{} up to the end of the file", self.remaining_bytes()),
         ))
+    }
+
+    /// Checks that nothing but blanks remains.
+    pub fn require_end(&mut self) -> Result<(), SplatError> {
+        loop {
+            let bytes = self.fill_buf()?;
+            let n = bytes.len();
+            if n == 0 {
+                return Ok(());
+            }
+            if !bytes.trim_ascii().is_empty() {
+                let left = format_args!("{} more bytes", self.remaining_bytes());
+                return Err(SplatError::malformed(&self.path, self.place(), "the end of the file", left));
+            }
+            self.consume(n);
+        }
     }
 
     /// Reads a line, line feed included, into `line`, at most `limit_bytes`; `line` is empty at the end of the

@@ -140,7 +140,7 @@ pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaus
 }
 
 pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
-    let file = fs_err::File::open(path)?;
+    let file = crate::files::open(path)?;
     let len_bytes = file.metadata()?.len();
     let archive = ZipArchive::new(BufReader::new(file))
         .map_err(|source| SplatError::undecodable(path, Place::Byte(0), "the ZIP directory", source))?;

@@ -243,9 +243,14 @@ fn read_whole(
         check_extensions(&path, &place, &mut stream)?;
     }
     // Read to the end: gzip's checksum stands there.
-    io::copy(&mut stream, &mut io::sink())
-        .map_err(|source| SplatError::undecodable(&path, place, "the end of the stream", source))?;
-    Ok(out)
+    match io::copy(&mut stream, &mut io::sink()) {
+        Ok(0) => Ok(out),
+        // With another count in the header, columns begin elsewhere.
+        Ok(n) => {
+            Err(SplatError::malformed(&path, place, "the end of the stream", format_args!("{n} more bytes")))
+        }
+        Err(source) => Err(SplatError::undecodable(&path, place, "the end of the stream", source)),
+    }
 }
 
 /// Reads and checks the part of version 4 that precedes the streams: the rest of the header, the extensions and

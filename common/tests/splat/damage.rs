@@ -9,7 +9,7 @@ use slag_math::random::Random;
 use slag_test_support::{memory_of, trials};
 
 use super::generated::{gzip, write_sog_v1};
-use super::{assert_columns_agree, needs_shared, read_all, shared};
+use super::{assert_columns_agree, needs_shared, read_all, read_bytes, shared};
 
 /// Damages a file: truncates it, flips bits, overwrites a word with an extreme value, or changes a digit. Half of
 /// the places lie near the front, among the headers.
@@ -103,6 +103,33 @@ fn damaged_files_as_they_are() {
         let bytes = fixture(name);
         survives_damage(name, &bytes, 1000, <[u8]>::to_vec);
     }
+}
+
+/// More rows than the header counts, or two columns of a name, would be half read in silence.
+#[needs_shared]
+#[test]
+fn files_that_go_on_behind_their_last_row_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let spz = fixture("playbot_lod6_v3.spz");
+    let mut content = Vec::new();
+    flate2::read::GzDecoder::new(&spz[..]).read_to_end(&mut content).expect("unpacks");
+    let longer = |bytes: &[u8]| [bytes, &[7; 400]].concat();
+    let (ascii, plain) = (fixture("gsplatrs_minimal_ascii.ply"), fixture("playbot_lod6.ply"));
+    let rows = ascii.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
+    for (name, bytes) in [
+        ("plain.ply", longer(&plain)),
+        ("ascii.ply", [&ascii, &b"\n"[..], &ascii[rows..]].concat()),
+        ("packed.ply", longer(&fixture("playbot_lod6.compressed.ply"))),
+        ("whole.spz", gzip(&longer(&content))),
+    ] {
+        let error = read_bytes(folder.path(), name, &bytes).expect_err(name).to_string();
+        assert!(error.contains("expected the end of the"), "{error}");
+    }
+    read_bytes(folder.path(), "blank.ply", &[&plain[..], b"\n"].concat()).expect("reads");
+    let (from, to) = ("property float opacity\n", "property float opacity\nproperty float opacity\n");
+    let twice = String::from_utf8(ascii).expect("text").replacen(from, to, 1);
+    let error = read_bytes(folder.path(), "twice.ply", twice.as_bytes()).expect_err("is refused").to_string();
+    assert!(error.contains("a property that the element does not have yet"), "{error}");
 }
 
 /// Damage inside an intact gzip stream; its checksum would otherwise catch the damage.

@@ -1,6 +1,7 @@
 //! `list`.
 
 use std::io::{self, Write};
+use std::num::NonZeroUsize;
 use std::time::Duration;
 
 use clap::Args;
@@ -47,7 +48,7 @@ pub struct ListArgs {
     pub sort: ObjectOrder,
     /// Most things [default: all].
     #[arg(long)]
-    pub limit: Option<usize>,
+    pub limit: Option<NonZeroUsize>,
     /// Print json, csv, or geojson, which needs a scene with a place on the earth [default: a table for people].
     #[arg(long, value_name = "FORMAT", value_parser = named::<ListFormat>)]
     pub format: Option<ListFormat>,
@@ -79,7 +80,7 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
     let format = if args.json { Some(ListFormat::Json) } else { args.format };
     let checked = format.unwrap_or_default().check(&on_board.snapshot.manifest);
     checked.map_err(|e| Failure::Usage(e.into()))?;
-    let limit = args.limit.unwrap_or(usize::MAX);
+    let limit = args.limit.map_or(usize::MAX, NonZeroUsize::get);
     let page = engine.objects(&on_board, &filter, limit, NAMES_WAIT, &Budget::default())?;
     if let Err(error) = on_board.check() {
         writeln!(io::stderr(), "without names: {error}")?;

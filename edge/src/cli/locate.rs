@@ -30,8 +30,8 @@ pub struct LocateArgs {
     #[arg(long, value_name = "PX", value_parser = parse_focal)]
     pub focal_px: f64,
     /// Principal point, pixels from the left and the top [default: the middle of the photo].
-    #[arg(long, value_name = "PX", num_args = 2, value_delimiter = ',')]
-    pub centre_px: Option<Vec<f64>>,
+    #[arg(long, value_name = "X,Y", value_parser = parse_centre)]
+    pub centre_px: Option<[f64; 2]>,
     /// Direction of gravity in the camera's frame (x right, y down, z forward), as an IMU measures it: poses that
     /// contradict it are refused.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
@@ -54,6 +54,11 @@ fn parse_focal(text: &str) -> Result<f64, String> {
     focal.ok_or_else(|| "expected pixels, at least 1".into())
 }
 
+fn parse_centre(text: &str) -> Result<[f64; 2], String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
+    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| "expected pixels X,Y".into())
+}
+
 fn parse_sigma(text: &str) -> Result<f64, String> {
     let sigma = text.parse().ok().filter(|sigma: &f64| *sigma > 0.0 && sigma.is_finite());
     sigma.ok_or_else(|| "expected world units, more than 0".into())
@@ -62,10 +67,9 @@ fn parse_sigma(text: &str) -> Result<f64, String> {
 pub fn run(args: LocateArgs) -> Result<(), Failure> {
     let cache = args.cache.open()?;
     let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
-    let centre_px = args.centre_px.map(|centre| [centre[0], centre[1]]);
     let prior =
         args.near.zip(args.sigma).map(|(position_in_world, sigma)| Prior { position_in_world, sigma });
-    let camera = Camera { focal_px: args.focal_px, centre_px, gravity: args.gravity, prior };
+    let camera = Camera { focal_px: args.focal_px, centre_px: args.centre_px, gravity: args.gravity, prior };
     let found = located(&snapshot, &args.photo, &camera)?;
     if args.json {
         return print_json(&found);

@@ -47,6 +47,11 @@ impl<'a> Client<'a> {
         if uri.authority().is_none_or(|a| a.host().is_empty() || a.as_str().contains('@')) {
             return Err(bad("it has no host, or names a user"));
         }
+        // A port beyond 65535 would be taken for none.
+        let end = uri.authority().and_then(|a| a.as_str().rsplit(']').next()).unwrap_or_default();
+        if end.contains(':') && uri.port_u16().is_none() {
+            return Err(bad("its port is no number from 0 to 65535"));
+        }
         if uri.query().is_some() || from.contains('#') {
             return Err(bad("it has a query or a fragment"));
         }

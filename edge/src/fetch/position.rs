@@ -9,6 +9,7 @@ use slag_common::frames::{Aabb, Geographic};
 use slag_common::manifest::Manifest;
 
 use super::plan_error::PlanError;
+use crate::score::MAX_COORDINATE;
 
 pub const MAX_TEXT_BYTES: usize = 256;
 
@@ -70,7 +71,7 @@ impl FromStr for Position {
     type Err = NotAPosition;
 
     /// Parses `x y z` (world frame), `lat,lon[,height]` (degrees, metres), or either as a JSON object.
-    /// Numbers must be finite, degrees in range.
+    /// Numbers must be in range.
     fn from_str(text: &str) -> Result<Self, NotAPosition> {
         let refuse = || NotAPosition { found: text.trim().chars().take(80).collect() };
         if text.len() > MAX_TEXT_BYTES {
@@ -96,7 +97,7 @@ impl FromStr for Position {
             }
         };
         match spoken {
-            Spoken::World { x, y, z } if [x, y, z].iter().all(|v| v.is_finite()) => {
+            Spoken::World { x, y, z } if [x, y, z].iter().all(|v| v.abs() <= MAX_COORDINATE) => {
                 Ok(Self::World(DVec3::new(x, y, z)))
             }
             Spoken::Geographic { lat, lon, height }

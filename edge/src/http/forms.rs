@@ -64,7 +64,8 @@ fn numbers(text: &str) -> Option<Vec<f64>> {
 }
 
 fn xy(text: &str) -> Result<[f64; 2], &'static str> {
-    numbers(text).and_then(|numbers| numbers.try_into().ok()).ok_or("x,y")
+    let numbers = numbers(text).filter(|numbers| numbers.iter().all(|v| v.is_finite()));
+    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or("x,y")
 }
 
 fn lat_lon(text: &str) -> Result<LatLon, &'static str> {

@@ -403,7 +403,15 @@ async fn positions_are_handed_on_or_refused() {
     assert_eq!(say(&app, r#"{"lat":46.8,"lon":-92}"#).await.0, StatusCode::ACCEPTED);
     let at = Position::Geographic { latitude_deg: 46.8, longitude_deg: -92.0, height_m: None };
     assert_eq!(following.status().position, Some(at));
-    for bad in ["", "{}", r#"{"x":1}"#, r#"{"lat":91,"lon":0}"#, "\u{1b}[2J", &"1".repeat(900)] {
+    for bad in [
+        "",
+        "{}",
+        r#"{"x":1}"#,
+        r#"{"x":1e300,"y":0,"z":0}"#,
+        r#"{"lat":91,"lon":0}"#,
+        "\u{1b}[2J",
+        &"1".repeat(900),
+    ] {
         let (status, _, body) = say(&app, bad).await;
         assert_eq!((status.as_u16(), &body["parameter"]), (400, &"body".into()), "{bad}");
     }

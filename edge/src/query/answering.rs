@@ -34,7 +34,7 @@ impl Engine {
     pub fn answer(&self, mut request: QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
-        request.understand(&on_board.snapshot);
+        request.understand(&on_board.snapshot)?;
         request.check()?;
         self.answer_on(on_board, request, budget)
     }

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
 use slag_common::frames::Aabb;
 use slag_common::manifest::Manifest;
 
@@ -22,8 +23,8 @@ pub struct Area {
     #[serde(rename = "box", skip_serializing_if = "Option::is_none")]
     pub bounds: Option<AreaBox>,
     /// A polygon of 3 to 256 corners, seen from above.
-    #[schemars(length(max = MAX_CORNERS))]
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(length(min = 3, max = MAX_CORNERS))]
+    #[serde(skip_serializing_if = "Vec::is_empty", deserialize_with = "corners")]
     pub polygon: Vec<Corner>,
 }
 
@@ -50,6 +51,16 @@ pub struct AreaBox {
 
 slag_common::named_members!(Area, AreaBall, AreaBox; Serialize);
 
+/// Reads the corners of a polygon; none would be the whole scene.
+fn corners<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<Corner>, D::Error> {
+    let corners = Vec::deserialize(from)?;
+    if corners.is_empty() {
+        Err(D::Error::custom("expected a polygon of 3 corners or more"))
+    } else {
+        Ok(corners)
+    }
+}
+
 impl Area {
     /// Returns the area in the world frame.
     pub(crate) fn in_world(&self, manifest: &Manifest) -> Result<Region, RequestError> {
@@ -67,7 +78,8 @@ impl Area {
             let corners = corners.collect::<Result<Vec<_>, _>>()?;
             let found = format!("{} corners", corners.len());
             let refused = || {
-                let expected = format!("a polygon of 3 to {MAX_CORNERS} corners within bounds");
+                let expected =
+                    format!("a polygon of 3 to {MAX_CORNERS} corners within bounds, not all on a line");
                 RequestError::new("region", &found, expected)
             };
             region.polygon = Some(Arc::new(Polygon::new(corners).ok_or_else(refused)?));

@@ -106,7 +106,7 @@ impl Ask {
             members: self.format == Some(Format::Ply),
         };
         if self.relations.unwrap_or(true) {
-            request.understand(snapshot);
+            request.understand(snapshot)?;
         }
         request.check()?;
         Ok(request)

@@ -245,17 +245,25 @@ impl QueryRequest {
     }
 
     /// Understands texts that name a relation, where answers are objects and the generation has them.
-    pub(super) fn understand(&mut self, snapshot: &Snapshot) {
+    ///
+    /// # Errors
+    /// A text names more things than a phrase may have: without its relations it would ask for something else.
+    pub(super) fn understand(&mut self, snapshot: &Snapshot) -> Result<(), RequestError> {
         if !matches!(self.kind, None | Some(AnswerKind::Objects)) || snapshot.objects.is_empty() {
-            return;
+            return Ok(());
         }
         for asked in &mut self.asked {
             let Asked::Text(text) = asked else { continue };
-            // A phrase that breaks a limit is one text for the text model, as one without relations is.
-            if let Some(phrase) = relations::understand(text).filter(|phrase| phrase.check().is_ok()) {
-                *asked = Asked::Phrase { text: Some(std::mem::take(text)), phrase };
+            match relations::understand(text) {
+                Some(phrase) if phrase.n_things() > relations::MAX_THINGS => phrase.check()?,
+                // A phrase that breaks another limit is one text for the text model, as one without relations is.
+                Some(phrase) if phrase.check().is_ok() => {
+                    *asked = Asked::Phrase { text: Some(std::mem::take(text)), phrase };
+                }
+                _ => {}
             }
         }
+        Ok(())
     }
 
     /// Returns the answers to each question of a page.
@@ -288,6 +296,11 @@ impl QueryRequest {
             return refuse("negatives", &found, format!("at most {MAX_NEGATIVES} phrases"));
         }
         negatives.iter().try_for_each(|text| check_text("negatives", text))?;
+        // Everything is as near to a text as to itself.
+        let mut texts = self.asked.iter().filter(|of| !matches!(of, Asked::Vector { .. })).map(Asked::label);
+        if let Some(text) = texts.find(|text| negatives.iter().any(|of| of.trim() == text.trim())) {
+            return refuse("negatives", &text, "words other than those asked for".into());
+        }
         self.asked.iter().try_for_each(|asked| asked.check(self))?;
         self.check_page()?;
         let (thresholds, expected) = match self.negatives {
@@ -303,10 +316,15 @@ impl QueryRequest {
         if let Some(near) = self.near.filter(|near| !within(*near)) {
             return refuse("near", &near, format!("three numbers X,Y,Z within ±{MAX_COORDINATE:e}"));
         }
-        let is_box = |b: &Aabb| b.min.cmple(b.max).all() && within(b.min) && within(b.max);
+        // In a flat box lies nothing.
+        let is_box = |b: &Aabb| b.min.cmplt(b.max).all() && within(b.min) && within(b.max);
         if let Some(bounds) = self.region.bounds.filter(|bounds| !is_box(bounds)) {
             let found = format!("{} to {}", bounds.min, bounds.max);
-            return refuse("box", &found, format!("two corners within ±{MAX_COORDINATE:e}"));
+            return refuse(
+                "box",
+                &found,
+                format!("two corners within ±{MAX_COORDINATE:e} that differ along each axis"),
+            );
         }
         if let Some(Ball { centre_in_world, radius }) = self.region.ball {
             if !positive(radius) {

@@ -16,11 +16,19 @@ pub struct Polygon {
 }
 
 impl Polygon {
-    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for another number or corners out of
-    /// bounds.
+    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for another number, corners out of bounds or
+    /// all on one line, which has no inside.
     pub fn new(corners: Vec<DVec2>) -> Option<Self> {
         let is_within = |corner: &DVec2| corner.is_finite() && corner.abs().max_element() <= MAX_COORDINATE;
         if !(3..=MAX_CORNERS).contains(&corners.len()) || !corners.iter().all(is_within) {
+            return None;
+        }
+        let from_first = |corner: &DVec2| *corner - corners[0];
+        let along = corners
+            .iter()
+            .map(from_first)
+            .fold(DVec2::ZERO, |far, to| if to.length_squared() > far.length_squared() { to } else { far });
+        if corners.iter().map(from_first).all(|to| along.perp_dot(to) == 0.0) {
             return None;
         }
         let min = corners.iter().copied().fold(DVec2::INFINITY, DVec2::min);

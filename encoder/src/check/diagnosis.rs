@@ -31,9 +31,12 @@ const HALVINGS: u32 = 6;
 const REFINED_GAIN_DB: f64 = 1.0;
 
 const LISTED_TRIALS: usize = 10;
-/// Pairs of a tile and a Gaussian that all trials may draw, beside 1,000 times those of the inputs as given: with
-/// the cameras in a heap of Gaussians, each is drawn everywhere.
+/// Pairs of a tile and a Gaussian that all trials may draw, beside 1,000 times those of the inputs as given, of which
+/// at most this many a Gaussian and view count: with the cameras in a heap of Gaussians, each is drawn everywhere.
 const MAX_PAIRS: usize = 200_000_000;
+const MOST_PAIRS_EACH: usize = 2;
+/// Views after which a correction is given up where none of them looks more like its photo than a plain colour.
+const FIRST_VIEWS: usize = 2;
 
 /// A correction that was tried, and the mean PSNR it leads to.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -111,7 +114,8 @@ impl Samples {
         means: &Means,
         options: &CheckOptions,
     ) -> Result<Diagnosis, CheckError> {
-        let (given_psnr_db, n_pairs) = mean_psnr_db(&self.views, loaded, None)?;
+        let (given_psnr_db, n_pairs) = mean_psnr_db(&self.views, loaded, None, self.views.len())?;
+        let n_pairs = n_pairs.min(scene.len() * self.views.len() * MOST_PAIRS_EACH);
         let search = Search {
             samples: &self.views,
             scene,
@@ -142,20 +146,26 @@ impl Samples {
     }
 }
 
-/// Returns the mean PSNR of the samples, dB, and how many pairs of a tile and a Gaussian were drawn.
+/// Returns the mean PSNR of the samples, dB, and how many pairs of a tile and a Gaussian were drawn. Ends after
+/// `n_first` samples if none of them looks more like its photo than a plain colour.
 fn mean_psnr_db(
     samples: &[CheckView],
     scene: &dyn LoadedScene,
     mistake: Option<Mistake>,
+    n_first: usize,
 ) -> Result<(f64, usize), CheckError> {
-    let (mut sum, mut n_pairs) = (0.0, 0usize);
+    let (mut sum, mut n, mut n_pairs, mut is_like) = (0.0, 0usize, 0usize, false);
     for sample in samples {
+        if n == n_first && !is_like {
+            break;
+        }
         let view = mistake.map_or(sample.view, |mistake| mistake.corrected(&sample.view));
         let drawing = CheckView { view, ..sample.clone() }.draw(scene)?;
-        sum += sample.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
-        n_pairs = n_pairs.saturating_add(drawing.counters.pairs);
+        let psnr_db = sample.psnr_db(|pixel, c| drawing.rgb[pixel * 3 + c]);
+        is_like |= psnr_db > sample.flat_psnr_db();
+        (sum, n, n_pairs) = (sum + psnr_db, n + 1, n_pairs.saturating_add(drawing.counters.pairs));
     }
-    Ok((sum / samples.len() as f64, n_pairs))
+    Ok((sum / n as f64, n_pairs))
 }
 
 /// The search for the correction with which drawings match photos best.
@@ -213,8 +223,8 @@ impl Search<'_> {
 
     fn trial(&self, mistake: Mistake) -> Result<Trial, CheckError> {
         let (psnr_db, n_pairs) = match mistake.corrected_splat(self.scene) {
-            Some(scene) => mean_psnr_db(self.samples, &*self.rasterizer.load(&scene)?, None)?,
-            None => mean_psnr_db(self.samples, self.loaded, Some(mistake))?,
+            Some(scene) => mean_psnr_db(self.samples, &*self.rasterizer.load(&scene)?, None, FIRST_VIEWS)?,
+            None => mean_psnr_db(self.samples, self.loaded, Some(mistake), FIRST_VIEWS)?,
         };
         self.pairs_left.set(self.pairs_left.get().saturating_sub(n_pairs));
         Ok(Trial { mistake, psnr_db })

@@ -37,14 +37,19 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
     let mut say = |mistake: Option<Mistake>, text: String| found.push(Suspicion { text, mistake });
     if usable.is_empty() {
         say(None, "the splat has no Gaussians that can be drawn".into());
-    } else if usable.iter().all(|i| scene.scales[*i] == [0.0; 3]) {
-        say(None, "all Gaussians are points without a size; export the splat again".into());
+    } else if share(&usable, |i| scene.scales[i] == [0.0; 3]) > 0.5 {
+        say(
+            None,
+            "most Gaussians are points without a size; export the splat again, or leave out --activated scales"
+                .into(),
+        );
     } else if usable.iter().all(|i| scene.scales[*i][2] == 0.0) {
         say(None, "the Gaussians are flat, as those of 2DGS: their third axis is taken as 0".into());
     }
     let n_lost = scene.len() - usable.len();
-    if 2 * n_lost > scene.len() {
-        say(None, format!("{n_lost} of {} Gaussians cannot be drawn; export the splat again", scene.len()));
+    if n_lost > 0 {
+        let advice = if 2 * n_lost > scene.len() { "; export the splat again" } else { " and are left out" };
+        say(None, format!("{n_lost} of {} Gaussians cannot be drawn{advice}", scene.len()));
     }
     if !usable.is_empty() && share(&usable, |i| scene.opacities[i] < INVISIBLE) > MOST {
         say(None, "all Gaussians are transparent; export the splat again".into());
@@ -109,7 +114,10 @@ fn share(usable: &[usize], is: impl Fn(usize) -> bool) -> f64 {
 /// A scale s read as a logarithm becomes exp(s): above 1, and just above it for most. An opacity of 0 to 1 read as
 /// a logit becomes 0.5 to 0.731.
 fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
-    let scale_share = |most: f32| share(usable, |i| scene.scales[i].iter().all(|s| (1.0..=most).contains(s)));
+    // Flat Gaussians have no third scale.
+    let given = |i: usize| scene.scales[i].iter().filter(|s| **s != 0.0);
+    let scale_share =
+        |most: f32| share(usable, |i| given(i).count() > 1 && given(i).all(|s| (1.0..=most).contains(s)));
     let scales = scale_share(f32::INFINITY) > MOST && scale_share(1.5) > 0.5;
     let opacities = share(usable, |i| (0.5..=ACTIVATED_OPACITY).contains(&scene.opacities[i])) > MOST;
     (usable.len() >= MANY && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
@@ -168,7 +176,7 @@ fn intrinsics(views: &[View]) -> Option<Mistake> {
     for camera in views.iter().map(|view| view.intrinsics) {
         let x = 2.0 * camera.centre_x_px / f64::from(camera.width_px);
         let y = 2.0 * camera.centre_y_px / f64::from(camera.height_px);
-        if x == 0.0 && y == 0.0 {
+        if x == 0.0 || y == 0.0 {
             return Some(Mistake::CentreAtZero);
         }
         if (x / y - 1.0).abs() > OFF_CENTRE || x <= 0.0 {

@@ -98,7 +98,7 @@ pub struct EncodeArgs {
     #[command(flatten)]
     up: UpArgs,
     /// Name of the scene [default: the name of the store's folder].
-    #[arg(long, value_name = "NAME", help_heading = "Output", hide_short_help = true)]
+    #[arg(long, value_name = "NAME", value_parser = parse_name, help_heading = "Output", hide_short_help = true)]
     name: Option<String>,
     /// World units are metres; a geo-reference implies it.
     #[arg(long, help_heading = "Inputs")]
@@ -159,6 +159,14 @@ pub struct EncodeArgs {
     restart: bool,
 }
 
+/// Names stand in logs and headers.
+fn parse_name(text: &str) -> Result<String, String> {
+    match (1..=200).contains(&text.len()) && !text.contains(char::is_control) {
+        true => Ok(text.to_owned()),
+        false => Err("expected 1 to 200 bytes without control characters".into()),
+    }
+}
+
 /// Returns the settings of the flags, with choices that may be others than those of the flags.
 fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     let input = &args.input;
@@ -185,6 +193,11 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     run.keep_views = args.keep_views || !args.added.is_empty() || !args.dropped.is_empty();
     run.allow_empty = args.allow_empty;
     choices.apply(&mut settings);
+    if input.views.is_some() && args.up.up.is_some() {
+        return Err(anyhow!(
+            "--up is for the planning of views, which --views replaces; leave one of them out"
+        ));
+    }
     if input.views.is_none() {
         let n_views = match settings.run.views_limit {
             ViewsLimit::Count(n) => n,

@@ -103,7 +103,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
         StoreCommand::Export { at, out } => {
             let exported = export(&at.store, out)?;
             let Exported { n_files, len_bytes, n_removed } = exported;
-            let lines = format!("{n_files} files written, {}; {n_removed} removed\n", ByteSize(len_bytes));
+            let lines = format!("{n_files} objects written, {}; {n_removed} removed\n", ByteSize(len_bytes));
             print(json, &exported, lines)?;
             Ok(Exit::Done)
         }

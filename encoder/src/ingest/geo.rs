@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use serde_json::Value;
+use slag_common::files;
 use slag_common::frames::{GeoReference, Geographic};
 
 #[derive(Debug, thiserror::Error)]
@@ -40,7 +41,7 @@ const MAX_BYTES: u64 = 1 << 20;
 /// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; other fields are ignored.
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let mut bytes = Vec::new();
-    fs_err::File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
+    files::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
     let malformed = |source| GeoError::Json { path: path.to_owned(), source };
     // Maps, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's; then structs, since a map

@@ -86,6 +86,12 @@ pub enum IngestError {
     },
     #[error("{}: the file ends before its image does; copy the photo again", path.display())]
     Cut { path: PathBuf },
+    #[error(
+        "{}: nothing of it is seen: it is transparent, or the camera's lens distortion leaves no pixel; give another \
+         copy, or leave the photo out",
+        path.display()
+    )]
+    Blank { path: PathBuf },
     #[error("{}: a piece of the image is zeros, which no camera writes; copy the photo again", path.display())]
     Zeros { path: PathBuf },
     #[error(
@@ -165,6 +171,12 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     let intrinsics = view.intrinsics.scaled_to(photo.width(), photo.height());
     let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
     let opaque = photo.color().has_alpha().then(|| opaque_pixels(&photo)).filter(|all| all.contains(&false));
+    let or_blank = |loaded: LoadedImage| match &loaded.valid {
+        Some(valid) if !valid.contains(&true) => {
+            Err(IngestError::Blank { path: loaded.view.image_path.clone() })
+        }
+        _ => Ok(loaded),
+    };
     let mut image = photo.into_rgb8();
     if let Some(opaque) = &opaque {
         // Their colours are left from editing, or noise.
@@ -172,7 +184,7 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
         hidden.for_each(|(pixel, _)| pixel.0 = [0; 3]);
     }
     if intrinsics.distortion == Distortion::None {
-        return Ok(LoadedImage { view, image, undistorter: None, valid: opaque, is_rotated });
+        return or_blank(LoadedImage { view, image, undistorter: None, valid: opaque, is_rotated });
     }
     let undistorter = Undistorter::new(intrinsics);
     let (image, mut valid) = undistorter.image(&image);
@@ -181,7 +193,7 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
         let opaque = undistorter.labels(&labels, 0);
         valid.iter_mut().zip(opaque).for_each(|(valid, opaque)| *valid &= opaque == 1);
     }
-    Ok(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), is_rotated })
+    or_blank(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), is_rotated })
 }
 
 /// Returns which pixels are at least half opaque.

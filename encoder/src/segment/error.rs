@@ -29,6 +29,8 @@ pub enum SegmentError {
         #[source]
         source: serde_json::Error,
     },
+    #[error("{}: {what}; correct it, or export the data set again", path.display())]
+    DataSet { path: PathBuf, what: String },
     #[error("{}: mask {index}: {source}", path.display())]
     Rle {
         path: PathBuf,

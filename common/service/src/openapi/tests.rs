@@ -129,7 +129,7 @@ fn operations_come_from_routes() {
         ],
         "responses": {
             "200": { "description": "Things.", "content": { "application/json": things } },
-            "400": refused("A parameter is invalid."),
+            "400": refused("A parameter is invalid, or none of this resource."),
             "404": refused("No such thing."),
             "431": { "description": "The request's head is longer than the service takes." },
             "503": refused("Too busy."),

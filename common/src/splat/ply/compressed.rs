@@ -123,6 +123,7 @@ pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<
         out.sh_rest.reserve_exact(count * properties.len());
         ply.rows(&properties, |row| out.sh_rest.extend(row.iter().map(|byte| unpack_sh(*byte))))?;
     }
+    ply.finish()?;
     Ok(out)
 }
 

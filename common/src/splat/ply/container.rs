@@ -303,6 +303,14 @@ impl Ply {
         Ok(())
     }
 
+    /// Checks that the file ends where its header says: rows beyond would be left out in silence.
+    pub fn finish(mut self) -> Result<(), SplatError> {
+        while self.next < self.elements.len() {
+            self.skip_element()?;
+        }
+        self.input.require_end()
+    }
+
     /// Skips all rows of the next element, lists included.
     fn skip_element(&mut self) -> Result<(), SplatError> {
         let element = &self.elements[self.next];
@@ -396,6 +404,9 @@ impl Header {
             }
             ["element", name, count] => {
                 let count = count.parse().map_err(|_| "a number of rows")?;
+                if self.elements.iter().any(|e| e.name == *name) {
+                    return Err("an element that the header does not have yet");
+                }
                 self.elements.push(Element { name: (*name).into(), count, properties: Vec::new() });
             }
             ["property", rest @ .., name] => {
@@ -406,6 +417,9 @@ impl Header {
                     _ => return Err("`property TYPE NAME` or `property list TYPE TYPE NAME`"),
                 };
                 let element = self.elements.last_mut().ok_or("an `element` line before any `property`")?;
+                if element.property(name).is_some() {
+                    return Err("a property that the element does not have yet");
+                }
                 element.properties.push(Property { name: (*name).into(), kind });
             }
             ["end_header"] => return Ok(true),

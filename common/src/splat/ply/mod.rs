@@ -83,6 +83,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
         out.sh_dc.push([r, g, b].map(|c| white.map_or(*c as f32, |white| dc_of_colour(c / white))));
         out.sh_rest.extend(rest.iter().map(|c| *c as f32));
     })?;
+    ply.finish()?;
     Ok(out)
 }
 
@@ -95,5 +96,6 @@ pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Ve
     ply.seek_element(vertex)?;
     let mut rows = Vec::with_capacity(ply.checked_count(vertex)?);
     ply.rows(&wanted, |row| rows.push(std::array::from_fn(|i| row[i])))?;
+    ply.finish()?;
     Ok(rows)
 }

@@ -89,6 +89,15 @@ async fn every_route_and_parameter_is_described() {
         let described = api["paths"][path][&method]["parameters"].as_array().cloned().unwrap_or_default();
         let of_path = described.iter().filter(|p| p["in"] == "path").count();
         assert_eq!(of_path, path.matches('{').count(), "{path}");
+        // What nobody reads is refused.
+        if !described.iter().any(|parameter| parameter["in"] == "query") {
+            let refused = read(service.send(route.method.as_str(), &format!("{uri}?x=1")).await).await;
+            assert_eq!(
+                (refused.0.as_u16(), &refused.2["parameter"]),
+                (400, &"query string".into()),
+                "{path}"
+            );
+        }
     }
     let described = api["paths"]["/query"]["get"]["parameters"].as_array().expect("parameters");
     let known: Vec<&str> = described.iter().filter_map(|parameter| parameter["name"].as_str()).collect();

@@ -99,6 +99,9 @@ fn problem(error: LocateError) -> Problem {
         LocateError::Version { .. } => {
             Problem::new(StatusCode::CONFLICT, "landmarks-version", "Landmarks do not fit", error.to_string())
         }
+        LocateError::Camera { parameter, found, expected } => {
+            RequestError::new(parameter, &found, expected).into()
+        }
         LocateError::Decode(_) | LocateError::TooLarge { .. } => {
             Problem::new(StatusCode::BAD_REQUEST, "bad-photo", "Bad photo", error.to_string())
         }

@@ -7,10 +7,10 @@
 //! ```
 //!
 //! Articles count for nothing. The leftmost relation divides a phrase, so relations nest to the right: "mug on the
-//! table near the window" is a mug on (a table near the window). A text of more than [`MAX_TEXT_BYTES`] or with
-//! more than [`MAX_THINGS`] things is no phrase: this bounds time and recursion for every caller.
+//! table near the window" is a mug on (a table near the window). A text of more than [`MAX_TEXT_BYTES`] is no phrase:
+//! this bounds time and recursion for every caller.
 
-use super::phrase::{By, MAX_THINGS, Phrase, Pick, Place, Relation};
+use super::phrase::{By, Phrase, Pick, Place, Relation};
 use crate::text::MAX_TEXT_BYTES;
 
 /// The words of each relation; where several begin at a word, the longest counts.
@@ -74,15 +74,15 @@ const OPENINGS: [&str; 10] = [
     "take me to",
 ];
 
-/// Returns the meaning of a text, or `None` if it names no relation and no pick, or more than the limits allow: it
-/// is one thing then, for the text model.
+/// Returns the meaning of a text, or `None` if it names no relation and no pick, or is too long: it is one thing then,
+/// for the text model. [`Phrase::check`] says whether it keeps the limits.
 pub fn understand(text: &str) -> Option<Phrase> {
     if text.len() > MAX_TEXT_BYTES {
         return None;
     }
     let lower = text.to_lowercase();
     let words = words(&lower);
-    let phrase = phrase(&words[opening(&words)..], &mut { MAX_THINGS })?;
+    let phrase = phrase(&words[opening(&words)..])?;
     (!phrase.is_asker() && (phrase.pick.is_some() || phrase.relation.is_some())).then_some(phrase)
 }
 
@@ -126,9 +126,8 @@ fn without_article<'a, 'b>(words: &'a [&'b str]) -> &'a [&'b str] {
     &words[n_articles..]
 }
 
-/// Reads a phrase; `None` if it is none, or has more than `n_left` things. Each level of recursion names a thing.
-fn phrase(words: &[&str], n_left: &mut usize) -> Option<Phrase> {
-    *n_left = n_left.checked_sub(1)?;
+/// Reads a phrase; `None` if it is none. Each level of recursion names a thing.
+fn phrase(words: &[&str]) -> Option<Phrase> {
     let words = without_article(words);
     let (nth, rest) = nth(words);
     let by = rest.first().and_then(|word| PICKS.iter().find(|(name, _)| name == word)).map(|(_, by)| *by);
@@ -149,7 +148,7 @@ fn phrase(words: &[&str], n_left: &mut usize) -> Option<Phrase> {
         return Some(Phrase { pick: pick(None), ..thing(named)? });
     };
     if is_from(at) {
-        let from = phrase(&head[at + 1..], n_left)?;
+        let from = phrase(&head[at + 1..])?;
         return Some(Phrase { pick: pick(Some(from)), ..thing(&head[..at])? });
     }
     let (is, n) = relation(&head[at..])?;
@@ -157,9 +156,9 @@ fn phrase(words: &[&str], n_left: &mut usize) -> Option<Phrase> {
     let named = if by.is_some() { &head[..at] } else { &words[..words.len() - head.len() + at] };
     let place = if is == Relation::Between {
         let and = after.iter().position(|word| *word == "and")?;
-        Place { is, of: phrase(&after[..and], n_left)?, and: Some(phrase(&after[and + 1..], n_left)?) }
+        Place { is, of: phrase(&after[..and])?, and: Some(phrase(&after[and + 1..])?) }
     } else {
-        Place { is, of: phrase(after, n_left)?, and: None }
+        Place { is, of: phrase(after)?, and: None }
     };
     Some(Phrase { pick: pick(None), relation: Some(Box::new(place)), ..thing(named)? })
 }
@@ -258,8 +257,9 @@ mod tests {
         // No article, which would be nothing.
         let relations = |n: usize| format!("b {}", "on b ".repeat(n));
         assert_eq!(read(relations(7)).map(|phrase| phrase.check()), Some(Ok(())));
+        let most = read(relations(101)).expect("512 bytes").check().expect_err("too many things");
+        assert_eq!((most.found, most.expected), ("\"102 things\"".to_owned(), "at most 8".to_owned()));
         let long = [
-            relations(8),
             relations(9_000),
             "c between ".repeat(9_000) + &"and b ".repeat(9_000),
             "the ".repeat(12_000) + "mug on the table",

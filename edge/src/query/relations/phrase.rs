@@ -192,7 +192,7 @@ impl Phrase {
         self.inner().for_each(|inner| inner.collect(things));
     }
 
-    fn n_things(&self) -> usize {
+    pub fn n_things(&self) -> usize {
         1 + self.inner().map(Phrase::n_things).sum::<usize>()
     }
 

@@ -1,9 +1,11 @@
 //! Run-length masks of JSON files: SAM's lists and COCO data sets.
 
 use std::collections::BTreeMap;
+use std::io::Read;
 use std::path::Path;
 
 use serde::Deserialize;
+use slag_common::files;
 
 use super::limits::{check_size, too_large};
 use super::undistort::undistorted;
@@ -51,16 +53,18 @@ struct DataSetImage {
 
 /// Reads the run-length masks of one photo, with their indices in the file.
 pub(super) fn read_list(path: &Path) -> Result<Vec<(usize, Rle)>, SegmentError> {
-    rles_of(path, parse(path, &fs_err::read(path)?)?.annotations)
+    rles_of(path, parse(path)?.annotations)
 }
 
 /// Parses a list of masks, or an object with a list as `annotations`.
-fn parse(path: &Path, bytes: &[u8]) -> Result<MaskFile, SegmentError> {
+fn parse(path: &Path) -> Result<MaskFile, SegmentError> {
+    let mut bytes = Vec::new();
+    files::open(path)?.read_to_end(&mut bytes)?;
     let is_list = bytes.iter().find(|byte| !byte.is_ascii_whitespace()) == Some(&b'[');
     let parsed = if is_list {
-        serde_json::from_slice(bytes).map(|annotations| MaskFile { images: Vec::new(), annotations })
+        serde_json::from_slice(&bytes).map(|annotations| MaskFile { images: Vec::new(), annotations })
     } else {
-        serde_json::from_slice(bytes)
+        serde_json::from_slice(&bytes)
     };
     parsed.map_err(|source| SegmentError::Json { path: path.to_owned(), source })
 }
@@ -87,17 +91,31 @@ fn rle_of(segmentation: Segmentation) -> Result<Rle, RleError> {
 
 /// Reads a data set: the masks of each image by file name.
 pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
-    let MaskFile { images, annotations } = parse(path, &fs_err::read(path)?)?;
+    let MaskFile { images, annotations } = parse(path)?;
     let image_ids: Vec<Option<u64>> = annotations.iter().map(|annotation| annotation.image_id).collect();
+    let inconsistent = |what: String| SegmentError::DataSet { path: path.to_owned(), what };
     let mut rles_of_id: BTreeMap<u64, Vec<(usize, Rle)>> = BTreeMap::new();
-    for (index, rle) in rles_of(path, annotations)? {
-        if let Some(id) = image_ids[index] {
-            rles_of_id.entry(id).or_default().push((index, rle));
+    for image in &images {
+        if rles_of_id.insert(image.id, Vec::new()).is_some() {
+            return Err(inconsistent(format!("two images have the id {}", image.id)));
         }
     }
-    let named =
-        images.into_iter().map(|image| (image.file_name, rles_of_id.remove(&image.id).unwrap_or_default()));
-    Ok(named.collect())
+    for (index, rle) in rles_of(path, annotations)? {
+        match image_ids[index].and_then(|id| rles_of_id.get_mut(&id)) {
+            Some(rles) => rles.push((index, rle)),
+            None => {
+                let id = image_ids[index].map_or("none".into(), |id| id.to_string());
+                return Err(inconsistent(format!("mask {index} has image_id {id}, which no image has")));
+            }
+        }
+    }
+    let mut named = MasksOfImage::new();
+    for DataSetImage { id, file_name } in images {
+        if let Some(_other) = named.insert(file_name.clone(), rles_of_id.remove(&id).unwrap_or_default()) {
+            return Err(inconsistent(format!("two images have the file_name {file_name:?}")));
+        }
+    }
+    Ok(named)
 }
 
 /// Returns the masks of a photo: by its name; or else by the one entry whose name is an ending of the photo's, or

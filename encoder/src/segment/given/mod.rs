@@ -80,6 +80,16 @@ impl GivenMasks {
         }
     }
 
+    /// Names a file that is not read because its view has another one.
+    fn second_file(&self, views: &[View]) -> Option<String> {
+        let Source::Folder(dir) = &self.source else { return None };
+        let [read, not] = views.iter().find_map(|view| {
+            let mut files = files_of(dir, view);
+            Some([files.next()?, files.next()?])
+        })?;
+        Some(format!("{} is read for masks, and {} beside it is not", read.display(), not.display()))
+    }
+
     /// Returns up to three names that the files or entries have.
     fn names_found(&self) -> Vec<String> {
         match &self.source {
@@ -129,7 +139,7 @@ impl Segmenter for GivenMasks {
 
     fn check_views(&self, views: &[View], strict: bool) -> Result<Option<String>, SegmentError> {
         let without: Vec<&View> = views.iter().filter(|view| !self.covers(view)).collect();
-        let Some(first) = without.first() else { return Ok(None) };
+        let Some(first) = without.first() else { return Ok(self.second_file(views)) };
         let path = match &self.source {
             Source::Folder(path) | Source::DataSet { path, .. } => path,
         };
@@ -155,7 +165,10 @@ impl Segmenter for GivenMasks {
             });
         }
         let (n, of) = (without.len(), views.len());
-        Ok(Some(format!("{n} of {of} views have no masks in {}, the first is {view}", path.display())))
+        let missing = format!("{n} of {of} views have no masks in {}, the first is {view}", path.display());
+        Ok(Some(
+            [Some(missing), self.second_file(views)].into_iter().flatten().collect::<Vec<_>>().join("; "),
+        ))
     }
 
     fn identity_of_view(&self, view: &View) -> Result<Option<Hash32>, SegmentError> {
@@ -179,12 +192,16 @@ impl Segmenter for GivenMasks {
 
 /// Returns the file with a view's masks in a folder of masks, if there is one, or the folder with a file a mask.
 pub fn file_of(dir: &Path, view: &View) -> Option<PathBuf> {
+    let folder = || Some(dir.join(&view.name).with_extension("")).filter(|of| of.join("0.png").is_file());
+    files_of(dir, view).next().or_else(folder)
+}
+
+fn files_of(dir: &Path, view: &View) -> impl Iterator<Item = PathBuf> + use<> {
     let image = dir.join(&view.name);
     let appended = |ending| dir.join(format!("{}.{ending}", view.name));
     let files =
         [image.with_extension("png"), appended("png"), image.with_extension("json"), appended("json")];
-    let folder = || Some(image.with_extension("")).filter(|folder| folder.join("0.png").is_file());
-    files.into_iter().find(|path| path.is_file()).or_else(folder)
+    files.into_iter().filter(|path| path.is_file())
 }
 
 /// Returns the images of a folder with a black and white PNG for each mask, by number.
