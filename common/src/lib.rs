@@ -24,7 +24,6 @@ pub mod photo_poses;
 pub mod poses;
 mod quantise;
 pub mod retry;
-pub mod roots;
 pub mod shard;
 pub mod similarity;
 pub mod splat;

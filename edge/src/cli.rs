@@ -17,8 +17,6 @@ mod progress;
 mod query;
 mod serve;
 mod status;
-mod supervisor;
-mod text;
 mod trust;
 
 use std::ffi::OsString;

@@ -89,7 +89,6 @@ pub fn map_working_bytes(snapshot: &Snapshot) -> usize {
     map_bytes(landmarks.map(|landmarks| landmarks.len()).sum())
 }
 
-/// Returns the landmarks on board.
 pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
     let mut all = Vec::new();
     for shard in &snapshot.shards {

@@ -31,7 +31,6 @@ impl ModelFile {
         })
     }
 
-    /// Returns its bytes.
     pub fn read(&self) -> io::Result<Cow<'static, [u8]>> {
         match self.embedded {
             Some(bytes) => Ok(Cow::Borrowed(bytes)),

@@ -76,7 +76,6 @@ pub struct ObjectRecord {
 }
 
 impl ObjectRecord {
-    /// Returns the box.
     pub fn bounds(&self) -> Aabb {
         Aabb { min: self.box_min.into(), max: self.box_max.into() }
     }

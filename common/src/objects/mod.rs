@@ -9,12 +9,10 @@ mod build;
 mod changes;
 mod columns;
 mod layout;
-mod thing;
 
 pub use build::{collect_runs, quantise_vectors};
-pub use changes::{Changes, Moved, Place, changes, is_unchanged};
+pub use changes::{Changes, Moved, Place, Thing, changes, is_unchanged, public_id};
 pub use columns::{
     MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, object_score, section,
 };
 pub(crate) use layout::ObjectsLayout;
-pub use thing::{Thing, public_id};

@@ -47,7 +47,6 @@ pub enum VoxelState {
     Unknown,
     /// Views have looked through it, and nothing is there.
     Free,
-    /// A surface is there.
     Occupied,
 }
 

@@ -131,7 +131,6 @@ pub enum PositionForm {
 }
 
 impl PositionForm {
-    /// Returns the form of `position_bits`.
     pub fn of(bits: [u8; 4]) -> Self {
         match bits {
             [16, 16, 16, _] => Self::Wide,

@@ -8,7 +8,7 @@ use serde_json::Value;
 use sha2::{Digest, Sha256, Sha512};
 
 use super::error::TufError;
-use super::key::Key;
+use super::signed::Key;
 
 /// What a role signs, beside the head.
 pub trait Body: Serialize + DeserializeOwned {
@@ -104,7 +104,6 @@ pub struct Timestamp {
 }
 
 impl Timestamp {
-    /// Returns what is stated of the snapshot.
     pub fn snapshot(&self) -> &FileMeta {
         &self.meta["snapshot.json"]
     }
@@ -151,7 +150,6 @@ pub struct TargetFile {
 }
 
 impl TargetFile {
-    /// Describes a file.
     pub fn of(bytes: &[u8]) -> Self {
         Self { length: bytes.len() as u64, hashes: hashes_of(bytes), custom: None }
     }
@@ -171,7 +169,6 @@ impl TargetFile {
         })
     }
 
-    /// Checks a file's bytes.
     pub fn check(&self, path: &str, bytes: &[u8]) -> Result<(), TufError> {
         check_content(path, bytes, Some(self.length), Some(&self.hashes))
     }

@@ -4,9 +4,8 @@ use std::collections::BTreeMap;
 
 use ed25519_dalek::SigningKey;
 
-use super::key::Key;
 use super::metadata::{FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
-use super::signed::sign;
+use super::signed::{Key, sign};
 
 /// Returns metadata by file name. `version` is that of all roles but root, which stays the same.
 pub fn one_key_repository(

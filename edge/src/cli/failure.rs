@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use crate::query::QueryError;
 use crate::store::StoreError;
 
-use super::text::visible;
+use super::output::visible;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {

@@ -12,7 +12,7 @@ use slag_common::frames::Aabb;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius, parse_reach};
 use super::failure::{Failure, store_failure};
-use super::text::{table, visible};
+use super::output::{table, visible};
 use crate::query::{ListFormat, ObjectFilter, ObjectOrder, parse_box, parse_point};
 use crate::score::{Ball, Budget, Region};
 
@@ -94,7 +94,6 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
     }
 }
 
-/// Prints a page as a table.
 fn print_page(page: &ObjectPage) -> Result<(), Failure> {
     let ObjectPage { n_objects, scene, generation, unit, .. } = page;
     let listed = page.objects.len();

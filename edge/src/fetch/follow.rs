@@ -26,7 +26,6 @@ use crate::store::EdgeCache;
 /// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(100);
 
-/// Settings for following a robot.
 #[derive(Clone, Debug)]
 pub struct FollowSettings {
     /// Cells within this distance of the robot are kept on board, as far as the network allows; world units.
@@ -56,7 +55,6 @@ impl Default for FollowSettings {
     }
 }
 
-/// What to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
     Fetch,
@@ -248,7 +246,6 @@ pub struct FollowEnvironment<'a> {
     pub report: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a dyn Fn() -> f64,
-    /// Set to end following.
     pub cancel: &'a AtomicBool,
 }
 

@@ -12,7 +12,7 @@ use slag_common::frames::Geographic;
 use slag_common::shard::ShardView;
 
 use super::request::AnswerKind;
-use super::threshold::ThresholdSource;
+use super::scale::ThresholdSource;
 use crate::score::{Hit, Run};
 
 /// Meaning of scores and thresholds.

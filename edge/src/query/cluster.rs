@@ -14,8 +14,7 @@ use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 use slag_math::union_find::UnionFind;
 
-use super::extent::{Extent, TRIMMED};
-use super::oriented::box_around;
+use super::oriented::{Extent, TRIMMED, box_around};
 use crate::score::{Budget, Run};
 
 /// Bits of a voxel coordinate in its key; three of them fill a `u64`.
@@ -43,7 +42,6 @@ pub struct Grouping {
 pub struct Cluster {
     /// Cell and index of its first member: its id within a generation.
     pub first: (u32, u32),
-    /// Members.
     pub n_gaussians: u64,
     /// Mean of the members' scores.
     pub score: f32,

@@ -33,7 +33,6 @@ pub(crate) const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 
 #[derive(Clone, Debug)]
 pub struct EncodeSettings {
-    /// What is read.
     pub inputs: InputSettings,
     /// How a view becomes contributions. A change of any of these is another encode.
     pub view: ViewSettings,
@@ -154,7 +153,6 @@ pub(crate) enum RasterWidth {
 }
 
 impl RasterWidth {
-    /// Returns the width of the raster of a photo of this width.
     pub(crate) fn px(self, photo_px: u32) -> u32 {
         match self {
             Self::Px(width_px) => width_px,

@@ -67,7 +67,6 @@ pub(super) fn pause(bucket: &Bucket) -> Duration {
     PAUSES[usize::from(!bucket.is_local())]
 }
 
-/// Works for the runs in a bucket.
 pub(crate) fn work(
     bucket: &Arc<Bucket>,
     settings: &WorkerSettings,

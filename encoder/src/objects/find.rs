@@ -11,7 +11,7 @@ use super::choice::{self, Sizes};
 use super::object::{NONE, Object, ObjectsReport, SceneObjects};
 use super::sightings::Sightings;
 use super::tree::Tree;
-use super::{affinity, near, vectors};
+use super::{near, tree, vectors};
 use crate::codebook::ScoreMetricContext;
 use crate::lift::photos::MaskOutline;
 use crate::lift::refine::PendingRefinement;
@@ -45,7 +45,7 @@ pub(super) fn find_among(
         None => Cow::Owned(Superpoints::new(scene.gaussians, None, &SuperpointSettings::default())),
     };
     let sightings = Sightings::gather(scene, table, &superpoints)?;
-    let pairs = affinity::of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
+    let pairs = tree::evidence_of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
     scene.check_cancelled()?;
     let tree = Tree::new(superpoints.n, &pairs);
     drop(pairs);

@@ -16,7 +16,6 @@
 //!
 //! The contributions are needed once, part by part; the result takes four bytes a Gaussian.
 
-mod affinity;
 mod choice;
 mod find;
 mod near;

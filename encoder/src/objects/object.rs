@@ -19,7 +19,6 @@ pub struct Object {
     pub id: u64,
     /// Its Gaussians, in all cells.
     pub n_gaussians: u32,
-    /// Masks that show it.
     pub n_masks: u32,
     /// Mean of its Gaussians inside the box.
     pub position_in_world: DVec3,
@@ -64,7 +63,6 @@ pub struct SceneObjects {
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ObjectsReport {
     pub n_objects: usize,
-    /// Gaussians that belong to one.
     pub n_gaussians: usize,
     pub n_masks: usize,
     /// Masks that show an object; others cover several things, or parts.

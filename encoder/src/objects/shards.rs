@@ -180,7 +180,6 @@ impl CellObjects {
         cell
     }
 
-    /// Returns the columns.
     pub fn view(&self) -> Objects<'_> {
         Objects {
             header: self.header,

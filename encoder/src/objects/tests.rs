@@ -7,9 +7,9 @@ use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 use slag_math::random::Random;
 
-use super::affinity::Evidence;
 use super::find::find_among;
 use super::shards::{CellObjects, CentroidBasis};
+use super::tree::Evidence;
 use super::*;
 use crate::cells::{CellLimits, CellSplit, split};
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
@@ -81,7 +81,6 @@ fn gaussians_at(means_in_world: Vec<DVec3>) -> Gaussians {
     }
 }
 
-/// Returns the vector of an axis.
 fn axis(of: usize) -> impl Iterator<Item = f32> {
     (0..DIM).map(move |c| f32::from(u8::from(c == of % DIM)))
 }

@@ -14,7 +14,6 @@ pub mod gpu;
 #[path = "no_gpu.rs"]
 pub mod gpu;
 mod rasterizer;
-mod validate;
 mod weights;
 
 pub use cpu::CpuRasterizer;

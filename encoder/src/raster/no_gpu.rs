@@ -10,7 +10,6 @@ use super::error::RasterError;
 use super::rasterizer::{LoadedScene, Rasterizer};
 
 pub(crate) struct Adapter {
-    /// Its description.
     pub report: AdapterReport,
     none: Infallible,
 }
@@ -30,7 +29,6 @@ pub fn adapters() -> Vec<Adapter> {
 }
 
 impl Adapter {
-    /// Opens the device.
     pub fn open(&self, _: Precision) -> Result<Device, RasterError> {
         match self.none {}
     }

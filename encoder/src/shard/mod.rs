@@ -26,7 +26,6 @@ use slag_math::matrix::Rows;
 /// A cell's shard, with its entry in the manifest.
 pub struct BuiltShard {
     pub profile: Profile,
-    /// The file.
     pub bytes: Vec<u8>,
     /// Hard bound of a score's error.
     pub score_error_bound: f32,
@@ -138,7 +137,6 @@ impl ShardOrder<'_> {
 }
 
 impl ShardBuilder<'_> {
-    /// Builds a cell's shards.
     pub fn build(
         &self,
         cell_id: u32,

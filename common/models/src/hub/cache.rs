@@ -8,8 +8,7 @@ use slag_common::durable;
 use super::download::client;
 use super::error::HubError;
 use super::lock::Lock;
-use super::options::HubOptions;
-use super::pull::{Pull, PulledFile, Side};
+use super::pull::{HubOptions, Pull, PulledFile, Side};
 use super::table::{Entry, Table};
 use crate::described::Described;
 use crate::description::{self, DescriptionError, Sha256};
@@ -22,7 +21,6 @@ pub enum Here {
     /// Nothing usable.
     No,
     Text,
-    /// All files.
     All,
 }
 

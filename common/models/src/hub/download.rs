@@ -7,7 +7,7 @@ use std::time::Duration;
 use ureq::http::{HeaderName, Method, Response, StatusCode};
 use ureq::tls::TlsConfig;
 
-use super::options::HubOptions;
+use super::pull::HubOptions;
 use crate::description::Sha256;
 use crate::download::{
     Client, DownloadError, DownloadFailure, Expected, NetworkLimits, Part, Watch, header_text, refusal,
@@ -31,7 +31,6 @@ impl Watch for Log {
 /// The hub's metadata of a file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Advertised {
-    /// The commit.
     pub revision: Option<String>,
     /// Its SHA-256: the hub's ETag of a file kept in large-file storage.
     pub sha256: Option<Sha256>,

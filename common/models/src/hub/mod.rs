@@ -8,16 +8,12 @@ mod cache;
 mod download;
 mod error;
 mod lock;
-mod options;
 mod pull;
-mod source;
 mod table;
 
 pub use cache::{Here, Hub};
 pub use download::MAX_FILE_BYTES;
-pub use error::{HubError, Wanted};
+pub use error::{HubError, Source, Wanted};
 pub use lock::{Accepted, Lock, LockedFile};
-pub use options::{HubOptions, cache_folder, models_folder};
-pub use pull::{PulledFile, Side};
-pub use source::Source;
+pub use pull::{HubOptions, PulledFile, Side, cache_folder, models_folder};
 pub use table::{Entry, Known, Table};

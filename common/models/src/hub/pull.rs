@@ -1,15 +1,14 @@
 //! One pull: downloads and checks the files of a model and records them in the lock.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use serde::Serialize;
 use slag_common::durable;
 
 use super::download::{Advertised, PartialFile, ask};
-use super::error::{HubError, Wanted};
+use super::error::{HubError, Source, Wanted};
 use super::lock::{Lock, LockedFile};
-use super::options::HubOptions;
-use super::source::Source;
 use super::table::{Entry, Table};
 use crate::description::Sha256;
 use crate::download::{Client, DownloadError, Part};
@@ -19,7 +18,6 @@ use crate::model_dir::hash_file;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
     Text,
-    /// All files.
     Both,
 }
 
@@ -170,4 +168,39 @@ impl Pull<'_> {
             }
         }
     }
+}
+
+/// Options of reaching the hub and keeping its models.
+#[derive(Clone, Debug)]
+pub struct HubOptions {
+    /// Folder of the models, see [`models_folder`].
+    pub root: PathBuf,
+    /// Address of the hub; default: the table's.
+    pub hub: Option<String>,
+    /// Proxy, in the format of `HTTPS_PROXY`.
+    pub proxy: Option<String>,
+    /// Timeout of connections and reads.
+    pub timeout: Duration,
+    /// Wait before the second attempt; doubled before each further one.
+    pub first_backoff: Duration,
+}
+
+impl HubOptions {
+    pub fn new(root: PathBuf) -> Self {
+        let (timeout, first_backoff) = (Duration::from_secs(30), Duration::from_millis(500));
+        Self { root, hub: None, proxy: None, timeout, first_backoff }
+    }
+}
+
+/// Returns the folder of the user's caches: `$XDG_CACHE_HOME/slag`, else `~/.cache/slag`; `variable` looks up
+/// environment variables.
+pub fn cache_folder(variable: impl Fn(&str) -> Option<std::ffi::OsString>) -> Option<PathBuf> {
+    // The XDG base directory specification ignores relative paths.
+    let absolute = |name: &str| variable(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let base = absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
+    Some(base.join("slag"))
+}
+
+pub fn models_folder(cache_folder: &Path) -> PathBuf {
+    cache_folder.join("models")
 }

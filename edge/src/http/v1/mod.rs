@@ -19,7 +19,6 @@ use super::query;
 use crate::locate::MAX_PHOTO_BYTES;
 use crate::query::Ask;
 
-/// Adds the routes.
 pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
     let to = view_routes(to)
         .get(

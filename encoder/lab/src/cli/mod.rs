@@ -37,7 +37,6 @@ enum Command {
     Bench(measure::BenchCommand),
 }
 
-/// Runs a command and returns the exit code.
 pub fn run(cli: Cli) -> Exit {
     let json = cli.output.json;
     let progress = progress::shown(cli.output.shows_progress());

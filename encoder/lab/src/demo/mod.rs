@@ -1,7 +1,5 @@
 //! The whole system in one run: generate, encode, serve, fetch as a robot does, ask, compare with the truth.
 
-mod answer;
-mod caption;
 mod picture;
 mod questions;
 
@@ -16,7 +14,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
-pub use answer::EdgeAnswer;
+pub use picture::EdgeAnswer;
 
 use crate::generate::Scene;
 use crate::generate::grammar::SceneKind;
@@ -28,7 +26,6 @@ use slag_encoder::query;
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
-/// A room and a yard beside it.
 const KINDS: [SceneKind; 2] = [SceneKind::Room, SceneKind::Yard];
 /// Photos of both together.
 const N_VIEWS: u32 = 72;
@@ -137,7 +134,6 @@ impl Demo {
     }
 }
 
-/// Runs the demo.
 pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
     if !options.edge.is_file() {
         return Err(anyhow!(

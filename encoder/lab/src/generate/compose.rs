@@ -34,7 +34,6 @@ pub struct Placed {
     pub noun: usize,
     /// Its parts, colours and paint.
     pub object: Object,
-    /// Its pose.
     pub world_from_object: DAffine3,
     /// The box around it.
     pub bounds: Aabb,

@@ -18,7 +18,6 @@ const SPACING: f64 = 1.1;
 #[derive(Clone, Debug)]
 pub struct WrittenCopies {
     pub scene: PathBuf,
-    /// The poses.
     pub views: PathBuf,
     /// The masks, if the scene has any.
     pub masks: Option<PathBuf>,

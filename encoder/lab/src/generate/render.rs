@@ -17,7 +17,6 @@ const OFF_SURFACE_M: f64 = 1e-4;
 pub enum Light {
     /// From a direction; unit length.
     Sun(DVec3),
-    /// From a point.
     Lamp(DVec3),
 }
 

@@ -7,10 +7,7 @@
 //! Data beyond the limit of a binding is divided: the scene into chunks, the image into bands of tile rows. This
 //! changes no contribution, because tiles are independent and integers add up exactly.
 
-mod band;
-mod bindings;
 mod buffers;
-mod chunk;
 mod device;
 mod jobs;
 mod layout;
@@ -30,20 +27,18 @@ use slag_raster::{Drawing, RasterView, ViewCounters, check_scene, check_view, co
 
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
-use super::cpu::CpuRasterizer;
+use super::cpu::{CpuRasterizer, check_regions};
 use super::error::RasterError;
 use super::rasterizer::{LoadedScene, Rasterizer};
-use super::validate::check_regions;
 use super::weights::{RegionWeight, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
-use band::{Band, band_size};
 use buffers::{REGION_BYTES, Size};
-use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
 pub(crate) use device::Adapter;
 pub use device::{Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, Counts, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
-use workspace::{PIXEL_BYTES, Workspace};
+use stages::{SCENE_GAUSSIAN_BYTES, SceneChunk};
+use workspace::{Band, PIXEL_BYTES, Workspace, band_size};
 
 pub struct GpuRasterizer {
     device: Arc<Device>,

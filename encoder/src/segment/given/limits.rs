@@ -2,8 +2,7 @@
 
 use std::path::Path;
 
-use crate::segment::error::SegmentError;
-use crate::segment::segmenter::{MAX_MASK_BYTES, SegmentInput};
+use crate::segment::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput};
 
 /// Returns the error for masks above [`MAX_MASK_BYTES`].
 pub(super) fn too_large(path: &Path) -> SegmentError {

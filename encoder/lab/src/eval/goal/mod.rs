@@ -183,7 +183,6 @@ impl Verdict {
         matches!(self, Self::Pose { shown, .. } if *shown >= MIN_SHOWN)
     }
 
-    /// Returns whether it is wrong.
     fn is_fault(&self, is_reachable: bool) -> bool {
         if is_reachable { !self.is_shown() } else { matches!(self, Self::Pose { .. }) }
     }

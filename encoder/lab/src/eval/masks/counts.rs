@@ -8,7 +8,6 @@ use crate::table::percent;
 /// Masks and labelled segments with fewer pixels do not count, as in `encode`.
 pub(super) const MIN_PX: u32 = 200;
 
-/// Returns the pixels of each mask, from those of its regions.
 pub(super) fn areas(
     regions: &RegionMap,
     masks_of_region: &[Vec<u32>],
