@@ -17,7 +17,6 @@ pub mod landmarks;
 pub mod manifest;
 mod named_members;
 pub mod npy;
-pub mod npz;
 pub mod objects;
 pub mod occupancy;
 pub mod photo_poses;

@@ -8,7 +8,7 @@ use ort::logging::LogLevel;
 use ort::session::RunOptions;
 use ort::value::{DynTensor, DynTensorValueType};
 
-use crate::device_memory::DeviceMemory;
+use crate::placement::DeviceMemory;
 use crate::session::{Model, SessionError};
 
 /// Where an output is left.

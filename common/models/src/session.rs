@@ -15,13 +15,12 @@ use ort::value::{
     TensorElementType, TensorRef, ValueType,
 };
 
-use crate::device_memory::DeviceMemory;
+use crate::file_ref::ModelFile;
 use crate::floats::Floats;
-use crate::model_file::ModelFile;
-use crate::placement::{Listener, Placement, forward_log};
+use crate::placement::{DeviceMemory, Listener, Placement, forward_log};
 use crate::provider::{Provider, names};
 
-pub use crate::session_error::SessionError;
+pub use crate::error::SessionError;
 
 /// Options of running models.
 #[derive(Clone, Debug)]

@@ -9,8 +9,7 @@ use crate::bin::{Tiles, bin};
 use crate::blend::{PerPixel, TileRect, WeightSink, walk_tile};
 use crate::buckets::Buckets;
 use crate::constants::TILE_SIZE_PX;
-use crate::project::{PreparedScene, Projection, ScreenGaussian};
-use crate::sh;
+use crate::project::{self, PreparedScene, Projection, ScreenGaussian};
 use crate::simd::Lanes;
 use crate::view::RasterView;
 
@@ -45,7 +44,7 @@ impl PreparedScene<'_> {
         let projection = self.project(view);
         let tiles = bin(&projection.visible, &view.intrinsics);
         let position_in_world = view.camera_from_world.inverse().translation;
-        let colours = sh::colours(self.scene, &projection.visible, position_in_world);
+        let colours = project::colours(self.scene, &projection.visible, position_in_world);
         let drawing = draw(instructions, &projection.visible, &colours, &tiles, background);
         Drawing { counters: ViewCounters::of(&projection, &tiles), ..drawing }
     }

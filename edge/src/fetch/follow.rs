@@ -19,8 +19,7 @@ use slag_common::retry::Backoff;
 use super::error::FetchError;
 use super::position::{MAX_TEXT_BYTES, NotAPosition, Position};
 use super::records;
-use super::report::FetchReport;
-use super::request::{DEFAULT_RADIUS, FetchRequest};
+use super::request::{DEFAULT_RADIUS, FetchReport, FetchRequest};
 use crate::store::EdgeCache;
 
 /// Longest sleep between looks at the cancel flag.

@@ -8,7 +8,7 @@ use slag_common::manifest::{CellIndex, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::Profile;
 
 use super::position::PlanError;
-use super::report::Tally;
+use super::request::Tally;
 use crate::store::CurrentCell;
 
 /// A shard on board.

@@ -23,7 +23,6 @@ mod object;
 pub(crate) mod shards;
 mod sightings;
 mod tree;
-mod vectors;
 
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
 use crate::memory::{MemoryPlan, Phase};

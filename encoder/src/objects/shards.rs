@@ -7,8 +7,7 @@ use slag_common::objects::{
 use slag_common::shard::Basis;
 use slag_math::cholesky::{SmallPivots, cholesky};
 
-use super::object::{NONE, SceneObjects};
-use super::vectors::MAX_MEDOIDS;
+use super::object::{MAX_MEDOIDS, NONE, SceneObjects};
 
 /// Vectors of an object: the mean of its masks' and the medoids.
 const N_VECTORS: usize = 1 + MAX_MEDOIDS;

@@ -6,7 +6,7 @@ use slag_math::simd::InstructionSet;
 use slag_raster::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
 use slag_raster::{Buckets, Lanes, ScreenGaussian, TileRect, Tiles, WeightSink, concat, walk_tile};
 
-use super::weights::{RegionWeight, WeightKind};
+use super::rasterizer::{RegionWeight, WeightKind};
 use crate::masks::{NO_REGION, RegionMap};
 
 /// Units of a fixed-point weight per pixel.

@@ -5,9 +5,7 @@ use slag_math::simd::InstructionSet;
 use slag_raster::{Drawing, PreparedScene, RasterView, ViewCounters, bin, check_scene, check_view};
 
 use super::contributions::{merge, tile_contributions};
-use super::error::RasterError;
-use super::rasterizer::{LoadedScene, Rasterizer};
-use super::weights::{ViewWeights, WeightKind};
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer, ViewWeights, WeightKind};
 use crate::masks::{NO_REGION, RegionMap};
 use crate::memory::{MemoryPlan, Phase};
 

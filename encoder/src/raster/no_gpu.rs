@@ -6,8 +6,7 @@ use slag_common::Gaussians;
 
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
-use super::error::RasterError;
-use super::rasterizer::{LoadedScene, Rasterizer};
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer};
 
 pub(crate) struct Adapter {
     pub report: AdapterReport,

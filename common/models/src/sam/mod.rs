@@ -34,8 +34,8 @@ use ort::value::DynTensor;
 
 use crate::bound::Place;
 use crate::description::FILE_NAME;
-use crate::device_memory::DeviceMemory;
 use crate::model_dir::{checked, sha256_of};
+use crate::placement::DeviceMemory;
 use crate::preprocess::{Filter, Window, resample, values_of_levels};
 use crate::session::{Model, SessionError, SessionOptions, Tensor};
 use crate::{Floats, ModelError};

@@ -6,7 +6,7 @@ use pollster::block_on;
 
 use super::shader::Kernels;
 use crate::raster::adapter::{AdapterReport, Precision};
-use crate::raster::error::RasterError;
+use crate::raster::rasterizer::RasterError;
 
 fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
     let info = adapter.get_info();

@@ -8,7 +8,7 @@ use slag_raster::{RasterView, reach2};
 
 use super::shader::{Counter, Counts, SUM_FRACTION_BITS};
 use crate::raster::adapter::Precision;
-use crate::raster::weights::RegionWeight;
+use crate::raster::rasterizer::RegionWeight;
 
 /// A Gaussian in device memory.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]

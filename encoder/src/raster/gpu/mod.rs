@@ -28,9 +28,7 @@ use slag_raster::{Drawing, RasterView, ViewCounters, check_scene, check_view, co
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
 use super::cpu::{CpuRasterizer, check_regions};
-use super::error::RasterError;
-use super::rasterizer::{LoadedScene, Rasterizer};
-use super::weights::{RegionWeight, ViewWeights, WeightKind};
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 use buffers::{REGION_BYTES, Size};
 pub(crate) use device::Adapter;

@@ -9,7 +9,7 @@ use super::device::Device;
 use super::jobs::{DIGIT_BITS, JOB_STRIDE_BYTES, Scan, SortKey, dispatch_offset, part, sort_job};
 use super::layout::{Chunk, ScanJob, SceneGaussian};
 use super::shader::{Counter, NONE, WORKGROUP_SIZE};
-use crate::raster::weights::WeightKind;
+use crate::raster::rasterizer::WeightKind;
 
 /// Records the stages of one view in flight.
 pub(crate) struct Stages {

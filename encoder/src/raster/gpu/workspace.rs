@@ -10,8 +10,7 @@ use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
 use super::layout::{Background, Capacities, RegionSum, ViewBlock};
 use super::shader::{Counter, Counts};
 use super::stages::{SceneChunk, Stages, bind, dispatch, number, whole};
-use crate::raster::error::RasterError;
-use crate::raster::weights::WeightKind;
+use crate::raster::rasterizer::{RasterError, WeightKind};
 
 /// Size of a drawn pixel, bytes.
 pub(crate) const PIXEL_BYTES: u64 = 20;

@@ -3,7 +3,7 @@
 use std::io::BufReader;
 use std::path::Path;
 
-use super::limits::check_size;
+use super::coco::check_size;
 use crate::segment::segmenter::{SegmentError, SegmentInput};
 
 /// Memory that the PNG decoder may use beyond the pixels.

@@ -2,7 +2,6 @@
 
 mod coco;
 mod id_image;
-mod limits;
 
 use std::path::{Path, PathBuf};
 
@@ -11,7 +10,7 @@ use slag_common::{Hash32, View};
 use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::masks::rle::Rle;
 use crate::masks::{Mask, NO_REGION, masks_of_labels};
-use limits::too_large;
+use coco::too_large;
 
 /// Masks from files.
 ///

@@ -483,7 +483,7 @@ fn tiny(settings: SamSettings) -> SamSegmenter {
 }
 
 fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
-    let mut archive = slag_common::npz::Npz::open(npz).expect("an npz");
+    let mut archive = slag_common::npy::Npz::open(npz).expect("an npz");
     let member = archive.array(name).expect("readable").expect("there");
     let array = npyz::NpyFile::new(member).expect("an array");
     (array.shape().to_vec(), array.into_vec().expect("of that type"))
