@@ -197,16 +197,8 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
         };
         settings.inputs.planned = Some(ViewpointSettings { n_views, up: args.up.up });
     }
-    match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
-        ("auto", None) => {}
-        ("auto", Some(masks)) => settings.view.masks = masks,
-        ("graph", None) => settings.view.masks = Masks::Graph,
-        (dir, None) => {
-            settings.view.masks = Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() };
-        }
-        (dir, Some(_)) => {
-            return Err(anyhow!("--masks {dir} and --segmenter exclude each other; give one of them"));
-        }
+    if let Some(masks) = masks(args, choices)? {
+        settings.view.masks = masks;
     }
     let EncodeSettings { cells, output, .. } = &mut settings;
     cells.limits.max_gaussians = args.cell_gaussians as usize;
@@ -226,6 +218,17 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     output.models = args.models.models.as_deref().map(lasting_name);
     output.text_model = args.text_model;
     Ok(settings)
+}
+
+/// Returns where masks come from, if not from the embedded model.
+fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
+    let ignore_ids = || args.ignore_mask_ids.clone();
+    match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
+        ("auto", of_sam) => Ok(of_sam),
+        ("graph", None) => Ok(Some(Masks::Graph)),
+        (dir, None) => Ok(Some(Masks::Given { dir: dir.into(), ignore_ids: ignore_ids() })),
+        (dir, Some(_)) => Err(anyhow!("--masks {dir} and --segmenter exclude each other; give one of them")),
+    }
 }
 
 /// Returns the settings of the flags, with the choices that a target picks, and what it expects.

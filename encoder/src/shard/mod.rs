@@ -9,7 +9,7 @@ use slag_common::landmarks::{BuiltLandmarks, Landmark, Landmarks};
 use slag_common::occupancy::Occupancy;
 use slag_common::photo_poses::{BuiltPhotoPoses, PhotoPoses};
 use slag_common::shard::{
-    Additions, ExactColumns, Fine, IndexColumn, PositionForm, Positions, Profile, Residuals, ScoreErrors,
+    Additions, ExactColumns, IndexColumn, PositionForm, Positions, Profile, Residuals, ScoreErrors,
     ShardHeader, ShardView,
 };
 use slag_common::{Gaussians, View};
@@ -177,19 +177,12 @@ impl ShardBuilder<'_> {
             Profile::Compact => built(profile, &compact, additions),
             Profile::Balanced => built(profile, &balanced, additions),
             Profile::Exact => {
-                // Codes and fine residuals decide which embeddings readers look at.
-                let fine = codebook.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
-                let exact = ExactColumns {
+                let exact = Some(ExactColumns {
                     input_indices: &order.in_input(),
                     embeddings: &order.halves(embeddings),
-                    fine: fine.map(|fine| Fine {
-                        errors: fine.errors,
-                        steps: &fine.steps,
-                        scales: &fine.scales,
-                        values: &fine.values,
-                    }),
-                };
-                let exact = Some(exact);
+                    // Codes and fine residuals decide which embeddings readers look at.
+                    fine: codebook.fine(),
+                });
                 let view = ShardView { radii: compact.radii, exact, packed_indices: None, ..balanced };
                 built(profile, &view, additions)
             }

@@ -75,10 +75,15 @@ pub(super) fn publish(
         progress.advance(1);
     }
     progress.end();
-    let manifest = Manifest {
+    store.publish(&manifest(store.next_generation()?, id, dim, cells), &Extras::new())?;
+    Ok(store.prune().map(|_| ())?)
+}
+
+fn manifest(generation: u64, id: Hash32, dim: usize, cells: Vec<CellRecord>) -> Manifest {
+    Manifest {
         version: manifest::VERSION,
         scene: "generated-field".into(),
-        generation: store.next_generation()?,
+        generation,
         created_unix_secs: 0,
         metric: true,
         geo_reference: None,
@@ -90,13 +95,11 @@ pub(super) fn publish(
             calibration: None,
             text_model: None,
         },
-        n_gaussians: (n * cells.len()) as u64,
+        n_gaussians: cells.iter().map(|cell| u64::from(cell.n_gaussians)).sum(),
         n_without_evidence: 0,
         n_rejected: 0,
         cells,
-    };
-    store.publish(&manifest, &Extras::new())?;
-    Ok(store.prune().map(|_| ())?)
+    }
 }
 
 /// Returns opaque round Gaussians at these means.

@@ -238,6 +238,29 @@ impl<'s> GpuScene<'s> {
         self.bands_of(&mut lent.workspace, view, px_bytes, &mut work)
     }
 
+    /// Takes a workspace that holds a band, or makes one; `None` where memory does not suffice and there is another
+    /// view's to try with instead.
+    fn workspace_for(
+        &self,
+        workspace: &mut Option<Workspace>,
+        n_tiles: u32,
+        n_px: u32,
+    ) -> Result<Option<Workspace>, RasterError> {
+        if let Some(current) = workspace.take().filter(|current| current.holds(n_tiles, n_px)) {
+            return Ok(Some(current));
+        }
+        let capacities = self.pool().capacities;
+        match self.make_workspace(capacities, n_tiles, n_px) {
+            Ok(made) => Ok(Some(made)),
+            Err(_) if self.give_up_workspace() => {
+                // Waits for another view's.
+                *workspace = self.take_workspace();
+                Ok(None)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
     fn bands_of(
         &self,
         workspace: &mut Option<Workspace>,
@@ -263,22 +286,9 @@ impl<'s> GpuScene<'s> {
         };
         while let Some([first, end]) = bands.pop() {
             let (n_tiles, n_px) = band_size(width_px, height_px, [first, end]);
-            let mut current = match workspace.take() {
-                Some(current) if current.holds(n_tiles, n_px) => current,
-                old => {
-                    drop(old);
-                    let capacities = self.pool().capacities;
-                    match self.make_workspace(capacities, n_tiles, n_px) {
-                        Ok(made) => made,
-                        Err(_) if self.give_up_workspace() => {
-                            // Waits for another view's.
-                            *workspace = self.take_workspace();
-                            bands.push([first, end]);
-                            continue;
-                        }
-                        Err(error) => return Err(error),
-                    }
-                }
+            let Some(mut current) = self.workspace_for(workspace, n_tiles, n_px)? else {
+                bands.push([first, end]);
+                continue;
             };
             let capacities = current.capacities;
             let block = ViewBlock::new(view, self.origin_in_world, [first, end], capacities);
