@@ -67,6 +67,14 @@ fn store(listed: Vec<u8>, shard: Vec<u8>) -> String {
     Box::leak(Box::new(server)).url()
 }
 
+/// Returns a cache with a scene of one shard on board.
+fn fetched((listed, shard): (Vec<u8>, Vec<u8>)) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().expect("a folder");
+    let from = store(listed, shard);
+    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    dir
+}
+
 /// Starts a service; returns its process and its address.
 fn serve(cache: &Path, args: &[&str]) -> (Child, String) {
     let mut serving = slag_edge(cache, &[&["serve", "--listen", "127.0.0.1:0"], args].concat());
@@ -210,10 +218,7 @@ fn an_interrupted_fetch_says_so() {
 
 #[test]
 fn nobody_reads_and_nobody_complains() {
-    let (listed, shard) = red_and_blue();
-    let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    let dir = fetched(red_and_blue());
     let mut child = slag_edge(dir.path(), &["query", "red", "--kind", "gaussians", "--json"]);
     let mut child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
     drop(child.stdout.take());
@@ -342,10 +347,7 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
 #[test]
 fn overload_is_turned_away_and_memory_stays() {
     const N_CLIENTS: usize = 160;
-    let (listed, shard) = red_and_blue();
-    let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    let dir = fetched(red_and_blue());
     let (serving, url) = serve(dir.path(), &[]);
     let agent: ureq::Agent =
         ureq::Agent::config_builder().proxy(None).http_status_as_error(false).build().into();
@@ -417,11 +419,7 @@ const ATTACK: &str = "kind=clusters&threshold=-1&min_count=1&voxel=1e-9&limit=1"
 fn grid_cache() -> tempfile::TempDir {
     let grid = |i: u32| [i % 100, i / 100 % 100, i / 10_000].map(|at| at as u16 * 100);
     let positions: Vec<[u16; 3]> = (0..120_000).map(grid).collect();
-    let (listed, shard) = painted(&positions, 60_000);
-    let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
-    dir
+    fetched(painted(&positions, 60_000))
 }
 
 /// 32 at once, three times: what they take together is bounded, and who gets no memory is told the budget.
