@@ -42,6 +42,19 @@ pub struct Intrinsics {
     pub distortion: Distortion,
 }
 
+/// Returns the intrinsics of an ideal lens with square pixels, whose axis meets the middle of the image.
+pub const fn pinhole([width_px, height_px]: [u32; 2], focal_px: f64) -> Intrinsics {
+    Intrinsics {
+        width_px,
+        height_px,
+        focal_x_px: focal_px,
+        focal_y_px: focal_px,
+        centre_x_px: width_px as f64 / 2.0,
+        centre_y_px: height_px as f64 / 2.0,
+        distortion: Distortion::None,
+    }
+}
+
 /// Normalised radius beyond which images are ignored: 89.4 degrees off the axis.
 const MAX_NORMALISED_RADIUS: f64 = 100.0;
 

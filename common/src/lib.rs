@@ -29,7 +29,7 @@ pub mod splat;
 pub mod tuf;
 
 pub use byte_size::ByteSize;
-pub use camera::{Distortion, Intrinsics, View};
+pub use camera::{Distortion, Intrinsics, View, pinhole};
 pub use error_line::error_line;
 pub use gaussians::Gaussians;
 pub use hash::Hash32;

@@ -26,4 +26,5 @@ pub use buckets::{Buckets, concat};
 pub use draw::{Drawing, ViewCounters, draw};
 pub use project::{PreparedScene, Projection, ScreenGaussian, colour, reach2};
 pub use simd::Lanes;
-pub use view::{InputError, RasterView, check_scene, check_view, pinhole};
+pub use slag_common::pinhole;
+pub use view::{InputError, RasterView, check_scene, check_view};

@@ -21,19 +21,6 @@ impl RasterView {
     }
 }
 
-/// Returns the intrinsics of an ideal lens with square pixels, whose axis meets the middle of the image.
-pub fn pinhole([width_px, height_px]: [u32; 2], focal_px: f64) -> Intrinsics {
-    Intrinsics {
-        width_px,
-        height_px,
-        focal_x_px: focal_px,
-        focal_y_px: focal_px,
-        centre_x_px: f64::from(width_px) / 2.0,
-        centre_y_px: f64::from(height_px) / 2.0,
-        distortion: Distortion::None,
-    }
-}
-
 /// What cannot be drawn.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum InputError {
