@@ -279,32 +279,26 @@ pub fn follow(
         if distrusted.as_ref().is_some_and(|before| *before != (n_seen, records::stamp(cache))) {
             follower.retry();
         }
-        let Some(position) = position else {
-            if is_over {
-                return Ok(());
-            }
-            following.wait(n_seen, NAP);
-            continue;
-        };
         let now = started.elapsed();
-        match follower.decide(now, in_world(position, manifest.as_ref())) {
-            Decision::Fetch => {}
+        let decision = match position {
+            Some(position) => follower.decide(now, in_world(position, manifest.as_ref())),
+            None => Decision::Rest(None),
+        };
+        let nap = match decision {
             Decision::Rest(_) if is_over => return Ok(()),
+            Decision::Fetch => None,
+            Decision::NotBefore(at) | Decision::Rest(Some(at)) => Some(at.saturating_sub(now).min(NAP)),
+            Decision::Rest(None) => Some(NAP),
+        };
+        if let Some(nap) = nap {
             // After the end nothing is posted, so nothing would end a wait.
-            Decision::NotBefore(at) if is_over => {
-                std::thread::sleep(at.saturating_sub(now).min(NAP));
-                continue;
+            match is_over {
+                true => std::thread::sleep(nap),
+                false => following.wait(n_seen, nap),
             }
-            Decision::NotBefore(at) | Decision::Rest(Some(at)) => {
-                following.wait(n_seen, at.saturating_sub(now).min(NAP));
-                continue;
-            }
-            Decision::Rest(None) => {
-                following.wait(n_seen, NAP);
-                continue;
-            }
+            continue;
         }
-        let request = FetchRequest { at: Some(position), radius: follower.fetch_radius(), ..request.clone() };
+        let request = FetchRequest { at: position, radius: follower.fetch_radius(), ..request.clone() };
         let before = (n_seen, records::stamp(cache));
         let outcome = (environment.fetch)(&request);
         following.note(&outcome);

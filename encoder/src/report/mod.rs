@@ -29,21 +29,7 @@ pub(crate) fn of_encode(
     let [found_objects, occupancy, bytes, busy] =
         ["objects", "occupancy", "shard_bytes", "busy_secs"].map(&mut take).map(Option::unwrap_or_default);
     let mut page = Page::new(&format!("{scene}, generation {}", summary.generation));
-    page.paragraph(&format!(
-        "{} Gaussians in {} cells, from {} masks of {} photos, in {:.1} s with {}.",
-        summary.n_gaussians,
-        summary.n_cells,
-        summary.n_masks,
-        summary.n_views,
-        summary.wall_secs,
-        summary.encoder
-    ));
-    if summary.n_views_drawn > 0 {
-        page.paragraph(&format!(
-            "{} of the views are drawings of the splat, no photos.",
-            summary.n_views_drawn
-        ));
-    }
+    opening(&mut page, summary);
     left_out(&mut page, summary, &skipped);
     if let Some(lost) = &summary.lost_views {
         page.heading("Kept views");
@@ -76,6 +62,24 @@ pub(crate) fn of_encode(
     page.heading("All else");
     page.value(&rest);
     Ok(page.finish())
+}
+
+fn opening(page: &mut Page, summary: &EncodeSummary) {
+    page.paragraph(&format!(
+        "{} Gaussians in {} cells, from {} masks of {} photos, in {:.1} s with {}.",
+        summary.n_gaussians,
+        summary.n_cells,
+        summary.n_masks,
+        summary.n_views,
+        summary.wall_secs,
+        summary.encoder
+    ));
+    if summary.n_views_drawn > 0 {
+        page.paragraph(&format!(
+            "{} of the views are drawings of the splat, no photos.",
+            summary.n_views_drawn
+        ));
+    }
 }
 
 fn left_out(page: &mut Page, summary: &EncodeSummary, skipped: &Value) {

@@ -245,46 +245,7 @@ impl Sam {
         n_points: usize,
         (points, labels): (&[[f32; 2]], &[i64]),
     ) -> Result<Decoded, SessionError> {
-        let n = (points.len() / n_points.max(1)) as i64;
-        let n_points = n_points as i64;
-        let names = &self.names;
-        let n_masks = MASKS_PER_PROMPT as i64;
-        let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
-        let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
-        outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
-        let (points_shape, labels_shape) = (vec![1, n, n_points, 2], vec![1, n, n_points]);
-        let found = match &self.memory {
-            Some(memory) => {
-                let points = decoder.owned(points_shape, points.as_flattened().to_vec())?;
-                let labels = decoder.owned(labels_shape, labels.to_vec())?;
-                let boxes = decoder.owned::<f32>(vec![1, 0, 4], Vec::new())?;
-                let mut inputs = vec![(names.points.as_str(), &points), (names.labels.as_str(), &labels)];
-                inputs.extend(names.boxes.iter().map(|name| (name.as_str(), &boxes)));
-                inputs.extend(embedding.tensors.iter().filter_map(|(name, held)| match held {
-                    Held::Device(value) => Some((name.as_str(), value)),
-                    Held::Host(_) => None,
-                }));
-                let places: Vec<_> = outputs.iter().map(|(name, _)| (*name, Place::Host)).collect();
-                let found = decoder.run_bound(memory, &inputs, &places)?;
-                let floats = |(value, (name, shape)): (DynTensor, &(&str, &[i64]))| {
-                    decoder.floats(Some(value), name, shape)
-                };
-                found.into_iter().zip(&outputs).map(floats).collect::<Result<Vec<_>, _>>()?
-            }
-            None => {
-                let mut inputs = vec![
-                    (names.points.as_str(), decoder.tensor(points_shape, points.as_flattened())?),
-                    (names.labels.as_str(), decoder.tensor(labels_shape, labels)?),
-                ];
-                if let Some(boxes) = &names.boxes {
-                    inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
-                }
-                for (name, shape, values) in embedding.tensors() {
-                    inputs.push((name, decoder.tensor(shape.to_vec(), values)?));
-                }
-                decoder.run_all(inputs, &outputs)?
-            }
-        };
+        let found = self.run_decoder(decoder, embedding, n_points, (points, labels))?;
         let mut found = found.into_iter();
         let mut next = || found.next().unwrap_or_default();
         let (scores, masks, objects) = (next(), next(), next());
@@ -302,6 +263,56 @@ impl Sam {
             logits: masks.values,
             logits_px,
         })
+    }
+
+    /// Returns the decoder's scores, masks and, if it has them, logits of objects.
+    fn run_decoder(
+        &self,
+        decoder: &mut Model,
+        embedding: &Embedding,
+        n_points: usize,
+        (points, labels): (&[[f32; 2]], &[i64]),
+    ) -> Result<Vec<Tensor>, SessionError> {
+        let n = (points.len() / n_points.max(1)) as i64;
+        let n_points = n_points as i64;
+        let names = &self.names;
+        let n_masks = MASKS_PER_PROMPT as i64;
+        let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
+        let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
+        outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
+        let (points_shape, labels_shape) = (vec![1, n, n_points, 2], vec![1, n, n_points]);
+        match &self.memory {
+            Some(memory) => {
+                let points = decoder.owned(points_shape, points.as_flattened().to_vec())?;
+                let labels = decoder.owned(labels_shape, labels.to_vec())?;
+                let boxes = decoder.owned::<f32>(vec![1, 0, 4], Vec::new())?;
+                let mut inputs = vec![(names.points.as_str(), &points), (names.labels.as_str(), &labels)];
+                inputs.extend(names.boxes.iter().map(|name| (name.as_str(), &boxes)));
+                inputs.extend(embedding.tensors.iter().filter_map(|(name, held)| match held {
+                    Held::Device(value) => Some((name.as_str(), value)),
+                    Held::Host(_) => None,
+                }));
+                let places: Vec<_> = outputs.iter().map(|(name, _)| (*name, Place::Host)).collect();
+                let found = decoder.run_bound(memory, &inputs, &places)?;
+                let floats = |(value, (name, shape)): (DynTensor, &(&str, &[i64]))| {
+                    decoder.floats(Some(value), name, shape)
+                };
+                found.into_iter().zip(&outputs).map(floats).collect()
+            }
+            None => {
+                let mut inputs = vec![
+                    (names.points.as_str(), decoder.tensor(points_shape, points.as_flattened())?),
+                    (names.labels.as_str(), decoder.tensor(labels_shape, labels)?),
+                ];
+                if let Some(boxes) = &names.boxes {
+                    inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
+                }
+                for (name, shape, values) in embedding.tensors() {
+                    inputs.push((name, decoder.tensor(shape.to_vec(), values)?));
+                }
+                decoder.run_all(inputs, &outputs)
+            }
+        }
     }
 }
 

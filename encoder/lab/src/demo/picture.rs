@@ -127,23 +127,7 @@ pub(super) fn map(
     robot_in_world: DVec3,
     radius_m: f64,
 ) -> RgbImage {
-    let mut low = DVec2::INFINITY;
-    let mut high = DVec2::NEG_INFINITY;
-    for cell in cells {
-        (low, high) = (low.min(cell.min.truncate()), high.max(cell.max.truncate()));
-    }
-    let size = ((high - low + 2.0 * MARGIN_M) * MAP_PX_PER_M).max(DVec2::ONE);
-    let (width, height) = (size.x as i64, size.y as i64);
-    let mut map = RgbImage::from_pixel(width as u32, height as u32, image::Rgb([250; 3]));
-    let place = |at: DVec2| {
-        let at = (at - low + MARGIN_M) * MAP_PX_PER_M;
-        (at.x as i64, height - 1 - at.y as i64)
-    };
-    let mut put = |(x, y): (i64, i64), rgb: [u8; 3]| {
-        if (0..width).contains(&x) && (0..height).contains(&y) {
-            map.put_pixel(x as u32, y as u32, image::Rgb(rgb));
-        }
-    };
+    let mut map = Map::of(cells);
     let is_fetched = |bounds: &Aabb| bounds.distance_to(robot_in_world) <= radius_m;
     let fetched: Vec<&Aabb> = cells.iter().filter(|bounds| is_fetched(bounds)).collect();
     let mut order: Vec<usize> =
@@ -155,32 +139,64 @@ pub(super) fn map(
         let on_board = fetched.iter().any(|bounds| bounds.distance_to(mean) == 0.0);
         let grey = 0.6 + 0.3 * luma(rgb);
         let rgb = if on_board { rgb } else { [grey; 3] }.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8);
-        let (x, y) = place(mean.truncate());
+        let (x, y) = map.place(mean.truncate());
         let reach = (f64::from(scene.scales[i][0]) * MAP_PX_PER_M).ceil() as i64;
-        (-reach..=reach).for_each(|dy| (-reach..=reach).for_each(|dx| put((x + dx, y + dy), rgb)));
+        (-reach..=reach).for_each(|dy| (-reach..=reach).for_each(|dx| map.put((x + dx, y + dy), rgb)));
     }
     for bounds in fetched {
-        let ((x0, y1), (x1, y0)) = (place(bounds.min.truncate()), place(bounds.max.truncate()));
-        (x0..=x1).for_each(|x| [y0, y1].into_iter().for_each(|y| put((x, y), [30, 90, 200])));
-        (y0..=y1).for_each(|y| [x0, x1].into_iter().for_each(|x| put((x, y), [30, 90, 200])));
+        let ((x0, y1), (x1, y0)) = (map.place(bounds.min.truncate()), map.place(bounds.max.truncate()));
+        (x0..=x1).for_each(|x| [y0, y1].into_iter().for_each(|y| map.put((x, y), [30, 90, 200])));
+        (y0..=y1).for_each(|y| [x0, x1].into_iter().for_each(|x| map.put((x, y), [30, 90, 200])));
     }
-    let mut ring = |centre: DVec3, radius_m: f64, rgb| {
-        for step in 0..4000 {
-            let angle = std::f64::consts::TAU * f64::from(step) / 4000.0;
-            let (x, y) = place(centre.truncate() + radius_m * DVec2::new(angle.cos(), angle.sin()));
-            [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().for_each(|(dx, dy)| put((x + dx, y + dy), rgb));
-        }
-    };
-    ring(robot_in_world, radius_m, [0, 0, 0]);
+    map.ring(robot_in_world, radius_m, [0, 0, 0]);
     for answer in answers {
-        [0.14, 0.17, 0.2].into_iter().for_each(|radius_m| ring(*answer, radius_m, [230, 0, 80]));
+        [0.14, 0.17, 0.2].into_iter().for_each(|radius_m| map.ring(*answer, radius_m, [230, 0, 80]));
     }
-    let (x, y) = place(robot_in_world.truncate());
+    let (x, y) = map.place(robot_in_world.truncate());
     for step in -9..=9 {
         let cross = [(step, 0), (step, 1), (0, step), (1, step)];
-        cross.into_iter().for_each(|(dx, dy)| put((x + dx, y + dy), [0, 0, 0]));
+        cross.into_iter().for_each(|(dx, dy)| map.put((x + dx, y + dy), [0, 0, 0]));
     }
-    map
+    map.image
+}
+
+/// A picture from above, north up.
+struct Map {
+    image: RgbImage,
+    /// The corner of the cells at the bottom left.
+    low: DVec2,
+}
+
+impl Map {
+    fn of(cells: &[Aabb]) -> Self {
+        let mut low = DVec2::INFINITY;
+        let mut high = DVec2::NEG_INFINITY;
+        for cell in cells {
+            (low, high) = (low.min(cell.min.truncate()), high.max(cell.max.truncate()));
+        }
+        let size = ((high - low + 2.0 * MARGIN_M) * MAP_PX_PER_M).max(DVec2::ONE);
+        Self { image: RgbImage::from_pixel(size.x as u32, size.y as u32, Rgb([250; 3])), low }
+    }
+
+    fn place(&self, at: DVec2) -> (i64, i64) {
+        let at = (at - self.low + MARGIN_M) * MAP_PX_PER_M;
+        (at.x as i64, i64::from(self.image.height()) - 1 - at.y as i64)
+    }
+
+    fn put(&mut self, (x, y): (i64, i64), rgb: [u8; 3]) {
+        let (Ok(x), Ok(y)) = (u32::try_from(x), u32::try_from(y)) else { return };
+        if let Some(pixel) = self.image.get_pixel_mut_checked(x, y) {
+            *pixel = Rgb(rgb);
+        }
+    }
+
+    fn ring(&mut self, centre: DVec3, radius_m: f64, rgb: [u8; 3]) {
+        for step in 0..4000 {
+            let angle = std::f64::consts::TAU * f64::from(step) / 4000.0;
+            let (x, y) = self.place(centre.truncate() + radius_m * DVec2::new(angle.cos(), angle.sin()));
+            [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().for_each(|(dx, dy)| self.put((x + dx, y + dy), rgb));
+        }
+    }
 }
 
 /// Edge of a glyph, in pixels of the font.
