@@ -17,6 +17,7 @@ mod progress;
 mod query;
 mod serve;
 mod status;
+mod text;
 mod trust;
 
 use std::ffi::OsString;

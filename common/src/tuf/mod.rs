@@ -22,11 +22,11 @@ mod update;
 
 pub use canonical::{NotCanonical, canonical_json};
 pub use error::TufError;
-pub use metadata::{Body, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, sha256_hex};
-pub use repository::one_key_repository;
-pub use signed::{
-    Envelope, Head, Key, MetadataSignature, SignedMetadata, add_signatures, generate_key, sign,
+pub use metadata::{
+    Body, FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, sha256_hex,
 };
+pub use repository::one_key_repository;
+pub use signed::{Envelope, Head, MetadataSignature, SignedMetadata, add_signatures, generate_key, sign};
 pub use time::{format_utc, parse_utc};
 pub use trusted::{Kept, Offered, Trusted};
 pub use update::{Source, refresh};

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use ed25519_dalek::SigningKey;
 
-use super::metadata::{FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
-use super::signed::{Key, sign};
+use super::metadata::{FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
+use super::signed::sign;
 
 /// Returns metadata by file name. `version` is that of all roles but root, which stays the same.
 pub fn one_key_repository(

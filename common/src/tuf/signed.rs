@@ -5,12 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value, json};
-use sha2::{Digest, Sha256};
+use serde_json::{Map, Value};
 
 use super::canonical::canonical_json;
 use super::error::TufError;
-use super::metadata::{Body, RoleKeys};
+use super::metadata::{Body, Key, RoleKeys};
 use super::time::{format_utc, parse_utc};
 
 /// What all metadata begins with.
@@ -177,44 +176,6 @@ pub fn add_signatures(role: &str, bytes: &[u8], keys: &[SigningKey]) -> Result<V
     }
     signatures.sort_by(|a, b| a.keyid.cmp(&b.keyid));
     Ok(serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON"))
-}
-
-const ED25519: &str = "ed25519";
-
-/// A public key as metadata lists it. Only Ed25519 keys can verify; others are kept and never count.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Key {
-    pub keytype: String,
-    pub scheme: String,
-    /// The key's values; `public` is the public key in hex.
-    pub keyval: BTreeMap<String, Value>,
-}
-
-impl Key {
-    /// Returns the public half of a signing key.
-    pub fn of(key: &SigningKey) -> Self {
-        let public = hex::encode(key.verifying_key().to_bytes());
-        let keyval = BTreeMap::from([("public".to_owned(), Value::String(public))]);
-        Self { keytype: ED25519.into(), scheme: ED25519.into(), keyval }
-    }
-
-    /// Returns the key's id: the SHA-256 of its canonical form, in hex.
-    pub fn id(&self) -> String {
-        let value = json!({ "keytype": self.keytype, "scheme": self.scheme, "keyval": self.keyval });
-        // A value that is no text makes the key useless, not the id wrong: no such key verifies.
-        let canonical = canonical_json(&value).unwrap_or_default();
-        hex::encode(Sha256::digest(canonical))
-    }
-
-    /// Returns the Ed25519 public key; `None` for another kind or an invalid point.
-    pub(super) fn verifying_key(&self) -> Option<VerifyingKey> {
-        if self.keytype != ED25519 || self.scheme != ED25519 {
-            return None;
-        }
-        let mut bytes = [0; 32];
-        hex::decode_to_slice(self.keyval.get("public")?.as_str()?, &mut bytes).ok()?;
-        VerifyingKey::from_bytes(&bytes).ok()
-    }
 }
 
 /// Generates a signing key from the system's randomness.

@@ -11,7 +11,7 @@ use slag_common::tuf::format_utc;
 use super::args::{CacheArgs, ModelArgs, engine};
 use super::failure::{Failure, store_failure};
 use super::output::print_json;
-use super::output::visible;
+use super::text::visible;
 use crate::error_line;
 use crate::fetch::accepted;
 use crate::query::Status;

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use crate::query::QueryError;
 use crate::store::StoreError;
 
-use super::output::visible;
+use super::text::visible;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {

@@ -13,7 +13,7 @@ use slag_api::goal::{Goal, GoalReply};
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
 use super::output::print_json;
-use super::output::{table, visible};
+use super::text::{table, visible};
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-edge goal chair\n\

@@ -12,7 +12,7 @@ use slag_common::frames::Aabb;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius, parse_reach};
 use super::failure::{Failure, store_failure};
-use super::output::{table, visible};
+use super::text::{table, visible};
 use crate::query::{ListFormat, ObjectFilter, ObjectOrder, parse_box, parse_point};
 use crate::score::{Ball, Budget, Region};
 

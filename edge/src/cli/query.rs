@@ -14,7 +14,7 @@ use slag_common::frames::Aabb;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
-use super::output::{table, visible};
+use super::text::{table, visible};
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-edge query chair\n\

@@ -32,7 +32,7 @@ mod view;
 pub use answer::answer;
 pub use answers::{
     Answers, AnswersOrBatch, BadCellAnswer, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason,
-    ReasonKind, ScoreKind, Searched,
+    ReasonKind, Searched,
 };
 pub use area::{Area, AreaBall, AreaBox, Corner, LatLon, Point};
 pub use ask::Ask;
@@ -49,7 +49,7 @@ pub use request::{
     AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_CLUSTERS, MAX_GAUSSIANS,
     MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, Words, parse_box, parse_point,
 };
-pub use scale::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
+pub use scale::{RELEVANCY_THRESHOLD, ScoreKind, ThresholdSource, calibrated_threshold};
 pub use scene::{Scene, default_voxel, unit};
 pub use status::{ShardStatus, Status, map_status};
 

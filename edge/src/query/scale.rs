@@ -4,9 +4,18 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::manifest::{Calibration, Manifest};
 
-use super::answers::ScoreKind;
 use super::request::QueryRequest;
 use crate::score::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
+
+/// Meaning of scores and thresholds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum ScoreKind {
+    /// `q · E_k`, -1..1.
+    Cosine,
+    /// `1 / (1 + exp(-10 (q · E_k - max_j n_j · E_k)))`, 0..1.
+    Relevancy,
+}
 
 /// Scale of the reported scores.
 #[derive(Clone, Copy)]

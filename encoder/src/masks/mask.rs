@@ -1,6 +1,7 @@
 //! One mask of an image.
 
-use super::regions::NO_REGION;
+/// Label of a pixel outside all masks, in [`RegionMap::region_of_pixel`](super::RegionMap::region_of_pixel) and in label images.
+pub const NO_REGION: u32 = u32::MAX;
 
 /// A box in pixels: `x0 <= x < x1`, `y0 <= y < y1`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -6,6 +6,6 @@ pub mod patches;
 pub mod regions;
 pub mod rle;
 
-pub use mask::{BoxPx, Mask, masks_of_labels};
+pub use mask::{BoxPx, Mask, NO_REGION, masks_of_labels};
 pub use overlay::overlay;
-pub use regions::{NO_REGION, RegionMap};
+pub use regions::RegionMap;

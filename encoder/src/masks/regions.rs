@@ -3,10 +3,7 @@
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-use super::mask::Mask;
-
-/// Label of a pixel outside all masks, in [`RegionMap::region_of_pixel`] and in label images.
-pub const NO_REGION: u32 = u32::MAX;
+use super::mask::{Mask, NO_REGION};
 
 /// The partition of a view by its masks: the pixels of a region lie in the same masks.
 #[derive(Clone, Debug, PartialEq)]

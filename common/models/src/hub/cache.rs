@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use slag_common::durable;
 
-use super::download::client;
+use super::download::{HubOptions, client};
 use super::error::HubError;
 use super::lock::Lock;
-use super::pull::{HubOptions, Pull, PulledFile, Side};
+use super::pull::{Pull, PulledFile, Side};
 use super::table::{Entry, Table};
 use crate::described::Described;
 use crate::description::{self, DescriptionError, Sha256};

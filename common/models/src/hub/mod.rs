@@ -12,8 +12,8 @@ mod pull;
 mod table;
 
 pub use cache::{Here, Hub};
-pub use download::MAX_FILE_BYTES;
+pub use download::{HubOptions, MAX_FILE_BYTES};
 pub use error::{HubError, Source, Wanted};
 pub use lock::{Accepted, Lock, LockedFile};
-pub use pull::{HubOptions, PulledFile, Side, cache_folder, models_folder};
+pub use pull::{PulledFile, Side, cache_folder, models_folder};
 pub use table::{Entry, Known, Table};

@@ -1,12 +1,11 @@
 //! One pull: downloads and checks the files of a model and records them in the lock.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use serde::Serialize;
 use slag_common::durable;
 
-use super::download::{Advertised, PartialFile, ask};
+use super::download::{Advertised, HubOptions, PartialFile, ask};
 use super::error::{HubError, Source, Wanted};
 use super::lock::{Lock, LockedFile};
 use super::table::{Entry, Table};
@@ -167,28 +166,6 @@ impl Pull<'_> {
                 return Err(expected.refusal(target.to_owned(), found, advice));
             }
         }
-    }
-}
-
-/// Options of reaching the hub and keeping its models.
-#[derive(Clone, Debug)]
-pub struct HubOptions {
-    /// Folder of the models, see [`models_folder`].
-    pub root: PathBuf,
-    /// Address of the hub; default: the table's.
-    pub hub: Option<String>,
-    /// Proxy, in the format of `HTTPS_PROXY`.
-    pub proxy: Option<String>,
-    /// Timeout of connections and reads.
-    pub timeout: Duration,
-    /// Wait before the second attempt; doubled before each further one.
-    pub first_backoff: Duration,
-}
-
-impl HubOptions {
-    pub fn new(root: PathBuf) -> Self {
-        let (timeout, first_backoff) = (Duration::from_secs(30), Duration::from_millis(500));
-        Self { root, hub: None, proxy: None, timeout, first_backoff }
     }
 }
 
