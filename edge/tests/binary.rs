@@ -342,6 +342,13 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
     assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
 }
 
+/// Returns a figure of a program's memory; 0 where Linux does not tell it.
+fn bytes_of(program: &Child, figure: &str) -> u64 {
+    let status = fs_err::read_to_string(format!("/proc/{}/status", program.id())).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix(figure)).unwrap_or("0 kB");
+    line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
+}
+
 /// More clients than the service lets in at once: what is not refused is answered in bounded time, and memory stays.
 /// Whether any is refused depends on the machine; `http::tests` forces it.
 #[test]
@@ -351,11 +358,7 @@ fn overload_is_turned_away_and_memory_stays() {
     let (serving, url) = serve(dir.path(), &[]);
     let agent: ureq::Agent =
         ureq::Agent::config_builder().proxy(None).http_status_as_error(false).build().into();
-    let resident_bytes = || {
-        let status = fs_err::read_to_string(format!("/proc/{}/status", serving.id())).unwrap_or_default();
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap_or("0 kB");
-        line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
-    };
+    let resident_bytes = || bytes_of(&serving, "VmRSS:");
     // Milliseconds of the answers, and the number of refusals, of each half of the time.
     let half = || {
         let end = std::time::Instant::now() + std::time::Duration::from_secs(4);
@@ -430,11 +433,7 @@ fn the_memory_attack_stays_within_the_budget() {
     let dir = grid_cache();
     let (serving, url) =
         serve(dir.path(), &["--max-query-secs", "600", "--max-query-bytes", &QUERY_BYTES.to_string()]);
-    let peak_bytes = || {
-        let status = fs_err::read_to_string(format!("/proc/{}/status", serving.id())).expect("Linux");
-        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("known");
-        line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
-    };
+    let peak_bytes = || bytes_of(&serving, "VmHWM:");
     let before = peak_bytes();
     let ask = || (0..3).map(|_| get(&format!("{url}/query?text=red&{ATTACK}"))).collect::<Vec<_>>();
     let answers: Vec<(u16, Value)> = std::thread::scope(|scope| {

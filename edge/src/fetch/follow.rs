@@ -217,6 +217,16 @@ impl Following {
         self.inbox.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Returns the last position, how many were posted, and whether they are over; a fetch that is due makes the
+    /// follower forget.
+    fn read(&self, follower: &mut Follower) -> (Option<Position>, u64, bool) {
+        let mut inbox = self.lock();
+        if std::mem::take(&mut inbox.is_due) {
+            follower.forget();
+        }
+        (inbox.status.position, inbox.n_posted, inbox.is_over)
+    }
+
     /// Waits for a position after `n_seen`, for the end, or for the timeout.
     fn wait(&self, n_seen: u64, at_most: Duration) {
         let is_quiet = |inbox: &mut Inbox| inbox.n_posted == n_seen && !inbox.is_over;
@@ -269,13 +279,7 @@ pub fn follow(
         if environment.cancel.load(Ordering::Relaxed) {
             return Err(FetchError::Cancelled);
         }
-        let (position, n_seen, is_over, is_due) = {
-            let mut inbox = following.lock();
-            (inbox.status.position, inbox.n_posted, inbox.is_over, std::mem::take(&mut inbox.is_due))
-        };
-        if is_due {
-            follower.forget();
-        }
+        let (position, n_seen, is_over) = following.read(&mut follower);
         if distrusted.as_ref().is_some_and(|before| *before != (n_seen, records::stamp(cache))) {
             follower.retry();
         }

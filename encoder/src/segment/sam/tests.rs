@@ -378,8 +378,6 @@ fn stability_equals_a_plain_recomputation() {
     assert!((5..25).contains(&n_soft), "{n_soft}");
 }
 
-/// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
-#[needs_shared]
 /// Outlines, holes and rough places lie along blocks of pixels that are enlarged, beside others that are not.
 #[test]
 fn rough_masks_equal_a_plain_recomputation() {
@@ -413,6 +411,8 @@ fn rough_masks_equal_a_plain_recomputation() {
     assert!(n_inside > 100_000, "{n_inside}");
 }
 
+/// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
+#[needs_shared]
 #[test]
 fn the_identity_holds_model_and_settings() {
     let segmenter = tiny(SamSettings::default());
