@@ -154,7 +154,6 @@ const REFUSED: &[(Speed, &str, &str)] = &[
     (Slow, "q9_transparent", "hardly any of 104878 Gaussians can be seen"),
 ];
 
-/// Makes the inputs.
 fn made(dir: &Path) {
     let python = python_with("tests/cases");
     for script in SCRIPTS {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use half::f16;
 use serde_json::Value;
-use slag_common::npz::Npz;
+use slag_common::npy::Npz;
 use slag_common::shard::Profile;
 use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;

@@ -77,7 +77,6 @@ impl AppearanceColumns {
         }
     }
 
-    /// Returns the columns.
     pub fn view(&self) -> Appearance<'_> {
         Appearance { colours: &self.colours, sizes: &self.sizes, rotations: &self.rotations }
     }

@@ -31,6 +31,19 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
+    /// Returns grey, half opaque balls at these means.
+    pub fn balls(means_in_world: Vec<DVec3>, scale: f32) -> Self {
+        let n = means_in_world.len();
+        Self {
+            means_in_world,
+            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
+            scales: vec![[scale; 3]; n],
+            opacities: vec![0.5; n],
+            sh_dc: vec![[0.0; 3]; n],
+            ..Self::default()
+        }
+    }
+
     pub fn len(&self) -> usize {
         self.means_in_world.len()
     }

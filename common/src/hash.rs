@@ -13,7 +13,6 @@ use serde::{Deserialize, Serialize};
 pub struct Hash32(pub [u8; 32]);
 
 impl Hash32 {
-    /// Returns the BLAKE3 hash of bytes.
     pub fn of(bytes: &[u8]) -> Self {
         Self(*blake3::hash(bytes).as_bytes())
     }

@@ -57,7 +57,6 @@ pub struct Landmarks<'a> {
 }
 
 impl<'a> Landmarks<'a> {
-    /// Returns the number of landmarks.
     #[expect(clippy::len_without_is_empty, reason = "a shard without landmarks has no such sections")]
     pub fn len(&self) -> usize {
         self.records.len()

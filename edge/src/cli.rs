@@ -17,7 +17,6 @@ mod progress;
 mod query;
 mod serve;
 mod status;
-mod supervisor;
 mod text;
 mod trust;
 

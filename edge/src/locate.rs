@@ -5,7 +5,7 @@ use std::io::Cursor;
 use glam::{DMat3, DQuat, DVec3};
 use image::{DynamicImage, ImageDecoder, ImageError, ImageReader};
 pub use slag_api::locate::{Answer, Pose, Verification};
-use slag_common::{Distortion, Intrinsics};
+use slag_common::{Intrinsics, pinhole};
 use slag_locate::{
     CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, Renderer, locate, map_bytes, working_bytes,
 };
@@ -91,7 +91,6 @@ pub fn map_working_bytes(snapshot: &Snapshot) -> usize {
     map_bytes(landmarks.map(|landmarks| landmarks.len()).sum())
 }
 
-/// Returns the landmarks on board.
 pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
     let mut all = Vec::new();
     for shard in &snapshot.shards {
@@ -131,13 +130,9 @@ pub fn answer(
         return Err(LocateError::Camera { parameter: "gravity", found, expected });
     }
     let intrinsics = Intrinsics {
-        width_px: grey.width as u32,
-        height_px: grey.height as u32,
-        focal_x_px: camera.focal_px,
-        focal_y_px: camera.focal_px,
         centre_x_px,
         centre_y_px,
-        distortion: Distortion::None,
+        ..pinhole([grey.width as u32, grey.height as u32], camera.focal_px)
     };
     let (gravity_in_camera, prior) = (camera.gravity, camera.prior);
     let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera, prior };

@@ -67,6 +67,14 @@ fn store(listed: Vec<u8>, shard: Vec<u8>) -> String {
     Box::leak(Box::new(server)).url()
 }
 
+/// Returns a cache with a scene of one shard on board.
+fn fetched((listed, shard): (Vec<u8>, Vec<u8>)) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().expect("a folder");
+    let from = store(listed, shard);
+    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    dir
+}
+
 /// Starts a service; returns its process and its address.
 fn serve(cache: &Path, args: &[&str]) -> (Child, String) {
     let mut serving = slag_edge(cache, &[&["serve", "--listen", "127.0.0.1:0"], args].concat());
@@ -213,10 +221,7 @@ fn an_interrupted_fetch_says_so() {
 
 #[test]
 fn nobody_reads_and_nobody_complains() {
-    let (listed, shard) = red_and_blue();
-    let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    let dir = fetched(red_and_blue());
     let mut child = slag_edge(dir.path(), &["query", "red", "--kind", "gaussians", "--json"]);
     let mut child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
     drop(child.stdout.take());
@@ -340,23 +345,23 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
     assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
 }
 
+/// Returns a figure of a program's memory; 0 where Linux does not tell it.
+fn bytes_of(program: &Child, figure: &str) -> u64 {
+    let status = fs_err::read_to_string(format!("/proc/{}/status", program.id())).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix(figure)).unwrap_or("0 kB");
+    line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
+}
+
 /// More clients than the service lets in at once: what is not refused is answered in bounded time, and memory stays.
 /// Whether any is refused depends on the machine; `http::tests` forces it.
 #[test]
 fn overload_is_turned_away_and_memory_stays() {
     const N_CLIENTS: usize = 160;
-    let (listed, shard) = red_and_blue();
-    let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    let dir = fetched(red_and_blue());
     let (serving, url) = serve(dir.path(), &[]);
     let agent: ureq::Agent =
         ureq::Agent::config_builder().proxy(None).http_status_as_error(false).build().into();
-    let resident_bytes = || {
-        let status = fs_err::read_to_string(format!("/proc/{}/status", serving.id())).unwrap_or_default();
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap_or("0 kB");
-        line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
-    };
+    let resident_bytes = || bytes_of(&serving, "VmRSS:");
     // Milliseconds of the answers, and the number of refusals, of each half of the time.
     let half = || {
         let end = std::time::Instant::now() + std::time::Duration::from_secs(4);
@@ -420,11 +425,7 @@ const ATTACK: &str = "kind=clusters&threshold=-1&min_count=1&voxel=1e-9&limit=1"
 fn grid_cache() -> tempfile::TempDir {
     let grid = |i: u32| [i % 100, i / 100 % 100, i / 10_000].map(|at| at as u16 * 100);
     let positions: Vec<[u16; 3]> = (0..120_000).map(grid).collect();
-    let (listed, shard) = painted(&positions, 60_000);
-    let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
-    dir
+    fetched(painted(&positions, 60_000))
 }
 
 /// 32 at once, three times: what they take together is bounded, and who gets no memory is told the budget.
@@ -435,11 +436,7 @@ fn the_memory_attack_stays_within_the_budget() {
     let dir = grid_cache();
     let (serving, url) =
         serve(dir.path(), &["--max-query-secs", "600", "--max-query-bytes", &QUERY_BYTES.to_string()]);
-    let peak_bytes = || {
-        let status = fs_err::read_to_string(format!("/proc/{}/status", serving.id())).expect("Linux");
-        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("known");
-        line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
-    };
+    let peak_bytes = || bytes_of(&serving, "VmHWM:");
     let before = peak_bytes();
     let ask = || (0..3).map(|_| get(&format!("{url}/query?text=red&{ATTACK}"))).collect::<Vec<_>>();
     let answers: Vec<(u16, Value)> = std::thread::scope(|scope| {

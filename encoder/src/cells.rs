@@ -39,7 +39,6 @@ impl PositionError {
         if metric { Self::Within(0.01) } else { Self::OfSize }
     }
 
-    /// Returns the error that the Gaussians of `part` may have.
     fn of_part(self, scene: &Gaussians, part: &[u32]) -> f64 {
         if let Self::Within(error) = self {
             return error;

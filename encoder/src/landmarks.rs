@@ -61,7 +61,6 @@ pub fn observe(scene: &dyn LoadedScene, number: u16, view: &View) -> Result<Mapp
     Ok(MappingView { view: number, intrinsics: view.intrinsics, camera_from_world: pose, observations })
 }
 
-/// Returns the landmarks of a scene of `n_gaussians`.
 pub fn landmarks(views: &[MappingView], n_gaussians: usize) -> Vec<Landmark> {
     build(views, n_gaussians / GAUSSIANS_A_LANDMARK)
 }

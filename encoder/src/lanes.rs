@@ -51,7 +51,6 @@ pub struct Lane<'a, T> {
 }
 
 impl<T> Lanes<T> {
-    /// Makes lanes of GPUs: numbers, and the lanes of each.
     pub fn new(gpus: impl IntoIterator<Item = (u32, Vec<T>)>) -> Self {
         let gpu = |(number, free): (u32, Vec<T>)| Gpu {
             number,

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
-use slag_common::{Distortion, Intrinsics, View, poses};
+use slag_common::{Distortion, Intrinsics, View, pinhole, poses};
 use slag_encoder::ingest::{
     GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, load_image, missing_images,
     read_geo_reference,
@@ -13,13 +13,11 @@ use slag_test_support::{needs_shared, shared};
 
 fn camera(distortion: Distortion) -> Intrinsics {
     Intrinsics {
-        width_px: 160,
-        height_px: 120,
-        focal_x_px: 100.0,
         focal_y_px: 105.0,
         centre_x_px: 82.0,
         centre_y_px: 57.0,
         distortion,
+        ..pinhole([160, 120], 100.0)
     }
 }
 

@@ -236,22 +236,10 @@ fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (
     (AlignedBytes::copy_of(&built.shards[0].bytes), built.position_error)
 }
 
-fn scene_at(means_in_world: Vec<DVec3>, scale: f32) -> Gaussians {
-    let n = means_in_world.len();
-    Gaussians {
-        means_in_world,
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        scales: vec![[scale; 3]; n],
-        opacities: vec![0.5; n],
-        sh_dc: vec![[0.0; 3]; n],
-        ..Gaussians::default()
-    }
-}
-
 /// Returns the exact shard of a scene of one cell, in which each Gaussian shows one mask.
 fn one_shard(vectors: &[Vec<f32>], means: Vec<DVec3>) -> AlignedBytes {
     let n = vectors.len();
-    let scene = scene_at(means, 0.1);
+    let scene = Gaussians::balls(means, 0.1);
     let limits = CellLimits { position_error: PositionError::Within(0.01), ..CellLimits::by_count(n) };
     let split = cells::split(&scene, limits);
     let cell = &split.cells[0];
@@ -366,7 +354,7 @@ fn positions_keep_their_error_with_strays() {
         let means: Vec<DVec3> = (0..n).map(|k| at(k, random)).collect();
         let limits = CellLimits { position_error: error, ..CellLimits::by_count(n) };
         let mut largest = 0.0f64;
-        let scene = scene_at(means, scale);
+        let scene = Gaussians::balls(means, scale);
         let split = cells::split(&scene, limits);
         for cell in &split.cells {
             let n = cell.gaussians.len();

@@ -22,7 +22,6 @@ pub struct Target {
 
 macro_rules! targets {
     ($($module:ident: $($name:ident),+;)+) => {
-        /// All decoders.
         pub const TARGETS: &[Target] =
             &[$($(Target { name: stringify!($name), run: $module::$name }),+),+];
     };

@@ -14,7 +14,7 @@ use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors,
     ShardHeader, ShardView, sample,
 };
-use slag_common::{Distortion, Hash32, Intrinsics, View, container};
+use slag_common::{Hash32, View, container, pinhole};
 use slag_edge::store::EdgeCache;
 
 /// Longest shared file used: in longer ones mutations rarely hit anything that matters.
@@ -239,16 +239,7 @@ fn shard(is_exact: bool) -> Vec<u8> {
 }
 
 fn photo(name: &str) -> View {
-    let (width_px, height_px, focal) = (64, 48, 50.0);
-    let intrinsics = Intrinsics {
-        width_px,
-        height_px,
-        focal_x_px: focal,
-        focal_y_px: focal,
-        centre_x_px: 32.0,
-        centre_y_px: 24.0,
-        distortion: Distortion::None,
-    };
+    let intrinsics = pinhole([64, 48], 50.0);
     View { name: name.into(), image_path: name.into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 

@@ -27,7 +27,6 @@ impl Scene {
         Self { dir: tempfile::tempdir().expect("a temporary folder") }
     }
 
-    /// Returns the room, and what one process makes of it.
     fn room() -> &'static (PathBuf, Vec<u8>) {
         static ROOM: OnceLock<(PathBuf, Vec<u8>)> = OnceLock::new();
         ROOM.get_or_init(|| {

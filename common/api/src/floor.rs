@@ -49,7 +49,6 @@ pub struct Floor {
     pub runs: String,
 }
 
-/// Returns the runs of cells.
 pub fn runs_of(cells: &[Place]) -> String {
     let letter = |cell: Place| Place::ALL.into_iter().find(|(of, _)| *of == cell).map(|(_, letter)| letter);
     let run = |run: &[Place]| format!("{}{}", letter(run[0]).unwrap_or_default(), run.len());

@@ -85,14 +85,12 @@ pub struct MissingCell {
 }
 
 impl MapCell {
-    /// Returns its box.
     pub fn bounds(&self) -> Aabb {
         Aabb { min: self.box_min_in_world, max: self.box_max_in_world }
     }
 }
 
 impl MissingCell {
-    /// Returns its box.
     pub fn bounds(&self) -> Aabb {
         Aabb { min: self.box_min_in_world, max: self.box_max_in_world }
     }

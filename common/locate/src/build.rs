@@ -6,8 +6,7 @@ use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
 use slag_common::landmarks::Landmark;
 
-use crate::code::{Code, distance};
-use crate::map::middle;
+use crate::map::{Code, distance, middle};
 use crate::pose::Pinhole;
 
 /// Views that a view's points are looked for in: those that look at places nearest to its own.

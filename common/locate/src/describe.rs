@@ -82,7 +82,6 @@ pub(crate) fn orientations(layer: &Grey, keypoint: &Keypoint) -> Vec<f32> {
     found
 }
 
-/// Returns the descriptor of a keypoint in one orientation.
 pub(crate) fn describe(layer: &Grey, keypoint: &Keypoint, angle: f32) -> Descriptor {
     let (sin, cos) = angle.sin_cos();
     let place = PLACE_WIDTH * keypoint.sigma;

@@ -3,10 +3,9 @@
 use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
 
-use crate::code::code;
 use crate::features::{Feature, MAX_FEATURES, features};
 use crate::grey::Grey;
-use crate::map::Map;
+use crate::map::{Map, code};
 use crate::matching::Query;
 use crate::pose::{Match, Pinhole, covariance};
 use crate::ransac::{Agreed, INLIER_PX, locally_refined, ransac};
@@ -86,7 +85,6 @@ pub struct Located {
     pub is_verified: bool,
 }
 
-/// The answer.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
     Found(Box<Located>),

@@ -7,26 +7,23 @@
 #![forbid(unsafe_code)]
 
 mod build;
-mod code;
 mod describe;
 mod features;
 mod find;
 mod grey;
 mod map;
 mod matching;
-mod p3p;
 mod patches;
 mod pose;
 mod ransac;
 mod render;
 
 pub use build::{MappingView, Observation, build};
-pub use code::{CODE_VERSION, Code, code};
 pub use describe::{DIM, Descriptor};
 pub use features::{Feature, MAX_FEATURES, features, working_bytes};
 pub use find::{Located, Outcome, Photo, Prior, Reason, locate};
 pub use grey::Grey;
-pub use map::{Map, map_bytes};
-pub use p3p::p3p;
+pub use map::{CODE_VERSION, Code, Map, code, map_bytes};
+pub use ransac::p3p;
 pub use render::{Renderer, Rendering, point_in_world};
 pub use slag_common::landmarks::Landmark;

@@ -4,8 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use glam::{DAffine3, DVec2};
 
-use crate::code::{Code, distance};
-use crate::map::Map;
+use crate::map::{Code, Map, distance};
 use crate::pose::{Match, Pinhole};
 
 /// Bits in which a feature and its landmark may differ.

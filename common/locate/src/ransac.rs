@@ -1,10 +1,10 @@
 //! The pose on which most matches agree: samples of three matches (P3P), scored by all (MSAC; Torr and Zisserman
 //! 2000), the best refined on its inliers (LO-RANSAC; Chum, Matas and Kittler 2003).
 
-use glam::DAffine3;
+use glam::{DAffine3, DMat3, DVec3};
+use slag_common::camera::roots_between;
 use slag_math::random::Random;
 
-use crate::p3p::p3p;
 use crate::pose::{Match, Pinhole, refine};
 
 /// Error of an inlier, pixels.
@@ -97,3 +97,80 @@ pub(crate) fn locally_refined(camera: &Pinhole, pose: DAffine3, matches: &[Match
     }
     best
 }
+
+/// Largest ratio of two distances from the camera that is looked for.
+const MAX_RATIO: f64 = 1e4;
+/// Steps of Newton's method on the distances: bisection's digits become those of f64.
+const POLISHING_STEPS: usize = 3;
+
+/// Returns the poses (`camera_from_world`) that see three points in three directions: at most four.
+///
+/// `rays`: unit vectors, camera frame. Points on a line, or two of them in one place, have none.
+pub fn p3p(rays: [DVec3; 3], points_in_world: [DVec3; 3]) -> Vec<DAffine3> {
+    let [p1, p2, p3] = points_in_world;
+    let (a2, b2, c2) = (p2.distance_squared(p3), p1.distance_squared(p3), p1.distance_squared(p2));
+    if a2.min(b2).min(c2) <= 0.0 {
+        return Vec::new();
+    }
+    let [alpha, beta, gamma] = [rays[1].dot(rays[2]), rays[0].dot(rays[2]), rays[0].dot(rays[1])];
+    let d = (a2 - c2) / b2;
+    let (ab, cb) = (a2 / b2, c2 / b2);
+    let sum = (a2 + c2) / b2;
+    // Of v, the ratio of the third distance and the first; from the constant term up.
+    let quartic = [
+        (1.0 + d).powi(2) - 4.0 * ab * gamma * gamma,
+        4.0 * (-d * (1.0 + d) * beta + 2.0 * ab * gamma * gamma * beta - (1.0 - sum) * alpha * gamma),
+        2.0 * (d * d - 1.0 + 2.0 * d * d * beta * beta + 2.0 * (1.0 - cb) * alpha * alpha
+            - 4.0 * sum * alpha * beta * gamma
+            + 2.0 * (1.0 - ab) * gamma * gamma),
+        4.0 * (d * (1.0 - d) * beta - (1.0 - sum) * alpha * gamma + 2.0 * cb * alpha * alpha * beta),
+        (d - 1.0).powi(2) - 4.0 * cb * alpha * alpha,
+    ];
+    let roots = roots_between(&quartic, 0.0, MAX_RATIO).into_iter();
+    let pose = |v: f64| {
+        let u = ((d - 1.0) * v * v - 2.0 * d * beta * v + 1.0 + d) / (2.0 * (gamma - v * alpha));
+        let s1 = (b2 / (1.0 + v * v - 2.0 * v * beta)).sqrt();
+        let lengths = polish([s1, u * s1, v * s1], [alpha, beta, gamma], [a2, b2, c2]);
+        let is_ahead = lengths.iter().all(|s| *s > 0.0 && s.is_finite());
+        let in_camera = [0, 1, 2].map(|i| rays[i] * lengths[i]);
+        is_ahead.then(|| align(in_camera, points_in_world)).flatten()
+    };
+    roots.filter_map(pose).collect()
+}
+
+/// Improves the distances of the three points so that those between the points are as given (law of cosines).
+fn polish([mut s1, mut s2, mut s3]: [f64; 3], [alpha, beta, gamma]: [f64; 3], between: [f64; 3]) -> [f64; 3] {
+    for _ in 0..POLISHING_STEPS {
+        let error = DVec3::new(
+            s2 * s2 + s3 * s3 - 2.0 * s2 * s3 * alpha - between[0],
+            s1 * s1 + s3 * s3 - 2.0 * s1 * s3 * beta - between[1],
+            s1 * s1 + s2 * s2 - 2.0 * s1 * s2 * gamma - between[2],
+        );
+        let columns = DMat3::from_cols(
+            2.0 * DVec3::new(0.0, s1 - s3 * beta, s1 - s2 * gamma),
+            2.0 * DVec3::new(s2 - s3 * alpha, 0.0, s2 - s1 * gamma),
+            2.0 * DVec3::new(s3 - s2 * alpha, s3 - s1 * beta, 0.0),
+        );
+        let step = columns.inverse() * error;
+        if !step.is_finite() {
+            break;
+        }
+        (s1, s2, s3) = (s1 - step.x, s2 - step.y, s3 - step.z);
+    }
+    [s1, s2, s3]
+}
+
+/// Returns the rigid transform that takes one triangle to another of the same shape.
+fn align(in_camera: [DVec3; 3], in_world: [DVec3; 3]) -> Option<DAffine3> {
+    let frame = |[a, b, c]: [DVec3; 3]| {
+        let x = (b - a).try_normalize()?;
+        let z = x.cross(c - a).try_normalize()?;
+        Some(DMat3::from_cols(x, z.cross(x), z))
+    };
+    let rotation = frame(in_camera)? * frame(in_world)?.transpose();
+    let translation = in_camera[0] - rotation * in_world[0];
+    translation.is_finite().then_some(DAffine3 { matrix3: rotation, translation })
+}
+
+#[cfg(test)]
+mod tests;

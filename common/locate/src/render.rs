@@ -140,7 +140,6 @@ impl<'a> Compared<'a> {
     }
 }
 
-/// A rendering and its camera.
 pub(crate) struct Rendered {
     rendering: Rendering,
     camera_from_world: DAffine3,

@@ -2,22 +2,14 @@
 //! drawn with, by intersection of rays and floor.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
-use slag_common::{Distortion, Intrinsics};
+use slag_common::{Intrinsics, pinhole};
 use slag_locate::{
     Grey, Landmark, Located, Map, MappingView, Observation, Outcome, Photo, Prior, Reason, Renderer,
     Rendering, build, code, features, locate,
 };
 use slag_math::random::mix64;
 
-const INTRINSICS: Intrinsics = Intrinsics {
-    width_px: 320,
-    height_px: 240,
-    focal_x_px: 280.0,
-    focal_y_px: 280.0,
-    centre_x_px: 160.0,
-    centre_y_px: 120.0,
-    distortion: Distortion::None,
-};
+const INTRINSICS: Intrinsics = pinhole([320, 240], 280.0);
 
 /// Returns the paint at a place of a floor: patches of random grey in four sizes.
 fn paint(floor: u64, at: DVec2) -> f32 {

@@ -36,7 +36,6 @@ impl Components {
         Self { sets, scale, sizes, thresholds: vec![scale; n_vertices] }
     }
 
-    /// Returns the root of a vertex's component.
     pub fn root(&mut self, vertex: u32) -> u32 {
         self.sets.root(vertex)
     }

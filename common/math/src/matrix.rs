@@ -18,7 +18,6 @@ const CHUNK: usize = 256;
 pub struct Rows<'a> {
     /// `[..][width]`.
     pub values: &'a [f32],
-    /// Columns.
     pub width: usize,
     /// Which rows, in order; absent: all.
     pub index: Option<&'a [u32]>,

@@ -25,7 +25,6 @@ impl UnionFind {
         Self { parents: (0..n as u32).collect() }
     }
 
-    /// Returns the root of an item's set.
     pub fn root(&mut self, mut item: u32) -> u32 {
         while self.parents[item as usize] != item {
             let grandparent = self.parents[self.parents[item as usize] as usize];

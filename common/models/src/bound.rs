@@ -8,7 +8,7 @@ use ort::logging::LogLevel;
 use ort::session::RunOptions;
 use ort::value::{DynTensor, DynTensorValueType};
 
-use crate::device_memory::DeviceMemory;
+use crate::placement::DeviceMemory;
 use crate::session::{Model, SessionError};
 
 /// Where an output is left.
@@ -43,7 +43,6 @@ impl Turns {
         Arc::clone(turns.entry(gpu).or_insert_with(all_free))
     }
 
-    /// Waits for a turn.
     pub(crate) fn take(&self) -> Turn<'_> {
         let n_free = self.n_free.lock().unwrap_or_else(PoisonError::into_inner);
         let free = self.is_free.wait_while(n_free, |n_free| *n_free == 0);

@@ -12,8 +12,7 @@ use std::sync::LazyLock;
 
 use slag_math::stats::{Rank, quantile};
 
-use crate::crop::Crop;
-use crate::encoder::{ImageEncoder, TextEncoder, normalise};
+use crate::encoder::{Crop, ImageEncoder, TextEncoder, normalise};
 use crate::error::InferenceError;
 
 pub const NAME: &str = "colour-shape-v1";

@@ -149,7 +149,6 @@ pub fn ask(question: &str) -> bool {
     asked.is_ok() && matches!(answer.trim(), "y" | "Y" | "yes")
 }
 
-/// Runs `command`.
 pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, HubError> {
     let mut options = options(context.variable).ok_or(HubError::NoFolder)?;
     if let ModelsCommand::Pull(PullArgs { hub, .. }) = command {

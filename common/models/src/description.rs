@@ -63,14 +63,15 @@
 //! Unknown fields are refused. On a robot, which has only the text files, the image file's `sha256` must be
 //! recorded, because the encoder id covers both.
 
+use std::fmt;
 use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use sha2::Digest;
 
-use crate::encoder_id::EncoderId;
-pub use crate::file_ref::{FileRef, Sha256};
 use crate::preprocess::{Filter, Preprocess, Resize};
-pub use crate::score::ScoreDescription;
+
+pub use crate::file_ref::{FileRef, Sha256};
 
 pub const FILE_NAME: &str = "model.toml";
 
@@ -181,7 +182,6 @@ impl ImageDescription {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum TextDescription {
-    /// A model for any text.
     Onnx(OnnxText),
     /// Vectors of fixed phrases.
     Phrases(PhrasesText),
@@ -242,7 +242,6 @@ pub struct CentreDescription {
 }
 
 impl Description {
-    /// Reads and checks `path`.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
         Self::parse(path, &read_text(path)?)
     }
@@ -409,4 +408,82 @@ pub(crate) fn check_common(
         require(path, is_flat, role, "data of data".to_owned(), "weights in one file")?;
     }
     Ok(())
+}
+
+/// Identifies an embedding space by everything that affects vectors, on the image and the text side.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EncoderId {
+    pub name: String,
+    /// Components of a vector.
+    pub dim: u32,
+    /// The description of the model as JSON, with the SHA-256 of each file in place of its path and without the
+    /// fields that do not affect vectors; empty for the built-in stand-in.
+    pub definition: String,
+}
+
+impl EncoderId {
+    /// Returns the SHA-256 of the id's canonical form: `slag-encoder-id 2`, a line feed, then the JSON array of
+    /// name, dim and definition (a string) without spaces.
+    pub fn hash(&self) -> [u8; 32] {
+        let mut hasher = sha2::Sha256::new();
+        hasher.update(b"slag-encoder-id 2\n");
+        hasher.update(serde_json::json!([self.name, self.dim, self.definition]).to_string());
+        hasher.finalize().into()
+    }
+}
+
+/// Shows the name and the start of the hash.
+impl fmt::Display for EncoderId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}@{}", self.name, hex::encode(&self.hash()[..6]))
+    }
+}
+
+/// The interpretation of scores: as a cosine, or as the sigmoid of a scaled cosine.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScoreDescription {
+    /// The cosine from which something counts as found, by default.
+    threshold: Option<f32>,
+    /// The factor from cosine to logit.
+    logit_scale: Option<f64>,
+    logit_bias: Option<f64>,
+    /// The probability from which something counts as found, by default.
+    probability: Option<f64>,
+}
+
+/// Shows the fields that are given.
+impl fmt::Display for ScoreDescription {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { threshold, logit_scale, logit_bias, probability } = *self;
+        let given = [
+            ("threshold", threshold.map(f64::from)),
+            ("logit_scale", logit_scale),
+            ("logit_bias", logit_bias),
+            ("probability", probability),
+        ];
+        let given = given.into_iter().filter_map(|(name, value)| Some(format!("{name} = {}", value?)));
+        f.write_str(&given.collect::<Vec<_>>().join(", "))
+    }
+}
+
+impl ScoreDescription {
+    /// Returns the cosine from which something counts as found: the threshold, or the solution of
+    /// 1 / (1 + exp(-(scale * cosine + bias))) = probability (Zhai et al. 2023, equation 1).
+    ///
+    /// `None` if the fields are not those of exactly one of the two, or give no cosine.
+    pub fn threshold(&self) -> Option<f32> {
+        let threshold = match *self {
+            Self { threshold, logit_scale: None, logit_bias: None, probability: None } => {
+                f64::from(threshold?)
+            }
+            Self { threshold: None, logit_scale, logit_bias, probability } => {
+                let probability = probability.unwrap_or(0.5);
+                ((probability / (1.0 - probability)).ln() - logit_bias?) / logit_scale.filter(|s| *s > 0.0)?
+            }
+            _ => return None,
+        };
+        (-1.0..=1.0).contains(&threshold).then_some(threshold as f32)
+    }
 }

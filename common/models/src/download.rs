@@ -193,6 +193,27 @@ impl Expected {
         let (Self::Exactly(bytes) | Self::AtMost(bytes)) = self;
         bytes
     }
+
+    /// Refuses a file of `total` bytes, if it is known, of which `rest` are to come and `content` are announced.
+    fn check(
+        self,
+        total: Option<u64>,
+        rest: Option<u64>,
+        content: Option<u64>,
+    ) -> Result<(), DownloadFailure> {
+        let (most, is_wrong) = match self {
+            Self::Exactly(bytes) => ("", total.is_some_and(|total| total != bytes)),
+            Self::AtMost(bytes) => ("at most ", total.is_some_and(|total| total > bytes)),
+        };
+        if is_wrong || content.is_some_and(|content| rest.is_some_and(|rest| rest != content)) {
+            let stated = if is_wrong { total } else { content };
+            return Err(DownloadFailure::Length {
+                expected: format!("{most}{}", self.most_bytes()),
+                found: format!("{} bytes", stated.unwrap_or(0)),
+            });
+        }
+        Ok(())
+    }
 }
 
 /// Sends requests to one server, and repeats them.
@@ -309,10 +330,6 @@ impl<'a> Client<'a> {
             None => offset = 0,
         }
         let response = self.request(Method::GET, url, expected.most_bytes(), &ranges, &mut |_, _| {})?;
-        let wrong_range = |expected: String, found: String| -> Result<(), Stop> {
-            part.discard()?;
-            Err(DownloadFailure::Length { expected, found }.into())
-        };
         let content_range = header_text(&response, header::CONTENT_RANGE);
         let content_bytes = response.body().content_length();
         let total = match response.status() {
@@ -340,18 +357,13 @@ impl<'a> Client<'a> {
         };
         if total.is_none() && !content_range.is_empty() {
             *may_resume = false;
-            return wrong_range(format!("bytes from {offset} to the end"), format!("{content_range:?}"));
+            part.discard()?;
+            let expected = format!("bytes from {offset} to the end");
+            return Err(DownloadFailure::Length { expected, found: format!("{content_range:?}") }.into());
         }
-        let most_bytes = expected.most_bytes();
-        let is_wrong = match expected {
-            Expected::Exactly(bytes) => total.is_some_and(|total| total != bytes),
-            Expected::AtMost(bytes) => total.is_some_and(|total| total > bytes),
-        };
-        let rest_bytes = total.map(|total| total - offset);
-        if is_wrong || content_bytes.is_some_and(|stated| rest_bytes.is_some_and(|rest| rest != stated)) {
-            let stated = if is_wrong { total } else { content_bytes };
-            let most = if matches!(expected, Expected::AtMost(_)) { "at most " } else { "" };
-            return wrong_range(format!("{most}{most_bytes}"), format!("{} bytes", stated.unwrap_or(0)));
+        if let Err(failure) = expected.check(total, total.map(|total| total - offset), content_bytes) {
+            part.discard()?;
+            return Err(failure.into());
         }
         if offset == 0 {
             // Only a strong validator proves that two parts belong together.
@@ -363,7 +375,7 @@ impl<'a> Client<'a> {
             Expected::Exactly(bytes) => Some(bytes),
             Expected::AtMost(_) => total,
         };
-        self.write_body(response, part, offset, end, most_bytes)
+        self.write_body(response, part, offset, end, expected.most_bytes())
     }
 
     /// Writes a body. `end`: where it ends, if known; never more than `most_bytes` are written.

@@ -1,7 +1,9 @@
 //! References to the files of a model, by path and SHA-256.
 
+use std::borrow::Cow;
 use std::fmt;
-use std::path::PathBuf;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
 
 use serde::ser::{Error as _, Serializer};
 use serde::{Deserialize, Serialize};
@@ -72,5 +74,44 @@ impl TryFrom<String> for Sha256 {
         hex::decode_to_slice(&text, &mut bytes)
             .map(|()| Self(bytes))
             .map_err(|error| format!("{text:?} is not a SHA-256 of 64 hexadecimal digits: {error}"))
+    }
+}
+
+/// A file of a model: on disk, or embedded in the program.
+#[derive(Clone, Debug)]
+pub struct ModelFile {
+    /// Its path; for messages only if it is embedded.
+    pub path: PathBuf,
+    embedded: Option<&'static [u8]>,
+}
+
+impl ModelFile {
+    pub(crate) fn embedded(path: &Path, bytes: &'static [u8]) -> Self {
+        Self { path: Path::new("(embedded)").join(path), embedded: Some(bytes) }
+    }
+
+    pub(crate) fn embedded_bytes(&self) -> Option<&'static [u8]> {
+        self.embedded
+    }
+
+    /// Opens it for reading from its start.
+    pub fn reader(&self) -> io::Result<Box<dyn Read>> {
+        Ok(match self.embedded {
+            Some(bytes) => Box::new(bytes),
+            None => Box::new(fs_err::File::open(&self.path)?),
+        })
+    }
+
+    pub fn read(&self) -> io::Result<Cow<'static, [u8]>> {
+        match self.embedded {
+            Some(bytes) => Ok(Cow::Borrowed(bytes)),
+            None => fs_err::read(&self.path).map(Cow::Owned),
+        }
+    }
+}
+
+impl<P: Into<PathBuf>> From<P> for ModelFile {
+    fn from(path: P) -> Self {
+        Self { path: path.into(), embedded: None }
     }
 }

@@ -4,8 +4,8 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
-use crate::device_memory::DeviceMemory;
 use crate::levels::Levels;
+use crate::placement::DeviceMemory;
 use crate::preprocess::{Filter, Preprocess, Resize};
 use crate::{Provider, SessionOptions};
 

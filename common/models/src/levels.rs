@@ -10,8 +10,8 @@ use ort::value::DynTensor;
 
 use crate::ModelFile;
 use crate::bound::Place;
-use crate::device_memory::DeviceMemory;
 use crate::floats::bytes_mut;
+use crate::placement::DeviceMemory;
 use crate::preprocess::Preprocess;
 use crate::session::{Model, SessionError, SessionOptions};
 

@@ -266,7 +266,6 @@ pub(crate) fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, Desc
     Ok(files_root.join(&file.path))
 }
 
-/// Returns the SHA-256 of a file.
 pub(crate) fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
     let mut hasher = Sha256::new();
     io::copy(&mut fs_err::File::open(path)?, &mut hasher)?;

@@ -13,7 +13,6 @@ const MAX_WORDS: usize = 4096;
 /// Least spread of scores: a smaller one says that nothing was measured.
 const MIN_SPREAD: f64 = 1e-3;
 
-/// a and c.
 #[derive(Clone, Copy, Debug)]
 struct Fit {
     sharpness: f64,

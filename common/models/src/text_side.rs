@@ -8,7 +8,7 @@ use slag_common::Hash32;
 
 use crate::EncoderId;
 use crate::description::{Description, DescriptionError, FileRef, Sha256};
-use crate::model_file::ModelFile;
+use crate::file_ref::ModelFile;
 
 /// Licences under which weights may be passed on, by their SPDX names.
 const REDISTRIBUTABLE: [&str; 10] = [

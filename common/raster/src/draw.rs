@@ -7,10 +7,9 @@ use slag_math::simd::InstructionSet;
 
 use crate::bin::{Tiles, bin};
 use crate::blend::{PerPixel, TileRect, WeightSink, walk_tile};
+use crate::buckets::Buckets;
 use crate::constants::TILE_SIZE_PX;
-use crate::counters::ViewCounters;
-use crate::project::{PreparedScene, ScreenGaussian};
-use crate::sh;
+use crate::project::{self, PreparedScene, Projection, ScreenGaussian};
 use crate::simd::Lanes;
 use crate::view::RasterView;
 
@@ -45,7 +44,7 @@ impl PreparedScene<'_> {
         let projection = self.project(view);
         let tiles = bin(&projection.visible, &view.intrinsics);
         let position_in_world = view.camera_from_world.inverse().translation;
-        let colours = sh::colours(self.scene, &projection.visible, position_in_world);
+        let colours = project::colours(self.scene, &projection.visible, position_in_world);
         let drawing = draw(instructions, &projection.visible, &colours, &tiles, background);
         Drawing { counters: ViewCounters::of(&projection, &tiles), ..drawing }
     }
@@ -131,4 +130,25 @@ impl WeightSink for PixelSink<'_> {
 
     #[inline(always)]
     fn end<S: Lanes>(&mut self, _: S, _: u32) {}
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ViewCounters {
+    /// Gaussians with a pixel of the image in their footprint; they may be occluded.
+    pub visible: usize,
+    /// Number of (Gaussian, tile) pairs.
+    pub pairs: usize,
+    /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once
+    /// projected.
+    pub unusable: usize,
+}
+
+impl ViewCounters {
+    pub fn of(projection: &Projection, tiles: &Tiles) -> Self {
+        Self {
+            visible: projection.visible.len(),
+            pairs: tiles.rows.iter().map(Buckets::n_items).sum(),
+            unusable: projection.unusable,
+        }
+    }
 }

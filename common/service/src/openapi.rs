@@ -208,7 +208,6 @@ fn help(title: &str, table: &[Route]) -> String {
     text
 }
 
-/// Returns a value as a URL has it.
 fn shown(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }

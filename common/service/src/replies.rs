@@ -29,7 +29,6 @@ impl Reply {
     }
 }
 
-/// What a handler returns.
 pub trait Described {
     fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply>;
 }

@@ -42,12 +42,10 @@ fn sizes_come_back_within_the_stated_error() {
 #[test]
 fn columns_follow_the_indices() {
     let scene = Gaussians {
-        means_in_world: vec![DVec3::ZERO; 2],
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 2],
         scales: vec![[1.0; 3], [0.1; 3]],
         opacities: vec![0.0, 0.6],
         sh_dc: vec![[0.0; 3], [9.0, -9.0, 0.0]],
-        ..Gaussians::default()
+        ..Gaussians::balls(vec![DVec3::ZERO; 2], 1.0)
     };
     let columns = AppearanceColumns::of(&scene, &[1, 0]);
     assert_eq!(columns.view().colours, [[255, 0, 128, 153], [128, 128, 128, 0]]);

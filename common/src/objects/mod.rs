@@ -5,16 +5,12 @@
 //! part of the scene still knows the size and position of the objects it sees in part. Objects have sections of
 //! their own: readers that do not know them skip them.
 
-mod build;
 mod changes;
 mod columns;
-mod layout;
-mod thing;
 
-pub use build::{collect_runs, quantise_vectors};
-pub use changes::{Changes, Moved, Place, changes, is_unchanged};
+pub use changes::{Changes, Moved, Place, Thing, changes, is_unchanged, public_id};
+pub(crate) use columns::ObjectsLayout;
 pub use columns::{
-    MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, object_score, section,
+    MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs,
+    object_score, quantise_vectors, section,
 };
-pub(crate) use layout::ObjectsLayout;
-pub use thing::{Thing, public_id};

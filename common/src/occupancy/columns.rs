@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::container;
+use crate::container::{self, ContainerError, Layout, damaged};
 
 /// Voxels along an edge of a block.
 pub const BLOCK_EDGE: i32 = 4;
@@ -47,7 +47,6 @@ pub enum VoxelState {
     Unknown,
     /// Views have looked through it, and nothing is there.
     Free,
-    /// A surface is there.
     Occupied,
 }
 
@@ -175,5 +174,170 @@ impl Occupancy<'_> {
             (offset < n_blocks[axis]).then_some(offset)
         };
         Some(at(2)? + n_blocks[2] * (at(1)? + n_blocks[1] * at(0)?))
+    }
+}
+
+/// Most blocks of a shard's box: readers count them in 32 bits, and a writer keeps within 512 along each axis.
+const MAX_BLOCKS: u64 = 1 << 27;
+/// Farthest block from the world's origin: voxels are numbered in 32 bits.
+const MAX_BLOCK: i64 = 1 << 28;
+/// Largest edge of a voxel.
+const MAX_VOXEL: f64 = 1e6;
+
+/// Where the columns of a shard's checked occupancy lie.
+#[derive(Clone, Debug)]
+pub(crate) struct OccupancyLayout {
+    header: OccupancyHeader,
+    columns: [Range<usize>; 2],
+}
+
+impl OccupancyLayout {
+    /// Checks the occupancy; returns `None` if the shard has none.
+    pub(crate) fn check(bytes: &[u8], layout: &Layout) -> Result<Option<Self>, ContainerError> {
+        let Some(at_header) = layout.find(section::HEADER) else { return Ok(None) };
+        let header: OccupancyHeader = layout.value(bytes, section::HEADER, "header of the occupancy")?;
+        check_header(&header).map_err(|what| damaged(at_header.start, what))?;
+        let runs = layout.column::<StoredRun>(section::RUNS, "runs of blocks", header.n_runs as usize)?;
+        let masks = layout.column::<[u64; 2]>(section::MASKS, "masks of blocks", header.n_mixed as usize)?;
+        let n_blocks: u32 = header.n_blocks.iter().product();
+        let (mut end, mut n_mixed) = (0u32, 0u64);
+        let stored: Vec<StoredRun> = bytemuck::pod_collect_to_vec(&bytes[runs.clone()]);
+        for (at, run) in stored.iter().enumerate() {
+            let stop = run.start.checked_add(run.len()).filter(|stop| *stop <= n_blocks);
+            let (true, true, Some(stop), Some(kind)) = (run.start >= end, run.len() > 0, stop, run.kind())
+            else {
+                let what = format!(
+                    "run {at} of blocks begins at {} and has {} of kind {}, expected a begin of at least {end}, an end of at most {n_blocks} and kind 1 to 3",
+                    run.start,
+                    run.len(),
+                    run.len_and_kind & 3
+                );
+                return Err(damaged(runs.start + at * size_of::<StoredRun>(), what));
+            };
+            end = stop;
+            n_mixed += if kind == RunKind::Mixed { u64::from(run.len()) } else { 0 };
+        }
+        if n_mixed != u64::from(header.n_mixed) {
+            let what = format!("{n_mixed} mixed blocks in the runs, the header has {}", header.n_mixed);
+            return Err(damaged(at_header.start, what));
+        }
+        for (at, pair) in bytes[masks.clone()].chunks_exact(16).enumerate() {
+            if (0..8).any(|byte| pair[byte] & pair[8 + byte] != 0) {
+                let what = format!("a voxel of mixed block {at} is free and occupied");
+                return Err(damaged(masks.start + at * 16, what));
+            }
+        }
+        Ok(Some(Self { header, columns: [runs, masks] }))
+    }
+
+    /// Returns the columns of the bytes that were checked.
+    pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Occupancy<'a> {
+        let [runs, masks] = self.columns.each_ref().map(|range| &bytes[range.clone()]);
+        Occupancy {
+            header: self.header,
+            runs: bytemuck::cast_slice(runs),
+            masks: bytemuck::cast_slice(masks),
+        }
+    }
+}
+
+fn check_header(header: &OccupancyHeader) -> Result<(), String> {
+    let OccupancyHeader { voxel, first_block, n_blocks, min_opacity, .. } = *header;
+    if !(voxel > 0.0 && voxel <= MAX_VOXEL) {
+        return Err(format!("voxels of {voxel}, expected above 0 and at most {MAX_VOXEL}"));
+    }
+    let product = n_blocks.iter().fold(1u64, |product, n| product.saturating_mul(u64::from(*n)));
+    let is_near = (0..3).all(|axis| {
+        let (first, n) = (i64::from(first_block[axis]), i64::from(n_blocks[axis]));
+        n > 0 && first >= -MAX_BLOCK && first + n <= MAX_BLOCK
+    });
+    if product > MAX_BLOCKS || !is_near {
+        return Err(format!(
+            "{n_blocks:?} blocks from {first_block:?}, expected 1 to {MAX_BLOCKS} in all, within {MAX_BLOCK} of the origin"
+        ));
+    }
+    if !(0.0..=1.0).contains(&min_opacity) {
+        return Err(format!("a least opacity of {min_opacity}, expected 0 to 1"));
+    }
+    Ok(())
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Block {
+    /// Its place on the scene's lattice.
+    pub at: [i32; 3],
+    /// Occupied voxels; the order of bits is that of [`Occupancy::masks`].
+    pub occupied: u64,
+    /// Free voxels, none of them occupied.
+    pub free: u64,
+}
+
+/// Most blocks along an axis of a shard: the box of all blocks stays within the format's limit.
+const MAX_EDGE: i32 = 512;
+
+/// The occupancy of a shard, to be written.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BuiltOccupancy {
+    header: OccupancyHeader,
+    runs: Vec<StoredRun>,
+    masks: Vec<[u64; 2]>,
+}
+
+impl BuiltOccupancy {
+    /// Packs blocks, in any order, each at most once. Blocks without a known voxel are left out; so are those more
+    /// than 256 blocks from the median block along an axis, which stray Gaussians make: a robot takes both as
+    /// unknown.
+    pub fn pack(voxel: f64, min_opacity: f32, min_views: u32, blocks: &[Block]) -> Self {
+        let mut known: Vec<Block> = blocks.iter().copied().filter(|b| b.occupied | b.free != 0).collect();
+        for axis in 0..3 {
+            let mut places: Vec<i32> = known.iter().map(|block| block.at[axis]).collect();
+            places.sort_unstable();
+            let Some(median) = places.get(places.len() / 2).copied() else { break };
+            let (low, high) = (median - MAX_EDGE / 2, median + MAX_EDGE / 2);
+            known.retain(|block| (low..high).contains(&block.at[axis]));
+        }
+        let corner = |pick: fn(i32, i32) -> i32| {
+            known.iter().map(|block| block.at).reduce(|a, b| [0, 1, 2].map(|axis| pick(a[axis], b[axis])))
+        };
+        let first_block = corner(i32::min).unwrap_or_default();
+        let last = corner(i32::max).unwrap_or_default();
+        let n_blocks = [0, 1, 2].map(|axis| (last[axis] - first_block[axis] + 1) as u32);
+        let index = |block: &Block| {
+            let [x, y, z] = [0, 1, 2].map(|axis| (block.at[axis] - first_block[axis]) as u32);
+            z + n_blocks[2] * (y + n_blocks[1] * x)
+        };
+        known.sort_unstable_by_key(index);
+        let (mut runs, mut masks) = (Vec::<StoredRun>::new(), Vec::new());
+        for block in &known {
+            let kind = match (block.occupied, block.free) {
+                (0, u64::MAX) => RunKind::Free,
+                (u64::MAX, 0) => RunKind::Occupied,
+                _ => RunKind::Mixed,
+            };
+            if kind == RunKind::Mixed {
+                masks.push([block.occupied, block.free]);
+            }
+            let start = index(block);
+            match runs.last_mut() {
+                Some(run) if run.start + run.len() == start && run.kind() == Some(kind) => {
+                    run.len_and_kind += 1 << KIND_BITS;
+                }
+                _ => runs.push(StoredRun { start, len_and_kind: 1 << KIND_BITS | kind as u32 }),
+            }
+        }
+        let (n_runs, n_mixed) = (runs.len() as u32, masks.len() as u32);
+        let header =
+            OccupancyHeader { voxel, first_block, n_blocks, n_runs, n_mixed, min_opacity, min_views };
+        Self { header, runs, masks }
+    }
+
+    /// Returns the columns as readers see them.
+    pub fn view(&self) -> Occupancy<'_> {
+        Occupancy { header: self.header, runs: &self.runs, masks: &self.masks }
+    }
+
+    /// Returns the bytes that the columns take.
+    pub fn len_bytes(&self) -> u64 {
+        self.view().sections().iter().map(|(_, bytes)| bytes.len() as u64).sum()
     }
 }

@@ -4,15 +4,13 @@
 //! Voxel (i, j, k) is the cube from (i, j, k) to (i + 1, j + 1, k + 1) times the voxel's edge, world frame: all
 //! shards of a scene share one lattice. 4 x 4 x 4 voxels are a block. Blocks that are nowhere stored are unknown.
 
-mod build;
 mod columns;
-mod layout;
 
 #[cfg(test)]
 mod tests;
 
-pub use build::{Block, BuiltOccupancy};
+pub(crate) use columns::OccupancyLayout;
 pub use columns::{
-    BLOCK_EDGE, BlockRun, Occupancy, OccupancyHeader, RunKind, StoredRun, VoxelState, section,
+    BLOCK_EDGE, Block, BlockRun, BuiltOccupancy, Occupancy, OccupancyHeader, RunKind, StoredRun, VoxelState,
+    section,
 };
-pub(crate) use layout::OccupancyLayout;

@@ -4,7 +4,7 @@ use glam::{DAffine3, DQuat};
 
 use super::*;
 use crate::container::{self, AlignedBytes};
-use crate::{Distortion, Intrinsics};
+use crate::{Intrinsics, pinhole};
 
 const MAGIC: [u8; 8] = *b"PHOTOSOF";
 
@@ -12,15 +12,7 @@ const MAGIC: [u8; 8] = *b"PHOTOSOF";
 fn photo(name: &str) -> View {
     let forward_is_x = DQuat::from_rotation_z(-FRAC_PI_2) * DQuat::from_rotation_x(-FRAC_PI_2);
     let world_from_camera = DAffine3::from_rotation_translation(forward_is_x, DVec3::new(1.0, 2.0, 3.0));
-    let intrinsics = Intrinsics {
-        width_px: 640,
-        height_px: 480,
-        focal_x_px: 500.0,
-        focal_y_px: 502.0,
-        centre_x_px: 320.0,
-        centre_y_px: 240.0,
-        distortion: Distortion::None,
-    };
+    let intrinsics = Intrinsics { focal_y_px: 502.0, ..pinhole([640, 480], 500.0) };
     let camera_from_world = world_from_camera.inverse();
     View { name: name.into(), image_path: name.into(), intrinsics, camera_from_world }
 }

@@ -24,7 +24,6 @@ pub enum PoseError {
     Frame { path: PathBuf, cause: serde_json::Error },
 }
 
-/// A place in a pose file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
     File,

@@ -120,7 +120,6 @@ pub struct ShardView<'a> {
     pub basis: Option<Basis<'a>>,
     /// The residual code, in the balanced and exact profiles.
     pub residuals: Option<Residuals<'a>>,
-    /// The columns that only the exact profile has.
     pub exact: Option<ExactColumns<'a>>,
     /// Indices in the input splat file, where the scene was encoded with them; exact shards have a column of their
     /// own.

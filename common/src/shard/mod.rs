@@ -15,7 +15,6 @@ mod decode;
 mod format;
 mod indices;
 mod layout;
-mod profile;
 pub mod sample;
 mod write;
 
@@ -27,9 +26,9 @@ mod tests;
 pub use crate::quantise::quantise;
 pub use columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView};
 pub use format::{
-    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, PositionForm, ScoreErrors, ShardHeader, VERSION, section,
+    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, PositionForm, Profile, ScoreErrors, ShardHeader,
+    VERSION, section,
 };
 pub use indices::{IndexColumn, IndicesHeader, PackedIndices};
 pub use layout::ShardLayout;
-pub use profile::Profile;
 pub use write::Additions;

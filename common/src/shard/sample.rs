@@ -83,7 +83,6 @@ pub struct SampleObject {
     /// `[n][m]`, in components of the shard's centroids.
     pub vectors: Vec<f32>,
     pub runs: Vec<Range<u32>>,
-    /// In all cells.
     pub n_gaussians: u32,
     pub photo: String,
     /// x0, y0, x1, y1.

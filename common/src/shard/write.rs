@@ -32,7 +32,6 @@ impl<'a> From<Option<&'a Objects<'a>>> for Additions<'a> {
 }
 
 impl ShardView<'_> {
-    /// Writes the shard.
     pub fn write(&self, out: impl io::Write) -> io::Result<()> {
         self.write_with(out, Additions::default())
     }

@@ -18,7 +18,6 @@ pub enum SplatError {
     Unsupported { path: PathBuf, format: String, advice: &'static str },
 }
 
-/// A place in a splat file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Place {
     /// An offset in the file, bytes.
@@ -63,7 +62,6 @@ impl SplatError {
         }
     }
 
-    /// Returns a [`SplatError::Undecodable`].
     pub(super) fn undecodable(
         path: &Path,
         place: Place,

@@ -68,7 +68,6 @@ impl Input {
         Ok(self.read_exact(buffer)?)
     }
 
-    /// Skips `n` bytes.
     pub fn skip(&mut self, n: u64, what: &str) -> Result<(), SplatError> {
         self.require(n, what)?;
         self.reader.seek_relative(n as i64)?;

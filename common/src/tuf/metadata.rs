@@ -2,13 +2,14 @@
 
 use std::collections::BTreeMap;
 
+use ed25519_dalek::{SigningKey, VerifyingKey};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Value, json};
 use sha2::{Digest, Sha256, Sha512};
 
+use super::canonical::canonical_json;
 use super::error::TufError;
-use super::key::Key;
 
 /// What a role signs, beside the head.
 pub trait Body: Serialize + DeserializeOwned {
@@ -104,7 +105,6 @@ pub struct Timestamp {
 }
 
 impl Timestamp {
-    /// Returns what is stated of the snapshot.
     pub fn snapshot(&self) -> &FileMeta {
         &self.meta["snapshot.json"]
     }
@@ -151,7 +151,6 @@ pub struct TargetFile {
 }
 
 impl TargetFile {
-    /// Describes a file.
     pub fn of(bytes: &[u8]) -> Self {
         Self { length: bytes.len() as u64, hashes: hashes_of(bytes), custom: None }
     }
@@ -171,7 +170,6 @@ impl TargetFile {
         })
     }
 
-    /// Checks a file's bytes.
     pub fn check(&self, path: &str, bytes: &[u8]) -> Result<(), TufError> {
         check_content(path, bytes, Some(self.length), Some(&self.hashes))
     }
@@ -224,5 +222,43 @@ fn check_content(
     match n_known {
         0 => refuse("no hash of a known kind is stated, expected sha256 or sha512".into()),
         _ => Ok(()),
+    }
+}
+
+const ED25519: &str = "ed25519";
+
+/// A public key as metadata lists it. Only Ed25519 keys can verify; others are kept and never count.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Key {
+    pub keytype: String,
+    pub scheme: String,
+    /// The key's values; `public` is the public key in hex.
+    pub keyval: BTreeMap<String, Value>,
+}
+
+impl Key {
+    /// Returns the public half of a signing key.
+    pub fn of(key: &SigningKey) -> Self {
+        let public = hex::encode(key.verifying_key().to_bytes());
+        let keyval = BTreeMap::from([("public".to_owned(), Value::String(public))]);
+        Self { keytype: ED25519.into(), scheme: ED25519.into(), keyval }
+    }
+
+    /// Returns the key's id: the SHA-256 of its canonical form, in hex.
+    pub fn id(&self) -> String {
+        let value = json!({ "keytype": self.keytype, "scheme": self.scheme, "keyval": self.keyval });
+        // A value that is no text makes the key useless, not the id wrong: no such key verifies.
+        let canonical = canonical_json(&value).unwrap_or_default();
+        hex::encode(Sha256::digest(canonical))
+    }
+
+    /// Returns the Ed25519 public key; `None` for another kind or an invalid point.
+    pub(super) fn verifying_key(&self) -> Option<VerifyingKey> {
+        if self.keytype != ED25519 || self.scheme != ED25519 {
+            return None;
+        }
+        let mut bytes = [0; 32];
+        hex::decode_to_slice(self.keyval.get("public")?.as_str()?, &mut bytes).ok()?;
+        VerifyingKey::from_bytes(&bytes).ok()
     }
 }

@@ -13,8 +13,6 @@
 
 mod canonical;
 mod error;
-mod kept;
-mod key;
 mod metadata;
 mod repository;
 mod signed;
@@ -24,13 +22,13 @@ mod update;
 
 pub use canonical::{NotCanonical, canonical_json};
 pub use error::TufError;
-pub use kept::Kept;
-pub use key::{Key, generate_key};
-pub use metadata::{Body, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, sha256_hex};
+pub use metadata::{
+    Body, FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, sha256_hex,
+};
 pub use repository::one_key_repository;
-pub use signed::{Envelope, Head, MetadataSignature, SignedMetadata, add_signatures, sign};
+pub use signed::{Envelope, Head, MetadataSignature, SignedMetadata, add_signatures, generate_key, sign};
 pub use time::{format_utc, parse_utc};
-pub use trusted::{Offered, Trusted};
+pub use trusted::{Kept, Offered, Trusted};
 pub use update::{Source, refresh};
 
 /// Version of the specification that is written.

@@ -4,8 +4,7 @@ use std::collections::BTreeMap;
 
 use ed25519_dalek::SigningKey;
 
-use super::key::Key;
-use super::metadata::{FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
+use super::metadata::{FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
 use super::signed::sign;
 
 /// Returns metadata by file name. `version` is that of all roles but root, which stays the same.

@@ -2,15 +2,14 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ed25519_dalek::{Signer, SigningKey};
+use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::canonical::canonical_json;
 use super::error::TufError;
-use super::key::{Key, is_signed};
-use super::metadata::{Body, RoleKeys};
+use super::metadata::{Body, Key, RoleKeys};
 use super::time::{format_utc, parse_utc};
 
 /// What all metadata begins with.
@@ -177,4 +176,16 @@ pub fn add_signatures(role: &str, bytes: &[u8], keys: &[SigningKey]) -> Result<V
     }
     signatures.sort_by(|a, b| a.keyid.cmp(&b.keyid));
     Ok(serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON"))
+}
+
+/// Generates a signing key from the system's randomness.
+pub fn generate_key() -> SigningKey {
+    SigningKey::generate(&mut rand_core::OsRng)
+}
+
+pub(super) fn is_signed(key: &VerifyingKey, message: &[u8], signature_hex: &str) -> bool {
+    let mut bytes = [0; 64];
+    // Strict verification refuses small-order keys, which have several valid signatures (RFC 8032, 5.1.7).
+    hex::decode_to_slice(signature_hex, &mut bytes).is_ok()
+        && key.verify_strict(message, &Signature::from_bytes(&bytes)).is_ok()
 }

@@ -2,9 +2,8 @@
 //! each.
 
 use super::error::TufError;
-use super::kept::{Kept, text};
 use super::metadata::{Body, Root, Snapshot, Targets, Timestamp};
-use super::trusted::Trusted;
+use super::trusted::{Kept, Trusted, text};
 use super::{MAX_ROOT_BYTES, MAX_ROOTS, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES};
 
 /// Where metadata comes from.

@@ -66,10 +66,8 @@ pub struct Step(usize);
 
 impl Step {
     pub const ALL: Self = Self(1);
-    /// The largest step.
     pub const MAX: usize = 1 << 16;
 
-    /// Parses a step.
     pub fn parse(text: &str) -> Result<Self, &'static str> {
         let step = text.parse().ok().filter(|step| (1..=Self::MAX).contains(step));
         step.map(Self).ok_or("a whole number from 1 to 65536")

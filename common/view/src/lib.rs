@@ -30,7 +30,6 @@ struct File {
     path: &'static str,
     /// Changes with the content; quoted.
     etag: &'static str,
-    /// Content.
     gzip: &'static [u8],
 }
 

@@ -70,7 +70,6 @@ impl ScoresMessage {
         (share * LAST_LEVEL).round().clamp(1.0, LAST_LEVEL) as u8
     }
 
-    /// Returns the message.
     pub fn into_bytes(self) -> Vec<u8> {
         self.bytes
     }

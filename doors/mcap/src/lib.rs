@@ -4,7 +4,6 @@
 mod args;
 mod file;
 mod messages;
-mod schemas;
 
 use std::time::SystemTime;
 
@@ -29,7 +28,7 @@ pub fn record(args: &Args) -> Result<usize> {
                 eprintln!("{text}: {}", none.detail);
             }
             let things = messages::things(stamp, text, &found.answers);
-            messages.push((format!("/slag/things/{text}"), schemas::THINGS, things));
+            messages.push((format!("/slag/things/{text}"), file::THINGS, things));
         }
         // A relation is between things; only words have Gaussians that match.
         let is_relation = reply.results.iter().any(|found| found.understood.is_some());
@@ -38,7 +37,7 @@ pub fn record(args: &Args) -> Result<usize> {
             let stamp = Stamp { time_ns, frame: &reply.frame };
             for found in &reply.results {
                 let points = messages::points(stamp, &found.answers);
-                messages.push((format!("/slag/points/{text}"), schemas::POINTS, points));
+                messages.push((format!("/slag/points/{text}"), file::POINTS, points));
             }
         }
     }
@@ -47,7 +46,7 @@ pub fn record(args: &Args) -> Result<usize> {
         let floor = robot.floor(&[])?;
         let ground = messages::ground(Stamp { time_ns, frame: &frame }, &floor);
         let ground = ground.context("the robot's ground has other cells than it says")?;
-        messages.push(("/slag/ground".to_owned(), schemas::GROUND, ground));
+        messages.push(("/slag/ground".to_owned(), file::GROUND, ground));
     }
     let mut file = File::create(&args.out, time_ns)?;
     for (topic, schema, message) in &messages {

@@ -52,7 +52,6 @@ pub struct Pose {
 }
 
 impl Seen {
-    /// Asks a robot.
     pub fn locate(&self, robot: &Robot) -> Result<Places, String> {
         let photo = BASE64_STANDARD.decode(&self.photo_base64);
         let photo =

@@ -77,7 +77,6 @@ pub fn ball(near: Option<[f64; 3]>, radius: Option<f64>) -> Result<Option<([f64;
 }
 
 impl Asked {
-    /// Asks the robot.
     pub fn describe(&self, robot: &Robot) -> Result<Description, String> {
         let ball = ball(self.near, self.radius)?;
         if self.words.len() > MAX_WORDS {

@@ -28,7 +28,6 @@ pub struct Tools {
 
 #[tool_router(router = router)]
 impl Tools {
-    /// Makes the tools over a robot.
     pub fn new(robot: Robot) -> Self {
         Self { robot, router: Self::router() }
     }

@@ -58,7 +58,6 @@ impl Robot {
         self.post("/v1/query", &request)
     }
 
-    /// Returns what is on board.
     pub fn place(&self) -> Result<MapStatus, RobotError> {
         self.get("/v1/map")
     }
@@ -166,7 +165,6 @@ pub fn xyz([x, y, z]: [f64; 3]) -> String {
     format!("{x},{y},{z}")
 }
 
-/// Returns whether a URL is of this machine.
 fn is_loopback(url: &str) -> bool {
     let Ok(uri) = url.parse::<ureq::http::Uri>() else { return false };
     let host = uri.host().unwrap_or_default().trim_start_matches('[').trim_end_matches(']');

@@ -47,14 +47,12 @@ pub struct Nothing {
     pub best_score: Option<f32>,
 }
 
-/// A thing.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Answer {
     /// 1 is the best.
     pub rank: u32,
     /// Stable within a generation.
     pub id: String,
-    /// Its middle.
     pub position_in_world: [f64; 3],
     /// The same on the earth, where the scene is geo-referenced.
     pub geographic: Option<Geographic>,
@@ -80,7 +78,6 @@ pub struct Answer {
 /// A Gaussian that matches.
 #[derive(Clone, Copy, Debug, Deserialize)]
 pub struct PointAnswer {
-    /// Its middle.
     pub position_in_world: [f64; 3],
     /// How well it matches.
     pub score: f32,

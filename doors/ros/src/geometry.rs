@@ -59,7 +59,6 @@ impl From<[f64; 4]> for Quaternion {
 }
 
 impl Quaternion {
-    /// No rotation.
     pub const IDENTITY: Self = Self { x: 0.0, y: 0.0, z: 0.0, w: 1.0 };
 }
 
@@ -71,7 +70,6 @@ impl Pose {
 }
 
 impl Rigid {
-    /// No motion.
     pub const IDENTITY: Self = Self { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
 
     /// Reads a transform; `None` if it is none: not finite, or a quaternion without direction.

@@ -133,7 +133,6 @@ pub async fn run(args: Args, robot: Robot, stop: impl Future<Output = ()>) -> Re
     Ok(())
 }
 
-/// Makes the node in its domain.
 fn join(args: &Args) -> Result<Node> {
     let mut participant = DomainParticipantBuilder::new(args.domain_id);
     if !args.interfaces().is_empty() {
@@ -162,7 +161,6 @@ impl Args {
 }
 
 impl Shared {
-    /// Makes the publishers.
     fn new(node: &mut Node, args: Args, robot: Robot) -> Result<Self> {
         // Those who join later hear no earlier answer, which they would take for the last; so map_server offers
         // its map.
@@ -236,7 +234,6 @@ impl Shared {
         Ok(())
     }
 
-    /// Listens to what tells where the robot is.
     fn listen_to_robot(self: &Arc<Self>, node: &mut Node) -> Result<()> {
         let args = &self.args;
         let (sensor, latched) =

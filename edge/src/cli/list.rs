@@ -95,7 +95,6 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
     }
 }
 
-/// Prints a page as a table.
 fn print_page(page: &ObjectPage) -> Result<(), Failure> {
     let ObjectPage { n_objects, scene, generation, unit, .. } = page;
     let listed = page.objects.len();

@@ -41,7 +41,6 @@ pub fn random() -> f64 {
     (RandomState::new().build_hasher().finish() >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Wraps the error of a fetch.
 pub fn failure(error: FetchError) -> Failure {
     match error {
         FetchError::Cancelled => Failure::Interrupted(error.into()),

@@ -6,10 +6,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use crate::fetch::follow::Following;
-use crate::http::{self, App, Settings};
-use crate::query::Engine;
-use crate::store::{EdgeCache, StoreError};
 use anyhow::anyhow;
 use clap::Args;
 use slag_service::access::{Access, AccessSettings};
@@ -20,7 +16,10 @@ use slag_service::tls::{Tls, TlsFiles};
 use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, parse_bytes};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
-use super::supervisor::{self, News};
+use crate::fetch::follow::Following;
+use crate::http::{self, App, Settings};
+use crate::query::Engine;
+use crate::store::{EdgeCache, StoreError};
 
 /// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
@@ -134,11 +133,11 @@ async fn serve(
         None => None,
     };
     let scrub = scrub_in_background(&app, args.scrub_secs)?;
-    supervisor::tell(News::Ready);
-    tokio::spawn(async move { supervisor::pulse(|| answers(&url)).await });
+    tell(News::Ready);
+    tokio::spawn(async move { pulse(|| answers(&url)).await });
     let stop = async {
         stop.await;
-        supervisor::tell(News::Stopping);
+        tell(News::Stopping);
     };
     let served = http::serve(app, listener, stop).await;
     // A fetch in progress need not be awaited: the next one resumes it.
@@ -254,5 +253,55 @@ mod tests {
         assert_eq!(with_mode(&shards, 0o755), None);
         let root = dir.path().to_owned();
         assert_eq!(with_mode(&root, 0o1777), Some(root.join("")));
+    }
+}
+
+/// Pulses in the time after which systemd takes a silent service for dead; it advises two.
+const PULSES_PER_TIMEOUT: u32 = 3;
+
+/// What systemd is told.
+#[derive(Clone, Copy, Debug)]
+enum News {
+    Ready,
+    Alive,
+    Stopping,
+}
+
+#[cfg(unix)]
+fn tell(news: News) {
+    use sd_notify::NotifyState;
+
+    let state = match news {
+        News::Ready => NotifyState::Ready,
+        News::Alive => NotifyState::Watchdog,
+        News::Stopping => NotifyState::Stopping,
+    };
+    if let Err(error) = sd_notify::notify(&[state]) {
+        tracing::warn!("systemd was not told {news:?}: {error}");
+    }
+}
+
+#[cfg(not(unix))]
+fn tell(_: News) {}
+
+/// Says for ever that the service is alive, as long as `is_alive` says so in time; returns at once if nobody
+/// expects it.
+async fn pulse<A: Future<Output = bool>>(is_alive: impl Fn() -> A) {
+    let timeout: Option<Duration> = match () {
+        #[cfg(unix)]
+        () => sd_notify::watchdog_enabled(),
+        #[cfg(not(unix))]
+        () => None,
+    };
+    let Some(pulse) = timeout.map(|timeout| timeout / PULSES_PER_TIMEOUT).filter(|pulse| !pulse.is_zero())
+    else {
+        return;
+    };
+    loop {
+        match tokio::time::timeout(pulse, is_alive()).await {
+            Ok(true) => tell(News::Alive),
+            _ => tracing::error!("the service does not answer itself; its supervisor may end it"),
+        }
+        tokio::time::sleep(pulse).await;
     }
 }

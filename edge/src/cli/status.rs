@@ -50,7 +50,6 @@ struct OnBoard<'a> {
     is_expired: bool,
 }
 
-/// Prints what is on board.
 fn print_status(status: &Status, pinned_scene: Option<String>) -> Result<(), Failure> {
     let unit = if status.metric { "m" } else { "world units" };
     let bad_cells: Vec<String> = status.bad_cells.iter().map(ToString::to_string).collect();

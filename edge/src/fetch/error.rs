@@ -8,7 +8,7 @@ use slag_common::manifest::ManifestError;
 use slag_common::tuf::TufError;
 use slag_models::download::{DownloadError, DownloadFailure};
 
-use super::plan_error::PlanError;
+use super::position::PlanError;
 use super::records::RecordsError;
 use crate::store::StoreError;
 

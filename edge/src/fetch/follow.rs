@@ -19,14 +19,12 @@ use slag_common::retry::Backoff;
 use super::error::FetchError;
 use super::position::{MAX_TEXT_BYTES, NotAPosition, Position};
 use super::records;
-use super::report::FetchReport;
-use super::request::{DEFAULT_RADIUS, FetchRequest};
+use super::request::{DEFAULT_RADIUS, FetchReport, FetchRequest};
 use crate::store::EdgeCache;
 
 /// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(100);
 
-/// Settings for following a robot.
 #[derive(Clone, Debug)]
 pub struct FollowSettings {
     /// Cells within this distance of the robot are kept on board, as far as the network allows; world units.
@@ -56,7 +54,6 @@ impl Default for FollowSettings {
     }
 }
 
-/// What to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
     Fetch,
@@ -220,6 +217,16 @@ impl Following {
         self.inbox.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Returns the last position, how many were posted, and whether they are over; a fetch that is due makes the
+    /// follower forget.
+    fn read(&self, follower: &mut Follower) -> (Option<Position>, u64, bool) {
+        let mut inbox = self.lock();
+        if std::mem::take(&mut inbox.is_due) {
+            follower.forget();
+        }
+        (inbox.status.position, inbox.n_posted, inbox.is_over)
+    }
+
     /// Waits for a position after `n_seen`, for the end, or for the timeout.
     fn wait(&self, n_seen: u64, at_most: Duration) {
         let is_quiet = |inbox: &mut Inbox| inbox.n_posted == n_seen && !inbox.is_over;
@@ -248,7 +255,6 @@ pub struct FollowEnvironment<'a> {
     pub report: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a dyn Fn() -> f64,
-    /// Set to end following.
     pub cancel: &'a AtomicBool,
 }
 
@@ -273,42 +279,30 @@ pub fn follow(
         if environment.cancel.load(Ordering::Relaxed) {
             return Err(FetchError::Cancelled);
         }
-        let (position, n_seen, is_over, is_due) = {
-            let mut inbox = following.lock();
-            (inbox.status.position, inbox.n_posted, inbox.is_over, std::mem::take(&mut inbox.is_due))
-        };
-        if is_due {
-            follower.forget();
-        }
+        let (position, n_seen, is_over) = following.read(&mut follower);
         if distrusted.as_ref().is_some_and(|before| *before != (n_seen, records::stamp(cache))) {
             follower.retry();
         }
-        let Some(position) = position else {
-            if is_over {
-                return Ok(());
-            }
-            following.wait(n_seen, NAP);
-            continue;
-        };
         let now = started.elapsed();
-        match follower.decide(now, in_world(position, manifest.as_ref())) {
-            Decision::Fetch => {}
+        let decision = match position {
+            Some(position) => follower.decide(now, in_world(position, manifest.as_ref())),
+            None => Decision::Rest(None),
+        };
+        let nap = match decision {
             Decision::Rest(_) if is_over => return Ok(()),
+            Decision::Fetch => None,
+            Decision::NotBefore(at) | Decision::Rest(Some(at)) => Some(at.saturating_sub(now).min(NAP)),
+            Decision::Rest(None) => Some(NAP),
+        };
+        if let Some(nap) = nap {
             // After the end nothing is posted, so nothing would end a wait.
-            Decision::NotBefore(at) if is_over => {
-                std::thread::sleep(at.saturating_sub(now).min(NAP));
-                continue;
+            match is_over {
+                true => std::thread::sleep(nap),
+                false => following.wait(n_seen, nap),
             }
-            Decision::NotBefore(at) | Decision::Rest(Some(at)) => {
-                following.wait(n_seen, at.saturating_sub(now).min(NAP));
-                continue;
-            }
-            Decision::Rest(None) => {
-                following.wait(n_seen, NAP);
-                continue;
-            }
+            continue;
         }
-        let request = FetchRequest { at: Some(position), radius: follower.fetch_radius(), ..request.clone() };
+        let request = FetchRequest { at: position, radius: follower.fetch_radius(), ..request.clone() };
         let before = (n_seen, records::stamp(cache));
         let outcome = (environment.fetch)(&request);
         following.note(&outcome);

@@ -7,8 +7,8 @@ use slag_common::Hash32;
 use slag_common::manifest::{CellIndex, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::Profile;
 
-use super::plan_error::PlanError;
-use super::report::Tally;
+use super::position::PlanError;
+use super::request::Tally;
 use crate::store::CurrentCell;
 
 /// A shard on board.
@@ -39,7 +39,6 @@ pub struct Object {
     pub len_bytes: u64,
 }
 
-/// What to do with each object.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Plan {
     /// The cells within the radius, by id, ascending.

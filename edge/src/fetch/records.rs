@@ -42,7 +42,6 @@ pub struct LastFetch {
     pub at: Position,
 }
 
-/// What a robot accepted.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Accepted {
     /// The scene; another one needs a request that names it. Absent before the first fetch.

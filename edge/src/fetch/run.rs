@@ -10,16 +10,13 @@ use slag_common::tuf::Kept;
 use super::download::Client;
 use super::error::FetchError;
 use super::generation::{Before, assemble};
-use super::history;
 use super::objects::{Check, Downloaded, download_all};
 use super::offer::Offer;
 use super::plan::{Held, Object, Plan, Wanted};
 use super::records::{LastFetch, Records, RecordsError};
-use super::report::{FetchReport, Tally, TextModelTally};
-use super::request::{Environment, FetchRequest};
-use super::staging::{clear_manifests, clear_staging, part_path, put, remove, staging};
+use super::request::{Environment, FetchReport, FetchRequest, Tally, TextModelTally};
+use super::staging::{Usage, clear_manifests, clear_staging, part_path, put, remove, staging};
 use super::trust::trust_first;
-use super::usage::Usage;
 use crate::store::{Current, EdgeCache, StoreError, damaged};
 
 /// Most bytes of a cell in `current`.
@@ -184,14 +181,22 @@ impl<'a> Planned<'a> {
             remove(cache, &cache.shard_path(*hash))?;
         }
         if let (Some(old), Some(on_board)) = (&locked.current, &locked.on_board) {
-            history::note(cache, old, &on_board.manifest, offer.manifest_hash, &self.plan.cells);
+            super::generation::remember(
+                cache,
+                old,
+                &on_board.manifest,
+                offer.manifest_hash,
+                &self.plan.cells,
+            );
         }
         clear_staging(cache, &self.plan.download)?;
         locked.environment.progress.planned(self.plan.to_download().bytes);
         let manifest_bytes = offer.bytes.len() as u64;
         let other_bytes = manifest_bytes + self.plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
         match check_space(cache, &self.plan.download, other_bytes) {
-            Err(_) if history::forget(cache) => check_space(cache, &self.plan.download, other_bytes),
+            Err(_) if super::generation::forget_earlier(cache) => {
+                check_space(cache, &self.plan.download, other_bytes)
+            }
             checked => checked,
         }
     }

@@ -1,13 +1,14 @@
 //! The cache's folders: lists and clears them, and replaces files durably.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 
 use super::error::FetchError;
-use super::plan::Object;
+use super::plan::{Held, Object};
 use crate::store::EdgeCache;
 use crate::store::files::is_bad_medium;
 
@@ -61,4 +62,65 @@ pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchErro
     files.sync(&aside)?;
     files.rename(&aside, path)?;
     Ok(files.sync_dir(path.parent().unwrap_or(cache.dir()))?)
+}
+
+/// A longer file is damaged; a shard takes about 80 bytes.
+const MAX_BYTES: u64 = 16 << 20;
+
+/// The records of use.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Usage {
+    n_fetches: u64,
+    /// Number of the last fetch that needed a shard on board.
+    last_used: BTreeMap<Hash32, u64>,
+}
+
+fn path(cache: &EdgeCache) -> PathBuf {
+    cache.dir().join("usage.json")
+}
+
+impl Usage {
+    /// Reads the records; they are empty if they are missing or damaged.
+    pub fn open(cache: &EdgeCache) -> Self {
+        let path = path(cache);
+        let read = cache.files().read(&path, MAX_BYTES).and_then(|bytes| Ok(serde_json::from_slice(&bytes)?));
+        read.unwrap_or_else(|e: io::Error| {
+            if e.kind() != io::ErrorKind::NotFound {
+                tracing::warn!("{} is made anew: {e}", path.display());
+            }
+            Self::default()
+        })
+    }
+
+    /// Lists the shards on board and removes other files in their folder.
+    pub(crate) fn held_shards(&self, cache: &EdgeCache) -> Result<BTreeMap<Hash32, Held>, FetchError> {
+        let dir = cache.dir().join("shards");
+        let mut held = BTreeMap::new();
+        for name in cache.files().list(&dir)? {
+            let path = dir.join(&name);
+            match (name.parse::<Hash32>(), cache.files().stat(&path)) {
+                (Ok(hash), Ok(Some(stat))) => {
+                    let last_used = self.last_used.get(&hash).copied().unwrap_or(0);
+                    held.insert(hash, Held { len_bytes: stat.len_bytes, last_used });
+                }
+                (Err(_), Ok(_)) => remove(cache, &path)?,
+                (_, Ok(None)) => {}
+                // As if it were not there: it costs its cell only.
+                (_, Err(e)) => tracing::warn!("{e}; the file system needs a check (fsck)"),
+            }
+        }
+        Ok(held)
+    }
+
+    /// Records the shards that a fetch needed; those that are no longer on board are forgotten.
+    pub fn finish(mut self, cache: &EdgeCache, needed: &BTreeSet<Hash32>, on_board: &BTreeSet<Hash32>) {
+        self.n_fetches = self.n_fetches.saturating_add(1);
+        self.last_used.extend(needed.iter().map(|shard| (*shard, self.n_fetches)));
+        self.last_used.retain(|shard, _| on_board.contains(shard));
+        let bytes = serde_json::to_vec(&self).expect("numbers and text become JSON");
+        if let Err(e) = put(cache, &bytes, &path(cache)) {
+            tracing::warn!("this fetch keeps no record of use: {e}");
+        }
+    }
 }

@@ -18,7 +18,6 @@ pub enum FirstRoot {
     Sha256 {
         /// Address of the store.
         from: String,
-        /// The hash.
         sha256: String,
     },
     /// The first root of the store at an address, whoever answers there.

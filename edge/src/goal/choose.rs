@@ -147,7 +147,6 @@ fn sifted(window: &Window, candidates: Vec<Candidate>) -> Vec<Candidate> {
 /// The thing to stand at.
 struct Target<'a> {
     points: &'a [DVec3],
-    /// Those that are looked at.
     samples: Vec<DVec3>,
     thing: sight::Thing<'a>,
 }
@@ -180,7 +179,6 @@ struct Look {
     /// By sample: whether it is seen.
     seen: u128,
     visible_share: f64,
-    /// With what is seen.
     cost_m: f64,
 }
 

@@ -5,8 +5,7 @@ use slag_api::goal::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use slag_common::objects::public_id;
 
 use super::choose::choose;
-use super::error::GoalError;
-use super::request::{GoalRequest, GoalTarget};
+use super::request::{GoalError, GoalRequest, GoalTarget};
 use super::surroundings::{START_M, Surroundings};
 use crate::query::{Ask, Engine, Outcome, Point, object_id};
 use crate::score::Budget;

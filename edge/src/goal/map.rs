@@ -5,10 +5,9 @@ use std::io::{self, Write};
 use glam::DVec3;
 use slag_api::floor::Place;
 
-use super::error::GoalError;
 use super::ground::Floor;
 use super::paths::Paths;
-use super::request::GoalRequest;
+use super::request::{GoalError, GoalRequest};
 use super::surroundings::Surroundings;
 use crate::query::Engine;
 use crate::score::Budget;

@@ -12,7 +12,6 @@
 
 mod choose;
 mod clearance;
-mod error;
 mod find;
 mod ground;
 mod map;
@@ -25,7 +24,6 @@ mod surroundings;
 #[cfg(test)]
 mod tests;
 
-pub use error::GoalError;
 pub use find::find;
 pub use map::{FloorMap, floor_map};
-pub use request::{GoalRequest, GoalTarget};
+pub use request::{GoalError, GoalRequest, GoalTarget};

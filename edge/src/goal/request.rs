@@ -2,7 +2,8 @@
 
 use glam::DVec3;
 
-use crate::query::RequestError;
+use crate::query::{QueryError, RequestError};
+use crate::score::{OverBudget, ScoreError};
 
 /// Least and largest radius of the robot.
 pub const RADIUS_M: [f64; 2] = [0.05, 2.0];
@@ -115,6 +116,42 @@ impl GoalRequest {
                 Err(RequestError::new("near", &near.to_string(), "a position within a million kilometres"))
             }
             _ => Ok(()),
+        }
+    }
+}
+
+/// Why a request has no reply.
+#[derive(Debug, thiserror::Error)]
+pub enum GoalError {
+    #[error(transparent)]
+    Query(#[from] QueryError),
+    #[error(
+        "the scene does not say which places are free; encode it with --occupancy, publish it, and fetch it again"
+    )]
+    NoOccupancy,
+    #[error(
+        "the scene has no objects to go to; encode it without --no-objects, publish it, and fetch it again"
+    )]
+    NoObjects,
+}
+
+impl From<RequestError> for GoalError {
+    fn from(error: RequestError) -> Self {
+        Self::Query(error.into())
+    }
+}
+
+impl GoalError {
+    pub(super) fn spent(error: OverBudget) -> Self {
+        Self::Query(ScoreError::from(error).into())
+    }
+
+    /// Returns the stable name of the error's kind, for programs.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Query(error) => error.kind(),
+            Self::NoOccupancy => "no-occupancy",
+            Self::NoObjects => "no-objects",
         }
     }
 }

@@ -36,7 +36,6 @@ pub struct Window {
 }
 
 impl Window {
-    /// Returns the window around a point.
     pub fn around(centre: DVec3, range: f64, voxel: f64) -> Self {
         let block = voxel * f64::from(BLOCK_EDGE);
         let at = |value: f64| (value / block).floor().clamp(-MAX_BLOCK, MAX_BLOCK) as i32;

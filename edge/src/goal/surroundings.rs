@@ -4,10 +4,9 @@ use glam::DVec3;
 use slag_common::occupancy::Occupancy;
 
 use super::clearance::{self, Clearance};
-use super::error::GoalError;
 use super::ground::{Floor, Ground, SURFACE_DEPTH};
 use super::paths::Paths;
-use super::request::{GoalRequest, LEAST_STEP_VOXELS};
+use super::request::{GoalError, GoalRequest, LEAST_STEP_VOXELS};
 use super::space::{Space, Window};
 use crate::query::RequestError;
 use crate::score::Budget;

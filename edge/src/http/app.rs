@@ -1,22 +1,24 @@
 //! The service's state.
 
 use std::collections::BTreeSet;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use glam::DVec3;
 use slag_common::Hash32;
 use slag_common::manifest::Manifest;
+use slag_service::access::Access;
+use slag_service::listener::ConnectionLimits;
+use slag_service::metrics::{Exposition, Histogram, ResponseCounts};
 use slag_service::problem::Problem;
 use tokio::sync::{Semaphore, watch};
 
-use super::metrics::Metrics;
 use super::problem::{out_of_time, overloaded, timeout};
-use super::settings::Settings;
-use crate::fetch::follow::Following;
+use crate::fetch::follow::{FollowStatus, Following};
 use crate::query::Engine;
 use crate::score::{Budget, OverBudget, Pool};
+use crate::store::Snapshot;
 
 /// The service's state.
 pub struct App {
@@ -177,5 +179,134 @@ impl App {
         });
         let late = |_| given.map_or_else(|| timeout(limit), out_of_time);
         tokio::time::timeout(limit, working).await.map_err(late)?
+    }
+}
+
+/// Time for a request and for sending its answer, besides that for the query.
+const STALL_BEYOND_QUERY: Duration = Duration::from_secs(50);
+
+/// Bounds of the service.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Bounds of the connections.
+    pub connections: ConnectionLimits,
+    /// Who may ask.
+    pub access: Access,
+    /// Queries in progress; further ones get 503.
+    pub max_queries: usize,
+    /// Clients of `GET /v1/events`; further ones get 503.
+    pub max_listeners: usize,
+    /// Time until an answer must begin, else 503; and what a query may compute for.
+    pub query_timeout: Duration,
+    /// Memory that a query may use; one that needs more gets 422.
+    pub query_bytes: u64,
+    /// Memory that all queries in progress may use; one that exceeds it gets 503.
+    pub all_queries_bytes: u64,
+    /// Time for sending a long answer.
+    pub stream_timeout: Duration,
+}
+
+impl Settings {
+    /// Returns bounds for a machine with a few cores, with a budget of memory and time for each query. All queries
+    /// together may use four times the memory.
+    pub(crate) fn with_budget(query_bytes: u64, query_timeout: Duration) -> Self {
+        let connections = ConnectionLimits {
+            n_connections: 512,
+            n_per_peer: 384,
+            stall_timeout: query_timeout + STALL_BEYOND_QUERY,
+            drain_timeout: Duration::from_secs(5),
+            ..ConnectionLimits::default()
+        };
+        Self {
+            connections,
+            access: Access::default(),
+            max_queries: 32,
+            max_listeners: 32,
+            query_timeout,
+            query_bytes,
+            all_queries_bytes: query_bytes.saturating_mul(4),
+            stream_timeout: Duration::from_secs(60),
+        }
+    }
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self::with_budget(256 << 20, Duration::from_secs(10))
+    }
+}
+
+/// Upper bounds of the buckets of query times, seconds: from a cached text over few centroids to a timeout.
+const QUERY_BOUNDS_SECS: [f64; 11] =
+    [0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.512, 2.048];
+
+/// The counters of this service.
+pub struct Metrics {
+    /// Responses by route and status.
+    pub responses: Arc<ResponseCounts>,
+    /// Times of queries, refused ones too.
+    pub query_times: Histogram,
+    /// Questions without an answer.
+    pub empty_answers: AtomicU64,
+    /// Generations put in place.
+    pub reloads: AtomicU64,
+    /// Generations that did not open.
+    pub reload_failures: AtomicU64,
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        Self {
+            responses: Arc::default(),
+            query_times: Histogram::new(&QUERY_BOUNDS_SECS),
+            empty_answers: AtomicU64::new(0),
+            reloads: AtomicU64::new(0),
+            reload_failures: AtomicU64::new(0),
+        }
+    }
+}
+
+impl Metrics {
+    /// Returns the scrape, with gauges of the loaded generation and of following.
+    pub fn render(
+        &self,
+        n_in_progress: usize,
+        snapshot: Option<&Snapshot>,
+        following: Option<&FollowStatus>,
+    ) -> Exposition {
+        let mut text = Exposition::new("slag_edge");
+        text.responses(&self.responses);
+        text.histogram(
+            "query_duration_seconds",
+            "Time from the request to the start of its answer.",
+            &self.query_times,
+        );
+        text.gauge("queries_in_flight", "Queries in progress.", n_in_progress as u64);
+        text.counter("empty_answers_total", "Questions that nothing matched.", &self.empty_answers);
+        text.counter("reloads_total", "Generations put in place.", &self.reloads);
+        text.counter("reload_failures_total", "Generations that did not open.", &self.reload_failures);
+        if let Some(snapshot) = snapshot {
+            text.gauge("generation", "Generation of the scene.", snapshot.manifest.generation);
+            text.gauge("shards", "Shards on board.", snapshot.shards.len() as u64);
+            let n_gaussians = snapshot.shards.iter().map(|shard| u64::from(shard.cell.n_gaussians)).sum();
+            text.gauge("gaussians", "Gaussians on board.", n_gaussians);
+        }
+        if let Some(following) = following {
+            let counts =
+                [following.n_fetches, following.n_failures, following.n_restarts].map(AtomicU64::new);
+            text.gauge(
+                "follower_up",
+                "Whether positions are followed.",
+                u64::from(following.failure.is_none()),
+            );
+            text.counter("follow_fetches_total", "Successful fetches of the follower.", &counts[0]);
+            text.counter("follow_failures_total", "Failed fetches of the follower.", &counts[1]);
+            text.counter(
+                "follower_restarts_total",
+                "Times that the follower failed and began again.",
+                &counts[2],
+            );
+        }
+        text
     }
 }

@@ -1,4 +1,5 @@
-//! Keeps a follower alive: one that panics is reported, and begins again after a pause.
+//! The service's work in the background: a follower, which begins again after a panic, and a scrubber, which finds
+//! rot before an answer needs it.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -7,7 +8,9 @@ use std::time::Duration;
 
 use slag_common::retry::Backoff;
 
+use super::app::App;
 use crate::fetch::follow::Following;
+use crate::store::Scrubber;
 
 /// Pauses before a follower that failed begins again.
 pub const RESTARTS: Backoff = Backoff { first: Duration::from_secs(1), longest: Duration::from_secs(60) };
@@ -33,20 +36,41 @@ pub fn keep_following<T>(
         let n_in_a_row = following.note_failure(&failure);
         let pause = restarts.after(u32::try_from(n_in_a_row).unwrap_or(u32::MAX));
         tracing::error!("{failure}; it begins again in {} s", pause.as_secs_f64());
-        let mut left = pause;
-        while !left.is_zero() {
-            if cancel.load(Ordering::Relaxed) {
-                return None;
-            }
-            std::thread::sleep(left.min(NAP));
-            left = left.saturating_sub(NAP);
+        if is_cancelled_within(pause, cancel) {
+            return None;
         }
         following.note_restart();
     }
 }
 
-/// Returns the message of a panic.
 fn text_of(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied().or(panic.downcast_ref::<String>().map(String::as_str));
     text.unwrap_or("without a message")
+}
+
+/// Pause while no scene is loaded.
+const IDLE: Duration = Duration::from_secs(1);
+
+/// Reads every shard on board once in `round`, evenly, until `cancel` is set. A damaged one is marked, the
+/// generation is opened again without it, and a follower fetches it.
+pub fn keep_scrubbing(app: &App, round: Duration, cancel: &AtomicBool) {
+    let mut scrubber = Scrubber::default();
+    while !cancel.load(Ordering::Relaxed) {
+        let snapshot = app.engine.snapshot().ok();
+        let step = snapshot.and_then(|snapshot| scrubber.step(app.engine.cache(), &snapshot));
+        if step.is_some_and(|step| !step.is_sound) {
+            app.reload_now();
+        }
+        is_cancelled_within(step.map_or(IDLE, |step| round.mul_f64(step.share)), cancel);
+    }
+}
+
+/// Sleeps; returns early, and true, once `cancel` is set.
+fn is_cancelled_within(pause: Duration, cancel: &AtomicBool) -> bool {
+    let mut left = pause;
+    while !left.is_zero() && !cancel.load(Ordering::Relaxed) {
+        std::thread::sleep(left.min(NAP));
+        left = left.saturating_sub(NAP);
+    }
+    !left.is_zero()
 }

@@ -4,22 +4,17 @@ mod app;
 mod ask;
 mod follower;
 mod forms;
-mod metrics;
 mod position;
 mod problem;
 mod query;
 mod router;
-mod scrub;
-mod settings;
 mod status;
 mod v1;
 
-pub use app::App;
-pub use follower::{RESTARTS, keep_following};
+pub use app::{App, Settings};
+pub use follower::{RESTARTS, keep_following, keep_scrubbing};
 pub use query::parse_query;
 pub use router::serve;
-pub use scrub::keep_scrubbing;
-pub use settings::Settings;
 
 #[cfg(test)]
 mod tests;

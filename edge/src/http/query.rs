@@ -132,7 +132,6 @@ impl Described for Formats {
     }
 }
 
-/// A message to the body.
 enum Message {
     Piece(Bytes),
     End,

@@ -72,9 +72,26 @@ impl Service {
         async move { router.oneshot(request).await.expect("infallible") }
     }
 
-    async fn get(&self, uri: &str) -> (StatusCode, HeaderMap, Value) {
+    async fn get(&self, uri: &str) -> Answered {
         soon(async { read(self.send("GET", uri).await).await }).await
     }
+
+    async fn post(&self, uri: &str, kind: &str, body: impl Into<Body>) -> Answered {
+        post(&self.app, uri, kind, body).await
+    }
+}
+
+type Answered = (StatusCode, HeaderMap, Value);
+
+async fn post(app: &Arc<App>, uri: &str, kind: &str, body: impl Into<Body>) -> Answered {
+    let request = Request::post(uri).header("content-type", kind).body(body.into()).expect("a request");
+    let router = router(Arc::clone(app));
+    soon(async { read(router.oneshot(request).await.expect("infallible")).await }).await
+}
+
+/// Checks that a request was refused for a parameter.
+fn assert_refused((status, _, body): &Answered, parameter: &str, asked: &str) {
+    assert_eq!((status.as_u16(), &body["parameter"]), (400, &json!(parameter)), "{asked}: {body}");
 }
 
 /// A failed test must end too: the runtime waits for every task at the gate.
@@ -89,7 +106,7 @@ async fn soon<T>(future: impl Future<Output = T>) -> T {
     tokio::time::timeout(Duration::from_secs(20), future).await.expect("within 20 s")
 }
 
-async fn read(response: Response) -> (StatusCode, HeaderMap, Value) {
+async fn read(response: Response) -> Answered {
     let (head, body) = response.into_parts();
     let bytes = to_bytes(body, 1 << 20).await.expect("a body");
     let text = String::from_utf8_lossy(&bytes).into_owned();
@@ -384,12 +401,8 @@ fn keep_timestamp(dir: &std::path::Path, expires_unix_secs: u64) {
 #[tokio::test]
 async fn positions_are_handed_on_or_refused() {
     let service = Service::with_chair();
-    let say = |app: &Arc<App>, body: &str| {
-        let request = Request::post("/position").header("content-type", "application/json");
-        let request = request.body(Body::from(body.to_owned())).expect("a request");
-        let router = router(Arc::clone(app));
-        soon(async { read(router.oneshot(request).await.expect("infallible")).await })
-    };
+    let say =
+        async |app: &Arc<App>, body: &str| post(app, "/position", "application/json", body.to_owned()).await;
     let (status, _, body) = say(&service.app, "1 2 3").await;
     assert_eq!((status.as_u16(), &body["type"]), (409, &"urn:slag:problem:not-following".into()));
     assert_eq!(service.get("/status").await.2["following"], Value::Null);
@@ -412,8 +425,7 @@ async fn positions_are_handed_on_or_refused() {
         "\u{1b}[2J",
         &"1".repeat(900),
     ] {
-        let (status, _, body) = say(&app, bad).await;
-        assert_eq!((status.as_u16(), &body["parameter"]), (400, &"body".into()), "{bad}");
+        assert_refused(&say(&app, bad).await, "body", bad);
     }
     let (status, _, body) = say(&app, &"1".repeat(100_000)).await;
     assert_eq!((status.as_u16(), &body["type"]), (413, &"urn:slag:problem:body-too-large".into()));

@@ -5,14 +5,13 @@ use std::sync::Arc;
 
 use slag_service::params::RequestError;
 
-use super::answer::{answer, object_answer, of_related};
+use super::answer::{Answering, answer, object_answer};
 use super::ask::Ask;
 use super::engine::{Engine, OnBoard, QueryError};
-use super::outcome::{Outcome, RelatedAnswers};
 use super::rank::Ranked;
 use super::reason;
 use super::relations::{self, Phrase, Things, Viewer};
-use super::reply::Reply;
+use super::reply::{Outcome, RelatedAnswers, Reply};
 use super::request::{Asked, QueryRequest, unit_vector};
 use super::scene::Scene;
 use crate::score::{Budget, Question, Region, ScoreError, Scratch, score_objects};
@@ -98,9 +97,10 @@ impl Engine {
         budget.check().map_err(ScoreError::from)?;
         let outcome = self.on_scene(snapshot, budget, |_, scene| {
             let related = related(scene, phrase, questions, request)?;
+            let answering = Answering { scene, request, budget: budget.clone() };
             Ok::<_, QueryError>(match request.paged {
                 true => Outcome::Related(related),
-                false => Outcome::Plain(of_related(scene, label, related, &questions[0], request)),
+                false => Outcome::Plain(answering.of_related(label, related, &questions[0])),
             })
         })?;
         budget.check().map_err(ScoreError::from)?;

@@ -12,18 +12,8 @@ use slag_common::frames::Geographic;
 use slag_common::shard::ShardView;
 
 use super::request::AnswerKind;
-use super::threshold::ThresholdSource;
+use super::scale::{ScoreKind, ThresholdSource};
 use crate::score::{Hit, Run};
-
-/// Meaning of scores and thresholds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum ScoreKind {
-    /// `q · E_k`, -1..1.
-    Cosine,
-    /// `1 / (1 + exp(-10 (q · E_k - max_j n_j · E_k)))`, 0..1.
-    Relevancy,
-}
 
 /// Answers to one question. `answers` is the last field, so that long lists can be sent piece by piece.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]

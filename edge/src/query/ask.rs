@@ -5,15 +5,13 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::area::Area;
+use super::area::{Area, Point};
 use super::format::Format;
-use super::point::Point;
 use super::relations::Phrase;
 use super::request::{
     AnswerKind, Asked, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives,
-    QueryRequest, RequestError,
+    QueryRequest, RequestError, Words,
 };
-use super::words::Words;
 use crate::score::{MAX_COORDINATE, Precision};
 use crate::store::Snapshot;
 

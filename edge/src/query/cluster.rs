@@ -14,8 +14,7 @@ use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 use slag_math::union_find::UnionFind;
 
-use super::extent::{Extent, TRIMMED};
-use super::oriented::box_around;
+use super::oriented::{Extent, TRIMMED, box_around};
 use crate::score::{Budget, Run};
 
 /// Bits of a voxel coordinate in its key; three of them fill a `u64`.
@@ -43,7 +42,6 @@ pub struct Grouping {
 pub struct Cluster {
     /// Cell and index of its first member: its id within a generation.
     pub first: (u32, u32),
-    /// Members.
     pub n_gaussians: u64,
     /// Mean of the members' scores.
     pub score: f32,
@@ -125,7 +123,7 @@ const MEMBER_BYTES: usize = size_of::<DVec3>() + size_of::<f64>();
 
 /// Clusters the members of disjoint runs. If the budget is spent the result is of no use: ask [`Budget::check`].
 pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping, budget: &Budget) -> Clusters {
-    let Grouping { mut voxel, min_count, threshold, alignment, with_members } = *grouping;
+    let Grouping { mut voxel, min_count, threshold, .. } = *grouping;
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
     let mut reach = Aabb::EMPTY;
     for runs_of_shard in runs.chunk_by(|a, b| a.shard == b.shard) {
@@ -175,12 +173,8 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping, budg
         .into_par_iter()
         .filter(|group| budget.goes_on() && budget.take(count(group) as usize * MEMBER_BYTES))
         .map(|group| {
-            let mut spans: Vec<Span> =
-                group.iter().flat_map(|voxel| voxels[*voxel as usize]).copied().collect();
-            // Members in storage order, so that sums do not depend on the voxels.
-            spans.sort_unstable_by_key(|span| (span.run, span.start));
-            let members = if with_members { members(runs, &spans) } else { Vec::new() };
-            Cluster { members, ..summarise(shards, runs, &spans, alignment) }
+            let spans = group.iter().flat_map(|voxel| voxels[*voxel as usize]).copied().collect();
+            summarise(shards, runs, spans, grouping)
         })
         .collect();
     result.clusters.sort_unstable_by_key(|cluster| cluster.first);
@@ -282,10 +276,12 @@ fn members(runs: &[Run], spans: &[Span]) -> Vec<Run> {
     members
 }
 
-fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: Alignment) -> Cluster {
+fn summarise(shards: &[ShardView<'_>], runs: &[Run], mut spans: Vec<Span>, grouping: &Grouping) -> Cluster {
+    // Members in storage order, so that sums do not depend on the voxels.
+    spans.sort_unstable_by_key(|span| (span.run, span.start));
     let mut points: Vec<DVec3> = Vec::new();
     let (mut score_sum, mut best_score, mut first) = (0.0, f32::NEG_INFINITY, (u32::MAX, u32::MAX));
-    for span in spans {
+    for span in &spans {
         let run = &runs[span.run as usize];
         let shard = &shards[run.shard as usize];
         points.extend((span.start..span.end).map(|index| shard.position_in_world(index as usize)));
@@ -301,8 +297,8 @@ fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: 
         score: (score_sum / points.len() as f64) as f32,
         best_score,
         extent,
-        oriented_box: box_around(&points, inside, alignment, TRIMMED),
-        members: Vec::new(),
+        oriented_box: box_around(&points, inside, grouping.alignment, TRIMMED),
+        members: if grouping.with_members { members(runs, &spans) } else { Vec::new() },
     }
 }
 

@@ -1,26 +1,25 @@
 //! Query engine: a cache, a text model, and the questions asked of them. Shared by the HTTP service and the
 //! command line.
 
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use slag_api::objects::OrientedBox;
 use slag_common::Hash32;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{Manifest, TextModelRecord};
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
-use slag_models::{InferenceError, SessionOptions};
+use slag_models::{InferenceError, ModelDir, SessionOptions};
 
-use super::carried;
 use super::names::{Names, Words};
 use super::relations;
-use super::request::{QueryRequest, RequestError};
+use super::request::{QueryRequest, RequestError, check_text};
 use super::scene::Scene;
-use super::words::check_text;
 use crate::score::{Budget, OverBudget, ScoreError, Scratch};
 use crate::store::files::Stat;
-use crate::store::{EdgeCache, Snapshot, StoreError};
-use crate::text::{EncoderInfo, TextError, TextService};
+use crate::store::{EdgeCache, Snapshot, StoreError, damaged};
+use crate::text::{EncoderInfo, TextError, TextOpenError, TextService};
 
 /// Most bytes that an answer may have used for its buffers to be kept.
 const KEPT_BYTES: u64 = 32 << 20;
@@ -114,7 +113,6 @@ impl OnBoard {
         self.text.is_alive()
     }
 
-    /// Returns the vector of a text.
     pub(super) fn encode(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
         check_text("text", text)?;
         let thing = relations::asked_thing(text);
@@ -130,7 +128,7 @@ impl OnBoard {
 
 /// Opens the text model that a scene carries; one that does not open is logged.
 fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
-    carried::open(cache, manifest, options).unwrap_or_else(|error| {
+    open_text_model(cache, manifest, options).unwrap_or_else(|error| {
         tracing::warn!("the scene's text model does not open: {}", crate::error_line(&error));
         None
     })
@@ -271,6 +269,61 @@ impl Engine {
             idle().push(scratch);
         }
         done
+    }
+}
+
+/// Longest description read; those of public models take two thousand bytes.
+const MAX_DESCRIPTION_BYTES: u64 = 1 << 20;
+
+/// Reasons for which a scene's text model does not open.
+#[derive(Debug, thiserror::Error)]
+pub enum CarriedError {
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[error("{path}: {cause}; fetch again, which replaces what is damaged", path = path.display())]
+    Open { path: PathBuf, cause: Box<TextOpenError> },
+}
+
+/// Opens the text model that a scene carries; `None` if it carries none.
+fn open_text_model(
+    cache: &EdgeCache,
+    manifest: &Manifest,
+    options: &SessionOptions,
+) -> Result<Option<TextService>, CarriedError> {
+    let Some(record) = &manifest.encoder.text_model else { return Ok(None) };
+    let expected = record.description.hash;
+    let path = cache.shard_path(expected);
+    let mark = || mark_damaged(cache, record);
+    let read = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::from);
+    let bytes = read.inspect_err(|e| {
+        if e.is_damage() {
+            mark()
+        }
+    })?;
+    let found = Hash32::of(&bytes);
+    if found != expected {
+        mark();
+        return Err(StoreError::Hash { path, expected, found }.into());
+    }
+    let folder = path.parent().unwrap_or(cache.dir());
+    let opened = ModelDir::carried(&bytes, &path, folder)
+        .map_err(TextOpenError::Model)
+        .and_then(|models| TextService::open(&models, options));
+    opened.map(Some).map_err(|cause| {
+        if matches!(cause, TextOpenError::Model(_)) {
+            mark();
+        }
+        CarriedError::Open { path, cause: Box::new(cause) }
+    })
+}
+
+/// Marks the files that are not as listed; the next fetch downloads them again.
+fn mark_damaged(cache: &EdgeCache, record: &TextModelRecord) {
+    for object in record.objects() {
+        let read = cache.files().read(&cache.shard_path(object.hash), object.len_bytes);
+        if !read.is_ok_and(|bytes| Hash32::of(&bytes) == object.hash) {
+            damaged::mark(cache, object.hash);
+        }
     }
 }
 

@@ -14,9 +14,9 @@ use slag_common::objects::public_id;
 
 use super::cluster::{Grouping, cluster};
 use super::engine::{Engine, OnBoard, QueryError};
-use super::extent::Extent;
 use super::names::Names;
 use super::objects::{self, FoundObject};
+use super::oriented::Extent;
 use super::request::RequestError;
 use super::scene::{Scene, alignment, default_voxel, unit};
 use crate::score::{Budget, Region, Run, ScoreError};
@@ -43,9 +43,7 @@ pub enum ObjectOrder {
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ObjectFilter {
-    /// Only those after the object with this id.
     pub after: Option<u64>,
-    /// Only those with their position there.
     pub region: Region,
     /// Least length of the longest edge of the box.
     pub min_size: f64,
@@ -80,7 +78,6 @@ impl Engine {
         Ok(page?)
     }
 
-    /// Returns an object of a generation, with those of `names` that it has.
     pub fn object(
         &self,
         snapshot: &Snapshot,

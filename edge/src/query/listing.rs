@@ -44,7 +44,6 @@ impl ListFormat {
         Ok(())
     }
 
-    /// Returns a page in the format.
     pub fn write(self, page: &ObjectPage) -> serde_json::Result<Vec<u8>> {
         match self {
             Self::Json => serde_json::to_vec(page),

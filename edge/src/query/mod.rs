@@ -7,24 +7,18 @@ mod area;
 #[cfg(feature = "arrow")]
 mod arrow;
 mod ask;
-mod carried;
 mod changes;
 pub mod cluster;
 mod engine;
-mod extent;
 mod format;
 mod inventory;
-mod json;
 mod listing;
-mod map;
 mod names;
 mod naming;
 mod objects;
 mod oriented;
-mod outcome;
 mod page;
 mod ply;
-mod point;
 mod rank;
 mod reason;
 pub mod relations;
@@ -33,37 +27,31 @@ mod request;
 mod scale;
 mod scene;
 mod status;
-mod threshold;
 mod view;
-mod words;
 
 pub use answer::answer;
 pub use answers::{
     Answers, AnswersOrBatch, BadCellAnswer, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason,
-    ReasonKind, ScoreKind, Searched,
+    ReasonKind, Searched,
 };
-pub use area::{Area, AreaBall, AreaBox};
+pub use area::{Area, AreaBall, AreaBox, Corner, LatLon, Point};
 pub use ask::Ask;
 pub use changes::{ChangesError, ChangesRequest};
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
 pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder, object_id};
 pub use listing::ListFormat;
-pub use map::map_status;
 pub(crate) use naming::NAMES_WAIT;
-pub use outcome::{Outcome, RelatedAnswers};
 pub use page::Page;
-pub use point::{Corner, LatLon, Point};
 pub use rank::relevance;
-pub use reply::Reply;
+pub use reply::{Outcome, RelatedAnswers, Reply};
 pub use request::{
     AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_CLUSTERS, MAX_GAUSSIANS,
-    MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
+    MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, Words, parse_box, parse_point,
 };
+pub use scale::{RELEVANCY_THRESHOLD, ScoreKind, ThresholdSource, calibrated_threshold};
 pub use scene::{Scene, default_voxel, unit};
-pub use status::{ShardStatus, Status};
-pub use threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
-pub use words::Words;
+pub use status::{ShardStatus, Status, map_status};
 
 #[cfg(test)]
 mod tests;

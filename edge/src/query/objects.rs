@@ -8,8 +8,7 @@ use slag_api::objects::{Alignment, OrientedBox};
 use slag_common::manifest::Calibration;
 use slag_common::objects::{ObjectRecord, Objects, public_id};
 
-use super::extent::{Extent, TRIMMED};
-use super::oriented::box_around;
+use super::oriented::{Extent, TRIMMED, box_around};
 use super::scene::Scene;
 use crate::score::{Region, Run};
 use crate::store::objects::Part;

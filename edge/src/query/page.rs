@@ -8,9 +8,8 @@ use serde::Serialize;
 use slag_api::{FRAME, UNITS};
 
 use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, ReasonKind, Searched};
-use super::outcome::{Outcome, RelatedAnswers};
 use super::relations::{self, Phrase, Witness};
-use super::reply::Reply;
+use super::reply::{Outcome, RelatedAnswers, Reply};
 use super::request::{AnswerKind, Asked};
 use super::scene::unit;
 

@@ -49,6 +49,17 @@ pub fn looked(
     }
 }
 
+/// Returns a reason. `best`: score and position of the best miss.
+fn reason(
+    told: (ReasonKind, String),
+    best: Option<(f32, DVec3)>,
+    (shards, region): (&[ShardView<'_>], &Region),
+) -> Reason {
+    let (kind, detail, seen_share) = looked(shards, region, told);
+    let (best_score, best_position_in_world) = best.unzip();
+    Reason { kind, detail, seen_share, best_score, best_position_in_world }
+}
+
 /// Returns why no object was found. `best`: score and position of the best object on board.
 pub fn of_objects(
     shards: &[ShardView<'_>],
@@ -75,14 +86,7 @@ pub fn of_objects(
             ),
         ),
     };
-    let (kind, detail, seen_share) = looked(shards, place, (kind, detail));
-    Reason {
-        kind,
-        detail,
-        seen_share,
-        best_score: best.map(|(score, _)| score),
-        best_position_in_world: best.map(|(_, at)| at),
-    }
+    reason((kind, detail), best, (shards, place))
 }
 
 /// Returns why no Gaussian or cluster was found.
@@ -119,12 +123,5 @@ pub fn of_gaussians(
             )
         }
     };
-    let (kind, detail, seen_share) = looked(search.shards(), place, (kind, detail));
-    Reason {
-        kind,
-        detail,
-        seen_share,
-        best_score: best.map(|(score, _)| score),
-        best_position_in_world: best.map(|(_, at)| at),
-    }
+    reason((kind, detail), best, (search.shards(), place))
 }

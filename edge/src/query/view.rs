@@ -8,9 +8,9 @@ use slag_view::{
 };
 
 use super::engine::{Engine, QueryError};
-use super::map::map_status;
 use super::naming::NAMES_WAIT;
 use super::request::{Negatives, QueryRequest};
+use super::status::map_status;
 use crate::score::{Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy};
 use crate::store::Snapshot;
 

@@ -3,7 +3,8 @@
 //! Work that fans out over threads cannot return an error from every loop, so a budget latches: once it is spent,
 //! loops end early, and whoever started the work asks [`Budget::check`] before it uses the result.
 
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::AtomicU64;
+use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
@@ -33,7 +34,6 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Makes a pool of so many bytes.
     pub fn new(bytes: u64) -> Arc<Self> {
         Arc::new(Self { bytes, used: AtomicU64::new(0) })
     }
@@ -128,6 +128,32 @@ impl Drop for Account {
     fn drop(&mut self) {
         self.pool.used.fetch_sub(*self.used.get_mut(), Relaxed);
     }
+}
+
+/// Largest coordinate of a scene, world units. Larger ones (a hundred times the earth's diameter) are
+/// refused, because computations with them would overflow.
+pub const MAX_COORDINATE: f64 = 1e9;
+
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ScoreError {
+    #[error(transparent)]
+    OverBudget(#[from] OverBudget),
+    #[error(
+        "cell {cell_id} holds embeddings of {expected} components, but the query vector has {found}; use the models that the scene was encoded with"
+    )]
+    Dimension { cell_id: u32, expected: usize, found: usize },
+    #[error(
+        "the query vector has length {found}, expected 1; the text model is damaged or does not normalise its vectors"
+    )]
+    NotUnit { found: f32 },
+    #[error(
+        "a negative has {found} components, but the query vector has {expected}; encode both with the same text model"
+    )]
+    Negative { expected: usize, found: usize },
+    #[error(
+        "cell {cell_id}: positions reach {found:e}, the limit is {MAX_COORDINATE:e} world units; encode the scene again around a nearer origin"
+    )]
+    Extent { cell_id: u32, found: f64 },
 }
 
 #[cfg(test)]

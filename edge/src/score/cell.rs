@@ -5,8 +5,8 @@ use slag_common::shard::{ExactColumns, Residuals, ShardView};
 use slag_math::simd::InstructionSet;
 
 use super::centroids::{AskedQuestion, ShardScores};
-use super::precision::Precision;
 use super::project::Projection;
+use super::question::Precision;
 use super::region::Region;
 
 /// Number of mean measured errors within which a score counts as undecided and is refined. With 9, answers

@@ -7,9 +7,8 @@ use slag_common::shard::ShardView;
 use slag_math::simd::InstructionSet;
 
 use super::budget::Budget;
-use super::precision::Precision;
 use super::project::{Projection, Vector};
-use super::question::Question;
+use super::question::{Precision, Question};
 use super::region::Region;
 
 /// Scores of one or several questions, centroid by centroid.
@@ -43,7 +42,6 @@ pub(super) struct ShardScores {
     /// Whether the shard reaches into the region. If not, the other fields are left over from an earlier
     /// search.
     pub is_searched: bool,
-    /// One for each vector.
     pub projections: Vec<Projection>,
     /// `[vectors][centroids]`.
     pub centroids: Vec<Vec<f32>>,

@@ -62,7 +62,6 @@ pub(super) struct ShardGather {
     /// Members of one centroid whose code sum reaches the minimum.
     sums: Vec<(u32, u16)>,
     refine: Refine,
-    /// Whether matches are only counted.
     is_counting: bool,
     /// Number of scores in each bin; empty if there is none.
     pub bins: Vec<u32>,

@@ -21,11 +21,8 @@ mod centroids;
 mod collect;
 mod columns;
 mod dot;
-mod error;
 mod matches;
 mod objects;
-mod polygon;
-mod precision;
 mod project;
 mod question;
 mod region;
@@ -33,16 +30,13 @@ mod search;
 mod select;
 mod simd;
 
-pub use budget::{Budget, OverBudget, Pool};
+pub use budget::{Budget, MAX_COORDINATE, OverBudget, Pool, ScoreError};
 pub use columns::Columns;
 pub use dot::{dot, rounding_bound};
-pub use error::{MAX_COORDINATE, ScoreError};
 pub use matches::{Effort, Hit, Matches, Run};
 pub use objects::{ObjectScores, score_objects};
-pub use polygon::{MAX_CORNERS, Polygon};
-pub use precision::Precision;
-pub use question::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
-pub use region::{Ball, Region};
+pub use question::{Precision, Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
+pub use region::{Ball, MAX_CORNERS, Polygon, Region};
 pub use search::{Scratch, Search};
 
 #[cfg(test)]

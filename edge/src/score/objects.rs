@@ -10,8 +10,8 @@ use slag_common::objects::{MAX_VECTORS, Objects, object_score};
 use slag_common::shard::ShardView;
 use slag_math::simd::InstructionSet;
 
+use super::budget::ScoreError;
 use super::centroids::{combine, distinct};
-use super::error::ScoreError;
 use super::project::{Projection, Vector, up};
 use super::question::{Question, check};
 use super::simd::SomeRowsTimesVector;

@@ -1,12 +1,19 @@
 //! A question as vectors.
 
+use std::fmt;
+use std::str::FromStr;
 use std::sync::Arc;
 
+use schemars::JsonSchema;
+use serde::de::IntoDeserializer;
+use serde::de::value::Error;
+use serde::{Deserialize, Serialize};
 use slag_common::shard::ShardView;
-pub use slag_math::relevancy::{RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 
+use super::budget::{MAX_COORDINATE, ScoreError};
 use super::dot::rounding_bound;
-use super::error::{MAX_COORDINATE, ScoreError};
+
+pub use slag_math::relevancy::{RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 
 /// A question as vectors. A Gaussian's score is `q · E_k`, or with negatives `q · E_k - max_j n_j · E_k`: how
 /// much closer it is to the thing asked for than to the closest negative (LERF, Kerr et al. 2023, section
@@ -85,6 +92,35 @@ pub(super) fn check(shards: &[ShardView<'_>], questions: &[Question]) -> Result<
 
 fn length(components: impl Iterator<Item = f32>) -> f64 {
     components.map(|v| f64::from(v).powi(2)).sum::<f64>().sqrt()
+}
+
+/// The data that scores come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Precision {
+    /// Codebook centroids only: fastest; every score is within the stated bound.
+    Centroids,
+    /// As `Exact`, but in shards with exact embeddings reads only those that the measured errors of codes and fine
+    /// residuals leave undecided. Finds nearly all of the exact answer, tens of times faster; answers state the
+    /// likely errors of its scores.
+    Measured,
+    /// Centroids, and where they cannot decide, the shard's exact embeddings or residual codes.
+    #[default]
+    Exact,
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Precision {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self, Error> {
+        Self::deserialize(text.into_deserializer())
+    }
 }
 
 #[cfg(test)]

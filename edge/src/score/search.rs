@@ -6,14 +6,12 @@ use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::shard::{ScoreErrors, ShardView};
 
-use super::budget::Budget;
+use super::budget::{Budget, ScoreError};
 use super::cell::Cell;
 use super::centroids::{AskedQuestion, CentroidScores};
 use super::collect::{Cut, ShardGather};
-use super::error::ScoreError;
 use super::matches::{Effort, Hit, Matches};
-use super::precision::Precision;
-use super::question::{Question, check};
+use super::question::{Precision, Question, check};
 use super::region::Region;
 use super::select::AnswerBuffers;
 

@@ -137,7 +137,6 @@ pub struct FindSums<'a> {
     /// Values of the subspaces in the high halves.
     pub high: &'a [Column],
     pub members: std::ops::Range<usize>,
-    /// The least sum wanted.
     pub least: u16,
     /// The block in which an earlier range may have ended.
     pub last: &'a mut LastBlock,

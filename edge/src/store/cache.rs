@@ -77,7 +77,6 @@ impl EdgeCache {
         &self.dir
     }
 
-    /// Returns the storage.
     pub fn files(&self) -> &dyn Files {
         &*self.files
     }

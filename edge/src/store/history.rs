@@ -133,7 +133,6 @@ impl Record {
         &self.places
     }
 
-    /// Returns the record as a file.
     pub fn to_bytes(&self) -> Vec<u8> {
         let about = serde_json::to_vec(self).expect("numbers and text become JSON");
         let (mut vectors, mut steps) = (Vec::new(), Vec::new());
@@ -150,7 +149,6 @@ impl Record {
         bytes
     }
 
-    /// Reads a record.
     pub fn parse(bytes: &[u8]) -> Result<Self, ContainerError> {
         let bytes = AlignedBytes::copy_of(bytes);
         let layout = Layout::check(&bytes, MAGIC, VERSION)?;

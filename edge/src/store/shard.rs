@@ -30,7 +30,6 @@ pub struct OpenShard {
 }
 
 impl OpenShard {
-    /// Returns its columns.
     pub fn view(&self) -> ShardView<'_> {
         self.layout.view(&self.bytes)
     }
@@ -40,7 +39,6 @@ impl OpenShard {
         self.layout.appearance(&self.bytes)
     }
 
-    /// Returns its objects, if the shard has any.
     pub fn objects(&self) -> Option<Objects<'_>> {
         self.layout.objects(&self.bytes)
     }

@@ -10,8 +10,8 @@ use slag_edge::fetch::follow::{Decision, FollowEnvironment, FollowSettings, Foll
 use slag_edge::fetch::{FetchError, FetchReport, FetchRequest, FirstRoot, Position, last_position};
 
 use super::scene::{Published, bounds};
-use super::server::{Fault, Server};
-use super::{Robot, assert_holds, at};
+use super::server::Fault;
+use super::{Robot, assert_holds, at, cells};
 
 const N_CELLS: usize = 30;
 
@@ -39,8 +39,7 @@ fn settings() -> FollowSettings {
 
 #[test]
 fn going_to_and_fro_over_an_edge_costs_one_fetch() {
-    let server = Server::start(Published::new(1, &[0; N_CELLS], 20));
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(Published::new(1, &[0; N_CELLS], 20));
     // Cells end at multiples of ten. For the first fetch the critical edge is also at 100 + 18 = 118: there
     // every step changes the set of cells in reach.
     for edge in [100.0, 102.0] {
@@ -59,8 +58,7 @@ fn going_to_and_fro_over_an_edge_costs_one_fetch() {
 #[test]
 fn a_drive_always_has_what_is_around() {
     let scene = Published::new(1, &[0; N_CELLS], 20);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(scene.clone());
     // Room for six cells: 12 + 6 to either side reach five or six at most.
     let budget_bytes = scene.bytes(0..6);
     robot.request.max_bytes = Some(budget_bytes);
@@ -79,7 +77,7 @@ fn a_drive_always_has_what_is_around() {
             let on_board: u64 = robot.shards().iter().map(|hash| scene.objects[hash].len() as u64).sum();
             assert!(on_board <= budget_bytes, "{on_board}");
         }
-        let on_board: Vec<u32> = robot.snapshot().shards.iter().map(|shard| shard.cell.cell_id).collect();
+        let on_board = cells(&robot.snapshot());
         for cell_id in 0..N_CELLS as u32 {
             if bounds(cell_id).distance_to(at) <= 12.0 {
                 assert!(on_board.contains(&cell_id), "cell {cell_id} at {x}");
@@ -96,8 +94,7 @@ fn a_drive_always_has_what_is_around() {
 #[test]
 fn following_survives_the_loss_of_the_network() {
     let scene = Published::new(1, &[0; N_CELLS], 20);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(scene.clone());
     robot.limits.attempts = 1;
     let settings = FollowSettings {
         radius: 4.0,
@@ -168,8 +165,7 @@ fn following_survives_the_loss_of_the_network() {
 #[test]
 fn a_follower_waits_for_trust_and_not_for_time() {
     let scene = Published::new(1, &[0; 3], 20);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::of(&server);
+    let (_server, mut robot) = Robot::started(scene.clone());
     robot.request.trust_first = false;
     let pause = Duration::from_secs(3600);
     let settings = FollowSettings {
@@ -202,8 +198,7 @@ fn a_follower_waits_for_trust_and_not_for_time() {
 /// Positions end while a fetch is due and fails: the error is returned.
 #[test]
 fn the_end_tells_whether_the_last_position_was_served() {
-    let server = Server::start(Published::new(1, &[0; 3], 20));
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(Published::new(1, &[0; 3], 20));
     robot.limits.attempts = 1;
     server.faults(|_| Fault::Status(404));
     let (following, cancel) = (Following::default(), AtomicBool::new(false));

@@ -12,7 +12,7 @@ use super::faults::text_service;
 use super::scene::{Published, TestThing};
 use super::server::Server;
 use super::sim::SimFiles;
-use super::{Robot, at};
+use super::{Robot, at, cells};
 
 fn thing(id: u64, x: f64, axis: usize) -> TestThing {
     TestThing { cell_id: (x / 10.0) as u32, id, x, axis }
@@ -56,9 +56,7 @@ fn assert_changed(robot: &Robot, context: &str) {
 
 #[test]
 fn changes_are_told_where_both_generations_are_known() {
-    let server = Server::start(before());
-    let mut robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, mut robot) = Robot::fetched(before());
     let reply = changes(&robot, None).expect("a reply");
     assert!(reply.none.is_some_and(|none| none.kind == "no-earlier-generation"));
     server.publish(after());
@@ -69,7 +67,7 @@ fn changes_are_told_where_both_generations_are_known() {
     robot.request.radius = 14.0;
     robot.request.max_bytes = Some(after().bytes(4..7));
     robot.fetch().expect("works");
-    let on_board: Vec<u32> = robot.snapshot().shards.iter().map(|shard| shard.cell.cell_id).collect();
+    let on_board = cells(&robot.snapshot());
     assert_eq!(on_board, [4, 5, 6], "the cells left behind are gone");
     assert_changed(&robot, "from elsewhere");
     assert_eq!(changes(&robot, Some(1)).expect("a reply").n_not_compared, 1, "10");
@@ -98,9 +96,7 @@ fn changes_are_told_where_both_generations_are_known() {
 /// The robot had the places of 1, 2 and 3 on board in the earlier generation alone, that of 10 in the later one.
 #[test]
 fn what_is_left_behind_has_not_gone() {
-    let server = Server::start(before());
-    let mut robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, mut robot) = Robot::fetched(before());
     server.publish(after());
     robot.request.at = Some(at(55.0));
     robot.request.radius = 14.0;
@@ -115,9 +111,7 @@ fn what_is_left_behind_has_not_gone() {
 #[test]
 fn where_the_splat_is_the_same_nothing_changed() {
     let of = |generation, things: &[TestThing]| Published::new(generation, &[0; 7], 20).with_things(things);
-    let server = Server::start(of(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1)]));
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, robot) = Robot::fetched(of(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1)]));
     server.publish(of(2, &[thing(1, 2.0, 0), thing(5, 18.0, 3)]));
     robot.fetch().expect("works");
     let reply = changes(&robot, None).expect("a reply");
@@ -154,9 +148,7 @@ fn a_power_cut_loses_no_history() {
 
 #[test]
 fn history_is_bounded_and_of_one_scene() {
-    let server = Server::start(before());
-    let mut robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, mut robot) = Robot::fetched(before());
     for generation in 2..=12 {
         server.publish(published(generation, &[thing(1, 2.0, 0), thing(generation, 12.0, 1)]));
         robot.fetch().expect("works");

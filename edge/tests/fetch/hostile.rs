@@ -11,7 +11,7 @@ use slag_edge::store::{BadCell, CellFault, Snapshot, StoreError};
 
 use super::scene::{ENCODER, FIRST, Published, ShardSpec, shard};
 use super::server::{Fault, Seen, Server};
-use super::{Robot, assert_holds};
+use super::{Robot, assert_holds, cells};
 
 fn objects(fault: Fault) -> impl FnMut(&Seen) -> Fault + Send + 'static {
     move |seen| if seen.path.contains("objects") { fault.clone() } else { Fault::None }
@@ -34,8 +34,7 @@ impl Progress for Count {
 #[test]
 fn other_content_under_a_hash_is_refused() {
     let (scene, other) = (Published::new(1, &[0; 1], 50), Published::new(1, &[1; 1], 50));
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
+    let (server, robot) = Robot::started(scene.clone());
     let instead = other.objects[&other.hash(0, Profile::Compact)].clone();
     assert_eq!(instead.len() as u64, scene.bytes(0..1));
     server.faults(objects(Fault::Instead(instead)));
@@ -50,8 +49,7 @@ fn other_content_under_a_hash_is_refused() {
 #[test]
 fn endless_bodies_are_cut_off() {
     let scene = Published::new(1, &[0; 1], 50);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(scene.clone());
     // The right content, followed by more: only the manifest's length is read.
     server.faults(objects(Fault::Endless));
     let count = Count::default();
@@ -105,8 +103,7 @@ fn lasting_faults_are_given_up_and_told() {
         (Fault::Cut(100), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
     ];
     for (fault, expected_attempts, is_expected) in cases {
-        let server = Server::start(scene.clone());
-        let robot = Robot::of(&server);
+        let (server, robot) = Robot::started(scene.clone());
         server.faults(objects(fault.clone()));
         let count = Count::default();
         match robot.fetch_watched(&count, &AtomicBool::new(false)).expect_err("lasting") {
@@ -142,7 +139,7 @@ fn signed_nonsense_is_refused() {
         let robot = Robot::on_disk(dir.path(), &server.url());
         let bad = BadCell { cell_id: bad_id, fault: CellFault::Invalid, old: None };
         assert_eq!(robot.fetch().expect("the other cell").bad_cells, [bad]);
-        let on_board: Vec<u32> = robot.snapshot().shards.iter().map(|shard| shard.cell.cell_id).collect();
+        let on_board = cells(&robot.snapshot());
         assert_eq!(on_board, [1 - bad_id]);
     };
     without_a_cell(scene.clone().edited(|manifest| manifest.cells[1].n_gaussians = 51), 1);
@@ -218,9 +215,7 @@ fn addresses_that_are_none_are_refused() {
 #[test]
 fn a_manifest_of_a_gigabyte_is_refused_unread() {
     let scene = Published::new(1, &[0; 1], 50);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, robot) = Robot::fetched(scene.clone());
     server.publish(Published::new(2, &[1; 1], 50));
     server.take_seen();
     type Faults = Box<dyn FnMut(&Seen) -> Fault + Send>;
@@ -247,8 +242,7 @@ fn names_that_are_paths_are_refused() {
         let mut hostile = scene.clone();
         hostile.listed = json.replace(&name, path).into_bytes();
         let hostile = hostile.signed_by(&[FIRST], 1);
-        let server = Server::start(hostile);
-        let robot = Robot::of(&server);
+        let (server, robot) = Robot::started(hostile);
         let error = robot.fetch().expect_err("refused");
         assert!(matches!(error, FetchError::Manifest(ManifestError::Content { .. })), "{path}: {error}");
 
@@ -302,8 +296,7 @@ fn shards_that_lie_are_refused() {
             let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
             (record.hash, record.len_bytes) = (hash, len_bytes);
         });
-        let server = Server::start(hostile);
-        let robot = Robot::of(&server);
+        let (_server, robot) = Robot::started(hostile);
         let error = robot.fetch().expect_err(name);
         let FetchError::Published { source, .. } = &error else { panic!("{name}: {error}") };
         let StoreError::Shard { source, .. } = &**source else { panic!("{name}: {source}") };

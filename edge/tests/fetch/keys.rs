@@ -23,8 +23,7 @@ struct Trial {
 
 impl Trial {
     fn new(first: Published) -> Self {
-        let server = Server::start(first.clone());
-        let robot = Robot::of(&server);
+        let (server, robot) = Robot::started(first.clone());
         assert!(robot.fetch().expect("first contact").is_first_contact);
         assert_holds(&robot.snapshot(), &first, 0..3);
         Self { server, robot }

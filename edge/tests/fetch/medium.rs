@@ -2,12 +2,12 @@
 
 use slag_common::shard::Profile;
 use slag_edge::fetch::Records;
-use slag_edge::store::{CellFault, Scrubber, Snapshot};
+use slag_edge::store::{CellFault, Scrubber};
 use slag_test_support::{LoopDisk, needs_loop_disk};
 
 use super::scene::Published;
 use super::server::Server;
-use super::{Robot, assert_holds};
+use super::{Robot, assert_holds, cells};
 
 /// More than 12 blocks a shard.
 const N: u32 = 4000;
@@ -31,10 +31,6 @@ fn trial() -> Trial {
     let robot = Robot::on_disk(disk.path(), &server.url());
     robot.fetch().expect("works");
     Trial { disk, _dir: dir, server, scene, robot }
-}
-
-fn cells(snapshot: &Snapshot) -> Vec<u32> {
-    snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect()
 }
 
 /// Read through the map, the sector would end this process with SIGBUS.

@@ -72,6 +72,20 @@ impl Robot {
         Self { _dir: Some(Arc::new(dir)), ..robot }
     }
 
+    /// Serves a scene, for a robot that has nothing yet.
+    fn started(scene: Published) -> (Server, Self) {
+        let server = Server::start(scene);
+        let robot = Self::of(&server);
+        (server, robot)
+    }
+
+    /// Serves a scene that a robot has on board.
+    fn fetched(scene: Published) -> (Server, Self) {
+        let (server, robot) = Self::started(scene);
+        robot.fetch().expect("works");
+        (server, robot)
+    }
+
     fn on_disk(dir: &Path, from: &str) -> Self {
         Self::new(EdgeCache::open(dir.join("cache")), from)
     }
@@ -102,7 +116,6 @@ impl Robot {
         Snapshot::open(&self.cache).expect("a whole generation")
     }
 
-    /// Returns the names in `shards/`.
     fn shards(&self) -> Vec<Hash32> {
         let names = self.cache.files().list(&self.cache.dir().join("shards")).expect("there");
         names.iter().map(|name| name.parse().expect("a hash")).collect()
@@ -113,14 +126,18 @@ impl Robot {
     }
 }
 
+/// Returns the ids of the cells that a snapshot holds.
+fn cells(snapshot: &Snapshot) -> Vec<u32> {
+    snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect()
+}
+
 fn at(x: f64) -> Position {
     Position::World(DVec3::new(x, 0.0, 105.0))
 }
 
 /// Checks that a snapshot holds exactly these cells of a scene.
 fn assert_holds(snapshot: &Snapshot, published: &Published, cell_ids: std::ops::Range<u32>) {
-    let found: Vec<u32> = snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect();
-    assert_eq!(found, cell_ids.collect::<Vec<_>>());
+    assert_eq!(cells(snapshot), cell_ids.collect::<Vec<_>>());
     assert_eq!(snapshot.manifest, published.manifest);
     for (shard, at) in snapshot.shards.iter().zip(&snapshot.current.cells) {
         let expected = &published.objects[&published.hash(at.cell_id, snapshot.current.profile)];

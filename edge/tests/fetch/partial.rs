@@ -33,9 +33,7 @@ pub fn answering(snapshot: &Snapshot) -> Vec<(u32, Hash32)> {
 
 /// Oracle: the same of whole scenes that were fetched without faults.
 fn whole(scene: &Published) -> Vec<(u32, Hash32)> {
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (_server, robot) = Robot::fetched(scene.clone());
     answering(&robot.snapshot())
 }
 
@@ -116,9 +114,7 @@ fn an_old_copy_answers_only_where_it_belongs() {
     ];
     for (name, edit) in edits {
         let first = Published::new(1, &[0; 3], 40);
-        let server = Server::start(first.clone());
-        let robot = Robot::of(&server);
-        robot.fetch().expect("works");
+        let (server, robot) = Robot::fetched(first.clone());
         let second = Published::new(2, &[0, 7, 0], 40).edited(edit);
         server.publish(second.clone());
         server.faults(at_cells(&second, &[1], &Fault::Status(404)));
@@ -133,9 +129,7 @@ fn an_old_copy_answers_only_where_it_belongs() {
 #[test]
 fn a_network_that_fails_publishes_nothing() {
     let (first, second) = (Published::new(1, &[0; 3], 40), Published::new(2, &[7; 3], 40));
-    let server = Server::start(first.clone());
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, robot) = Robot::fetched(first.clone());
     let before = answering(&robot.snapshot());
     server.publish(second.clone());
     for fault in [Fault::Cut(0), Fault::Status(503)] {
@@ -159,8 +153,7 @@ fn a_network_that_fails_publishes_nothing() {
 #[test]
 fn a_cell_is_either_on_board_or_bad() {
     let scene = Published::new(1, &[0; 3], 40);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
+    let (server, robot) = Robot::started(scene.clone());
     server.faults(at_cells(&scene, &[1], &Fault::Status(404)));
     robot.fetch().expect("the others are good");
     let path = robot.cache.current_path();

@@ -1,8 +1,7 @@
 //! A shard that rots on board costs its cell only, is named, and is fetched again.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use slag_common::shard::Profile;
@@ -16,7 +15,7 @@ use super::partial::answering;
 use super::scene::Published;
 use super::server::Server;
 use super::sim::SimFiles;
-use super::{Robot, assert_holds, at};
+use super::{Robot, assert_holds, at, cells};
 
 const UNREADABLE: BadCell = BadCell { cell_id: 1, fault: CellFault::Unreadable, old: None };
 
@@ -29,16 +28,10 @@ pub fn flip_unseen(path: &std::path::Path) {
     std::fs::OpenOptions::new().write(true).open(path).expect("there").set_modified(modified).expect("set");
 }
 
-fn cells(snapshot: &Snapshot) -> Vec<u32> {
-    snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect()
-}
-
 #[test]
 fn a_rotten_shard_costs_its_cell_only() {
     let scene = Published::new(1, &[0; 3], 40);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (_server, robot) = Robot::fetched(scene.clone());
     let path = robot.cache.shard_path(scene.hash(1, Profile::Compact));
     let faults: [(&str, &dyn Fn()); 3] = [
         ("a flipped bit", &|| flip_unseen(&path)),
@@ -112,9 +105,7 @@ fn any_rot_costs_its_cells_only() {
 #[test]
 fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
     let scene = Published::new(1, &[0; 3], 40);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (_server, robot) = Robot::fetched(scene.clone());
     let (snapshot, mut scrubber) = (robot.snapshot(), Scrubber::default());
     let mut steps = |n: usize| -> Vec<(u32, bool)> {
         let step = |_| scrubber.step(&robot.cache, &snapshot).map(|step| (step.cell_id, step.is_sound));
@@ -133,8 +124,7 @@ fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
 #[test]
 fn a_robot_in_service_heals_rot() {
     let scene = Published::new(1, &[0; 3], 40);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
+    let (_server, robot) = Robot::started(scene.clone());
     let (following, cancel) = (Arc::<Following>::default(), AtomicBool::new(false));
     let engine = Engine::new(robot.cache.clone(), text_service());
     let app = App::following(engine, Settings::default(), Some(Arc::clone(&following)));

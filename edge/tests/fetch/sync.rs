@@ -15,8 +15,7 @@ use super::{Robot, assert_holds, at};
 #[test]
 fn the_second_fetch_brings_only_the_difference() {
     let first = Published::new(1, &[0; 8], 100);
-    let server = Server::start(first.clone());
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(first.clone());
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
 
     // x = 5, radius 20: cells 0 (0..10), 1, 2 (20..30, 15 away).
@@ -60,8 +59,7 @@ fn the_second_fetch_brings_only_the_difference() {
 #[test]
 fn the_least_recently_used_are_freed_first() {
     let scene = Published::new(1, &[0; 8], 100);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::of(&server);
+    let (_server, mut robot) = Robot::started(scene.clone());
     robot.request.radius = 2.0;
     robot.request.max_bytes = Some(scene.bytes(0..3));
     // Visits cells 0, 1, 0, 2: the next one evicts cell 1, not cell 0.
@@ -83,8 +81,7 @@ fn the_least_recently_used_are_freed_first() {
 #[test]
 fn an_interrupted_download_goes_on_where_it_ended() {
     let scene = Published::new(1, &[0; 3], 2000);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(scene.clone());
     robot.request.radius = 2.0;
     robot.limits.attempts = 1;
     let len = scene.bytes(0..1) as usize;
@@ -124,8 +121,7 @@ fn passing_faults_are_overcome() {
     ];
     for (fault, is_retry_cheap) in faults {
         let scene = Published::new(1, &[0; 3], 300);
-        let server = Server::start(scene.clone());
-        let mut robot = Robot::of(&server);
+        let (server, mut robot) = Robot::started(scene.clone());
         robot.limits.read_timeout = std::time::Duration::from_millis(400);
         let (mut seen_paths, fault_given) = (std::collections::BTreeSet::new(), fault.clone());
         server.faults(move |seen| {
@@ -174,8 +170,7 @@ fn wrong_ranges_do_not_stick() {
     let refused = [304, 403, 500].map(Fault::Status);
     for fault in [Fault::ShiftedRange(1), Fault::Slice].into_iter().chain(refused) {
         let scene = Published::new(1, &[0; 1], 300);
-        let server = Server::start(scene.clone());
-        let robot = Robot::of(&server);
+        let (server, robot) = Robot::started(scene.clone());
         let hash = scene.hash(0, Profile::Compact);
         let staging = robot.cache.dir().join("staging");
         fs_err::create_dir_all(&staging).expect("made");
@@ -192,8 +187,7 @@ fn wrong_ranges_do_not_stick() {
 fn a_root_that_is_not_there_may_be_refused() {
     for status in [403, 404, 410] {
         let scene = Published::new(1, &[0; 1], 10);
-        let server = Server::start(scene.clone());
-        let robot = Robot::of(&server);
+        let (server, robot) = Robot::started(scene.clone());
         server.faults(move |seen| match seen.path.ends_with("/2.root.json") {
             true => Fault::Status(status),
             false => Fault::None,
@@ -221,8 +215,7 @@ impl Progress for CancelAt<'_> {
 #[test]
 fn cancelling_ends_soon_and_loses_nothing() {
     let scene = Published::new(1, &[0; 3], 5000);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
+    let (_server, robot) = Robot::started(scene.clone());
     let cancel = AtomicBool::new(false);
     let progress = CancelAt { cancel: &cancel, bytes: 10_000, received: AtomicU64::new(0) };
     assert!(matches!(robot.fetch_watched(&progress, &cancel), Err(FetchError::Cancelled)));
@@ -236,9 +229,7 @@ fn cancelling_ends_soon_and_loses_nothing() {
 
 #[test]
 fn one_fetch_at_a_time() {
-    let server = Server::start(Published::new(1, &[0; 3], 10));
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (_server, robot) = Robot::fetched(Published::new(1, &[0; 3], 10));
     let records = Records::open(&robot.cache).expect("free");
     assert!(matches!(robot.fetch(), Err(FetchError::Records(RecordsError::Busy { .. }))));
     // Reading needs no lock.
@@ -250,9 +241,7 @@ fn one_fetch_at_a_time() {
 #[test]
 fn damage_on_board_is_found_and_healed() {
     let scene = Published::new(1, &[0; 3], 100);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, robot) = Robot::fetched(scene.clone());
     let victim = scene.hash(1, Profile::Compact);
     let path = robot.cache.shard_path(victim);
     let mut bytes = fs_err::read(&path).expect("there");
@@ -280,8 +269,7 @@ fn damage_on_board_is_found_and_healed() {
 fn a_shard_that_the_manifest_does_not_describe_is_refused() {
     // Alone, so that nothing else answers.
     let scene = Published::new(1, &[0], 100);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
+    let (_server, robot) = Robot::started(scene.clone());
     for (cell_id, encoder, expected) in
         [(1, ENCODER, "the cell is 1, the manifest says 0"), (0, Hash32([8; 32]), "the encoder is 0808")]
     {
@@ -342,8 +330,7 @@ fn retry_after_is_honoured_within_bounds() {
         (Fault::RetryAfter(500, 3600), 3_600_000, 0..60_000),
         (Fault::RetryAfter(503, u64::MAX), 1, 1..60_000),
     ] {
-        let server = Server::start(scene.clone());
-        let mut robot = Robot::of(&server);
+        let (server, mut robot) = Robot::started(scene.clone());
         robot.limits.longest_retry_after = std::time::Duration::from_millis(allowed_ms);
         let (mut is_first, given) = (true, fault.clone());
         server.faults(move |_| if std::mem::take(&mut is_first) { given.clone() } else { Fault::None });

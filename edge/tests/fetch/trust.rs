@@ -25,8 +25,7 @@ struct Rotated {
 
 impl Rotated {
     fn new() -> Self {
-        let server = Server::start(of(1, &[FIRST]));
-        let mut robot = Robot::of(&server);
+        let (server, mut robot) = Robot::started(of(1, &[FIRST]));
         robot.fetch().expect("first contact");
         robot.request.trust_first = false;
         server.publish(of(2, &[FIRST, SECOND]));
@@ -108,8 +107,7 @@ fn adding_the_first_root_again_does_not_bring_its_keys_back() {
 #[test]
 fn first_trust_is_a_step_of_its_own() {
     let published = of(2, &[FIRST, SECOND]);
-    let server = Server::start(published.clone());
-    let mut robot = Robot::of(&server);
+    let (server, mut robot) = Robot::started(published.clone());
     robot.request.trust_first = false;
     let error = robot.fetch().expect_err("nothing is trusted");
     assert!(matches!(error, FetchError::NoTrust { .. }), "{error}");

@@ -8,7 +8,6 @@ use slag_edge::store::{Scrubber, Snapshot};
 
 use super::rot::flip_unseen;
 use super::scene::Published;
-use super::server::Server;
 use super::{Robot, assert_holds};
 
 /// A bit that flips on the medium leaves the file's time alone. No fetch reads it; a reader, or the scrub of one
@@ -16,9 +15,7 @@ use super::{Robot, assert_holds};
 #[test]
 fn rot_is_found_within_a_day() {
     let scene = Published::new(1, &[0; 3], 40);
-    let server = Server::start(scene.clone());
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (_server, robot) = Robot::fetched(scene.clone());
     for is_open in [false, true] {
         let open = is_open.then(|| robot.snapshot());
         flip_unseen(&robot.cache.shard_path(scene.hash(1, Profile::Compact)));
@@ -39,9 +36,7 @@ fn rot_is_found_within_a_day() {
 /// A new generation shares the open shards of the one before, except those that were replaced.
 #[test]
 fn open_shards_are_shared_by_generations() {
-    let server = Server::start(Published::new(1, &[0; 3], 40));
-    let robot = Robot::of(&server);
-    robot.fetch().expect("works");
+    let (server, robot) = Robot::fetched(Published::new(1, &[0; 3], 40));
     let first = robot.snapshot();
     let next = Published::new(2, &[0, 7, 0], 40);
     server.publish(next.clone());

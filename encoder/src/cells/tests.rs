@@ -3,16 +3,8 @@ use proptest::prelude::*;
 use super::*;
 
 fn scene(means: &[[f64; 3]], scale: f32) -> Gaussians {
-    let n = means.len();
-    Gaussians {
-        means_in_world: means.iter().map(|m| DVec3::from(*m)).collect(),
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        scales: vec![[scale, 2.0 * scale, 0.0]; n],
-        opacities: vec![0.5; n],
-        sh_dc: vec![[0.0; 3]; n],
-        sh_rest: Vec::new(),
-        sh_degree: 0,
-    }
+    let scales = vec![[scale, 2.0 * scale, 0.0]; means.len()];
+    Gaussians { scales, ..Gaussians::balls(means.iter().map(|m| DVec3::from(*m)).collect(), scale) }
 }
 
 proptest! {

@@ -17,7 +17,6 @@ const ROUNDING: f64 = 1e-12;
 pub struct Alignment {
     /// From the first set's world to the second's.
     pub similarity: Similarity,
-    /// Cameras in both sets.
     pub(crate) n_cameras: usize,
     /// Root mean square of the distances that remain, over the root mean square distance of the second set's
     /// cameras from their mean.

@@ -3,9 +3,11 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::{Result, anyhow};
-use clap::Args;
+use anyhow::{Context, Result, anyhow};
+use clap::{Args, FromArgMatches};
+use slag_common::ByteSize;
 use slag_common::shard::Profile;
+use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
 use super::choices::ChoiceArgs;
@@ -16,20 +18,23 @@ use super::common::{
 use super::draw::UpArgs;
 use super::memory::{default_memory_bytes, parse_memory};
 use super::next;
-use super::sam::SamArgs;
 use super::summary::lines;
-use super::target::TargetArgs;
 use crate::cells::PositionError;
-#[cfg(not(feature = "fleet"))]
-use crate::encode;
-use crate::encode::front::Expectation;
-use crate::encode::{DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, MAX_CELL_GAUSSIANS, Masks, ViewsLimit};
+use crate::encode::front::{Expectation, Front, Target};
+use crate::encode::{
+    DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, InputSettings, MAX_CELL_GAUSSIANS, Masks, ViewsLimit,
+    count_inputs,
+};
 use crate::occupancy::OccupancySettings;
 use crate::progress::Progress;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::report::{self, Recorder};
+use crate::segment::{SamLevels, SamSettings};
 use crate::viewpoints::{DEFAULT_N_VIEWS, POSES_FILE, ViewpointSettings};
+
+#[cfg(not(feature = "fleet"))]
+use crate::encode;
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder encode --scene splat.ply --store STORE\n\
@@ -205,16 +210,8 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
         };
         settings.inputs.planned = Some(ViewpointSettings { n_views, up: args.up.up });
     }
-    match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
-        ("auto", None) => {}
-        ("auto", Some(masks)) => settings.view.masks = masks,
-        ("graph", None) => settings.view.masks = Masks::Graph,
-        (dir, None) => {
-            settings.view.masks = Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() };
-        }
-        (dir, Some(_)) => {
-            return Err(anyhow!("--masks {dir} and --segmenter exclude each other; give one of them"));
-        }
+    if let Some(masks) = masks(args, choices)? {
+        settings.view.masks = masks;
     }
     let EncodeSettings { cells, output, .. } = &mut settings;
     cells.limits.max_gaussians = args.cell_gaussians as usize;
@@ -234,6 +231,17 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     output.models = args.models.models.as_deref().map(lasting_name);
     output.text_model = args.text_model;
     Ok(settings)
+}
+
+/// Returns where masks come from, if not from the embedded model.
+fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
+    let ignore_ids = || args.ignore_mask_ids.clone();
+    match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
+        ("auto", of_sam) => Ok(of_sam),
+        ("graph", None) => Ok(Some(Masks::Graph)),
+        (dir, None) => Ok(Some(Masks::Given { dir: dir.into(), ignore_ids: ignore_ids() })),
+        (dir, Some(_)) => Err(anyhow!("--masks {dir} and --segmenter exclude each other; give one of them")),
+    }
 }
 
 /// Returns the settings of the flags, with the choices that a target picks, and what it expects.
@@ -267,4 +275,189 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
         fs_err::write(path, report::of_encode(&settings.output.scene_name, &summary, recorder)?)?;
     }
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+/// A target instead of a preset.
+#[derive(Clone, Debug, Default, Args)]
+#[command(next_help_heading = "Target")]
+pub(crate) struct TargetArgs {
+    /// Picks the most accurate measured setting that is expected to take at most this many seconds. The
+    /// expectation holds for the machine, models and size of photos that the front was measured with.
+    #[arg(long, value_name = "S", value_parser = parse_secs, requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]
+    target_seconds: Option<Duration>,
+    /// Picks the most accurate measured setting whose compact shards are expected to have at most this many bytes.
+    #[arg(long, value_name = "BYTES", requires = "front", conflicts_with_all = ["choices", "segmenter"], hide_short_help = true)]
+    target_bytes: Option<ByteSize>,
+    /// Front to pick from: front.json, as `slag-lab bench tradeoff` writes it for your machine and scenes.
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
+    front: Option<PathBuf>,
+}
+
+impl TargetArgs {
+    /// Returns the choices that meet the target on the inputs, and what is expected of them; `None` without a
+    /// target.
+    pub(super) fn choose(&self, inputs: &InputSettings) -> Result<Option<(ChoiceArgs, Expectation)>> {
+        let seconds = self.target_seconds.map(|seconds| seconds.as_secs_f64());
+        let target = Target { seconds, bytes: self.target_bytes.map(|bytes| bytes.0) };
+        let Some(path) = &self.front else { return Ok(None) };
+        if target == Target::default() {
+            return Err(anyhow!("--front needs --target-seconds or --target-bytes"));
+        }
+        let front = Front::read(path)?;
+        let (n_photos, n_gaussians) = count_inputs(inputs)?;
+        let chosen = front.choose(target, n_photos, n_gaussians)?;
+        let bytes = ByteSize(chosen.bytes as u64);
+        tracing::info!(
+            "setting {:?} ({}): {:.1} s and {bytes} of {} shards are expected for {n_photos} photos and {n_gaussians} \
+             Gaussians, measured on {} scenes on {} with {}; mIoU there {:.3}",
+            chosen.setting.name,
+            chosen.setting.flags,
+            chosen.seconds,
+            chosen.setting.profile,
+            front.n_scenes,
+            front.machine,
+            front.measured_with,
+            chosen.setting.miou,
+        );
+        Ok(Some((parse_choices(&chosen.setting.flags)?, chosen)))
+    }
+}
+
+/// Parses the flags of a front's setting.
+fn parse_choices(flags: &str) -> Result<ChoiceArgs> {
+    let command = ChoiceArgs::augment_args(clap::Command::new("encode").no_binary_name(true));
+    command
+        .try_get_matches_from(flags.split_whitespace())
+        .and_then(|matches| ChoiceArgs::from_arg_matches(&matches))
+        .with_context(|| format!("the front's setting {flags:?} is not understood"))
+}
+
+/// Masks from Segment Anything; the other flags need `--segmenter`.
+#[derive(Clone, Debug, Args)]
+#[command(next_help_heading = "Segment Anything")]
+pub(crate) struct SamArgs {
+    /// SAM, SAM 2, MobileSAM, EdgeTAM or another model of that kind: a folder with model.toml, or the name of a
+    /// pulled model (`models list`).
+    #[arg(long, value_name = "NAME|DIR", help_heading = "Models")]
+    segmenter: Option<PathBuf>,
+    /// Points along each side of the grid of prompts: 8, 16, 32, 64 [default: the preset's].
+    #[arg(long, value_name = "N",
+        value_parser = clap::value_parser!(u32).range(1..=256), help_heading = "Speed and accuracy", hide_short_help = true)]
+    points_per_side: Option<u32>,
+    /// Points per run of the model: more are faster on GPUs and take more memory.
+    #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_batch,
+        value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
+    sam_points_per_batch: u32,
+    /// Least IoU that the model predicts for a mask, 0 to 1 [default: the preset's].
+    #[arg(long, value_name = "IOU", value_parser = parse_f32_ratio, hide_short_help = true)]
+    sam_predicted_iou: Option<f32>,
+    /// Least IoU of a mask with itself under a higher and a lower threshold, 0 to 1 [default: the preset's].
+    #[arg(long, value_name = "IOU", value_parser = parse_ratio, hide_short_help = true)]
+    sam_stability: Option<f64>,
+    /// Distance of those thresholds from 0, logits.
+    #[arg(long, value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset, hide_short_help = true)]
+    sam_stability_offset: f32,
+    /// IoU of boxes from which two masks are the same.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    sam_box_nms: f64,
+    /// IoU of pixels from which two masks are the same; 1 compares boxes only.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    sam_mask_nms: f64,
+    /// Layers of crops, to find small things: layer i segments 4^i crops besides the whole image [default: the
+    /// preset's].
+    #[arg(long, value_name = "N",
+        value_parser = clap::value_parser!(u32).range(0..=4), hide_short_help = true)]
+    sam_crop_layers: Option<u32>,
+    /// IoU of boxes from which masks of two crops are the same.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    sam_crop_nms: f64,
+    /// Fills holes and drops islands of masks with fewer pixels [default: the preset's].
+    #[arg(long, value_name = "PX", hide_short_help = true)]
+    sam_min_region_px: Option<u32>,
+    /// Which of the three masks of each prompt are used [default: the preset's].
+    #[arg(long, value_enum, hide_short_help = true)]
+    sam_levels: Option<SamLevels>,
+    /// Threads within the model; masks may depend on their number in the last bits [default: all cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
+    sam_threads: Option<u32>,
+}
+
+impl SamArgs {
+    /// Returns Segment Anything as the source of masks, if --segmenter names it.
+    pub(super) fn masks(&self, preset: &SamSettings) -> Result<Option<Masks>> {
+        let Some(segmenter) = &self.segmenter else { return Ok(None) };
+        let dir = commands::resolve(segmenter, &|name| std::env::var_os(name))?;
+        let settings = SamSettings {
+            points_per_side: self.points_per_side.unwrap_or(preset.points_per_side),
+            points_per_batch: self.sam_points_per_batch,
+            predicted_iou: self.sam_predicted_iou.unwrap_or(preset.predicted_iou),
+            stability: self.sam_stability.unwrap_or(preset.stability),
+            stability_offset: self.sam_stability_offset,
+            box_nms_iou: self.sam_box_nms,
+            mask_nms_iou: self.sam_mask_nms,
+            crop_layers: self.sam_crop_layers.unwrap_or(preset.crop_layers),
+            crop_nms_iou: self.sam_crop_nms,
+            min_region_px: self.sam_min_region_px.unwrap_or(preset.min_region_px),
+            levels: self.sam_levels.unwrap_or(preset.levels),
+            ..*preset
+        };
+        let n_model_threads = self.sam_threads.map_or_else(available_threads, |n| n as usize);
+        Ok(Some(Masks::Sam { dir, settings, n_model_threads }))
+    }
+}
+
+fn parse_ratio(text: &str) -> Result<f64, String> {
+    let ratio: f64 = text.parse().map_err(|error| format!("{error}"))?;
+    (0.0..=1.0).contains(&ratio).then_some(ratio).ok_or_else(|| "expected 0 to 1".into())
+}
+
+fn parse_f32_ratio(text: &str) -> Result<f32, String> {
+    parse_ratio(text).map(|ratio| ratio as f32)
+}
+
+fn parse_offset(text: &str) -> Result<f32, String> {
+    let offset: f32 = text.parse().map_err(|error| format!("{error}"))?;
+    (0.0..=100.0).contains(&offset).then_some(offset).ok_or_else(|| "expected 0 to 100".into())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+    use crate::cli::Cli;
+    use crate::encode::{EncodeSettings, ViewsLimit};
+
+    #[test]
+    fn a_setting_of_a_front_has_choices_and_nothing_else() {
+        let choices = parse_choices("--preset fast --views-limit 25% --superpoint 3").expect("understood");
+        let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        choices.apply(&mut settings);
+        assert_eq!(
+            (settings.run.views_limit, settings.aggregation.superpoint),
+            (ViewsLimit::Share(0.25), 3.0)
+        );
+        for wrong in ["--scene x", "--segmenter x", "--threads 1", "--preset nothing", "--models=x"] {
+            let message = format!("{:#}", parse_choices(wrong).expect_err("refused"));
+            assert!(message.contains(wrong), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_target_excludes_what_it_chooses() {
+        let parse = |flags: &str| {
+            let line = format!("slag-encoder encode --scene a --views b --store c {flags}");
+            Cli::command().try_get_matches_from(line.split_whitespace())
+        };
+        for flag in ["--preset fast", "--keep-slivers", "--max-components 8", "--fill true", "--segmenter x"]
+        {
+            parse(flag).expect("a flag of encode");
+            let error = parse(&format!("--front f.json --target-bytes 3MiB {flag}")).expect_err("excluded");
+            assert_eq!(error.kind(), clap::error::ErrorKind::ArgumentConflict, "{flag}");
+        }
+        parse("--front f.json --target-bytes 3MiB --threads 2").expect("no choice");
+        assert!(parse("--front f.json --target-seconds 0").is_err());
+        let without = parse("--target-seconds 60").expect_err("no front");
+        assert_eq!(without.kind(), clap::error::ErrorKind::MissingRequiredArgument);
+    }
 }

@@ -16,11 +16,9 @@ pub mod progress;
 #[cfg(feature = "qdrant")]
 mod push;
 mod query;
-mod sam;
 mod serve;
 mod store;
 mod summary;
-mod target;
 mod view;
 
 use anyhow::Result;

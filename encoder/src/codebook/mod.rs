@@ -124,6 +124,11 @@ impl Codebook {
     pub(crate) fn stored_basis(&self) -> shard::Basis<'_> {
         shard::Basis { mean: &self.mean, vectors: &self.basis, steps: &self.basis_steps }
     }
+
+    pub(crate) fn fine(&self) -> Option<shard::Fine<'_>> {
+        let FineResiduals { steps, scales, values, errors } = self.residuals.as_ref()?.fine.as_ref()?;
+        Some(shard::Fine { errors: *errors, steps, scales, values })
+    }
 }
 
 pub struct CodebookResiduals {

@@ -1,23 +1,20 @@
 //! What changed between two generations: things that appeared, went or moved, and the bytes that robots have to
 //! fetch.
 //!
-//! `things.rs` reads the objects of a generation; [`changes`] says which of two generations are the same.
-
-mod things;
+//! [`changes`] says which things of two generations are the same.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_common::objects::{Moved, Thing, changes, is_unchanged};
+use slag_common::objects::{Moved, Place, Thing, changes, is_unchanged};
 
-pub(crate) use things::{DiffError, Generation};
+use crate::store::{Published, StoreError, StoreReader};
 
 /// What changed from one generation to another.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Diff {
     pub(crate) old_generation: u64,
-    /// The later one.
     pub(crate) new_generation: u64,
     /// Whether lengths and positions are metres.
     pub(crate) metric: bool,
@@ -48,7 +45,7 @@ pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, Dif
         let [old, new] = [old_manifest, manifest].map(|m| format!("{} ({})", m.encoder.name, m.encoder.id));
         return Err(DiffError::Encoders { old, new });
     }
-    let ((old_things, old_places), (things, places)) = (things::read(old)?, things::read(new)?);
+    let ((old_things, old_places), (things, places)) = (read_things(old)?, read_things(new)?);
     let new_tells = |thing: &Thing| !is_unchanged(thing, &old_places, &places);
     let old_tells = |thing: &Thing| !is_unchanged(thing, &places, &old_places);
     let changes = changes(old_things, things, new_tells, old_tells);
@@ -76,6 +73,42 @@ pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, Dif
         n_cells_changed,
         fetch_bytes,
     })
+}
+
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Generation<'a> {
+    pub(crate) reader: &'a StoreReader,
+    /// Its current generation or the one before it.
+    pub(crate) published: &'a Published,
+}
+
+/// Two generations cannot be compared.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum DiffError {
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[error("generation {generation} has no objects to compare; encode again, without --no-objects")]
+    NoObjects { generation: u64 },
+    #[error(
+        "the generations are of different encoders, {old} and {new}; encode one of them again with the other's models"
+    )]
+    Encoders { old: String, new: String },
+}
+
+/// Reads the objects of a generation, by id, and its cells, from the finest shards of each.
+fn read_things(generation: Generation<'_>) -> Result<(Vec<Thing>, Vec<Place>), DiffError> {
+    let manifest = &generation.published.manifest;
+    let mut places = Vec::new();
+    let mut things: BTreeMap<u64, Thing> = BTreeMap::new();
+    for cell in &manifest.cells {
+        let Some(shard) = cell.shards.values().next_back() else { continue };
+        let shard = generation.reader.read_shard(shard)?;
+        let no_objects = DiffError::NoObjects { generation: manifest.generation };
+        let objects = shard.objects().ok_or(no_objects)?;
+        Thing::add_all(&mut things, &shard.view(), &objects);
+        places.push(Place { bounds: cell.bounds, splat: shard.view().splat_digest() });
+    }
+    Ok((things.into_values().collect(), places))
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! What a photo shows in and around a mask, as a share of the mask's vector.
 
-use crate::masks::windows::Windows;
+use crate::masks::patches::Windows;
 use crate::masks::{Mask, patches};
 
 /// Share of a mask's vector that is the mean of patches or windows; the rest is its crop's. Chosen on the labelled

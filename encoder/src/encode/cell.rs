@@ -43,7 +43,6 @@ pub(super) struct CellMaker<'a> {
     pub(super) context: &'a RunContext<'a>,
 }
 
-/// The memory for cells.
 #[derive(Clone, Copy)]
 pub(super) struct CellsBudget {
     /// Bytes for the contributions of a group of cells.

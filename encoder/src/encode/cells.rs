@@ -22,7 +22,7 @@ use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::{PendingRefinement, Refinement};
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable, SceneContributions};
 use crate::memory;
-use crate::objects::{self, Object, ObjectsReport};
+use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
 use crate::store::Extras;
@@ -110,30 +110,8 @@ fn build(
     context.progress().begin("cells", "cell", inputs.split.cells.len() as u64, 0);
     // Before refinement adds superpoints to the regions.
     let counts = Counts::of(views, &index, &table);
-
-    context.begin_phase(Phase::Superpoints);
-    let begin = || context.install(|| PendingRefinement::begin(settings.aggregation, &scene, table));
-    let pending = context.time("superpoints", begin)?;
-    // From all masks alike, whatever weight they have in the refinement.
-    context.begin_phase(Phase::Objects);
-    let find = || context.install(|| objects::find(&scene, &pending, &score_context));
-    let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
-    if let Some(found) = &objects {
-        context.progress().objects(&mut found.objects.iter().map(Object::found));
-    }
-    context.begin_phase(Phase::Refine);
-    let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
-    let finish = || context.install(|| pending.finish(&scene, object_of));
-    let (table, refinement) = context.time("refine", finish)?;
-
-    let mut extras = Extras::new();
-    if settings.aggregation != Aggregation::PLAIN {
-        let record = serde_json::to_vec(&settings.aggregation).map_err(std::io::Error::from)?;
-        extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
-    }
-    let regions = context.install(|| store.put_object(|out| table.write(out)))?.0;
-    extras.insert(EXTRA_REGIONS.into(), regions);
-
+    let Refined { table, refinement, objects } = refine(plan, &scene, table, &score_context, context)?;
+    let extras = put_extras(plan, &table, context)?;
     context.begin_phase(Phase::Cells);
     let has_poses = settings.cells.photo_poses;
     let maker = CellMaker {
@@ -168,6 +146,52 @@ fn build(
     };
     finished.into_iter().for_each(|cell| built.add(cell));
     Ok(built)
+}
+
+/// The regions with the superpoints that refinement adds, and the objects.
+struct Refined {
+    table: RegionTable,
+    refinement: Refinement,
+    objects: Option<SceneObjects>,
+}
+
+/// Weighs masks, finds objects, and refines by both.
+fn refine(
+    plan: &Plan<'_>,
+    scene: &SceneContributions<'_>,
+    table: RegionTable,
+    score_context: &ScoreMetricContext,
+    context: &RunContext<'_>,
+) -> Result<Refined, EncodeError> {
+    let settings = plan.settings;
+    context.begin_phase(Phase::Superpoints);
+    let begin = || context.install(|| PendingRefinement::begin(settings.aggregation, scene, table));
+    let pending = context.time("superpoints", begin)?;
+    // From all masks alike, whatever weight they have in the refinement.
+    context.begin_phase(Phase::Objects);
+    let find = || context.install(|| objects::find(scene, &pending, score_context));
+    let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
+    if let Some(found) = &objects {
+        context.progress().objects(&mut found.objects.iter().map(Object::found));
+    }
+    context.begin_phase(Phase::Refine);
+    let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
+    let finish = || context.install(|| pending.finish(scene, object_of));
+    let (table, refinement) = context.time("refine", finish)?;
+    Ok(Refined { table, refinement, objects })
+}
+
+/// Puts what later questions need beside the cells into the store.
+fn put_extras(plan: &Plan<'_>, table: &RegionTable, context: &RunContext<'_>) -> Result<Extras, EncodeError> {
+    let Plan { store, settings, .. } = *plan;
+    let mut extras = Extras::new();
+    if settings.aggregation != Aggregation::PLAIN {
+        let record = serde_json::to_vec(&settings.aggregation).map_err(std::io::Error::from)?;
+        extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
+    }
+    let regions = context.install(|| store.put_object(|out| table.write(out)))?.0;
+    extras.insert(EXTRA_REGIONS.into(), regions);
+    Ok(extras)
 }
 
 /// Returns texts that queries are expected to be like.

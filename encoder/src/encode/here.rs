@@ -16,7 +16,6 @@ use super::report::{LeftOut, StageReport};
 use super::sink::ViewRecord;
 use super::view::{ViewStages, Work};
 
-/// This machine.
 pub(super) struct Here;
 
 impl Executor for Here {

@@ -68,7 +68,6 @@ struct ViewIdentity<'a> {
     camera_from_world: glam::DAffine3,
 }
 
-/// Returns the identities of an encode of these inputs.
 pub(super) fn identities(
     settings: &EncodeSettings,
     engines: &Engines<'_>,

@@ -37,7 +37,6 @@ mod settings;
 mod sink;
 mod view;
 mod views;
-mod workers;
 
 use std::sync::atomic::AtomicBool;
 

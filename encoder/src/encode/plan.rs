@@ -30,7 +30,6 @@ use crate::segment::{
 use crate::shard;
 use crate::store::{Store, StoreReader};
 
-/// What was decided.
 pub(crate) struct Plan<'a> {
     pub(crate) settings: &'a EncodeSettings,
     pub(crate) engines: &'a Engines<'a>,

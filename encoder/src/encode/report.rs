@@ -13,7 +13,6 @@ use crate::occupancy::OccupancyReport;
 /// A view that was left out.
 #[derive(Clone, Debug, Serialize)]
 pub struct SkippedView {
-    /// Its name.
     pub view: String,
     pub reason: String,
 }
@@ -67,7 +66,6 @@ pub struct CellReport {
 /// The cost of each view, a column per figure, in the order of the names.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct ViewsReport {
-    /// Names.
     pub view: Vec<String>,
     /// Width at which weights were rasterised, pixels.
     pub raster_width_px: Vec<u32>,
@@ -107,7 +105,6 @@ pub struct GpuReport {
 }
 
 impl StageReport {
-    /// Adds the loads of GPUs over `wall_secs`.
     pub(super) fn add_gpus(&mut self, loads: Vec<GpuLoad>, wall_secs: f64) {
         let report = |GpuLoad { gpu, n_lanes, busy_secs }| GpuReport {
             gpu,
@@ -166,7 +163,6 @@ pub struct EncodeSummary {
     pub n_views_with_photo: usize,
     /// Views whose image is a drawing of the splat, no photo.
     pub n_views_drawn: usize,
-    /// The order in which views were taken.
     pub view_order: ViewOrder,
     /// What the used views show of what all views show, where the order is by coverage.
     pub coverage: Option<CoverageReport>,

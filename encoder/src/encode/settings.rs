@@ -33,7 +33,6 @@ pub(crate) const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 
 #[derive(Clone, Debug)]
 pub struct EncodeSettings {
-    /// What is read.
     pub inputs: InputSettings,
     /// How a view becomes contributions. A change of any of these is another encode.
     pub view: ViewSettings,
@@ -154,7 +153,6 @@ pub(crate) enum RasterWidth {
 }
 
 impl RasterWidth {
-    /// Returns the width of the raster of a photo of this width.
     pub(crate) fn px(self, photo_px: u32) -> u32 {
         match self {
             Self::Px(width_px) => width_px,
@@ -249,24 +247,30 @@ pub enum ViewOrder {
     Nth,
 }
 
+impl InputSettings {
+    fn new(scene: PathBuf, views: PathBuf, metric: bool) -> Self {
+        Self {
+            scene,
+            views,
+            planned: None,
+            images: None,
+            added: Vec::new(),
+            dropped: Vec::new(),
+            every: None,
+            splat_frame: FrameChoice::Auto,
+            activated: Activated::default(),
+            metric,
+            geo: None,
+        }
+    }
+}
+
 impl EncodeSettings {
     /// Returns the settings to encode a splat and its photos into a store: those of the program without flags, and
     /// of [`Preset::Balanced`](super::Preset::Balanced).
     pub fn new(scene: PathBuf, views: PathBuf, store: PathBuf, metric: bool) -> Self {
         Self {
-            inputs: InputSettings {
-                scene,
-                views,
-                planned: None,
-                images: None,
-                added: Vec::new(),
-                dropped: Vec::new(),
-                every: None,
-                splat_frame: FrameChoice::Auto,
-                activated: Activated::default(),
-                metric,
-                geo: None,
-            },
+            inputs: InputSettings::new(scene, views, metric),
             view: ViewSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
                 min_mask_px: 200,
@@ -318,64 +322,47 @@ impl EncodeSettings {
     /// Checks every setting that has a range.
     pub(crate) fn validate(&self) -> Result<(), EncodeError> {
         let Self { view, aggregation, cells, run, .. } = self;
-        let codebook = &cells.shards.codebook;
+        let (limits, codebook) = (&cells.limits, &cells.shards.codebook);
         let is_positive = |x: f64| x > 0.0 && x.is_finite();
-        let is_metric = self.inputs.metric || self.inputs.geo.is_some();
         let is_error = |x: f32| x >= 0.0 && x.is_finite();
+        let is_even = |n: usize| n >= 2 && n.is_multiple_of(2);
+        let is_metric = self.inputs.metric || self.inputs.geo.is_some();
+        let has_share = !matches!(run.views_limit, ViewsLimit::Share(share) if !(0.0..=1.0).contains(&share));
+        let has_levels = !matches!(view.masks, Masks::Auto { n_levels } if !(1..=4).contains(&n_levels));
+        let has_width = !matches!(view.raster_width, RasterWidth::Px(px) if !(16..=8192).contains(&px));
+        let has_gaussians = (1..=MAX_CELL_GAUSSIANS).contains(&limits.max_gaussians);
+        let has_components = is_even(codebook.max_components) && codebook.max_components <= MAX_COMPONENTS;
+        let has_error = !matches!(limits.position_error, PositionError::Within(error) if !is_positive(error));
+        let has_voxels = cells.occupancy.is_none_or(|of| (0.02..=0.5).contains(&of.voxel_m));
         let checks = [
             ("threads", run.threads > 0, "0 threads; expected at least 1"),
             ("gpus", !run.gpus.is_empty(), "none; expected at least one number"),
-            (
-                "views_limit",
-                !matches!(run.views_limit, ViewsLimit::Share(share) if !(0.0..=1.0).contains(&share)),
-                "expected a share of 0 to 1",
-            ),
-            (
-                "masks",
-                !matches!(view.masks, Masks::Auto { n_levels } if !(1..=4).contains(&n_levels)),
-                "expected 1 to 4 levels",
-            ),
-            (
-                "raster_width",
-                !matches!(view.raster_width, RasterWidth::Px(px) if !(16..=8192).contains(&px)),
-                "expected 16 to 8192 pixels",
-            ),
-            (
-                "max_gaussians",
-                (1..=MAX_CELL_GAUSSIANS).contains(&cells.limits.max_gaussians),
-                "expected 1 to 65536 Gaussians a cell",
-            ),
-            ("max_width", cells.limits.max_width.is_none_or(is_positive), "expected a finite width above 0"),
+            ("views_limit", has_share, "expected a share of 0 to 1"),
+            ("masks", has_levels, "expected 1 to 4 levels"),
+            ("raster_width", has_width, "expected 16 to 8192 pixels"),
+            ("max_gaussians", has_gaussians, "expected 1 to 65536 Gaussians a cell"),
+            ("max_width", limits.max_width.is_none_or(is_positive), "expected a finite width above 0"),
             ("profiles", !cells.shards.profiles.is_empty(), "expected at least one profile"),
             (
                 "max_components",
-                (2..=MAX_COMPONENTS).contains(&codebook.max_components)
-                    && codebook.max_components.is_multiple_of(2),
+                has_components,
                 "expected an even number of components, 2 to 128: subspaces come in pairs",
             ),
             (
                 "max_subspaces",
-                codebook.max_subspaces >= 2 && codebook.max_subspaces.is_multiple_of(2),
+                is_even(codebook.max_subspaces),
                 "expected an even number of subspaces, at least 2: two share a byte",
             ),
             ("compact_error", is_error(codebook.compact_error), "expected a finite error, at least 0"),
             ("balanced_error", is_error(codebook.balanced_error), "expected a finite error, at least 0"),
-            (
-                "occupancy",
-                cells.occupancy.is_none_or(|of| (0.02..=0.5).contains(&of.voxel_m)),
-                "expected voxels of 0.02 to 0.5 metres",
-            ),
+            ("occupancy", has_voxels, "expected voxels of 0.02 to 0.5 metres"),
             (
                 "occupancy",
                 cells.occupancy.is_none() || is_metric,
                 "a robot's size is in metres, the scene's units are not known to be; give --metric if they are metres",
             ),
             ("min_view_share", aggregation.min_view_share <= 1.0, "expected a share of 0 to 1"),
-            (
-                "position_error",
-                !matches!(cells.limits.position_error, PositionError::Within(error) if !is_positive(error)),
-                "expected a finite error above 0",
-            ),
+            ("position_error", has_error, "expected a finite error above 0"),
         ];
         let refuse = |setting, problem: String| Err(EncodeError::Setting { setting, problem });
         if let Some((setting, _, problem)) = checks.into_iter().find(|(_, is_valid, _)| !is_valid) {

@@ -24,9 +24,8 @@ use crate::ingest::{self, LoadedImage, RotatedPhotos};
 use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
-use crate::masks::patches::patch_masks;
+use crate::masks::patches::{Windows, patch_masks};
 use crate::masks::regions::{absorb_slivers, partition};
-use crate::masks::windows::Windows;
 use crate::masks::{self, Mask, RegionMap};
 use crate::memory::MemoryPlan;
 use crate::raster::{GpuSlots, LoadedScene, RasterView};
@@ -41,7 +40,6 @@ pub(crate) struct ViewTools<'a> {
     pub(crate) engines: &'a Engines<'a>,
     pub(crate) settings: &'a ViewSettings,
     pub(crate) n_threads: usize,
-    /// GPUs for the models.
     pub(crate) gpus: &'a [u32],
     pub(crate) segmenter: &'a dyn Segmenter,
     pub(crate) scene: &'a dyn LoadedScene,

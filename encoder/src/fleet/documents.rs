@@ -71,7 +71,6 @@ pub(super) struct FailedView {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum End {
-    /// Its coordinator publishes it.
     Published,
     /// Another coordinator began the next run.
     Superseded,

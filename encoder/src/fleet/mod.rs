@@ -35,7 +35,6 @@ mod objects;
 mod prepared;
 mod queue;
 mod run;
-mod run_folder;
 mod views;
 pub(crate) mod worker;
 

@@ -23,7 +23,6 @@ use crate::segment::Segmenter;
 /// packed.
 const N_AT_ONCE: usize = 2;
 
-/// What views are done with.
 pub(super) struct ViewWork<'a> {
     pub(super) bucket: &'a Bucket,
     pub(super) prepared: &'a Prepared,

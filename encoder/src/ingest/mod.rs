@@ -64,7 +64,6 @@ impl RotatedPhotos {
         }
     }
 
-    /// Returns what [`Self::warn`] says.
     pub fn line(&self) -> Option<String> {
         let rotated = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let (n, first) = &*rotated;

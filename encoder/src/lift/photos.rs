@@ -72,7 +72,6 @@ pub(crate) fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec
     Ok(bytes)
 }
 
-/// Reads the outlines of a view of `n_masks` masks.
 pub(crate) fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<MaskOutline>, ContributionError> {
     let damaged = |source| ContributionError::Damaged { path: path.to_owned(), source };
     let bytes = AlignedBytes::read(path)?;

@@ -63,7 +63,6 @@ pub(crate) struct Superpoints {
 /// Short vectors that differ as embeddings do, of any common scale; zeros where unknown.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sketches<'a> {
-    /// Components.
     pub width: usize,
     /// `[N][width]`.
     pub values: &'a [i8],

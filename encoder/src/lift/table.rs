@@ -152,7 +152,6 @@ impl RegionTable {
         self.all_masks_of(region).iter().all(|mask| level(mask) == Mask::FILLER)
     }
 
-    /// Returns the masks of a region, and the weight of each.
     #[inline(always)]
     pub fn masks_of(&self, region: usize) -> impl Iterator<Item = (u32, f32)> + '_ {
         let listed = self.listed(region);

@@ -3,10 +3,7 @@
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-use super::mask::Mask;
-
-/// Label of a pixel outside all masks, in [`RegionMap::region_of_pixel`] and in label images.
-pub const NO_REGION: u32 = u32::MAX;
+use super::mask::{Mask, NO_REGION};
 
 /// The partition of a view by its masks: the pixels of a region lie in the same masks.
 #[derive(Clone, Debug, PartialEq)]
@@ -67,42 +64,63 @@ pub fn partition(
         }
     }
 
-    let mut size_of_class = vec![class_of_pixel.iter().filter(|class| **class == UNCOVERED).count()];
-    let (mut inside_of_class, mut split_of_class) = (vec![0_usize], vec![INVALID]);
-    let mut pixels = Vec::new();
-    let mut touched = Vec::new();
+    let mut classes = Classes::of(class_of_pixel);
     for mask in masks {
-        pixels.clear();
-        touched.clear();
-        for_each_pixel(mask, &columns, &rows, |pixel| {
-            let class = class_of_pixel[pixel];
+        classes.refine(mask, &columns, &rows);
+    }
+    number_regions(classes.of_pixel, classes.sizes.len(), masks, &columns, &rows)
+}
+
+/// Pixels by the masks so far in which they lie.
+struct Classes {
+    of_pixel: Vec<u32>,
+    sizes: Vec<usize>,
+    /// Of each class, its pixels within the mask at hand, and the class that they get. Between masks: 0.
+    n_inside: Vec<usize>,
+    split: Vec<u32>,
+    /// Pixels and classes of the mask at hand.
+    pixels: Vec<usize>,
+    touched: Vec<u32>,
+}
+
+impl Classes {
+    fn of(of_pixel: Vec<u32>) -> Self {
+        let sizes = vec![of_pixel.iter().filter(|class| **class == UNCOVERED).count()];
+        let (pixels, touched) = (Vec::new(), Vec::new());
+        Self { of_pixel, sizes, n_inside: vec![0], split: vec![INVALID], pixels, touched }
+    }
+
+    /// Splits the classes that lie in the mask in part.
+    fn refine(&mut self, mask: &Mask, columns: &[u32], rows: &[u32]) {
+        self.pixels.clear();
+        for_each_pixel(mask, columns, rows, |pixel| {
+            let class = self.of_pixel[pixel];
             if class != INVALID {
-                if inside_of_class[class as usize] == 0 {
-                    touched.push(class);
+                if self.n_inside[class as usize] == 0 {
+                    self.touched.push(class);
                 }
-                inside_of_class[class as usize] += 1;
-                pixels.push(pixel);
+                self.n_inside[class as usize] += 1;
+                self.pixels.push(pixel);
             }
         });
-        for class in touched.drain(..) {
+        for class in self.touched.drain(..) {
             let at = class as usize;
-            let inside = std::mem::take(&mut inside_of_class[at]);
+            let inside = std::mem::take(&mut self.n_inside[at]);
             // A class that lies in the mask entirely keeps its number, so there are never more classes than
             // pixels. The uncovered class is the exception: its number is reserved.
-            split_of_class[at] = class;
-            if class == UNCOVERED || inside < size_of_class[at] {
-                split_of_class[at] = size_of_class.len() as u32;
-                size_of_class[at] -= inside;
-                size_of_class.push(inside);
-                inside_of_class.push(0);
-                split_of_class.push(INVALID);
+            self.split[at] = class;
+            if class == UNCOVERED || inside < self.sizes[at] {
+                self.split[at] = self.sizes.len() as u32;
+                self.sizes[at] -= inside;
+                self.sizes.push(inside);
+                self.n_inside.push(0);
+                self.split.push(INVALID);
             }
         }
-        for pixel in &pixels {
-            class_of_pixel[*pixel] = split_of_class[class_of_pixel[*pixel] as usize];
+        for pixel in &self.pixels {
+            self.of_pixel[*pixel] = self.split[self.of_pixel[*pixel] as usize];
         }
     }
-    number_regions(class_of_pixel, size_of_class.len(), masks, &columns, &rows)
 }
 
 /// Merges slivers, which ragged edges of overlapping masks leave, into their neighbours.

@@ -103,7 +103,6 @@ impl NodeView {
     }
 }
 
-/// Returns what views show of a superpoint.
 fn views_of(sightings: &Sightings, superpoint: usize, sizes: Sizes<'_>) -> NodeViews {
     let of_view = |of_view: ViewSighting<'_>| {
         let mut view = NodeView::of(&of_view);
@@ -166,7 +165,6 @@ pub(super) fn objects(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> V
     node_of.into_iter().map(|node| node.map(&mut number)).collect()
 }
 
-/// Returns the worth of each node.
 fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
     let Sizes { of_superpoints, min_gaussians, .. } = sizes;
     let alone = |superpoint: usize| {

@@ -11,7 +11,7 @@ use super::choice::{self, Sizes};
 use super::object::{NONE, Object, ObjectsReport, SceneObjects};
 use super::sightings::Sightings;
 use super::tree::Tree;
-use super::{affinity, near, vectors};
+use super::{near, object, tree};
 use crate::codebook::ScoreMetricContext;
 use crate::lift::photos::MaskOutline;
 use crate::lift::refine::PendingRefinement;
@@ -46,7 +46,7 @@ pub(super) fn find_among(
         None => Cow::Owned(Superpoints::new(scene.gaussians, scene.standing, &SuperpointSettings::default())),
     };
     let sightings = Sightings::gather(scene, table, &superpoints)?;
-    let pairs = affinity::of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
+    let pairs = tree::evidence_of_pairs(&sightings, &near::pairs(scene.gaussians, &superpoints));
     scene.check_cancelled()?;
     let tree = Tree::new(superpoints.n, &pairs);
     drop(pairs);
@@ -75,7 +75,7 @@ pub(super) fn find_among(
     let object_of: Vec<Vec<u32>> =
         cells.map(|cell| cell.gaussians.iter().map(of_gaussian).collect()).collect();
     let objects = describe(scene, table, &object_of, &masks);
-    let calibration = vectors::calibrate(&objects, score_context, table.dim());
+    let calibration = object::calibrate(&objects, score_context, table.dim());
     let report = ObjectsReport {
         n_objects: objects.len(),
         n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),
@@ -171,7 +171,7 @@ fn describe(
             n_masks: of_object.len() as u32,
             position_in_world,
             box_in_world,
-            vectors: vectors::choose(of_object, &masks.weights, table),
+            vectors: object::choose_vectors(of_object, &masks.weights, table),
             photo: photo.name.clone(),
             photo_box_px: photo.outlines[mask as usize].box_px,
         }

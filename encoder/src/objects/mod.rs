@@ -16,7 +16,6 @@
 //!
 //! The contributions are needed once, part by part; the result takes four bytes a Gaussian.
 
-mod affinity;
 mod choice;
 mod find;
 mod near;
@@ -24,7 +23,6 @@ mod object;
 pub(crate) mod shards;
 mod sightings;
 mod tree;
-mod vectors;
 
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
 use crate::memory::{MemoryPlan, Phase};

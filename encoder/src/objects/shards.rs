@@ -7,8 +7,7 @@ use slag_common::objects::{
 use slag_common::shard::Basis;
 use slag_math::cholesky::{SmallPivots, cholesky};
 
-use super::object::{NONE, SceneObjects};
-use super::vectors::MAX_MEDOIDS;
+use super::object::{MAX_MEDOIDS, NONE, Object, SceneObjects};
 
 /// Vectors of an object: the mean of its masks' and the medoids.
 const N_VECTORS: usize = 1 + MAX_MEDOIDS;
@@ -144,31 +143,7 @@ impl CellObjects {
         let mut number_of = vec![NO_OBJECT; n_here.len()];
         for (number, object) in here.into_iter().enumerate() {
             number_of[object] = number as u16;
-            let n_here = n_here[object];
-            let object = &scene.objects[object];
-            let name = plain(&object.photo);
-            // Many objects share the photo that shows them best.
-            let photo_start = cell.photos.find(&name).unwrap_or_else(|| {
-                cell.photos.push_str(&name);
-                cell.photos.len() - name.len()
-            });
-            cell.records.push(ObjectRecord {
-                id: object.id,
-                position_in_world: object.position_in_world.to_array(),
-                box_min: object.box_in_world.min.to_array(),
-                box_max: object.box_in_world.max.to_array(),
-                n_gaussians: object.n_gaussians,
-                n_gaussians_here: n_here,
-                photo_box_px: object.photo_box_px,
-                photo_start: photo_start as u32,
-                photo_bytes: name.len() as u32,
-            });
-            let (components, steps) =
-                quantise_vectors(&basis.components(&object.vectors), basis.m(), N_VECTORS);
-            let error = basis.largest_error(&object.vectors, &components, &steps);
-            cell.header.score_error_bound = cell.header.score_error_bound.max(error);
-            cell.vectors.extend(components);
-            cell.steps.extend(steps);
+            cell.add(&scene.objects[object], n_here[object], basis);
         }
         (cell.run_ends, cell.run_objects) =
             collect_runs(locals.iter().map(|local| match object_of[*local as usize] {
@@ -180,7 +155,32 @@ impl CellObjects {
         cell
     }
 
-    /// Returns the columns.
+    /// Adds an object with `n_gaussians_here` Gaussians in the cell.
+    fn add(&mut self, object: &Object, n_gaussians_here: u32, basis: &CentroidBasis<'_>) {
+        let name = plain(&object.photo);
+        // Many objects share the photo that shows them best.
+        let photo_start = self.photos.find(&name).unwrap_or_else(|| {
+            self.photos.push_str(&name);
+            self.photos.len() - name.len()
+        });
+        self.records.push(ObjectRecord {
+            id: object.id,
+            position_in_world: object.position_in_world.to_array(),
+            box_min: object.box_in_world.min.to_array(),
+            box_max: object.box_in_world.max.to_array(),
+            n_gaussians: object.n_gaussians,
+            n_gaussians_here,
+            photo_box_px: object.photo_box_px,
+            photo_start: photo_start as u32,
+            photo_bytes: name.len() as u32,
+        });
+        let (components, steps) = quantise_vectors(&basis.components(&object.vectors), basis.m(), N_VECTORS);
+        let error = basis.largest_error(&object.vectors, &components, &steps);
+        self.header.score_error_bound = self.header.score_error_bound.max(error);
+        self.vectors.extend(components);
+        self.steps.extend(steps);
+    }
+
     pub fn view(&self) -> Objects<'_> {
         Objects {
             header: self.header,

@@ -7,9 +7,9 @@ use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 use slag_math::random::Random;
 
-use super::affinity::Evidence;
 use super::find::find_among;
 use super::shards::{CellObjects, CentroidBasis};
+use super::tree::Evidence;
 use super::*;
 use crate::cells::{CellLimits, CellSplit, split};
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
@@ -39,7 +39,7 @@ fn world() -> World {
     let n = 3 * PER_THING;
     let means =
         (0..n).map(|i| DVec3::new(f64::from(i / PER_THING) * 10.0, f64::from(i % PER_THING) * 0.1, 0.0));
-    let gaussians = gaussians_at(means.collect());
+    let gaussians = Gaussians::balls(means.collect(), 0.1);
     // Cells of at most 70: the things are cut.
     let split = split(&gaussians, CellLimits::by_count(70));
     let mut random = Random::new(3);
@@ -70,19 +70,6 @@ fn world() -> World {
     World::new(gaussians, split, &views)
 }
 
-fn gaussians_at(means_in_world: Vec<DVec3>) -> Gaussians {
-    let n = means_in_world.len();
-    Gaussians {
-        means_in_world,
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        scales: vec![[0.1; 3]; n],
-        opacities: vec![0.5; n],
-        sh_dc: vec![[0.0; 3]; n],
-        ..Gaussians::default()
-    }
-}
-
-/// Returns the vector of an axis.
 fn axis(of: usize) -> impl Iterator<Item = f32> {
     (0..DIM).map(move |c| f32::from(u8::from(c == of % DIM)))
 }
@@ -212,7 +199,7 @@ fn a_search_can_be_cancelled() {
 #[test]
 fn a_mask_is_of_one_object_at_most() {
     let (n, per_superpoint) = (1500u32, 10u32);
-    let gaussians = gaussians_at((0..n).map(|i| DVec3::new(f64::from(i), 0.0, 0.0)).collect());
+    let gaussians = Gaussians::balls((0..n).map(|i| DVec3::new(f64::from(i), 0.0, 0.0)).collect(), 0.1);
     let split = split(&gaussians, CellLimits::by_count(2000));
     let seen = (0..n).filter(|i| *i < per_superpoint || *i >= n - per_superpoint);
     let local = |i: u32| split.local_of_gaussian[i as usize];

@@ -6,7 +6,7 @@ use slag_math::simd::InstructionSet;
 use slag_raster::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
 use slag_raster::{Buckets, Lanes, ScreenGaussian, TileRect, Tiles, WeightSink, concat, walk_tile};
 
-use super::weights::{RegionWeight, WeightKind};
+use super::rasterizer::{RegionWeight, WeightKind};
 use crate::masks::{NO_REGION, RegionMap};
 
 /// Units of a fixed-point weight per pixel.
@@ -223,7 +223,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     use glam::DVec2;
-    use slag_common::{Distortion, Intrinsics};
+    use slag_common::pinhole;
     use slag_raster::{bin, draw};
 
     use super::*;
@@ -232,15 +232,7 @@ mod tests {
     const HEIGHT_PX: u32 = 18;
 
     fn scene(n: u32) -> (Vec<ScreenGaussian>, Tiles) {
-        let camera = Intrinsics {
-            width_px: WIDTH_PX,
-            height_px: HEIGHT_PX,
-            focal_x_px: 1.0,
-            focal_y_px: 1.0,
-            centre_x_px: 0.0,
-            centre_y_px: 0.0,
-            distortion: Distortion::None,
-        };
+        let camera = pinhole([WIDTH_PX, HEIGHT_PX], 1.0);
         let visible: Vec<ScreenGaussian> = (0..n)
             .map(|i| ScreenGaussian {
                 gaussian: i,

@@ -1,15 +1,12 @@
 //! The reference backend, on the CPU.
 
-use slag_common::Gaussians;
+use slag_common::{Gaussians, Intrinsics};
 use slag_math::simd::InstructionSet;
 use slag_raster::{Drawing, PreparedScene, RasterView, ViewCounters, bin, check_scene, check_view};
 
 use super::contributions::{merge, tile_contributions};
-use super::error::RasterError;
-use super::rasterizer::{LoadedScene, Rasterizer};
-use super::validate::check_regions;
-use super::weights::{ViewWeights, WeightKind};
-use crate::masks::RegionMap;
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer, ViewWeights, WeightKind};
+use crate::masks::{NO_REGION, RegionMap};
 use crate::memory::{MemoryPlan, Phase};
 
 /// Reserves what a loaded scene keeps besides its Gaussians.
@@ -59,5 +56,20 @@ impl LoadedScene for CpuScene<'_> {
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
         check_view(view)?;
         Ok(self.prepared.draw(self.instructions, view, background))
+    }
+}
+
+/// Checks that a region map has the size of the view and no region number out of range.
+pub(super) fn check_regions(regions: &RegionMap, intrinsics: &Intrinsics) -> Result<(), RasterError> {
+    let expected_px = [intrinsics.width_px, intrinsics.height_px];
+    let found_px = [regions.width_px, regions.height_px];
+    let found_values = regions.region_of_pixel.len();
+    if found_px != expected_px || found_values as u64 != u64::from(found_px[0]) * u64::from(found_px[1]) {
+        return Err(RasterError::RegionMapSize { expected_px, found_px, found_values });
+    }
+    let n_regions = regions.n_regions;
+    match regions.region_of_pixel.iter().position(|&r| r >= n_regions && r != NO_REGION) {
+        Some(pixel) => Err(RasterError::Region { pixel, found: regions.region_of_pixel[pixel], n_regions }),
+        None => Ok(()),
     }
 }

@@ -8,10 +8,8 @@ use slag_common::Gaussians;
 use slag_raster::{Drawing, RasterView};
 
 use super::cpu::CpuRasterizer;
-use super::error::RasterError;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
-use super::rasterizer::{GpuSlots, LoadedScene, Rasterizer};
-use super::weights::{ViewWeights, WeightKind};
+use super::rasterizer::{GpuSlots, LoadedScene, RasterError, Rasterizer, ViewWeights, WeightKind};
 use crate::lanes::Lanes;
 use crate::masks::RegionMap;
 

@@ -7,20 +7,15 @@ mod adapter;
 mod contributions;
 mod cpu;
 pub mod devices;
-mod error;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(not(feature = "gpu"))]
 #[path = "no_gpu.rs"]
 pub mod gpu;
 mod rasterizer;
-mod validate;
-mod weights;
 
 pub use cpu::CpuRasterizer;
 pub(crate) use cpu::reserve;
-pub use error::RasterError;
 pub(crate) use rasterizer::GpuSlots;
-pub use rasterizer::{LoadedScene, Rasterizer};
+pub use rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights, WeightKind};
 pub use slag_raster::{Drawing, InputError, RasterView, constants, pinhole};
-pub use weights::{RegionWeight, ViewWeights, WeightKind};

@@ -6,11 +6,9 @@ use slag_common::Gaussians;
 
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
-use super::error::RasterError;
-use super::rasterizer::{LoadedScene, Rasterizer};
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer};
 
 pub(crate) struct Adapter {
-    /// Its description.
     pub report: AdapterReport,
     none: Infallible,
 }
@@ -30,7 +28,6 @@ pub fn adapters() -> Vec<Adapter> {
 }
 
 impl Adapter {
-    /// Opens the device.
     pub fn open(&self, _: Precision) -> Result<Device, RasterError> {
         match self.none {}
     }

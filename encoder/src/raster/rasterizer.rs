@@ -1,10 +1,8 @@
 //! The interface of all backends.
 
 use slag_common::Gaussians;
-use slag_raster::{Drawing, RasterView};
+use slag_raster::{Drawing, InputError, RasterView, ViewCounters};
 
-use super::error::RasterError;
-use super::weights::{ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
 /// The GPUs that rasterise a scene.
@@ -75,4 +73,51 @@ pub trait LoadedScene: Send + Sync {
     fn gpus(&self) -> Option<GpuSlots> {
         None
     }
+}
+
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum RasterError {
+    #[error(transparent)]
+    Input(#[from] InputError),
+    #[error(
+        "the region map has {} x {} px ({found_values} values) but the view {} x {} px; \
+         rasterise at the resolution of the masks",
+        found_px[0], found_px[1], expected_px[0], expected_px[1]
+    )]
+    RegionMapSize { expected_px: [u32; 2], found_px: [u32; 2], found_values: usize },
+    #[error("{adapter}: {what}; use --device cpu to work without it")]
+    Device { adapter: String, what: String },
+    #[error("{adapter}: {what}; rasterise at a smaller width or use --device cpu")]
+    DeviceCapacity { adapter: String, what: String },
+    #[error(
+        "pixel {pixel} has region {found}, but the map has {n_regions} regions; create the region map again"
+    )]
+    Region { pixel: usize, found: u32, n_regions: u32 },
+}
+
+/// Quantity that is summed over the pixels of a region.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, clap::ValueEnum)]
+pub enum WeightKind {
+    /// `alpha * T`: the Gaussian's contribution to the picture, attenuated by the Gaussians in front of it.
+    Blend,
+    /// `exp(-d' S^-1 d / 2)`, as printed in the paper: without opacity and occlusion. The footprint still ends
+    /// where alpha falls below 1/255.
+    Falloff,
+}
+
+/// Contribution of a Gaussian to a region: its weight summed over the pixels.
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Zeroable)]
+pub struct RegionWeight {
+    /// Index of the Gaussian in the scene.
+    pub gaussian: u32,
+    pub region: u32,
+    /// Weight, pixels; above 0.
+    pub weight: f32,
+}
+
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ViewWeights {
+    /// Contributions above zero, ordered by (Gaussian, region); each pair occurs once.
+    pub entries: Vec<RegionWeight>,
+    pub counters: ViewCounters,
 }

@@ -1,17 +1,19 @@
 //! The report of an encode: one page with its views, masks, objects, cells, errors by profile, and what was left
 //! out and why.
 
-mod map;
 mod recorder;
 
+use std::fmt::Write as _;
+
 use glam::DVec3;
+use recorder::{Recorded, RecordedView};
 use serde_json::Value;
 
 use crate::encode::EncodeSummary;
-use crate::html::Page;
+use crate::html::{Page, escaped};
 use crate::progress::FoundObject;
+
 pub(crate) use recorder::Recorder;
-use recorder::{Recorded, RecordedView};
 
 /// Makes the page of an encode that was recorded.
 pub(crate) fn of_encode(
@@ -27,28 +29,14 @@ pub(crate) fn of_encode(
     let [found_objects, occupancy, bytes, busy] =
         ["objects", "occupancy", "shard_bytes", "busy_secs"].map(&mut take).map(Option::unwrap_or_default);
     let mut page = Page::new(&format!("{scene}, generation {}", summary.generation));
-    page.paragraph(&format!(
-        "{} Gaussians in {} cells, from {} masks of {} photos, in {:.1} s with {}.",
-        summary.n_gaussians,
-        summary.n_cells,
-        summary.n_masks,
-        summary.n_views,
-        summary.wall_secs,
-        summary.encoder
-    ));
-    if summary.n_views_drawn > 0 {
-        page.paragraph(&format!(
-            "{} of the views are drawings of the splat, no photos.",
-            summary.n_views_drawn
-        ));
-    }
+    opening(&mut page, summary);
     left_out(&mut page, summary, &skipped);
     if let Some(lost) = &summary.lost_views {
         page.heading("Kept views");
         page.paragraph(&lost.reason);
     }
     page.heading("Map");
-    page.drawing(&map::svg(&recorded), "Seen from above: cells, and the cameras by their number of masks");
+    page.drawing(&map_svg(&recorded), "Seen from above: cells, and the cameras by their number of masks");
     masks(&mut page, &recorded);
     objects(&mut page, summary, &recorded, &found_objects);
     if !occupancy.is_null() {
@@ -74,6 +62,24 @@ pub(crate) fn of_encode(
     page.heading("All else");
     page.value(&rest);
     Ok(page.finish())
+}
+
+fn opening(page: &mut Page, summary: &EncodeSummary) {
+    page.paragraph(&format!(
+        "{} Gaussians in {} cells, from {} masks of {} photos, in {:.1} s with {}.",
+        summary.n_gaussians,
+        summary.n_cells,
+        summary.n_masks,
+        summary.n_views,
+        summary.wall_secs,
+        summary.encoder
+    ));
+    if summary.n_views_drawn > 0 {
+        page.paragraph(&format!(
+            "{} of the views are drawings of the splat, no photos.",
+            summary.n_views_drawn
+        ));
+    }
 }
 
 fn left_out(page: &mut Page, summary: &EncodeSummary, skipped: &Value) {
@@ -138,4 +144,58 @@ fn profiles(summary: &EncodeSummary, bytes: &Value) -> Vec<Vec<String>> {
         vec![profile.clone(), bytes.to_string(), format!("{:.4}", sum / n.max(1.0)), format!("{worst:.4}")]
     };
     bytes.as_object().into_iter().flatten().map(row).collect()
+}
+
+const WIDTH: f64 = 640.0;
+const MARGIN: f64 = 12.0;
+
+/// Draws the map: x to the right, y up.
+fn map_svg(recorded: &Recorded) -> String {
+    let corners = recorded.cells.iter().flat_map(|cell| [cell.min, cell.max]);
+    let points: Vec<DVec3> =
+        corners.chain(recorded.views.iter().map(|view| view.position_in_world)).collect();
+    let low = points.iter().copied().reduce(DVec3::min).unwrap_or_default();
+    let size = (points.iter().copied().reduce(DVec3::max).unwrap_or_default() - low).max(DVec3::splat(1e-6));
+    let scale = (WIDTH - 2.0 * MARGIN) / size.x.max(size.y);
+    let height = size.y * scale + 2.0 * MARGIN;
+    let place = |point: DVec3| {
+        let at = (point - low) * scale;
+        [MARGIN + at.x, height - MARGIN - at.y]
+    };
+    let most = recorded.views.iter().filter_map(|view| view.n_masks).max().unwrap_or(1).max(1) as f64;
+    let mut out = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {height:.1}\" width=\"{WIDTH}\" role=\"img\" aria-label=\"Map\">"
+    );
+    for cell in &recorded.cells {
+        let ([x, bottom], [right, y]) = (place(cell.min), place(cell.max));
+        let _ = write!(
+            out,
+            "<rect x=\"{x:.1}\" y=\"{y:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"none\" stroke=\"#99a\"/>",
+            right - x,
+            bottom - y
+        );
+    }
+    for view in &recorded.views {
+        let [x, y] = place(view.position_in_world);
+        let (colour, said) = look(view, most);
+        let _ = write!(
+            out,
+            "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"{colour}\"><title>{}</title></circle>",
+            escaped(&format!("{}: {said}", view.name))
+        );
+    }
+    out.push_str("</svg>");
+    out
+}
+
+/// Returns the colour of a view, the darker the more masks it has, and what is said of it.
+fn look(view: &RecordedView, most: f64) -> (String, String) {
+    match (&view.reason, view.n_masks) {
+        (Some(reason), _) => ("#d33".into(), format!("left out, {reason}")),
+        (None, None) => ("#999".into(), "done by an earlier run or another machine".into()),
+        (None, Some(n)) => {
+            let lightness = 75.0 - 50.0 * n as f64 / most;
+            (format!("hsl(210 80% {lightness:.0}%)"), format!("{n} masks"))
+        }
+    }
 }

@@ -60,7 +60,6 @@ impl<'a> Recorder<'a> {
     }
 }
 
-/// Returns whether view `at` of `n` has a picture.
 fn has_picture(at: usize, n: usize) -> bool {
     at.is_multiple_of(n.div_ceil(N_PICTURES).max(1))
 }

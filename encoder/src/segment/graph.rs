@@ -20,8 +20,7 @@ use slag_models::session::SessionError;
 use image::{RgbImage, imageops};
 
 use super::colour::{distance, lab_of, smooth};
-use super::error::SegmentError;
-use super::segmenter::{SegmentInput, Segmenter};
+use super::segmenter::{SegmentError, SegmentInput, Segmenter};
 use super::support;
 use crate::masks::regions::nearest;
 use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};

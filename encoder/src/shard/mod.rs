@@ -1,7 +1,6 @@
 //! Stage 6: a cell's field becomes its shards.
 
-mod positions;
-
+use glam::DVec3;
 use half::f16;
 use rayon::prelude::*;
 use slag_common::appearance::AppearanceColumns;
@@ -10,9 +9,11 @@ use slag_common::landmarks::{BuiltLandmarks, Landmark, Landmarks};
 use slag_common::occupancy::Occupancy;
 use slag_common::photo_poses::{BuiltPhotoPoses, PhotoPoses};
 use slag_common::shard::{
-    Additions, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
+    Additions, ExactColumns, IndexColumn, PositionForm, Positions, Profile, Residuals, ScoreErrors,
+    ShardHeader, ShardView,
 };
 use slag_common::{Gaussians, View};
+use slag_math::matrix::Rows;
 
 use crate::cells::{Cell, CellSplit};
 use crate::codebook::measure::ScoreMoments;
@@ -20,13 +21,10 @@ use crate::codebook::{self, Codebook, CodebookResiduals, CodebookSettings, Score
 use crate::memory::{MemoryPlan, Phase};
 use crate::objects::SceneObjects;
 use crate::objects::shards::{CellObjects, CentroidBasis};
-use positions::QuantisedPositions;
-use slag_math::matrix::Rows;
 
 /// A cell's shard, with its entry in the manifest.
 pub struct BuiltShard {
     pub profile: Profile,
-    /// The file.
     pub bytes: Vec<u8>,
     /// Hard bound of a score's error.
     pub score_error_bound: f32,
@@ -138,7 +136,6 @@ impl ShardOrder<'_> {
 }
 
 impl ShardBuilder<'_> {
-    /// Builds a cell's shards.
     pub fn build(
         &self,
         cell_id: u32,
@@ -180,19 +177,12 @@ impl ShardBuilder<'_> {
             Profile::Compact => built(profile, &compact, additions),
             Profile::Balanced => built(profile, &balanced, additions),
             Profile::Exact => {
-                // Codes and fine residuals decide which embeddings readers look at.
-                let fine = codebook.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
-                let exact = ExactColumns {
+                let exact = Some(ExactColumns {
                     input_indices: &order.in_input(),
                     embeddings: &order.halves(embeddings),
-                    fine: fine.map(|fine| Fine {
-                        errors: fine.errors,
-                        steps: &fine.steps,
-                        scales: &fine.scales,
-                        values: &fine.values,
-                    }),
-                };
-                let exact = Some(exact);
+                    // Codes and fine residuals decide which embeddings readers look at.
+                    fine: codebook.fine(),
+                });
                 let view = ShardView { radii: compact.radii, exact, packed_indices: None, ..balanced };
                 built(profile, &view, additions)
             }
@@ -296,4 +286,60 @@ pub fn landmarks(split: &CellSplit, code_version: u32, all: &[Landmark]) -> Vec<
         }
     }
     of_cells.iter().map(|landmarks| BuiltLandmarks::pack(code_version, landmarks)).collect()
+}
+
+/// A cell's positions, on the cell's grid.
+struct QuantisedPositions {
+    /// Largest distance of a stored position from the mean, per axis: half a step, unless the doubles of readers
+    /// are coarser.
+    error: f64,
+    columns: Columns,
+}
+
+enum Columns {
+    Packed(Vec<u32>),
+    Wide(Vec<[u16; 3]>),
+    Full(Vec<[u32; 3]>),
+}
+
+impl QuantisedPositions {
+    /// Rounds the means of a cell's Gaussians, in the order of `locals`.
+    fn new(scene: &Gaussians, cell: &Cell, locals: &[u32]) -> Self {
+        let (step, bits) = (cell.grid.step, cell.grid.bits);
+        let largest: [f64; 3] = std::array::from_fn(|axis| ((1u64 << bits[axis]) - 1) as f64);
+        let origin = cell.mean_bounds.min;
+        let mut error = step.into_iter().fold(0.0, f64::max) / 2.0;
+        let steps = locals.iter().map(|local| {
+            let mean = scene.means_in_world[cell.gaussians[*local as usize] as usize];
+            let offset: DVec3 = mean - origin;
+            let steps: [u32; 3] = std::array::from_fn(|axis| match step[axis] > 0.0 {
+                true => (offset[axis] / step[axis]).round().clamp(0.0, largest[axis]) as u32,
+                false => 0,
+            });
+            let stored = origin + DVec3::from(steps.map(f64::from)) * DVec3::from(step);
+            error = (stored - mean).abs().max_element().max(error);
+            steps
+        });
+        let columns = match PositionForm::of(bits) {
+            PositionForm::Wide => Columns::Wide(steps.map(|at| at.map(|v| v as u16)).collect()),
+            PositionForm::Full => Columns::Full(steps.collect()),
+            PositionForm::Packed => {
+                let pack = |[x, y, z]: [u32; 3]| {
+                    let (y, z) = (u64::from(y) << bits[0], u64::from(z) << (bits[0] + bits[1]));
+                    (u64::from(x) | y | z) as u32
+                };
+                Columns::Packed(steps.map(pack).collect())
+            }
+        };
+        Self { error, columns }
+    }
+
+    /// Returns the columns to write.
+    fn view(&self) -> Positions<'_> {
+        match &self.columns {
+            Columns::Packed(words) => Positions::Packed(words),
+            Columns::Wide(steps) => Positions::Wide(steps),
+            Columns::Full(steps) => Positions::Full(steps),
+        }
+    }
 }

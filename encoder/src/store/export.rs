@@ -20,7 +20,6 @@ use super::reader::{Published, StoreReader};
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Exported {
-    /// Objects that were not there.
     pub(crate) n_files: usize,
     pub(crate) len_bytes: u64,
     /// Objects removed that neither generation needs.

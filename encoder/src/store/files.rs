@@ -1,14 +1,16 @@
 //! Files that survive a power cut: written beside, synced, renamed, the folder synced; and those of manifests.
 
 use std::io::{self, BufWriter, Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use fs_err::File;
+use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
-pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
 use slag_common::manifest::{self, ManifestError};
 
 use super::error::StoreError;
+
+pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
 
 /// Counts and hashes what passes on its way to a file.
 pub(super) struct HashingWriter {
@@ -78,4 +80,30 @@ pub(super) fn read_manifest_bytes(path: &Path) -> Result<Option<Vec<u8>>, StoreE
         return Err(StoreError::Manifest { path: path.to_owned(), cause });
     }
     Ok(Some(bytes))
+}
+
+const FILE: &str = "models.json";
+
+/// The models of the last encode into a store.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct ModelsRecord {
+    /// The encoder's id, as the manifest has it.
+    pub(crate) encoder: Hash32,
+    /// Name or folder of the models; `None` for the embedded ones.
+    pub(crate) models: Option<PathBuf>,
+}
+
+impl ModelsRecord {
+    pub(super) fn path(dir: &Path) -> PathBuf {
+        dir.join(FILE)
+    }
+
+    /// Reads the record. An unreadable one counts as absent: the user can still name the models.
+    pub(super) fn read(dir: &Path) -> io::Result<Option<Self>> {
+        match fs_err::read(Self::path(dir)) {
+            Ok(bytes) => Ok(serde_json::from_slice(&bytes).ok()),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(e) => Err(e),
+        }
+    }
 }

@@ -31,7 +31,6 @@ mod files;
 pub(crate) mod metadata;
 #[cfg(test)]
 mod metadata_tests;
-mod models;
 mod reader;
 mod roles;
 #[cfg(test)]
@@ -42,7 +41,7 @@ mod writer;
 pub(crate) use catalogue::{CatalogueCopy, GenerationRecord};
 pub(crate) use error::StoreError;
 pub(crate) use export::{Exported, export};
-pub(crate) use models::ModelsRecord;
+pub(crate) use files::ModelsRecord;
 pub use reader::{Extras, StoreReader};
 pub(crate) use reader::{Published, Stamp, StoredShard};
 pub(crate) use verify::{Fault, Verified};

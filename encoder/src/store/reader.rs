@@ -13,7 +13,7 @@ use slag_common::shard::{ShardLayout, ShardView};
 
 use super::error::StoreError;
 use super::files;
-use super::models::ModelsRecord;
+use super::files::ModelsRecord;
 
 /// Objects by name that belong to a generation but are not sent to robots.
 pub type Extras = BTreeMap<String, Hash32>;
@@ -40,7 +40,6 @@ impl Published {
         Ok(Self { manifest, bytes, hash, extras })
     }
 
-    /// Returns the lengths of the shards, by hash.
     pub(crate) fn shard_lens(&self) -> BTreeMap<Hash32, u64> {
         let shards = self.manifest.cells.iter().flat_map(|cell| cell.shards.values());
         shards.map(|shard| (shard.hash, shard.len_bytes)).collect()

@@ -27,7 +27,6 @@ pub(super) fn root_folder(store: &Path) -> PathBuf {
     store.join("keys").join("root")
 }
 
-/// Reads a role's key.
 pub(super) fn read(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
     Ok(SigningKey::from_bytes(&read_hex_key(&key_path(store, role))?.0))
 }

@@ -12,9 +12,8 @@ use slag_common::manifest::{Manifest, TextModelRecord};
 
 use super::catalogue::Catalogue;
 use super::error::StoreError;
-use super::files::{self, Access, HashingWriter};
+use super::files::{self, Access, HashingWriter, ModelsRecord};
 use super::metadata::Metadata;
-use super::models::ModelsRecord;
 use super::reader::{self, Extras, Published, StoreReader};
 
 /// Time to wait for the lock: sled releases the lock of a writer that has just ended on a thread of its own.

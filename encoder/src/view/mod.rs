@@ -7,13 +7,11 @@
 mod answers;
 mod error;
 mod generation;
-mod photos;
 mod routes;
 mod shards;
 mod splat;
 mod viewer;
 
-pub(crate) use photos::up_of;
 pub(crate) use routes::router;
 pub(crate) use splat::Splat;
-pub(crate) use viewer::{OpenText, Viewed, Viewer};
+pub(crate) use viewer::{OpenText, Viewed, Viewer, up_of};

@@ -117,7 +117,6 @@ pub fn plan(
     })
 }
 
-/// Looks at the candidates of a kind.
 fn look_at_all(
     space: &Space,
     rasterizer: &dyn Rasterizer,

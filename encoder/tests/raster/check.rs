@@ -412,12 +412,9 @@ fn black_is_no_explanation() {
     let mut view = tiny_view();
     view.image.put_pixel(1, 2, image::Rgb([255; 3]));
     let before_the_camera = Gaussians {
-        means_in_world: vec![DVec3::new(0.0, 0.0, 2.0)],
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
-        scales: vec![[5.0; 3]],
         opacities: vec![0.99],
         sh_dc: vec![[1.77; 3]],
-        ..Gaussians::default()
+        ..Gaussians::balls(vec![DVec3::new(0.0, 0.0, 2.0)], 5.0)
     };
     let report = check(&before_the_camera, [Ok(view)], &CpuRasterizer, &CheckOptions::default()).unwrap();
     let diagnosis = report.diagnosis.expect("white is not black");

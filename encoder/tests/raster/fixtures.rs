@@ -2,18 +2,17 @@
 
 use glam::{DAffine3, DMat3, DVec3};
 use npyz::{Deserialize, NpyFile};
-use slag_common::npz;
-use slag_common::{Distortion, Gaussians, Intrinsics};
+use slag_common::{Distortion, Gaussians, Intrinsics, npy};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
 pub use slag_test_support::{needs_shared, shared};
 
 /// An open archive of arrays.
-pub struct Npz(npz::Npz);
+pub struct Npz(npy::Npz);
 
 impl Npz {
     pub fn open(path: &str) -> Self {
-        Self(npz::Npz::open(&shared(path)).unwrap())
+        Self(npy::Npz::open(&shared(path)).unwrap())
     }
 
     pub fn array<T: Deserialize>(&mut self, name: &str) -> Vec<T> {

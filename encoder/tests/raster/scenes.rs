@@ -1,7 +1,7 @@
 //! Generated scenes, views and region maps.
 
 use glam::{DAffine3, DQuat, DVec3};
-use slag_common::{Distortion, Gaussians, Intrinsics};
+use slag_common::{Gaussians, Intrinsics, pinhole};
 use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::RasterView;
 use slag_math::random::Random;
@@ -39,13 +39,10 @@ pub fn random_view(random: &mut Random, width_px: u32, height_px: u32) -> Raster
     RasterView {
         camera_from_world: world_from_camera.inverse(),
         intrinsics: Intrinsics {
-            width_px,
-            height_px,
-            focal_x_px: focal,
             focal_y_px: focal * random.between(0.9, 1.1),
             centre_x_px: f64::from(width_px) * random.between(0.4, 0.6),
             centre_y_px: f64::from(height_px) * random.between(0.4, 0.6),
-            distortion: Distortion::None,
+            ..pinhole([width_px, height_px], focal)
         },
     }
 }

@@ -5,10 +5,9 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use slag_common::durable;
 
-use super::download::client;
+use super::download::{HubOptions, client};
 use super::error::HubError;
 use super::lock::Lock;
-use super::options::HubOptions;
 use super::pull::{Pull, PulledFile, Side};
 use super::table::{Entry, Table};
 use crate::described::Described;
@@ -22,7 +21,6 @@ pub enum Here {
     /// Nothing usable.
     No,
     Text,
-    /// All files.
     All,
 }
 

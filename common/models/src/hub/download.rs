@@ -7,7 +7,6 @@ use std::time::Duration;
 use ureq::http::{HeaderName, Method, Response, StatusCode};
 use ureq::tls::TlsConfig;
 
-use super::options::HubOptions;
 use crate::description::Sha256;
 use crate::download::{
     Client, DownloadError, DownloadFailure, Expected, NetworkLimits, Part, Watch, header_text, refusal,
@@ -20,6 +19,28 @@ const MAX_REDIRECTS: usize = 5;
 /// Limit on consecutive attempts without progress.
 const MAX_ATTEMPTS: u32 = 5;
 
+/// Options of reaching the hub and keeping its models.
+#[derive(Clone, Debug)]
+pub struct HubOptions {
+    /// Folder of the models, see [`models_folder`](super::models_folder).
+    pub root: PathBuf,
+    /// Address of the hub; default: the table's.
+    pub hub: Option<String>,
+    /// Proxy, in the format of `HTTPS_PROXY`.
+    pub proxy: Option<String>,
+    /// Timeout of connections and reads.
+    pub timeout: Duration,
+    /// Wait before the second attempt; doubled before each further one.
+    pub first_backoff: Duration,
+}
+
+impl HubOptions {
+    pub fn new(root: PathBuf) -> Self {
+        let (timeout, first_backoff) = (Duration::from_secs(30), Duration::from_millis(500));
+        Self { root, hub: None, proxy: None, timeout, first_backoff }
+    }
+}
+
 struct Log;
 
 impl Watch for Log {
@@ -31,7 +52,6 @@ impl Watch for Log {
 /// The hub's metadata of a file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Advertised {
-    /// The commit.
     pub revision: Option<String>,
     /// Its SHA-256: the hub's ETag of a file kept in large-file storage.
     pub sha256: Option<Sha256>,

@@ -1,9 +1,10 @@
 //! Errors of pulling models.
 
-use std::io;
 use std::path::PathBuf;
+use std::{fmt, io};
 
-use super::source::Source;
+use serde::{Deserialize, Serialize};
+
 use crate::description::{DescriptionError, Sha256};
 use crate::download::{DownloadError, DownloadFailure};
 use crate::error::ModelError;
@@ -75,5 +76,30 @@ impl std::fmt::Display for Wanted {
         let Self { url, path, sha256 } = self;
         let hash = sha256.map_or("unknown".to_owned(), |sha256| sha256.to_string());
         write!(f, "{url} as {} (SHA-256 {hash})", path.display())
+    }
+}
+
+/// The source of an expected hash.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Source {
+    /// The program's table of models.
+    Table,
+    /// The hub, which advertises it.
+    Hub,
+    /// None: it is the hash of the first download.
+    FirstPull,
+    /// None: it is the hash of a file placed by hand.
+    PlacedByHand,
+}
+
+impl fmt::Display for Source {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Table => "known to this program",
+            Self::Hub => "advertised by the hub",
+            Self::FirstPull => "as pulled first, see models.lock",
+            Self::PlacedByHand => "as placed by hand, see models.lock",
+        })
     }
 }

@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::error::HubError;
-use super::source::Source;
+use super::error::{HubError, Source};
 use crate::description::Sha256;
 
 /// The entries of all models.
@@ -22,7 +21,6 @@ pub struct Lock {
 #[serde(deny_unknown_fields)]
 pub struct Accepted {
     pub licence: String,
-    /// The commit.
     pub revision: Option<String>,
     pub files: BTreeMap<String, LockedFile>,
 }

@@ -5,11 +5,9 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use slag_common::durable;
 
-use super::download::{Advertised, PartialFile, ask};
-use super::error::{HubError, Wanted};
+use super::download::{Advertised, HubOptions, PartialFile, ask};
+use super::error::{HubError, Source, Wanted};
 use super::lock::{Lock, LockedFile};
-use super::options::HubOptions;
-use super::source::Source;
 use super::table::{Entry, Table};
 use crate::description::Sha256;
 use crate::download::{Client, DownloadError, Part};
@@ -19,7 +17,6 @@ use crate::model_dir::hash_file;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
     Text,
-    /// All files.
     Both,
 }
 
@@ -170,4 +167,17 @@ impl Pull<'_> {
             }
         }
     }
+}
+
+/// Returns the folder of the user's caches: `$XDG_CACHE_HOME/slag`, else `~/.cache/slag`; `variable` looks up
+/// environment variables.
+pub fn cache_folder(variable: impl Fn(&str) -> Option<std::ffi::OsString>) -> Option<PathBuf> {
+    // The XDG base directory specification ignores relative paths.
+    let absolute = |name: &str| variable(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let base = absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
+    Some(base.join("slag"))
+}
+
+pub fn models_folder(cache_folder: &Path) -> PathBuf {
+    cache_folder.join("models")
 }

@@ -100,7 +100,6 @@ impl Table {
         toml::from_str(include_str!("../../models.toml")).map_err(Box::new)
     }
 
-    /// Returns the entry called `name`.
     pub fn find(&self, name: &str) -> Option<&Entry> {
         self.models.iter().find(|entry| entry.name == name)
     }

@@ -78,7 +78,6 @@ fn imagenet_std() -> [f64; 3] {
 }
 
 impl SamDescription {
-    /// Reads and checks `path`.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
         let description: Self = read_toml(path)?;
         check_common(path, &description.name, &description.files_root, &description.files())?;

@@ -23,26 +23,24 @@
 //! 2's decoder takes one prompt a call and tells whether there is an object at all (`object_score_logits`).
 
 mod description;
-mod letterbox;
 mod names;
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 use image::RgbImage;
+use names::Names;
 use ort::value::DynTensor;
 
 use crate::bound::Place;
 use crate::description::FILE_NAME;
-use crate::device_memory::DeviceMemory;
 use crate::model_dir::{checked, sha256_of};
+use crate::placement::DeviceMemory;
 use crate::preprocess::{Filter, Window, resample, values_of_levels};
 use crate::session::{Model, SessionError, SessionOptions, Tensor};
 use crate::{Floats, ModelError};
-use names::Names;
 
 pub use description::{SamDescription, SamFiles, SegmentDescription};
-pub use letterbox::Letterbox;
 pub use names::MASKS_PER_PROMPT;
 
 /// An opened SAM. Each file runs one call at a time; the two files can run in parallel.
@@ -247,46 +245,7 @@ impl Sam {
         n_points: usize,
         (points, labels): (&[[f32; 2]], &[i64]),
     ) -> Result<Decoded, SessionError> {
-        let n = (points.len() / n_points.max(1)) as i64;
-        let n_points = n_points as i64;
-        let names = &self.names;
-        let n_masks = MASKS_PER_PROMPT as i64;
-        let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
-        let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
-        outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
-        let (points_shape, labels_shape) = (vec![1, n, n_points, 2], vec![1, n, n_points]);
-        let found = match &self.memory {
-            Some(memory) => {
-                let points = decoder.owned(points_shape, points.as_flattened().to_vec())?;
-                let labels = decoder.owned(labels_shape, labels.to_vec())?;
-                let boxes = decoder.owned::<f32>(vec![1, 0, 4], Vec::new())?;
-                let mut inputs = vec![(names.points.as_str(), &points), (names.labels.as_str(), &labels)];
-                inputs.extend(names.boxes.iter().map(|name| (name.as_str(), &boxes)));
-                inputs.extend(embedding.tensors.iter().filter_map(|(name, held)| match held {
-                    Held::Device(value) => Some((name.as_str(), value)),
-                    Held::Host(_) => None,
-                }));
-                let places: Vec<_> = outputs.iter().map(|(name, _)| (*name, Place::Host)).collect();
-                let found = decoder.run_bound(memory, &inputs, &places)?;
-                let floats = |(value, (name, shape)): (DynTensor, &(&str, &[i64]))| {
-                    decoder.floats(Some(value), name, shape)
-                };
-                found.into_iter().zip(&outputs).map(floats).collect::<Result<Vec<_>, _>>()?
-            }
-            None => {
-                let mut inputs = vec![
-                    (names.points.as_str(), decoder.tensor(points_shape, points.as_flattened())?),
-                    (names.labels.as_str(), decoder.tensor(labels_shape, labels)?),
-                ];
-                if let Some(boxes) = &names.boxes {
-                    inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
-                }
-                for (name, shape, values) in embedding.tensors() {
-                    inputs.push((name, decoder.tensor(shape.to_vec(), values)?));
-                }
-                decoder.run_all(inputs, &outputs)?
-            }
-        };
+        let found = self.run_decoder(decoder, embedding, n_points, (points, labels))?;
         let mut found = found.into_iter();
         let mut next = || found.next().unwrap_or_default();
         let (scores, masks, objects) = (next(), next(), next());
@@ -304,6 +263,56 @@ impl Sam {
             logits: masks.values,
             logits_px,
         })
+    }
+
+    /// Returns the decoder's scores, masks and, if it has them, logits of objects.
+    fn run_decoder(
+        &self,
+        decoder: &mut Model,
+        embedding: &Embedding,
+        n_points: usize,
+        (points, labels): (&[[f32; 2]], &[i64]),
+    ) -> Result<Vec<Tensor>, SessionError> {
+        let n = (points.len() / n_points.max(1)) as i64;
+        let n_points = n_points as i64;
+        let names = &self.names;
+        let n_masks = MASKS_PER_PROMPT as i64;
+        let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
+        let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
+        outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
+        let (points_shape, labels_shape) = (vec![1, n, n_points, 2], vec![1, n, n_points]);
+        match &self.memory {
+            Some(memory) => {
+                let points = decoder.owned(points_shape, points.as_flattened().to_vec())?;
+                let labels = decoder.owned(labels_shape, labels.to_vec())?;
+                let boxes = decoder.owned::<f32>(vec![1, 0, 4], Vec::new())?;
+                let mut inputs = vec![(names.points.as_str(), &points), (names.labels.as_str(), &labels)];
+                inputs.extend(names.boxes.iter().map(|name| (name.as_str(), &boxes)));
+                inputs.extend(embedding.tensors.iter().filter_map(|(name, held)| match held {
+                    Held::Device(value) => Some((name.as_str(), value)),
+                    Held::Host(_) => None,
+                }));
+                let places: Vec<_> = outputs.iter().map(|(name, _)| (*name, Place::Host)).collect();
+                let found = decoder.run_bound(memory, &inputs, &places)?;
+                let floats = |(value, (name, shape)): (DynTensor, &(&str, &[i64]))| {
+                    decoder.floats(Some(value), name, shape)
+                };
+                found.into_iter().zip(&outputs).map(floats).collect()
+            }
+            None => {
+                let mut inputs = vec![
+                    (names.points.as_str(), decoder.tensor(points_shape, points.as_flattened())?),
+                    (names.labels.as_str(), decoder.tensor(labels_shape, labels)?),
+                ];
+                if let Some(boxes) = &names.boxes {
+                    inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
+                }
+                for (name, shape, values) in embedding.tensors() {
+                    inputs.push((name, decoder.tensor(shape.to_vec(), values)?));
+                }
+                decoder.run_all(inputs, &outputs)
+            }
+        }
     }
 }
 
@@ -331,6 +340,43 @@ impl Decoded {
             }
         };
         self.logits_px = more.logits_px;
+    }
+}
+
+/// Placement of an image in the encoder's square: the longer edge fills it and the rest is padding at the right or
+/// the bottom (SAM), or the image is stretched over it (SAM 2).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Letterbox {
+    /// Edge length of the square, in pixels.
+    pub size_px: u32,
+    /// Width and height of the image, in pixels.
+    pub image_px: [u32; 2],
+    /// Width and height of the resized image, in pixels.
+    pub resized_px: [u32; 2],
+    /// Whether the image is stretched over the square; masks then go to the image's size in one step.
+    pub is_stretched: bool,
+}
+
+impl Letterbox {
+    /// Returns the placement of an image of `image_px` (width, height; neither 0) in a square of `size_px` that
+    /// keeps its proportions.
+    pub fn new(size_px: u32, image_px: [u32; 2]) -> Self {
+        let scale = f64::from(size_px) / f64::from(image_px[0].max(image_px[1]));
+        let resized_px = image_px.map(|edge| ((f64::from(edge) * scale + 0.5) as u32).max(1));
+        Self { size_px, image_px, resized_px, is_stretched: false }
+    }
+
+    /// Returns the placement of an image of `image_px` (width, height; neither 0) that is stretched over a square
+    /// of `size_px`.
+    pub fn stretched(size_px: u32, image_px: [u32; 2]) -> Self {
+        Self { size_px, image_px, resized_px: [size_px; 2], is_stretched: true }
+    }
+
+    /// Converts a point from pixels of the image to pixels of the square.
+    pub fn point(&self, point_px: [f64; 2]) -> [f32; 2] {
+        std::array::from_fn(|axis| {
+            (point_px[axis] * (f64::from(self.resized_px[axis]) / f64::from(self.image_px[axis]))) as f32
+        })
     }
 }
 

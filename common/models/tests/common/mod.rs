@@ -6,7 +6,7 @@ pub mod onnx;
 
 use std::path::{Path, PathBuf};
 
-use slag_common::npz::Npz;
+use slag_common::npy::Npz;
 use slag_models::SessionOptions;
 pub use slag_test_support::{needs_shared, shared, workspace_root};
 

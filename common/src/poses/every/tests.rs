@@ -3,22 +3,14 @@ use std::path::PathBuf;
 use glam::DAffine3;
 
 use super::*;
-use crate::camera::{Distortion, Intrinsics, View};
+use crate::camera::{View, pinhole};
 use crate::poses::PoseSource;
 
 fn set(names: &[&str], without_pose: &[&str]) -> ViewSet {
     let view = |name: &&str| View {
         name: (*name).to_owned(),
         image_path: PathBuf::from(name),
-        intrinsics: Intrinsics {
-            width_px: 8,
-            height_px: 6,
-            focal_x_px: 8.0,
-            focal_y_px: 8.0,
-            centre_x_px: 4.0,
-            centre_y_px: 3.0,
-            distortion: Distortion::None,
-        },
+        intrinsics: pinhole([8, 6], 8.0),
         camera_from_world: DAffine3::IDENTITY,
     };
     ViewSet {

@@ -206,7 +206,7 @@ async fn a_follower_that_panics_is_reported_and_begins_again() {
     assert!(metrics.contains(&format!("slag_edge_follower_restarts_total {restarts}\n")), "{metrics}");
 
     let cancelled = AtomicBool::new(true);
-    assert_eq!(keep_following(&following, restarts_of(60), &cancelled, || -> () { panic!("again") }), None);
+    assert_eq!(keep_following(&following, RESTARTS, &cancelled, || -> () { panic!("again") }), None);
     let environment = FollowEnvironment {
         fetch: &mut |_| Err(FetchError::Cancelled),
         report: &mut |_| (),
@@ -219,10 +219,6 @@ async fn a_follower_that_panics_is_reported_and_begins_again() {
     assert!(matches!(followed, Err(FetchError::Cancelled)), "a fetch has ended");
     assert_eq!(ask(&app, "GET", "/readyz", &[]).await.0, 200);
     assert_eq!(ask(&app, "POST", "/position", &json).await.0, 202);
-}
-
-fn restarts_of(seconds: u64) -> Backoff {
-    Backoff { first: Duration::from_secs(seconds), longest: Duration::from_secs(seconds) }
 }
 
 async fn service_of(app: &Arc<App>, uri: &str) -> Response {

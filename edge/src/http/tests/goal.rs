@@ -79,8 +79,7 @@ async fn poses_or_reasons_are_given() {
     // A robot beyond the known ground.
     let (_, _, away) = service.get("/v1/goal?text=0&near=20,3,0&step_m=0.15").await;
     assert_eq!(away["none"]["kind"], "unknown-ground", "{away:#}");
-    let (status, _, body) = service.get("/v1/goal?near=2,3,0").await;
-    assert_eq!((status, &body["parameter"]), (StatusCode::BAD_REQUEST, &json!("text")));
+    assert_refused(&service.get("/v1/goal?near=2,3,0").await, "text", "nothing");
 }
 
 /// By hand: 6 by 5 m of seen floor in cells of 0.1 m, the table and the floor's mug in it.

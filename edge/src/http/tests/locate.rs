@@ -4,15 +4,7 @@ use super::openapi::{check, description};
 use super::*;
 
 async fn post(service: &Service, query: &str, kind: &str, photo: Vec<u8>) -> (StatusCode, Value) {
-    let request = Request::builder()
-        .method("POST")
-        .uri(format!("/v1/locate?{query}"))
-        .header("content-type", kind)
-        .body(Body::from(photo))
-        .expect("a request");
-    let router = router(Arc::clone(&service.app));
-    let (status, headers, body) =
-        soon(async { read(router.oneshot(request).await.expect("infallible")).await }).await;
+    let (status, headers, body) = service.post(&format!("/v1/locate?{query}"), kind, photo).await;
     let api = description();
     let replies = &api["paths"]["/v1/locate"]["post"]["responses"][status.as_str()]["content"];
     let kind = headers["content-type"].to_str().expect("text");

@@ -195,11 +195,16 @@ async fn every_answer_is_as_described() {
         ("/query", "text=0&negatives=sofa"),
         ("/status", ""),
     ];
-    for (path, query) in cases {
-        let (status, headers, body) = service.get(&format!("{path}?{query}")).await;
+    let is_described = async |service: &Service, path: &str, query: &str| {
+        let uri = if path.contains('{') { path.replace("{id}", query) } else { format!("{path}?{query}") };
+        let (status, headers, body) = service.get(&uri).await;
         let kind = headers["content-type"].to_str().expect("text");
         let found = check(&response_schema(path, status, kind), &body, "");
-        assert_eq!(found, Ok(()), "{path}?{query}: {body:#}");
+        assert_eq!(found, Ok(()), "{uri}: {body:#}");
+        body
+    };
+    for (path, query) in cases {
+        is_described(&service, path, query).await;
     }
     // Objects come first where there are any.
     let object = TestObject { id: 5, vectors: vec![1.0, 0.0, 0.0], runs: vec![2..8, 8..14], n_gaussians: 40 };
@@ -208,9 +213,7 @@ async fn every_answer_is_as_described() {
     for (query, kind, n) in
         [("text=0", "objects", 1), ("text=1", "objects", 0), ("text=0&kind=clusters", "clusters", 1)]
     {
-        let (_, _, body) = service.get(&format!("/query?{query}&near=0,0,0")).await;
-        let schema = response_schema("/query", StatusCode::OK, "application/json");
-        assert_eq!(check(&schema, &body, ""), Ok(()), "{query}: {body:#}");
+        let body = is_described(&service, "/query", &format!("{query}&near=0,0,0")).await;
         assert_eq!(
             (&body["kind"], body["answers"].as_array().map(Vec::len)),
             (&json!(kind), Some(n)),
@@ -248,13 +251,7 @@ async fn every_answer_is_as_described() {
         ("/v1/objects/{id}", "5"),
     ];
     for (path, query) in cases {
-        let uri = if path.contains('{') { path.replace("{id}", query) } else { format!("{path}?{query}") };
-        let (status, headers, body) = service.get(&uri).await;
-        let kind = headers["content-type"].to_str().expect("text");
-        let found = check(&response_schema(path, status, kind), &body, "");
-        assert_eq!(found, Ok(()), "{uri}: {body:#}");
+        is_described(&service, path, query).await;
     }
-    let empty = Service::new(None, Settings::default());
-    let (_, _, body) = empty.get("/status").await;
-    assert_eq!(check(&response_schema("/status", StatusCode::OK, "application/json"), &body, ""), Ok(()));
+    is_described(&Service::new(None, Settings::default()), "/status", "").await;
 }

@@ -51,19 +51,8 @@ pub(super) fn room_with(places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
     [shard.with_objects_and_places(&objects, calibration, places)]
 }
 
-async fn post(service: &Service, body: &Value) -> (StatusCode, HeaderMap, Value) {
-    post_bytes(service, body.to_string()).await
-}
-
-async fn post_bytes(service: &Service, body: String) -> (StatusCode, HeaderMap, Value) {
-    let request = Request::builder()
-        .method("POST")
-        .uri("/v1/query")
-        .header("content-type", "application/json")
-        .body(Body::from(body))
-        .expect("a request");
-    let router = router(Arc::clone(&service.app));
-    soon(async { read(router.oneshot(request).await.expect("infallible")).await }).await
+async fn post(service: &Service, body: &Value) -> Answered {
+    service.post("/v1/query", "application/json", body.to_string()).await
 }
 
 fn ids(result: &Value) -> Vec<String> {
@@ -149,8 +138,7 @@ async fn areas_restrict_what_is_found() {
     let far = json!({"ball": {"centre": [50, 50, 0], "radius": 1.0}});
     let (_, _, body) = post(&service, &json!({"texts": ["0 on the 1"], "region": far})).await;
     assert_eq!(body["results"][0]["none"]["kind"], "not-in-region", "{body}");
-    let (status, _, body) = service.get("/v1/query?text=0&near_lat_lon=47,8&radius=5").await;
-    assert_eq!((status, &body["parameter"]), (StatusCode::BAD_REQUEST, &json!("region")), "{body}");
+    assert_refused(&service.get("/v1/query?text=0&near_lat_lon=47,8&radius=5").await, "region", "no origin");
 }
 
 #[tokio::test]
@@ -226,12 +214,7 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({"phrases": [{"thing": "0"}], "kind": "clusters"}), "kind"),
     ];
     for (body, parameter) in cases {
-        let (status, _, reply) = post(&service, &body).await;
-        assert_eq!(
-            (status, &reply["parameter"]),
-            (StatusCode::BAD_REQUEST, &json!(parameter)),
-            "{body}: {reply}"
-        );
+        assert_refused(&post(&service, &body).await, parameter, &body.to_string());
     }
     for (query, parameter) in [
         ("text=0&colour=1", "colour"),
@@ -240,12 +223,7 @@ async fn wrong_requests_are_refused_by_name() {
         ("text=0&relations=maybe", "relations"),
         ("text=0&polygon=1,2,3", "polygon"),
     ] {
-        let (status, _, reply) = service.get(&format!("/v1/query?{query}")).await;
-        assert_eq!(
-            (status, &reply["parameter"]),
-            (StatusCode::BAD_REQUEST, &json!(parameter)),
-            "{query}: {reply}"
-        );
+        assert_refused(&service.get(&format!("/v1/query?{query}")).await, parameter, query);
     }
     // A negative may have a comma.
     let (_, _, reply) = post(&service, &json!({"texts": ["0"], "negatives": ["1 red, 2 blue"]})).await;
@@ -272,17 +250,11 @@ async fn long_and_deep_questions_are_refused() {
         (deep(9_000), "body"),
     ];
     for (body, parameter) in bodies {
-        let (status, _, reply) = post_bytes(&service, body).await;
-        assert_eq!((status, &reply["parameter"]), (StatusCode::BAD_REQUEST, &json!(parameter)), "{reply}");
+        assert_refused(&service.post("/v1/query", "application/json", body).await, parameter, "");
     }
     let long = long.replace(' ', "+");
     for path in ["/query", "/v1/query", "/v1/goal", "/v1/changes", "/v1/view/scores"] {
-        let (status, _, reply) = service.get(&format!("{path}?text={long}")).await;
-        assert_eq!(
-            (status, &reply["parameter"]),
-            (StatusCode::BAD_REQUEST, &json!("text")),
-            "{path}: {reply}"
-        );
+        assert_refused(&service.get(&format!("{path}?text={long}")).await, "text", path);
     }
 }
 
@@ -308,12 +280,7 @@ async fn members_have_names() {
         phrase(json!({"thing": "0", "relation": {"is": "on", "of": ["1"]}})),
         json!([["0"]]),
     ] {
-        let (status, _, reply) = post(&service, &body).await;
-        assert_eq!(
-            (status, &reply["parameter"]),
-            (StatusCode::BAD_REQUEST, &json!("body")),
-            "{body}: {reply}"
-        );
+        assert_refused(&post(&service, &body).await, "body", &body.to_string());
     }
     let (status, _, reply) = post(&service, &near(json!([3, 3, 0]))).await;
     assert_eq!(status, StatusCode::OK, "{reply}");

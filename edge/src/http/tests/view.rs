@@ -8,7 +8,7 @@ use slag_common::appearance::AppearanceColumns;
 use slag_common::container::AlignedBytes;
 use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::{Additions, ShardLayout};
-use slag_common::{Distortion, Gaussians, Intrinsics, View};
+use slag_common::{Gaussians, View, pinhole};
 
 use super::*;
 
@@ -92,12 +92,9 @@ async fn every_gaussian_has_its_score_and_its_place() {
 async fn appearances_on_board_are_handed_on() {
     let [near, _] = two_cells();
     let scene = Gaussians {
-        means_in_world: vec![DVec3::ZERO; 25],
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 25],
         scales: (0..25).map(|i| [0.01 * (1 + i) as f32; 3]).collect(),
-        opacities: vec![0.5; 25],
         sh_dc: vec![[1.0, 0.0, -1.0]; 25],
-        ..Gaussians::default()
+        ..Gaussians::balls(vec![DVec3::ZERO; 25], 0.0)
     };
     let columns = AppearanceColumns::of(&scene, &(0..25).collect::<Vec<u32>>());
     let mut bytes = Vec::new();
@@ -182,15 +179,7 @@ async fn photo_poses_on_board_are_handed_on() {
     let view = View {
         name: "a.jpg".into(),
         image_path: PathBuf::new(),
-        intrinsics: Intrinsics {
-            width_px: 64,
-            height_px: 48,
-            focal_x_px: 50.0,
-            focal_y_px: 50.0,
-            centre_x_px: 32.0,
-            centre_y_px: 24.0,
-            distortion: Distortion::None,
-        },
+        intrinsics: pinhole([64, 48], 50.0),
         camera_from_world: DAffine3::from_translation(DVec3::new(-2.0, 0.0, 1.5)),
     };
     let mut photos = BuiltPhotoPoses::default();

@@ -73,7 +73,6 @@ pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> 
     Ok(As::new((headers, Body::new(Events(receiver)))))
 }
 
-/// What a client was told.
 #[derive(Default)]
 struct Told {
     /// The generation's manifest; the inner one is absent without a scene.

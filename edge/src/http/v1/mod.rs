@@ -4,22 +4,26 @@ mod changes;
 mod events;
 mod goal;
 mod locate;
-mod map;
 mod objects;
 mod view;
 
 use std::sync::Arc;
 
+use axum::Json;
+use axum::extract::State;
+use slag_api::map::MapStatus;
+use slag_service::problem::Problem;
 use slag_service::routes::{Parameter, Routes};
 
-use super::app::App;
 use super::forms::ObjectIdText;
 use super::problem::{BUDGET, NO_PLACES, SCENE, TEXTS, TIME_BUDGET};
 use super::query;
+use crate::fetch::accepted;
+use crate::http::app::App;
+use crate::http::problem::query_problem;
 use crate::locate::MAX_PHOTO_BYTES;
-use crate::query::Ask;
+use crate::query::{Ask, map_status};
 
-/// Adds the routes.
 pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
     let to = view_routes(to)
         .get(
@@ -47,7 +51,7 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .parameters([Parameter::of_path::<ObjectIdText>("id", "o and 16 hex digits")])
         .errors(&SCENE)
         .errors(&[(404, "No such thing is on board."), BUDGET])
-        .get("/v1/map", "the area on board, its age, and what is missing", map::map)
+        .get("/v1/map", "the area on board, its age, and what is missing", map)
         .errors(&SCENE)
         .get("/v1/changes", "things that appeared, went or moved between two generations", changes::changes)
         .errors(&SCENE)
@@ -110,4 +114,15 @@ fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         (404, "The cell is not on board, or another generation is."),
         BUDGET,
     ])
+}
+
+/// Answers with what is on board, how old it is, and what is missing.
+async fn map(State(app): State<Arc<App>>) -> Result<Json<MapStatus>, Problem> {
+    app.blocking(|app| {
+        app.reload_if_stale();
+        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        let expires_unix_secs = accepted(app.engine.cache()).and_then(|accepted| accepted.expires_unix_secs);
+        Ok(Json(map_status(&snapshot, crate::now_unix_secs(), expires_unix_secs)))
+    })
+    .await
 }

@@ -72,7 +72,6 @@ fn default_page() -> usize {
 }
 
 impl ListParams {
-    /// Returns the area asked for.
     fn area(&mut self) -> Result<Area, RequestError> {
         let near = forms::point(self.near.take(), self.near_lat_lon.take())?;
         let ball = forms::ball(near, self.radius)?;

@@ -65,7 +65,6 @@ impl<'a> Things<'a> {
         Self { of: of.collect() }
     }
 
-    /// Returns what was found for each thing.
     pub fn found(&self) -> Vec<Found> {
         self.of.iter().map(|(found, _)| found.clone()).collect()
     }

@@ -73,7 +73,6 @@ pub enum Relation {
 slag_common::named_members!(Phrase, Place, Pick; Serialize);
 
 impl Relation {
-    /// Every relation.
     pub const ALL: [Self; 11] = [
         Self::On,
         Self::Under,
@@ -167,7 +166,6 @@ impl Phrase {
         Self { thing: thing.into(), pick: None, relation: None }
     }
 
-    /// Returns whether it stands for the asker.
     pub(crate) fn is_asker(&self) -> bool {
         ASKER.contains(&self.thing.as_str())
     }

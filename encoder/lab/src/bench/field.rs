@@ -48,7 +48,7 @@ pub(super) fn publish(
     progress.begin("cells", "cell", field.n_cells() as u64, 0);
     for cell_id in 0..field.n_cells() {
         let corner = DVec3::new((cell_id % per_side) as f64, (cell_id / per_side) as f64, 0.0) * CELL_PITCH_M;
-        let scene = grey_gaussians((0..n as u64).map(|k| corner + place_in_cube(k)).collect());
+        let scene = Gaussians::balls((0..n as u64).map(|k| corner + place_in_cube(k)).collect(), 0.05);
         let cell = &split(&scene, limits).cells[0];
         let vectors = field.embeddings(cell_id);
         let in_order = cell.gaussians.iter().flat_map(|k| &vectors[*k as usize * dim..][..dim]);
@@ -75,10 +75,15 @@ pub(super) fn publish(
         progress.advance(1);
     }
     progress.end();
-    let manifest = Manifest {
+    store.publish(&manifest(store.next_generation()?, id, dim, cells), &Extras::new())?;
+    Ok(store.prune().map(|_| ())?)
+}
+
+fn manifest(generation: u64, id: Hash32, dim: usize, cells: Vec<CellRecord>) -> Manifest {
+    Manifest {
         version: manifest::VERSION,
         scene: "generated-field".into(),
-        generation: store.next_generation()?,
+        generation,
         created_unix_secs: 0,
         metric: true,
         geo_reference: None,
@@ -90,24 +95,9 @@ pub(super) fn publish(
             calibration: None,
             text_model: None,
         },
-        n_gaussians: (n * cells.len()) as u64,
+        n_gaussians: cells.iter().map(|cell| u64::from(cell.n_gaussians)).sum(),
         n_without_evidence: 0,
         n_rejected: 0,
         cells,
-    };
-    store.publish(&manifest, &Extras::new())?;
-    Ok(store.prune().map(|_| ())?)
-}
-
-/// Returns opaque round Gaussians at these means.
-fn grey_gaussians(means_in_world: Vec<DVec3>) -> Gaussians {
-    let n = means_in_world.len();
-    Gaussians {
-        means_in_world,
-        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        scales: vec![[0.05; 3]; n],
-        opacities: vec![1.0; n],
-        sh_dc: vec![[0.0; 3]; n],
-        ..Gaussians::default()
     }
 }

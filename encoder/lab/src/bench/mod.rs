@@ -8,4 +8,3 @@ pub(crate) mod query;
 pub(crate) mod raster;
 pub(crate) mod robot;
 pub(crate) mod tradeoff;
-mod truth;

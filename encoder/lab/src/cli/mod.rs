@@ -1,13 +1,19 @@
 //! The command line: flags in, exit code out. The flags of a benchmark or an evaluation stand beside its code.
 
-mod demo;
 mod generate;
 #[cfg(feature = "measure")]
 mod measure;
 
-use clap::{Parser, Subcommand};
-use slag_encoder::cli::common::OutputArgs;
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::{Args, Parser, Subcommand};
+use slag_encoder::cli::common::{OutputArgs, cancel_flag, now_unix_secs, print, runtime, session_options};
 use slag_encoder::cli::{Exit, exit_of, progress};
+use slag_encoder::progress::Progress;
+use slag_models::commands::RunArgs;
+
+use crate::demo;
 
 /// Generates scenes with known contents, evaluates encoders and stores on them, and benchmarks this machine.
 #[derive(Debug, Parser)]
@@ -30,14 +36,13 @@ enum Command {
     #[command(subcommand)]
     Generate(generate::GenerateCommand),
     /// Generates a room and a yard, then encodes, serves, fetches and queries them.
-    Demo(demo::DemoArgs),
+    Demo(DemoArgs),
     /// Benchmarks this machine.
     #[cfg(feature = "measure")]
     #[command(subcommand)]
     Bench(measure::BenchCommand),
 }
 
-/// Runs a command and returns the exit code.
 pub fn run(cli: Cli) -> Exit {
     let json = cli.output.json;
     let progress = progress::shown(cli.output.shows_progress());
@@ -46,11 +51,44 @@ pub fn run(cli: Cli) -> Exit {
         #[cfg(feature = "measure")]
         Command::Eval(args) => measure::eval(&args, progress, json),
         Command::Generate(command) => generate::run(&command, progress),
-        Command::Demo(args) => demo::run(&args, progress, json),
+        Command::Demo(args) => run_demo(&args, progress, json),
         #[cfg(feature = "measure")]
         Command::Bench(command) => measure::bench(&command, progress, json),
     };
     exit_of(result, json)
+}
+
+#[derive(Debug, Args)]
+struct DemoArgs {
+    /// Working folder; an earlier demo in it is deleted.
+    #[arg(long, value_name = "DIR", default_value = "target/demo")]
+    out: PathBuf,
+    /// Seed of room and yard.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Model runtime.
+    #[command(flatten)]
+    how: RunArgs,
+    /// Keeps the services running until ctrl-c, for queries of your own.
+    #[arg(long)]
+    keep: bool,
+}
+
+fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let edge = std::env::current_exe()?.with_file_name(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
+    let options = demo::DemoOptions {
+        out: args.out.clone(),
+        seed: args.seed,
+        session: session_options(&args.how)?,
+        edge,
+        created_unix_secs: now_unix_secs(),
+    };
+    let demo = runtime()?.block_on(async { demo::run(&options, progress, cancel_flag()?.as_ref()).await })?;
+    print(json, &demo.report, &demo.report)?;
+    if args.keep {
+        demo.keep()?;
+    }
+    Ok(if demo.report.all_right() { Exit::Done } else { Exit::Failed })
 }
 
 #[cfg(test)]

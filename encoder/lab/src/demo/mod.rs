@@ -1,7 +1,5 @@
 //! The whole system in one run: generate, encode, serve, fetch as a robot does, ask, compare with the truth.
 
-mod answer;
-mod caption;
 mod picture;
 mod questions;
 
@@ -16,7 +14,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
-pub use answer::EdgeAnswer;
+pub use picture::EdgeAnswer;
 
 use crate::generate::Scene;
 use crate::generate::grammar::SceneKind;
@@ -28,7 +26,6 @@ use slag_encoder::query;
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
-/// A room and a yard beside it.
 const KINDS: [SceneKind; 2] = [SceneKind::Room, SceneKind::Yard];
 /// Photos of both together.
 const N_VIEWS: u32 = 72;
@@ -137,7 +134,6 @@ impl Demo {
     }
 }
 
-/// Runs the demo.
 pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
     if !options.edge.is_file() {
         return Err(anyhow!(
@@ -146,16 +142,37 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         ));
     }
     clear(&options.out)?;
-    let store = options.out.join("store");
-    let cache = options.out.join("cache");
-
+    let (store, cache) = (options.out.join("store"), options.out.join("cache"));
     let mut scene = Scene::new(&KINDS, options.seed, N_VIEWS);
-    let written = tokio::task::block_in_place(|| scene.write(&options.out.join("scene"), progress))
-        .context("generate")?;
+    let models = ModelDir::embedded()?;
+    let encoding = || encode(options, &mut scene, &store, &models, (progress, cancel));
+    let encode = tokio::task::block_in_place(encoding)?;
     let camera_in_world = scene.views[ROBOT_VIEW].camera_from_world.inverse().translation;
     let robot_in_world = DVec3::new(camera_in_world.x, camera_in_world.y, 0.0);
-    let models = ModelDir::embedded()?;
-    let mut settings = EncodeSettings::new(written.scene, written.views, store.clone(), true);
+    let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
+    let downloaded_bytes = fetch(options, store, &cache, &at).await?;
+    // The robot is offline from here on.
+    let questions = ask(options, &cache, &scene, (robot_in_world, &at))?;
+    let mut encoder = models.text_encoder(&options.session)?;
+    let pictures =
+        tokio::task::block_in_place(|| draw(options, &scene, &questions, &mut *encoder, robot_in_world))
+            .context("pictures")?;
+    let about_model = models.about().to_owned();
+    let report = DemoReport { pictures, encode, downloaded_bytes, about_model, questions };
+    fs_err::write(options.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
+    Ok(Demo { report, edge: options.edge.clone(), cache })
+}
+
+/// Photographs the scene and encodes it into a store.
+fn encode(
+    options: &DemoOptions,
+    scene: &mut Scene,
+    store: &Path,
+    models: &ModelDir,
+    (progress, cancel): (&dyn Progress, &AtomicBool),
+) -> Result<EncodeSummary> {
+    let written = scene.write(&options.out.join("scene"), progress).context("generate")?;
+    let mut settings = EncodeSettings::new(written.scene, written.views, store.to_owned(), true);
     settings.output.scene_name = "demo house and yard".into();
     settings.output.created_unix_secs = options.created_unix_secs;
     settings.run.memory_bytes = 1 << 30;
@@ -164,20 +181,18 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     settings.cells.shards.appearance = true;
     // Small cells, so that the demo has several.
     settings.cells.limits = CellLimits { max_gaussians: 16_384, ..settings.cells.limits };
-    let engines = Engines::new(&models, &options.session, &CpuRasterizer);
-    let summary = tokio::task::block_in_place(|| encode::encode(&settings, &engines, progress, cancel))
-        .context("encode")?;
+    let engines = Engines::new(models, &options.session, &CpuRasterizer);
+    encode::encode(&settings, &engines, progress, cancel).context("encode")
+}
 
+/// Serves the store while the robot fetches what is around it; returns the bytes that it downloads.
+async fn fetch(options: &DemoOptions, store: PathBuf, cache: &Path, at: &str) -> Result<u64> {
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let (listens, listening) = tokio::sync::oneshot::channel();
     let serving = tokio::spawn(async move {
         // A channel fails only if its other end is dropped: the demo has failed and reports why.
-        let on_listening = |url| {
-            let _ = listens.send(url);
-        };
-        let stopped = async {
-            let _ = stopped.await;
-        };
+        let on_listening = |url| drop(listens.send(url));
+        let stopped = async { drop(stopped.await) };
         let address = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
         serve::serve(&store, address, Limits::default(), Access::default(), None, on_listening, stopped).await
     });
@@ -185,19 +200,26 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         serving.await.context("serve")?.context("serve")?;
         return Err(anyhow!("serve: ended before it listened on a port"));
     };
-    let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
     let radius = RADIUS_M.to_string();
-    let fetch = ["fetch", "--trust-first", "--from", &url, "--at", &at, "--radius", &radius];
-    let fetched: FetchReply = edge(options, &cache, &fetch).context("fetch")?;
-    // The robot is offline from here on.
+    let fetch = ["fetch", "--trust-first", "--from", &url, "--at", at, "--radius", &radius];
+    let fetched: FetchReply = edge(options, cache, &fetch).context("fetch")?;
     let _ = stop.send(());
     serving.await.context("serve")?.context("serve")?;
+    Ok(fetched.downloaded.bytes)
+}
 
+/// Asks the robot, and compares its answers with the truth. `at`: the robot's position as a flag.
+fn ask(
+    options: &DemoOptions,
+    cache: &Path,
+    scene: &Scene,
+    (robot_in_world, at): (DVec3, &str),
+) -> Result<Vec<Question>> {
     let mut questions = Vec::new();
     for asked in questions::questions(&scene.objects, robot_in_world, RADIUS_M) {
         let start = Instant::now();
         let reply: EdgeReply =
-            edge(options, &cache, &["query", &asked.text, "--near", &at]).context("query")?;
+            edge(options, cache, &["query", &asked.text, "--near", at]).context("query")?;
         let process_ms = start.elapsed().as_secs_f64() * 1e3;
         let answer = reply.answers.into_iter().next();
         let right = match &answer {
@@ -210,19 +232,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         let truth = asked.truth.iter().map(|o| (o.category.clone(), o.centre)).collect();
         questions.push(Question { text: asked.text, answer, reason: reply.reason, truth, process_ms, right });
     }
-    let mut encoder = models.text_encoder(&options.session)?;
-    let pictures =
-        tokio::task::block_in_place(|| draw(options, &scene, &questions, &mut *encoder, robot_in_world))
-            .context("pictures")?;
-    let report = DemoReport {
-        pictures,
-        encode: summary,
-        downloaded_bytes: fetched.downloaded.bytes,
-        about_model: models.about().to_owned(),
-        questions,
-    };
-    fs_err::write(options.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
-    Ok(Demo { report, edge: options.edge.clone(), cache })
+    Ok(questions)
 }
 
 /// Draws the answers, from the full-precision scores of the store, and the map.

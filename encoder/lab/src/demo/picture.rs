@@ -1,13 +1,12 @@
 //! Pictures of the answers: each answer's Gaussians in colour and the rest in grey, and a map from above.
 
+use font8x8::{BASIC_FONTS, UnicodeFonts};
 use glam::{DVec2, DVec3};
-use image::{RgbImage, imageops};
+use image::{Rgb, RgbImage, imageops};
+use serde::{Deserialize, Serialize};
 use slag_common::Gaussians;
 use slag_common::frames::Aabb;
 use slag_common::gaussians::SH_C0;
-
-use super::answer::EdgeAnswer;
-use super::caption;
 use slag_encoder::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 
 const PANEL_WIDTH_PX: u32 = 320;
@@ -71,7 +70,7 @@ pub(super) fn answers(
         let view = best_view(scene, views, panel)?;
         let view = RasterView { intrinsics: view.intrinsics.scaled_to_width(PANEL_WIDTH_PX), ..view };
         let mut drawn = draw_lit(scene, &panel.cosines, panel.threshold, &view)?;
-        caption::write(&mut drawn, panel.question);
+        write_caption(&mut drawn, panel.question);
         let (column, row) = (i % COLUMNS, i / COLUMNS);
         imageops::replace(
             &mut picture,
@@ -128,23 +127,7 @@ pub(super) fn map(
     robot_in_world: DVec3,
     radius_m: f64,
 ) -> RgbImage {
-    let mut low = DVec2::INFINITY;
-    let mut high = DVec2::NEG_INFINITY;
-    for cell in cells {
-        (low, high) = (low.min(cell.min.truncate()), high.max(cell.max.truncate()));
-    }
-    let size = ((high - low + 2.0 * MARGIN_M) * MAP_PX_PER_M).max(DVec2::ONE);
-    let (width, height) = (size.x as i64, size.y as i64);
-    let mut map = RgbImage::from_pixel(width as u32, height as u32, image::Rgb([250; 3]));
-    let place = |at: DVec2| {
-        let at = (at - low + MARGIN_M) * MAP_PX_PER_M;
-        (at.x as i64, height - 1 - at.y as i64)
-    };
-    let mut put = |(x, y): (i64, i64), rgb: [u8; 3]| {
-        if (0..width).contains(&x) && (0..height).contains(&y) {
-            map.put_pixel(x as u32, y as u32, image::Rgb(rgb));
-        }
-    };
+    let mut map = Map::of(cells);
     let is_fetched = |bounds: &Aabb| bounds.distance_to(robot_in_world) <= radius_m;
     let fetched: Vec<&Aabb> = cells.iter().filter(|bounds| is_fetched(bounds)).collect();
     let mut order: Vec<usize> =
@@ -156,30 +139,159 @@ pub(super) fn map(
         let on_board = fetched.iter().any(|bounds| bounds.distance_to(mean) == 0.0);
         let grey = 0.6 + 0.3 * luma(rgb);
         let rgb = if on_board { rgb } else { [grey; 3] }.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8);
-        let (x, y) = place(mean.truncate());
+        let (x, y) = map.place(mean.truncate());
         let reach = (f64::from(scene.scales[i][0]) * MAP_PX_PER_M).ceil() as i64;
-        (-reach..=reach).for_each(|dy| (-reach..=reach).for_each(|dx| put((x + dx, y + dy), rgb)));
+        (-reach..=reach).for_each(|dy| (-reach..=reach).for_each(|dx| map.put((x + dx, y + dy), rgb)));
     }
     for bounds in fetched {
-        let ((x0, y1), (x1, y0)) = (place(bounds.min.truncate()), place(bounds.max.truncate()));
-        (x0..=x1).for_each(|x| [y0, y1].into_iter().for_each(|y| put((x, y), [30, 90, 200])));
-        (y0..=y1).for_each(|y| [x0, x1].into_iter().for_each(|x| put((x, y), [30, 90, 200])));
+        let ((x0, y1), (x1, y0)) = (map.place(bounds.min.truncate()), map.place(bounds.max.truncate()));
+        (x0..=x1).for_each(|x| [y0, y1].into_iter().for_each(|y| map.put((x, y), [30, 90, 200])));
+        (y0..=y1).for_each(|y| [x0, x1].into_iter().for_each(|x| map.put((x, y), [30, 90, 200])));
     }
-    let mut ring = |centre: DVec3, radius_m: f64, rgb| {
-        for step in 0..4000 {
-            let angle = std::f64::consts::TAU * f64::from(step) / 4000.0;
-            let (x, y) = place(centre.truncate() + radius_m * DVec2::new(angle.cos(), angle.sin()));
-            [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().for_each(|(dx, dy)| put((x + dx, y + dy), rgb));
-        }
-    };
-    ring(robot_in_world, radius_m, [0, 0, 0]);
+    map.ring(robot_in_world, radius_m, [0, 0, 0]);
     for answer in answers {
-        [0.14, 0.17, 0.2].into_iter().for_each(|radius_m| ring(*answer, radius_m, [230, 0, 80]));
+        [0.14, 0.17, 0.2].into_iter().for_each(|radius_m| map.ring(*answer, radius_m, [230, 0, 80]));
     }
-    let (x, y) = place(robot_in_world.truncate());
+    let (x, y) = map.place(robot_in_world.truncate());
     for step in -9..=9 {
         let cross = [(step, 0), (step, 1), (0, step), (1, step)];
-        cross.into_iter().for_each(|(dx, dy)| put((x + dx, y + dy), [0, 0, 0]));
+        cross.into_iter().for_each(|(dx, dy)| map.put((x + dx, y + dy), [0, 0, 0]));
     }
-    map
+    map.image
+}
+
+/// A picture from above, north up.
+struct Map {
+    image: RgbImage,
+    /// The corner of the cells at the bottom left.
+    low: DVec2,
+}
+
+impl Map {
+    fn of(cells: &[Aabb]) -> Self {
+        let mut low = DVec2::INFINITY;
+        let mut high = DVec2::NEG_INFINITY;
+        for cell in cells {
+            (low, high) = (low.min(cell.min.truncate()), high.max(cell.max.truncate()));
+        }
+        let size = ((high - low + 2.0 * MARGIN_M) * MAP_PX_PER_M).max(DVec2::ONE);
+        Self { image: RgbImage::from_pixel(size.x as u32, size.y as u32, Rgb([250; 3])), low }
+    }
+
+    fn place(&self, at: DVec2) -> (i64, i64) {
+        let at = (at - self.low + MARGIN_M) * MAP_PX_PER_M;
+        (at.x as i64, i64::from(self.image.height()) - 1 - at.y as i64)
+    }
+
+    fn put(&mut self, (x, y): (i64, i64), rgb: [u8; 3]) {
+        let (Ok(x), Ok(y)) = (u32::try_from(x), u32::try_from(y)) else { return };
+        if let Some(pixel) = self.image.get_pixel_mut_checked(x, y) {
+            *pixel = Rgb(rgb);
+        }
+    }
+
+    fn ring(&mut self, centre: DVec3, radius_m: f64, rgb: [u8; 3]) {
+        for step in 0..4000 {
+            let angle = std::f64::consts::TAU * f64::from(step) / 4000.0;
+            let (x, y) = self.place(centre.truncate() + radius_m * DVec2::new(angle.cos(), angle.sin()));
+            [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().for_each(|(dx, dy)| self.put((x + dx, y + dy), rgb));
+        }
+    }
+}
+
+/// Edge of a glyph, in pixels of the font.
+const GLYPH: u32 = 8;
+/// Pixels of the picture per pixel of the font, along each axis.
+const SCALE: u32 = 2;
+/// Space around the text and between its lines, pixels of the picture.
+const MARGIN_PX: u32 = 6;
+/// Colour of the text.
+const INK: Rgb<u8> = Rgb([20; 3]);
+
+/// Writes a text on a light band across the top of a picture, in as many lines as it needs.
+fn write_caption(picture: &mut RgbImage, text: &str) {
+    let (width, height) = picture.dimensions();
+    let n_columns = width.saturating_sub(2 * MARGIN_PX) / (GLYPH * SCALE);
+    let lines = lines(text, n_columns.max(1) as usize);
+    let pitch_px = GLYPH * SCALE + MARGIN_PX;
+    let band_px = (lines.len() as u32 * pitch_px + MARGIN_PX).min(height);
+    for pixel in picture.pixels_mut().take((width * band_px) as usize) {
+        // A fifth of the picture shows through.
+        pixel.0 = pixel.0.map(|c| 255 - (255 - c) / 5);
+    }
+    for (row, line) in lines.iter().enumerate() {
+        for (column, character) in line.chars().enumerate() {
+            let left = MARGIN_PX + column as u32 * GLYPH * SCALE;
+            glyph(picture, character, left, MARGIN_PX + row as u32 * pitch_px);
+        }
+    }
+}
+
+/// Draws a character; one that the font lacks becomes a question mark. Pixels outside the picture are dropped.
+fn glyph(picture: &mut RgbImage, character: char, left: u32, top: u32) {
+    let rows = BASIC_FONTS.get(character).or_else(|| BASIC_FONTS.get('?')).unwrap_or_default();
+    for (y, x) in (0..GLYPH * SCALE).flat_map(|y| (0..GLYPH * SCALE).map(move |x| (y, x))) {
+        // The lowest bit of a row is its leftmost pixel.
+        let is_set = rows[(y / SCALE) as usize] >> (x / SCALE) & 1 == 1;
+        if let (true, Some(pixel)) = (is_set, picture.get_pixel_mut_checked(left + x, top + y)) {
+            *pixel = INK;
+        }
+    }
+}
+
+/// Breaks a text between words into lines of at most `n_columns` characters; a longer word has a line of its own.
+fn lines(text: &str, n_columns: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= n_columns => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines
+}
+
+/// A cluster of matching Gaussians.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+pub struct EdgeAnswer {
+    pub position_in_world: DVec3,
+    /// Edge lengths of its box.
+    pub size: DVec3,
+    pub score: f32,
+    pub n_gaussians: u64,
+    pub distance: Option<f64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_break_between_words() {
+        assert_eq!(lines("something to move things with", 19), ["something to move", "things with"]);
+        assert_eq!(lines("a refrigerator", 4), ["a", "refrigerator"]);
+        assert_eq!(lines("", 4), [""; 0]);
+    }
+
+    /// By hand: the font's slash, its upper end at the right; the picture below the band is unchanged.
+    #[test]
+    fn captions_are_legible() {
+        let slash =
+            [".....##.", "....##..", "...##...", "..##....", ".##.....", "##......", "#.......", "........"];
+        let mut picture = RgbImage::from_pixel(320, 240, Rgb([100; 3]));
+        write_caption(&mut picture, "a /");
+        for (y, row) in slash.iter().enumerate() {
+            for (x, cell) in row.chars().enumerate() {
+                let (left, top) = (MARGIN_PX + 2 * GLYPH * SCALE, MARGIN_PX);
+                let found = picture.get_pixel(left + x as u32 * SCALE, top + y as u32 * SCALE);
+                assert_eq!(*found == INK, cell == '#', "column {x}, row {y}");
+            }
+        }
+        assert_eq!((picture.get_pixel(319, 27).0, picture.get_pixel(319, 28).0), ([224; 3], [100; 3]));
+        // A picture smaller than its caption.
+        write_caption(&mut RgbImage::new(7, 5), "where is the refrigerator");
+    }
 }

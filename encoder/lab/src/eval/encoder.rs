@@ -10,7 +10,7 @@ use clap::Args;
 use rayon::prelude::*;
 use serde::Serialize;
 use slag_encoder::cli::common::{ModelArgs, open_models};
-use slag_models::Crop;
+use slag_models::{Crop, TextEncoder};
 
 use super::judge::ABSENT;
 use crate::generate::crops::{self, Label, Split};
@@ -84,19 +84,36 @@ pub(crate) struct EncoderReport {
     ms_per_text: f64,
 }
 
+/// Embeddings of the texts that crops are compared with.
+struct Texts {
+    nouns: Vec<Vec<f32>>,
+    colours: Vec<Vec<f32>>,
+    materials: Vec<Vec<f32>>,
+    absent: Vec<Vec<f32>>,
+}
+
+impl Texts {
+    fn encode(text: &mut dyn TextEncoder) -> Result<Self> {
+        let mut encode = |texts: Vec<String>| -> Result<Vec<Vec<f32>>> {
+            Ok(texts.iter().map(|content| text.encode(content)).collect::<Result<_, _>>()?)
+        };
+        Ok(Self {
+            nouns: encode(NOUNS.iter().map(|noun| format!("a {}", noun.name)).collect())?,
+            colours: encode(Colour::ALL.iter().map(|c| format!("something {}", c.word())).collect())?,
+            materials: encode(
+                Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect(),
+            )?,
+            absent: encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?,
+        })
+    }
+}
+
 /// Evaluates an encoder on the crops of scenes.
 pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<EncoderReport> {
     let (models, session) = open_models(&args.models)?;
     let (nouns, seeds) = (&NOUNS[..], args.seed..args.seed + args.n_scenes);
     let mut text = models.text_encoder(&session)?;
-    let mut encode = |texts: Vec<String>| -> Result<Vec<Vec<f32>>> {
-        Ok(texts.iter().map(|content| text.encode(content)).collect::<Result<_, _>>()?)
-    };
-    let of_nouns = encode(nouns.iter().map(|noun| format!("a {}", noun.name)).collect())?;
-    let of_colours = encode(Colour::ALL.iter().map(|c| format!("something {}", c.word())).collect())?;
-    let of_materials =
-        encode(Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect())?;
-    let of_absent = encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?;
+    let texts = Texts::encode(&mut *text)?;
     let text_times = Times::measure(0, N_TIMED, |i| text.encode(&nouns[i % nouns.len()].name).map(|_| ()))?;
 
     let mut image = models.image_encoder(&session)?;
@@ -115,14 +132,14 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
         }
         let vectors = image.encode(&crops)?;
         for (vector, label) in vectors.chunks_exact(models.dim()).zip(labels) {
-            let scores: Vec<f32> = of_nouns.iter().map(|of| dot(of, vector)).collect();
+            let scores: Vec<f32> = texts.nouns.iter().map(|of| dot(of, vector)).collect();
             let threshold = threshold.unwrap_or(f32::INFINITY);
             let n_found = scores.iter().filter(|score| **score >= threshold).count() as u64;
             let own = u64::from(scores[label.noun] >= threshold);
-            let absent = of_absent.iter().filter(|of| dot(of, vector) >= threshold).count() as u64;
+            let absent = texts.absent.iter().filter(|of| dot(of, vector) >= threshold).count() as u64;
             found.iter_mut().zip([own, n_found - own, absent]).for_each(|(sum, n)| *sum += n);
             let best = |of: &[Vec<f32>]| argmax(of.iter().map(|of| dot(of, vector)));
-            seen.push((label, argmax(scores.into_iter()), best(&of_colours), best(&of_materials)));
+            seen.push((label, argmax(scores.into_iter()), best(&texts.colours), best(&texts.materials)));
         }
         progress.advance(n_scenes);
     }

@@ -313,7 +313,6 @@ impl LerfReport {
     }
 }
 
-/// Returns the scene with only the Gaussians that reach the threshold.
 fn selected(scene: &Gaussians, scores: &[f32], threshold: f32) -> Gaussians {
     let mut selected = scene.clone();
     (selected.sh_degree, selected.sh_rest) = (0, Vec::new());

@@ -125,7 +125,6 @@ struct Figures {
     median_m: Option<f64>,
     median_secs: Option<f64>,
     bytes_per_million: Option<f64>,
-    /// Time for making the map.
     #[serde(skip)]
     map_secs: f64,
 }
@@ -167,7 +166,6 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
     Ok(LocateReport { all, scenes: of_scenes })
 }
 
-/// Makes the map of a scene.
 fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     let gaussians = splat::read(&files.splat, &ReadOptions { with_sh_rest: true })?;
     let views = poses::read(&files.poses, files.images.as_deref())?.views;

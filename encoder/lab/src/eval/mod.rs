@@ -20,7 +20,6 @@ pub(crate) mod names;
 mod public_tests;
 pub(crate) mod relations;
 pub(crate) mod run;
-mod scan;
 pub(crate) mod scannet;
 pub(crate) mod splat_only;
 mod truth;

@@ -101,7 +101,6 @@ pub(crate) fn run(args: &NamesArgs) -> Result<NamesReport> {
     Ok(NamesReport { rows })
 }
 
-/// Names the objects of a store.
 fn judge(reader: &StoreReader, truth: &Truth, models: &ModelArgs) -> Result<Vec<Named>> {
     let objects = PublishedObjects::read(reader)?;
     let mut encoder = text_encoder_of(reader, models)?;
@@ -132,7 +131,6 @@ fn judge(reader: &StoreReader, truth: &Truth, models: &ModelArgs) -> Result<Vec<
     Ok(things.iter().enumerate().map(named).collect())
 }
 
-/// Returns the thing that each object is.
 fn things_of<'a>(truth: &'a Truth, objects: &PublishedObjects) -> Vec<Option<&'a Thing>> {
     let mut counts: Vec<BTreeMap<u16, usize>> = vec![BTreeMap::new(); objects.ids.len()];
     for (object, id) in objects.object_of.iter().zip(&truth.id_of_gaussian) {
@@ -149,7 +147,6 @@ fn things_of<'a>(truth: &'a Truth, objects: &PublishedObjects) -> Vec<Option<&'a
     counts.iter().map(thing).collect()
 }
 
-/// Returns whether a name is right for a thing.
 fn is_right(name: &str, thing: &Thing) -> bool {
     let singular = |word: &str| {
         let word = word.split('(').next().unwrap_or_default().trim().to_lowercase();

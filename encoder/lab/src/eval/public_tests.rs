@@ -12,8 +12,7 @@ use slag_common::{Gaussians, Intrinsics, poses, splat};
 use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 
 use super::lerf::{self, LerfLabels};
-use super::scan::Scan;
-use super::scannet::{self, ScanReport, ScannetReport, ScannetSettings};
+use super::scannet::{self, Scan, ScanReport, ScannetReport, ScannetSettings};
 use slag_encoder::cells::CellLimits;
 use slag_encoder::codebook::CodebookSettings;
 use slag_encoder::encode::{self, CellSettings, EncodeSettings, Engines, Masks};

@@ -37,7 +37,6 @@ pub(crate) struct ScenesArgs {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum MaskSource {
-    /// The labels.
     Given,
     /// The built-in segmenter.
     Automatic,

@@ -16,7 +16,6 @@ use slag_encoder::store::StoreReader;
 pub(super) struct Thing {
     pub(super) id: u16,
     pub(super) category: String,
-    /// Synonyms.
     #[serde(default)]
     pub(super) words: Vec<String>,
     /// Pixels that show it, over all photos to encode; generated scenes have it.

@@ -34,7 +34,6 @@ pub struct Placed {
     pub noun: usize,
     /// Its parts, colours and paint.
     pub object: Object,
-    /// Its pose.
     pub world_from_object: DAffine3,
     /// The box around it.
     pub bounds: Aabb,
@@ -179,8 +178,6 @@ impl Layout {
         vehicle: bool,
         random: &mut Xorshift,
     ) -> Option<DAffine3> {
-        let around_z =
-            |yaw_rad: f64, at: DVec3| DAffine3::from_mat3_translation(DMat3::from_rotation_z(yaw_rad), at);
         let own = bounds(&object.parts, DAffine3::IDENTITY);
         let (low, high) = (area.corner, area.corner + area.size);
         let pi = std::f64::consts::PI;
@@ -210,27 +207,30 @@ impl Layout {
                 let at = DVec2::new(random.between(low.x, high.x), random.between(low.y, high.y));
                 around_z(random.between(-pi, pi), at.extend(0.0))
             }
-            Place::On => {
-                let tops: Vec<(&Placed, _)> = self
-                    .placed
-                    .iter()
-                    .filter(|p| p.bounds.min.x >= area.corner.x - 0.1)
-                    .filter_map(|p| p.object.top.map(|top| (p, top)))
-                    .collect();
-                if tops.is_empty() {
-                    return None;
-                }
-                let (below, top) = *random.pick(&tops);
-                let half = [0, 1].map(|i| top.size_m[i] / 2.0 - own.size()[i] / 2.0);
-                if half.iter().any(|h| *h < 0.0) {
-                    // Too large for this top, but another try may pick a larger one.
-                    return Some(around_z(0.0, DVec3::splat(f64::MAX)));
-                }
-                let at = DVec3::new(half[0] * random.signed(), half[1] * random.signed(), top.z_m);
-                below.world_from_object * around_z(0.3 * random.signed(), at)
-            }
+            Place::On => return self.on_top(area, own.size(), random),
             Place::Shell => return None,
         })
+    }
+
+    /// Returns a pose on top of something.
+    fn on_top(&self, area: &Area, size: DVec3, random: &mut Xorshift) -> Option<DAffine3> {
+        let tops: Vec<(&Placed, _)> = self
+            .placed
+            .iter()
+            .filter(|p| p.bounds.min.x >= area.corner.x - 0.1)
+            .filter_map(|p| p.object.top.map(|top| (p, top)))
+            .collect();
+        if tops.is_empty() {
+            return None;
+        }
+        let (below, top) = *random.pick(&tops);
+        let half = [0, 1].map(|i| top.size_m[i] / 2.0 - size[i] / 2.0);
+        if half.iter().any(|h| *h < 0.0) {
+            // Too large for this top, but another try may pick a larger one.
+            return Some(around_z(0.0, DVec3::splat(f64::MAX)));
+        }
+        let at = DVec3::new(half[0] * random.signed(), half[1] * random.signed(), top.z_m);
+        Some(below.world_from_object * around_z(0.3 * random.signed(), at))
     }
 
     fn is_free(&self, bounds: &Aabb, place: Place) -> bool {
@@ -387,6 +387,10 @@ pub fn looking(position: DVec3, heading: DVec3) -> DAffine3 {
     let down = forward.cross(right);
     let camera_from_world = DMat3::from_cols(right, down, forward).transpose();
     DAffine3::from_mat3_translation(camera_from_world, -(camera_from_world * position))
+}
+
+fn around_z(yaw_rad: f64, at: DVec3) -> DAffine3 {
+    DAffine3::from_mat3_translation(DMat3::from_rotation_z(yaw_rad), at)
 }
 
 /// Returns the intrinsics of a scene's photos.

@@ -4,8 +4,10 @@
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Error, Result, anyhow};
 use glam::DVec3;
+use serde_json::Value;
+use slag_common::Gaussians;
 use slag_common::splat::{self, ReadOptions};
 use slag_encoder::progress::Progress;
 use slag_math::stats::trimmed_range;
@@ -18,7 +20,6 @@ const SPACING: f64 = 1.1;
 #[derive(Clone, Debug)]
 pub struct WrittenCopies {
     pub scene: PathBuf,
-    /// The poses.
     pub views: PathBuf,
     /// The masks, if the scene has any.
     pub masks: Option<PathBuf>,
@@ -37,90 +38,129 @@ pub fn write(
     n_views: u32,
     progress: &dyn Progress,
 ) -> Result<WrittenCopies> {
-    let unfit = |what: String| anyhow!("{}: {what}", source.display());
-    let splat =
-        ["scene.ply", "point_cloud.ply"].map(|name| source.join(name)).into_iter().find(|p| p.exists());
-    let splat = splat.ok_or_else(|| unfit("no scene.ply or point_cloud.ply".into()))?;
-    let mut gaussians = splat::read(&splat, &ReadOptions { with_sh_rest: true })?;
-    let poses = source.join("transforms.json");
-    let mut poses: serde_json::Value =
-        serde_json::from_slice(&fs_err::read(&poses)?).with_context(|| poses.display().to_string())?;
-    let frames = poses["frames"].as_array().filter(|frames| !frames.is_empty());
-    let frames = frames.ok_or_else(|| unfit("transforms.json has no frames".into()))?;
-    if u64::from(n_views) > u64::from(n_copies) * frames.len() as u64 {
-        let n = frames.len();
-        return Err(unfit(format!(
-            "it has {n} photos, too few for {n_views} of {n_copies} copies; ask for fewer"
-        )));
+    let mut source = Source::read(source)?;
+    if u64::from(n_views) > u64::from(n_copies) * source.frames.len() as u64 {
+        let n = source.frames.len();
+        return Err(source
+            .unfit(format!("it has {n} photos, too few for {n_views} of {n_copies} copies; ask for fewer")));
     }
-
-    let size = [0, 1, 2].map(|axis| {
-        let mut values: Vec<f64> = gaussians.means_in_world.iter().map(|mean| mean[axis]).collect();
-        trimmed_range(&mut values, TRIMMED).map_or(0.0, |(low, high)| high - low)
-    });
-    // Which axis points up is not known: the grid spans the two longest sides.
-    let up = (0..3).min_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(2);
-    let spacing = size.into_iter().fold(0.0, f64::max) * SPACING;
-    let side = f64::from(n_copies).sqrt().ceil() as u32;
-    let offset = |copy: u32| {
-        let mut offset = DVec3::ZERO;
-        offset[(up + 1) % 3] = f64::from(copy % side) * spacing;
-        offset[(up + 2) % 3] = f64::from(copy / side) * spacing;
-        offset
-    };
-
-    let masks = source.join("gt/masks");
-    let masks = masks.is_dir().then_some(masks);
+    let grid = Grid::of(&source.gaussians, n_copies);
     fs_err::create_dir_all(folder.join("images"))?;
     fs_err::create_dir_all(folder.join("gt/masks"))?;
-    let scene = folder.join("scene.ply");
-    let n_gaussians = gaussians.len() as u64 * u64::from(n_copies);
-    progress.begin("copies", "copy", u64::from(n_copies), 0);
-    let mut out = BufWriter::new(fs_err::File::create(&scene)?);
-    splat::ply::write_header(&mut out, n_gaussians, gaussians.sh_degree)?;
-    let means = gaussians.means_in_world.clone();
-    for copy in 0..n_copies {
-        let moved = offset(copy);
-        gaussians.means_in_world.iter_mut().zip(&means).for_each(|(out, mean)| *out = *mean + moved);
-        splat::ply::write_rows(&mut out, &gaussians)?;
-        progress.advance(1);
-    }
-    out.flush()?;
-    progress.end();
+    let (scene, views) = (folder.join("scene.ply"), folder.join("transforms.json"));
+    let n_gaussians = source.write_copies(&scene, &grid, progress)?;
+    let frames = (0..n_views).map(|view| source.frame(view, n_views, &grid, folder));
+    source.poses["frames"] = frames.collect::<Result<Vec<_>>>()?.into();
+    fs_err::write(&views, serde_json::to_vec(&source.poses)?)?;
+    let masks = source.masks.map(|_| folder.join("gt/masks"));
+    Ok(WrittenCopies { scene, views, masks, n_gaussians, spacing: grid.spacing })
+}
 
-    let mut moved_frames = Vec::with_capacity(n_views as usize);
-    let n_views = u64::from(n_views);
-    for view in 0..n_views {
-        let copy = (view * u64::from(n_copies) / n_views) as u32;
+/// Where copies stand. Which axis points up is not known: the grid spans the two longest sides.
+struct Grid {
+    n_copies: u32,
+    up: usize,
+    side: u32,
+    spacing: f64,
+}
+
+impl Grid {
+    fn of(gaussians: &Gaussians, n_copies: u32) -> Self {
+        let size = [0, 1, 2].map(|axis| {
+            let mut values: Vec<f64> = gaussians.means_in_world.iter().map(|mean| mean[axis]).collect();
+            trimmed_range(&mut values, TRIMMED).map_or(0.0, |(low, high)| high - low)
+        });
+        let up = (0..3).min_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(2);
+        let spacing = size.into_iter().fold(0.0, f64::max) * SPACING;
+        Self { n_copies, up, side: f64::from(n_copies).sqrt().ceil() as u32, spacing }
+    }
+
+    fn offset(&self, copy: u32) -> DVec3 {
+        let mut offset = DVec3::ZERO;
+        offset[(self.up + 1) % 3] = f64::from(copy % self.side) * self.spacing;
+        offset[(self.up + 2) % 3] = f64::from(copy / self.side) * self.spacing;
+        offset
+    }
+}
+
+/// A labelled scene.
+struct Source {
+    folder: PathBuf,
+    gaussians: Gaussians,
+    /// The content of `transforms.json`.
+    poses: Value,
+    frames: Vec<Value>,
+    masks: Option<PathBuf>,
+}
+
+impl Source {
+    fn read(folder: &Path) -> Result<Self> {
+        let unfit = |what: &str| anyhow!("{}: {what}", folder.display());
+        let splats = ["scene.ply", "point_cloud.ply"].map(|name| folder.join(name));
+        let splat = splats.into_iter().find(|path| path.exists());
+        let splat = splat.ok_or_else(|| unfit("no scene.ply or point_cloud.ply"))?;
+        let gaussians = splat::read(&splat, &ReadOptions { with_sh_rest: true })?;
+        let poses = folder.join("transforms.json");
+        let poses: Value =
+            serde_json::from_slice(&fs_err::read(&poses)?).with_context(|| poses.display().to_string())?;
+        let frames = poses["frames"].as_array().filter(|frames| !frames.is_empty());
+        let frames = frames.ok_or_else(|| unfit("transforms.json has no frames"))?.clone();
+        let masks = Some(folder.join("gt/masks")).filter(|masks| masks.is_dir());
+        Ok(Self { folder: folder.to_owned(), gaussians, poses, frames, masks })
+    }
+
+    fn unfit(&self, what: String) -> Error {
+        anyhow!("{}: {what}", self.folder.display())
+    }
+
+    /// Writes the Gaussians of all copies; returns their number.
+    fn write_copies(&mut self, path: &Path, grid: &Grid, progress: &dyn Progress) -> Result<u64> {
+        let gaussians = &mut self.gaussians;
+        let n_gaussians = gaussians.len() as u64 * u64::from(grid.n_copies);
+        progress.begin("copies", "copy", u64::from(grid.n_copies), 0);
+        let mut out = BufWriter::new(fs_err::File::create(path)?);
+        splat::ply::write_header(&mut out, n_gaussians, gaussians.sh_degree)?;
+        let means = gaussians.means_in_world.clone();
+        for copy in 0..grid.n_copies {
+            let moved = grid.offset(copy);
+            gaussians.means_in_world.iter_mut().zip(&means).for_each(|(out, mean)| *out = *mean + moved);
+            splat::ply::write_rows(&mut out, gaussians)?;
+            progress.advance(1);
+        }
+        out.flush()?;
+        progress.end();
+        Ok(n_gaussians)
+    }
+
+    /// Links the photo and the mask of a view, and returns its frame.
+    fn frame(&self, view: u32, n_views: u32, grid: &Grid, folder: &Path) -> Result<Value> {
+        let [view, n_views, n_copies] = [view, n_views, grid.n_copies].map(u64::from);
+        let copy = view * n_copies / n_views;
         // Neighbouring copies show different photos where each has few.
-        let first = (u64::from(copy) * n_views).div_ceil(u64::from(n_copies));
-        let of_copy = ((u64::from(copy) + 1) * n_views).div_ceil(u64::from(n_copies)) - first;
-        let at = (view - first) * frames.len() as u64 / of_copy + u64::from(copy) * 7;
-        let mut frame = frames[at as usize % frames.len()].clone();
-        let path = frame["file_path"].as_str().ok_or_else(|| unfit("a frame without file_path".into()))?;
-        let photo = source.join(path);
+        let first = (copy * n_views).div_ceil(n_copies);
+        let of_copy = ((copy + 1) * n_views).div_ceil(n_copies) - first;
+        let at = (view - first) * self.frames.len() as u64 / of_copy + copy * 7;
+        let mut frame = self.frames[at as usize % self.frames.len()].clone();
+        let path = frame["file_path"].as_str();
+        let photo = self.folder.join(path.ok_or_else(|| self.unfit("a frame without file_path".into()))?);
         let (stem, suffix) = (file_part(photo.file_stem()), file_part(photo.extension()));
         let name = format!("c{copy:04}_{stem}");
         link(&photo, &folder.join(format!("images/{name}.{suffix}")))?;
-        if let Some(masks) = &masks {
+        if let Some(masks) = &self.masks {
             link(&masks.join(format!("{stem}.png")), &folder.join(format!("gt/masks/{name}.png")))?;
         }
         frame["file_path"] = format!("images/{name}.{suffix}").into();
-        for (axis, by) in offset(copy).to_array().into_iter().enumerate() {
+        for (axis, by) in grid.offset(copy as u32).to_array().into_iter().enumerate() {
             let cell = &mut frame["transform_matrix"][axis][3];
-            let value = cell.as_f64().ok_or_else(|| unfit("a transform_matrix that is not 4x4".into()))?;
+            let value = cell.as_f64();
+            let value = value.ok_or_else(|| self.unfit("a transform_matrix that is not 4x4".into()))?;
             *cell = (value + by).into();
         }
         if let Some(frame) = frame.as_object_mut() {
             frame.remove("mask_instance_path");
         }
-        moved_frames.push(frame);
+        Ok(frame)
     }
-    poses["frames"] = moved_frames.into();
-    let views = folder.join("transforms.json");
-    fs_err::write(&views, serde_json::to_vec(&poses)?)?;
-    let masks = masks.map(|_| folder.join("gt/masks"));
-    Ok(WrittenCopies { scene, views, masks, n_gaussians, spacing })
 }
 
 fn file_part(part: Option<&std::ffi::OsStr>) -> String {

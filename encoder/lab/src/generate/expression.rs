@@ -9,7 +9,6 @@ pub enum Expression {
     Variable(usize),
     /// A new random number in -1..1 at each evaluation.
     Random,
-    /// Negation.
     Minus(Box<Expression>),
     /// An operator with two operands.
     Binary(Operator, Box<[Expression; 2]>),

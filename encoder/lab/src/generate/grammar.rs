@@ -80,7 +80,6 @@ pub enum Place {
 /// Surface for other things on top of a thing, in the thing's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Top {
-    /// Height.
     pub z_m: f64,
     /// Width along x and depth along y.
     pub size_m: [f64; 2],
@@ -90,7 +89,6 @@ pub struct Top {
 #[derive(Clone, Debug)]
 pub struct Noun {
     pub name: String,
-    /// Its synonyms.
     pub words: Vec<String>,
     /// Kinds of thing that it belongs to.
     pub kinds: Vec<String>,

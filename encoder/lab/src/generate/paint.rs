@@ -21,7 +21,6 @@ macro_rules! named {
                 match self { $(Self::$variant => $text),+ }
             }
 
-            /// Returns the value with this word.
             pub fn parse(word: &str) -> Result<Self, String> {
                 Self::ALL.iter().copied().find(|known| known.word() == word).ok_or_else(|| {
                     format!("`{word}`, expected one of: {}", Self::ALL.iter().map(|k| k.word()).collect::<Vec<_>>().join(", "))

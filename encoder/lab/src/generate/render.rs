@@ -17,7 +17,6 @@ const OFF_SURFACE_M: f64 = 1e-4;
 pub enum Light {
     /// From a direction; unit length.
     Sun(DVec3),
-    /// From a point.
     Lamp(DVec3),
 }
 
@@ -211,21 +210,9 @@ impl Solids {
             .map(|tile| {
                 let (x0, y0) = (tile % columns * TILE_PX, tile / columns * TILE_PX);
                 let (x1, y1) = ((x0 + TILE_PX).min(k.width_px), (y0 + TILE_PX).min(k.height_px));
-                // A cone around the tile's rays, and the things that intersect it.
+                let corners = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| ray(x.into(), y.into()));
                 let axis = ray(f64::from(x0 + x1) / 2.0, f64::from(y0 + y1) / 2.0);
-                let spread = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)]
-                    .map(|(x, y)| ray(f64::from(x), f64::from(y)).dot(axis).clamp(-1.0, 1.0).acos())
-                    .into_iter()
-                    .fold(0.0, f64::max);
-                let candidates: Vec<usize> = (0..self.things.len())
-                    .filter(|i| {
-                        let to = self.things[*i].centre - origin;
-                        let (distance, radius) = (to.length(), self.things[*i].radius_m);
-                        radius >= distance
-                            || (to.dot(axis) / distance).clamp(-1.0, 1.0).acos()
-                                <= spread + (radius / distance).asin()
-                    })
-                    .collect();
+                let candidates = self.things_within(origin, axis, &corners);
                 let mut seen = vec![0; self.things.len()];
                 let mut pixels = Vec::with_capacity((TILE_PX * TILE_PX) as usize);
                 for (x, y) in (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))) {
@@ -256,6 +243,18 @@ impl Solids {
             photo.unhidden_px.iter_mut().zip(seen).for_each(|(sum, n)| *sum += n);
         }
         photo
+    }
+
+    /// Returns the things that intersect the cone from `origin` around `axis` that reaches to all of `directions`.
+    fn things_within(&self, origin: DVec3, axis: DVec3, directions: &[DVec3]) -> Vec<usize> {
+        let angle = |cosine: f64| cosine.clamp(-1.0, 1.0).acos();
+        let spread = directions.iter().map(|direction| angle(direction.dot(axis))).fold(0.0, f64::max);
+        let intersects = |i: &usize| {
+            let to = self.things[*i].centre - origin;
+            let (distance, radius) = (to.length(), self.things[*i].radius_m);
+            radius >= distance || angle(to.dot(axis) / distance) <= spread + (radius / distance).asin()
+        };
+        (0..self.things.len()).filter(intersects).collect()
     }
 
     fn shade(&self, hit: &Hit, origin: DVec3, direction: DVec3) -> [f64; 3] {

@@ -5,9 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use glam::{DQuat, DVec3};
 use serde::Serialize;
-use slag_common::Gaussians;
 use slag_common::gaussians::SH_C0;
-use slag_common::{npy, splat};
+use slag_common::{Gaussians, npy, splat};
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::RasterView;
 use slag_math::random::Xorshift;
@@ -48,7 +47,6 @@ pub struct TrueObject {
     /// Its id in masks and labels.
     pub id: u16,
     pub category: String,
-    /// Its synonyms.
     pub words: Vec<String>,
     /// Kinds of thing that it belongs to.
     pub kinds: Vec<String>,
@@ -70,7 +68,6 @@ pub struct TrueObject {
 
 pub struct WrittenScene {
     pub scene: PathBuf,
-    /// The poses.
     pub views: PathBuf,
     /// The folder of labels.
     pub truth: PathBuf,

@@ -25,7 +25,6 @@ pub struct Part {
     pub shape: Shape,
     /// Its pose in the object's or the world's frame: a rotation and a translation.
     pub object_from_part: DAffine3,
-    /// Its looks.
     pub paint: Paint,
 }
 

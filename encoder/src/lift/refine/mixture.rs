@@ -1,9 +1,11 @@
 //! Gaussians share evidence within superpoints and objects: each superpoint becomes one more region, a mixture of
 //! the masks of its Gaussians, and its Gaussians get an entry of that region.
 
-use rayon::prelude::*;
+use std::ops::Range;
 
-use super::points::{AXES, Point, add, length, make_unit, sum_of};
+use rayon::prelude::*;
+use slag_math::dot;
+
 use crate::lift::contributions::ContributionError;
 use crate::lift::embeddings::MIN_MEAN_LENGTH;
 use crate::lift::part::PartContributions;
@@ -197,4 +199,54 @@ impl Mixtures {
         }
         (contributions.regions, contributions.weights) = (regions, weights);
     }
+}
+
+/// Principal axes. 48 keep nine tenths of the variance of mask vectors of 512 components (measured).
+pub(super) const AXES: usize = 48;
+
+/// A vector's coordinates along the principal axes.
+pub(super) type Point = [f32; AXES];
+
+#[inline(always)]
+pub(super) fn add(sum: &mut Point, weight: f32, point: &Point) {
+    sum.iter_mut().zip(point).for_each(|(s, p)| *s += weight * p);
+}
+
+pub(super) fn length(point: &Point) -> f32 {
+    dot(point, point).sqrt()
+}
+
+/// Scales a point to unit length; zeros stay zeros.
+pub(super) fn make_unit(point: &mut Point) {
+    let length = length(point);
+    if length > 0.0 {
+        point.iter_mut().for_each(|c| *c /= length);
+    }
+}
+
+pub(super) fn points_of_regions(
+    table: &RegionTable,
+    mask_points: &[Point],
+    regions: Range<usize>,
+) -> Vec<Point> {
+    let point = |region: usize| {
+        let mut sum = [0.0; AXES];
+        table.masks_of(region).for_each(|(mask, share)| add(&mut sum, share, &mask_points[mask as usize]));
+        sum
+    };
+    regions.into_par_iter().map(point).collect()
+}
+
+/// Returns the weighted sum of the regions of some entries.
+pub(super) fn sum_of(
+    contributions: &PartContributions,
+    entries: Range<usize>,
+    region_points: &[Point],
+) -> Point {
+    let mut sum = [0.0; AXES];
+    for (region, weight) in contributions.regions[entries.clone()].iter().zip(&contributions.weights[entries])
+    {
+        add(&mut sum, *weight, &region_points[*region as usize]);
+    }
+    sum
 }

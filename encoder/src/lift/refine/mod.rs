@@ -19,7 +19,6 @@
 //! depends neither on threads nor on the memory budget.
 
 mod mixture;
-mod points;
 mod prune;
 mod settings;
 
@@ -33,8 +32,7 @@ use super::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Supe
 use super::table::RegionTable;
 use crate::masks::Mask;
 use crate::memory::{self, MemoryPlan, Phase};
-use mixture::{Mixtures, PartSums, SuperpointSums};
-use points::{AXES, Point};
+use mixture::{AXES, Mixtures, PartSums, Point, SuperpointSums};
 pub use settings::Aggregation;
 
 /// Least base of a mask's weight: a mask that is wholly cut off still gives its Gaussians evidence.
@@ -116,7 +114,7 @@ impl PendingRefinement {
         if settings.needs_mixtures() && !pending.table.is_empty() {
             let Self { refinement, table, mask_points, scales } = &mut pending;
             *mask_points = principal_coordinates(table.mask_vectors(), AXES).as_chunks().0.to_vec();
-            refinement.region_points = points::of_regions(table, mask_points, 0..table.len());
+            refinement.region_points = mixture::points_of_regions(table, mask_points, 0..table.len());
             if settings.needs_superpoints() {
                 *scales = refinement.superpoints(scene, table)?;
             }
@@ -210,7 +208,8 @@ impl Refinement {
             self.mixtures.push(Mixtures::new(weight, superpoints, sums, table, mask_points)?);
         }
         // The next scale is mixed with rows that hold entries of those before it.
-        let of_mixtures = points::of_regions(table, mask_points, self.region_points.len()..table.len());
+        let of_mixtures =
+            mixture::points_of_regions(table, mask_points, self.region_points.len()..table.len());
         self.region_points.extend(of_mixtures);
         Ok(())
     }

@@ -235,7 +235,7 @@ fn things_are_found_among_masks_of_parts_and_of_everything() {
 fn world_of(views: &Views) -> (World, Superpoints) {
     let n = PER_ROW * N_THINGS;
     let mean = |i: u32| DVec3::new(f64::from(i / PER_ROW) * 3.0, f64::from(i % PER_ROW) * 0.1, 0.0);
-    let gaussians = gaussians_at((0..n).map(mean).collect());
+    let gaussians = Gaussians::balls((0..n).map(mean).collect(), 0.1);
     let split = split(&gaussians, CellLimits::by_count(90));
     let view = |of_view: &BTreeMap<u32, BTreeSet<u32>>| {
         let mut regions: Vec<&BTreeSet<u32>> = of_view.values().collect();

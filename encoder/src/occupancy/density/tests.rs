@@ -80,12 +80,9 @@ fn background_is_left_out() {
 fn the_largest_gaussians_are_background() {
     for scale in [1.5e9, 1e15, 1e25, f32::MAX] {
         let scene = Gaussians {
-            means_in_world: vec![DVec3::ZERO, DVec3::splat(1e30), DVec3::ONE],
-            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 3],
             scales: vec![[scale, scale, 0.01], [0.1, 0.1, 0.01], [0.1, 0.1, 0.01]],
             opacities: vec![0.9; 3],
-            sh_dc: vec![[0.0; 3]; 3],
-            ..Gaussians::default()
+            ..Gaussians::balls(vec![DVec3::ZERO, DVec3::splat(1e30), DVec3::ONE], 0.1)
         };
         let found = occupied(&scene, &[0, 1, 2], Lattice { voxel: 0.05 });
         assert_eq!(found.n_background, 2, "{scale}");

@@ -1,7 +1,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use glam::{DAffine3, DQuat};
-use slag_common::Distortion;
+use slag_common::pinhole;
 use slag_math::random::Random;
 
 use super::*;
@@ -16,13 +16,10 @@ fn random_picture(random: &mut Random) -> (RasterView, Drawing) {
     let camera_from_world = DAffine3::from_rotation_translation(rotation.normalize(), place);
     let (width_px, height_px) = (40, 30);
     let intrinsics = Intrinsics {
-        width_px,
-        height_px,
-        focal_x_px: 30.0,
         focal_y_px: 34.0,
         centre_x_px: 18.5,
         centre_y_px: 16.0,
-        distortion: Distortion::None,
+        ..pinhole([width_px, height_px], 30.0)
     };
     // Patches of 8 x 8 pixels: the neighbours of a pixel mostly agree.
     let patches: Vec<(f32, f32)> = (0..20)

@@ -9,7 +9,6 @@
 //! may be sent again.
 
 mod database;
-mod points;
 mod push;
 mod settings;
 #[cfg(test)]

@@ -5,8 +5,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest};
 
-use super::database::{Collection, Database};
-use super::points::CellShard;
+use super::database::{CellShard, Collection, Database};
 use super::{Layout, PushError, PushOptions, PushProgress, PushReport};
 use crate::store::StoreReader;
 

@@ -6,7 +6,7 @@ use pollster::block_on;
 
 use super::shader::Kernels;
 use crate::raster::adapter::{AdapterReport, Precision};
-use crate::raster::error::RasterError;
+use crate::raster::rasterizer::RasterError;
 
 fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
     let info = adapter.get_info();
@@ -29,7 +29,6 @@ fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
 
 /// An adapter that can be opened.
 pub struct Adapter {
-    /// Its description.
     pub report: AdapterReport,
     adapter: wgpu::Adapter,
 }
@@ -144,7 +143,6 @@ impl Device {
         block_on(scope.pop()).is_none().then_some(buffer)
     }
 
-    /// Waits for the end of a submission.
     pub(super) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), RasterError> {
         let wait = wgpu::PollType::Wait { submission_index: Some(submission), timeout: None };
         let polled = self.device.poll(wait);

@@ -35,7 +35,6 @@ pub(crate) enum SortKey {
 
 /// Bits per sort pass.
 pub(crate) const DIGIT_BITS: u32 = RADIX.ilog2();
-/// Passes for the longest key.
 pub(crate) const MAX_PASSES: u32 = (u32::BITS + REGION_BITS).div_ceil(DIGIT_BITS);
 
 impl SortKey {

@@ -8,7 +8,7 @@ use slag_raster::{RasterView, reach2};
 
 use super::shader::{Counter, Counts, SUM_FRACTION_BITS};
 use crate::raster::adapter::Precision;
-use crate::raster::weights::RegionWeight;
+use crate::raster::rasterizer::RegionWeight;
 
 /// A Gaussian in device memory.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -76,7 +76,6 @@ pub(crate) struct ScanJob {
     pub block: u32,
     /// Values per block.
     pub columns: u32,
-    /// Counter for the total.
     pub total: u32,
 }
 
@@ -95,7 +94,6 @@ pub(crate) struct SortPass {
     pub(crate) low_bits: u32,
     /// Position of the digit, bits.
     pub shift: u32,
-    /// Capacity for items.
     pub capacity: u32,
 }
 
@@ -144,7 +142,6 @@ pub(crate) struct Capacities {
 }
 
 impl Capacities {
-    /// Returns what a band needed, by its counts.
     pub(crate) fn needed(counts: &Counts) -> Self {
         let [visible, pairs, entries] =
             [Counter::Visible, Counter::Pairs, Counter::Entries].map(|counter| counts[counter as usize]);

@@ -7,10 +7,7 @@
 //! Data beyond the limit of a binding is divided: the scene into chunks, the image into bands of tile rows. This
 //! changes no contribution, because tiles are independent and integers add up exactly.
 
-mod band;
-mod bindings;
 mod buffers;
-mod chunk;
 mod device;
 mod jobs;
 mod layout;
@@ -30,20 +27,16 @@ use slag_raster::{Drawing, RasterView, ViewCounters, check_scene, check_view, co
 
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
-use super::cpu::CpuRasterizer;
-use super::error::RasterError;
-use super::rasterizer::{LoadedScene, Rasterizer};
-use super::validate::check_regions;
-use super::weights::{RegionWeight, ViewWeights, WeightKind};
+use super::cpu::{CpuRasterizer, check_regions};
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
-use band::{Band, band_size};
 use buffers::{REGION_BYTES, Size};
-use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
 pub(crate) use device::Adapter;
 pub use device::{Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, Counts, MAX_CAPACITY, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
-use workspace::{PIXEL_BYTES, Workspace};
+use stages::{SCENE_GAUSSIAN_BYTES, SceneChunk};
+use workspace::{Band, PIXEL_BYTES, Workspace, band_size};
 
 pub struct GpuRasterizer {
     device: Arc<Device>,
@@ -245,6 +238,29 @@ impl<'s> GpuScene<'s> {
         self.bands_of(&mut lent.workspace, view, px_bytes, &mut work)
     }
 
+    /// Takes a workspace that holds a band, or makes one; `None` where memory does not suffice and there is another
+    /// view's to try with instead.
+    fn workspace_for(
+        &self,
+        workspace: &mut Option<Workspace>,
+        n_tiles: u32,
+        n_px: u32,
+    ) -> Result<Option<Workspace>, RasterError> {
+        if let Some(current) = workspace.take().filter(|current| current.holds(n_tiles, n_px)) {
+            return Ok(Some(current));
+        }
+        let capacities = self.pool().capacities;
+        match self.make_workspace(capacities, n_tiles, n_px) {
+            Ok(made) => Ok(Some(made)),
+            Err(_) if self.give_up_workspace() => {
+                // Waits for another view's.
+                *workspace = self.take_workspace();
+                Ok(None)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
     fn bands_of(
         &self,
         workspace: &mut Option<Workspace>,
@@ -270,22 +286,9 @@ impl<'s> GpuScene<'s> {
         };
         while let Some([first, end]) = bands.pop() {
             let (n_tiles, n_px) = band_size(width_px, height_px, [first, end]);
-            let mut current = match workspace.take() {
-                Some(current) if current.holds(n_tiles, n_px) => current,
-                old => {
-                    drop(old);
-                    let capacities = self.pool().capacities;
-                    match self.make_workspace(capacities, n_tiles, n_px) {
-                        Ok(made) => made,
-                        Err(_) if self.give_up_workspace() => {
-                            // Waits for another view's.
-                            *workspace = self.take_workspace();
-                            bands.push([first, end]);
-                            continue;
-                        }
-                        Err(error) => return Err(error),
-                    }
-                }
+            let Some(mut current) = self.workspace_for(workspace, n_tiles, n_px)? else {
+                bands.push([first, end]);
+                continue;
             };
             let capacities = current.capacities;
             let block = ViewBlock::new(view, self.origin_in_world, [first, end], capacities);

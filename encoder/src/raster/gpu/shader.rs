@@ -10,7 +10,7 @@ use slag_raster::constants::{
 use slag_raster::{EXP_OF_MINUS_C, MAX_POWER};
 
 use crate::raster::adapter::Precision;
-use crate::raster::weights::WeightKind;
+use crate::raster::rasterizer::WeightKind;
 
 /// Threads of a workgroup, equal to the pixels of a tile.
 pub(crate) const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
@@ -125,7 +125,16 @@ pub(crate) fn module_text(stage: &str, precision: Precision) -> String {
     for (counter, name) in Counter::ALL {
         let _ = writeln!(text, "const COUNTER_{name}: u32 = {}u;", counter as u32);
     }
-    // Unrolls Horner's scheme, because an array of constants would be indexed in memory.
+    text.push_str(&exp_of_minus());
+    text.push_str(COMMON);
+    text.push_str(STAGES.iter().find(|s| s.0 == stage).map_or("", |s| s.1));
+    text
+}
+
+/// Returns the source of the exponential function: Horner's scheme unrolled, because an array of constants would be
+/// indexed in memory.
+fn exp_of_minus() -> String {
+    let mut text = String::new();
     let [first @ .., last] = EXP_OF_MINUS_C;
     let _ = writeln!(text, "fn exp_of_minus(power: f32) -> f32 {{");
     let _ = writeln!(text, "    let t = MAX_POWER / 8.0 - min(power, MAX_POWER) * 0.25;");
@@ -134,8 +143,6 @@ pub(crate) fn module_text(stage: &str, precision: Precision) -> String {
         let _ = writeln!(text, "    root = root * t + {c:e}f;");
     }
     let _ = writeln!(text, "    let square = root * root;\n    return square * square;\n}}");
-    text.push_str(COMMON);
-    text.push_str(STAGES.iter().find(|s| s.0 == stage).map_or("", |s| s.1));
     text
 }
 

@@ -2,13 +2,14 @@
 
 use std::collections::HashMap;
 
-use super::bindings::{bind, cached, dispatch, dispatch_indirect, number, whole};
+use wgpu::BufferUsages as Usage;
+
 use super::buffers::Buffers;
-use super::chunk::SceneChunk;
 use super::device::Device;
-use super::jobs::{DIGIT_BITS, Scan, SortKey, dispatch_offset, part, sort_job};
-use super::shader::{Counter, WORKGROUP_SIZE};
-use crate::raster::weights::WeightKind;
+use super::jobs::{DIGIT_BITS, JOB_STRIDE_BYTES, Scan, SortKey, dispatch_offset, part, sort_job};
+use super::layout::{Chunk, ScanJob, SceneGaussian};
+use super::shader::{Counter, NONE, WORKGROUP_SIZE};
+use crate::raster::rasterizer::WeightKind;
 
 /// Records the stages of one view in flight.
 pub(crate) struct Stages {
@@ -225,5 +226,95 @@ impl Stages {
         dispatch_indirect(pass, &kernels.count_heads, group, (&self.buffers.dispatches, offset));
         self.scan(device, pass, Scan::Heads);
         dispatch_indirect(pass, &kernels.add_up, &add_up, (&self.buffers.dispatches, offset));
+    }
+}
+
+pub fn whole(buffer: &wgpu::Buffer) -> wgpu::BufferBinding<'_> {
+    buffer.as_entire_buffer_binding()
+}
+
+/// Numbers bindings from 0 on.
+pub fn number<'a>(bindings: &[wgpu::BufferBinding<'a>]) -> Vec<(u32, wgpu::BufferBinding<'a>)> {
+    (0..).zip(bindings.iter().cloned()).collect()
+}
+
+pub fn bind(
+    device: &Device,
+    kernel: &wgpu::ComputePipeline,
+    bound: &[(u32, wgpu::BufferBinding<'_>)],
+) -> wgpu::BindGroup {
+    let entries: Vec<_> = bound
+        .iter()
+        .map(|(binding, buffer)| wgpu::BindGroupEntry {
+            binding: *binding,
+            resource: wgpu::BindingResource::Buffer(buffer.clone()),
+        })
+        .collect();
+    device.device.create_bind_group(&wgpu::BindGroupDescriptor {
+        label: None,
+        layout: &kernel.get_bind_group_layout(0),
+        entries: &entries,
+    })
+}
+
+/// Returns the bind group with this name and number, and creates it at the first use.
+pub(crate) fn cached<'g>(
+    groups: &'g mut HashMap<(&'static str, u32), wgpu::BindGroup>,
+    key: (&'static str, u32),
+    make: impl FnOnce() -> wgpu::BindGroup,
+) -> &'g wgpu::BindGroup {
+    groups.entry(key).or_insert_with(make)
+}
+
+/// Records a kernel with `n` workgroups along x and y.
+pub(crate) fn dispatch(
+    pass: &mut wgpu::ComputePass<'_>,
+    kernel: &wgpu::ComputePipeline,
+    group: &wgpu::BindGroup,
+    n: [u32; 2],
+) {
+    pass.set_pipeline(kernel);
+    pass.set_bind_group(0, group, &[]);
+    pass.dispatch_workgroups(n[0], n[1], 1);
+}
+
+/// Records a kernel with the number of workgroups from a buffer.
+pub(crate) fn dispatch_indirect(
+    pass: &mut wgpu::ComputePass<'_>,
+    kernel: &wgpu::ComputePipeline,
+    group: &wgpu::BindGroup,
+    (sizes, offset): (&wgpu::Buffer, u64),
+) {
+    pass.set_pipeline(kernel);
+    pass.set_bind_group(0, group, &[]);
+    pass.dispatch_workgroups_indirect(sizes, offset);
+}
+
+/// Size of a Gaussian in device memory, bytes.
+pub(crate) const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
+
+pub(crate) struct SceneChunk {
+    pub n_gaussians: u32,
+    /// The [`Chunk`] and the [`ScanJob`] of its blocks, [`JOB_STRIDE_BYTES`] apart.
+    pub jobs: wgpu::Buffer,
+    /// The Gaussians; `None` if they are uploaded for each view.
+    pub gaussians: Option<wgpu::Buffer>,
+}
+
+impl SceneChunk {
+    /// Creates the buffers of a chunk without its Gaussians; `None` if the memory does not suffice.
+    pub fn new(device: &Device, first_gaussian: u32, n_gaussians: u32) -> Option<Self> {
+        let jobs = device.buffer("chunk jobs", 2 * JOB_STRIDE_BYTES, Usage::STORAGE | Usage::COPY_DST)?;
+        let chunk = Chunk { first_gaussian, n_gaussians };
+        let scan = ScanJob {
+            items: NONE,
+            n_most: n_gaussians,
+            block: WORKGROUP_SIZE,
+            columns: 1,
+            total: Counter::Visible as u32,
+        };
+        device.queue.write_buffer(&jobs, 0, bytemuck::bytes_of(&chunk));
+        device.queue.write_buffer(&jobs, JOB_STRIDE_BYTES, bytemuck::bytes_of(&scan));
+        Some(Self { n_gaussians, jobs, gaussians: None })
     }
 }

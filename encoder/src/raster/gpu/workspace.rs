@@ -1,19 +1,16 @@
 //! One view in flight: submits the stages and reads the results back.
 
 use bytemuck::Zeroable;
+use slag_raster::constants::TILE_SIZE_PX;
 use wgpu::BufferUsages as Usage;
 
-use super::band::Band;
-use super::bindings::{bind, dispatch, number, whole};
 use super::buffers::{Buffers, COUNTERS_BYTES, Size, VIEW_BYTES, regions_bytes};
-use super::chunk::SceneChunk;
 use super::device::Device;
 use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
-use super::layout::{Background, Capacities, RegionSum};
+use super::layout::{Background, Capacities, RegionSum, ViewBlock};
 use super::shader::{Counter, Counts};
-use super::stages::Stages;
-use crate::raster::error::RasterError;
-use crate::raster::weights::WeightKind;
+use super::stages::{SceneChunk, Stages, bind, dispatch, number, whole};
+use crate::raster::rasterizer::{RasterError, WeightKind};
 
 /// Size of a drawn pixel, bytes.
 pub(crate) const PIXEL_BYTES: u64 = 20;
@@ -261,6 +258,29 @@ impl Workspace {
         let mut pass = encoder.begin_compute_pass(&Default::default());
         self.stages.project(device, &mut pass, chunk, gaussians);
     }
+}
+
+pub(crate) struct Band<'a> {
+    pub device: &'a Device,
+    pub chunks: &'a [SceneChunk],
+    /// Uploads the Gaussians of a chunk that is not on the device.
+    pub(crate) upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
+    /// The view and the rows of tiles of the band.
+    pub view: &'a ViewBlock,
+}
+
+impl Band<'_> {
+    /// Returns the number of columns and rows of tiles.
+    pub fn tiles(&self) -> [u32; 2] {
+        let [_, _, first_row, end_row, columns, ..] = self.view.words;
+        [columns, end_row - first_row]
+    }
+}
+
+pub(crate) fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (u32, u32) {
+    let tile = TILE_SIZE_PX as u32;
+    let rows_px = (tile_rows[1] * tile).min(height_px) - tile_rows[0] * tile;
+    ((tile_rows[1] - tile_rows[0]) * width_px.div_ceil(tile), rows_px * width_px)
 }
 
 #[cfg(test)]

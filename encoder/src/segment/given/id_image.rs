@@ -3,9 +3,8 @@
 use std::io::BufReader;
 use std::path::Path;
 
-use super::limits::check_size;
-use crate::segment::error::SegmentError;
-use crate::segment::segmenter::SegmentInput;
+use super::coco::check_size;
+use crate::segment::segmenter::{SegmentError, SegmentInput};
 
 /// Memory that the PNG decoder may use beyond the pixels.
 const PNG_OVERHEAD_BYTES: usize = 1 << 20;

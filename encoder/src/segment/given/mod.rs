@@ -2,18 +2,15 @@
 
 mod coco;
 mod id_image;
-mod limits;
-mod undistort;
 
 use std::path::{Path, PathBuf};
 
 use slag_common::{Hash32, View};
 
-use super::error::SegmentError;
-use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
+use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::masks::rle::Rle;
 use crate::masks::{Mask, NO_REGION, masks_of_labels};
-use limits::too_large;
+use coco::too_large;
 
 /// Masks from files.
 ///

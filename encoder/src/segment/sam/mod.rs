@@ -24,8 +24,7 @@ use image::imageops;
 use slag_models::sam::{Decoded, Sam};
 use slag_models::{ModelError, SessionOptions};
 
-use super::error::SegmentError;
-use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
+use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::lanes::{GpuLoad, Lanes};
 use crate::masks::{BoxPx, Mask};
 use candidate::Candidate;

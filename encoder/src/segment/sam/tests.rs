@@ -378,8 +378,6 @@ fn stability_equals_a_plain_recomputation() {
     assert!((5..25).contains(&n_soft), "{n_soft}");
 }
 
-/// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
-#[needs_shared]
 /// Outlines, holes and rough places lie along blocks of pixels that are enlarged, beside others that are not.
 #[test]
 fn rough_masks_equal_a_plain_recomputation() {
@@ -413,6 +411,8 @@ fn rough_masks_equal_a_plain_recomputation() {
     assert!(n_inside > 100_000, "{n_inside}");
 }
 
+/// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
+#[needs_shared]
 #[test]
 fn the_identity_holds_model_and_settings() {
     let segmenter = tiny(SamSettings::default());
@@ -483,7 +483,7 @@ fn tiny(settings: SamSettings) -> SamSegmenter {
 }
 
 fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
-    let mut archive = slag_common::npz::Npz::open(npz).expect("an npz");
+    let mut archive = slag_common::npy::Npz::open(npz).expect("an npz");
     let member = archive.array(name).expect("readable").expect("there");
     let array = npyz::NpyFile::new(member).expect("an array");
     (array.shape().to_vec(), array.into_vec().expect("of that type"))

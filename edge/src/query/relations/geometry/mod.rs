@@ -1,19 +1,16 @@
-//! Relations as plain geometry of upright boxes: a file for each family. Each relation gives a degree from 0 to 1;
+//! Relations as plain geometry of upright boxes. Each relation gives a degree from 0 to 1;
 //! at [`HOLDS`] and above it holds. `docs/api.md` has the definitions for users.
 
-mod contact;
-mod distance;
-mod enclosed;
-mod measure;
-mod outline;
-mod seen;
 mod solid;
 
-pub use distance::between;
-pub use seen::Viewer;
-pub use solid::Solid;
+use std::f64::consts::FRAC_PI_2;
+
+use glam::{DVec2, DVec3};
 
 use super::phrase::Relation;
+
+use self::solid::to_segment;
+pub use solid::Solid;
 
 /// Least degree at which a relation holds.
 pub const HOLDS: f64 = 0.5;
@@ -21,17 +18,192 @@ pub const HOLDS: f64 = 0.5;
 /// Returns the degree to which a thing is so placed to another; `between` is 0 here, see [`between`].
 pub fn degree(is: Relation, thing: &Solid, of: &Solid, viewer: Option<&Viewer>, metre: f64) -> f64 {
     match is {
-        Relation::On => contact::on(thing, of, metre),
-        Relation::Under => contact::under(thing, of, metre),
-        Relation::Above => contact::under(of, thing, metre),
-        Relation::In => enclosed::inside(thing, of, metre),
-        Relation::Near => distance::near(thing, of, metre),
-        Relation::Beside => distance::beside(thing, of, metre),
+        Relation::On => on(thing, of, metre),
+        Relation::Under => under(thing, of, metre),
+        Relation::Above => under(of, thing, metre),
+        Relation::In => inside(thing, of, metre),
+        Relation::Near => near(thing, of, metre),
+        Relation::Beside => beside(thing, of, metre),
         Relation::Between => 0.0,
         Relation::LeftOf | Relation::RightOf | Relation::InFrontOf | Relation::Behind => {
-            viewer.map_or(0.0, |viewer| seen::towards(is, thing, of, viewer, metre))
+            viewer.map_or(0.0, |viewer| towards(is, thing, of, viewer, metre))
         }
     }
+}
+
+/// Returns 1 below `full`, 0 above `none`, and a straight line between them.
+fn falling(value: f64, full: f64, none: f64) -> f64 {
+    ((none - value) / (none - full)).clamp(0.0, 1.0)
+}
+
+/// Distance, in metres, between a thing's bottom and the surface below it that still counts as touching: positions
+/// are those of Gaussians, and the box leaves out the outermost ones.
+const TOUCHES_M: f64 = 0.1;
+/// Distance at which it surely does not touch.
+const APART_M: f64 = 0.25;
+/// Share of the support's height by which a thing's bottom may lie below its top: seats are lower than backs, and
+/// the masks of a support may take in what stands on it.
+const SUNK: f64 = 0.6;
+/// Share of a thing's outline that must lie over its support.
+const OVER: [f64; 2] = [0.6, 0.2];
+/// A panel, such as a wall, is thinner than this share of its width.
+const PANEL: f64 = 0.25;
+
+/// Returns the degree to which a thing rests on another, or hangs on it if that is a panel.
+fn on(thing: &Solid, support: &Solid, metre: f64) -> f64 {
+    resting(thing, support, metre).max(hanging(thing, support, metre))
+}
+
+fn resting(thing: &Solid, support: &Solid, metre: f64) -> f64 {
+    // A thing that is much larger than its support rests on something else.
+    if thing.area() > 2.0 * support.area() || thing.centre.z <= support.centre.z {
+        return 0.0;
+    }
+    let over = thing.shared_area(support) / thing.area().max(f64::MIN_POSITIVE);
+    let gap = thing.bottom() - support.top();
+    let sunk = -gap / (SUNK * support.height()).max(TOUCHES_M * metre);
+    let touches = falling(gap, TOUCHES_M * metre, APART_M * metre) * falling(sunk, 1.0, 1.5);
+    touches * falling(-over, -OVER[0], -OVER[1])
+}
+
+fn hanging(thing: &Solid, panel: &Solid, metre: f64) -> f64 {
+    let (thick, wide) = (panel.half.x.min(panel.half.y), panel.half.x.max(panel.half.y));
+    let is_panel = thick < PANEL * wide && thing.volume() < panel.volume().max(wide * wide * thick);
+    let is_off_the_ground = thing.bottom() > panel.bottom() + TOUCHES_M * metre;
+    if !is_panel || !is_off_the_ground || thing.shared_height(panel) < 0.5 * thing.height() {
+        return 0.0;
+    }
+    falling(thing.horizontal_gap(panel), TOUCHES_M * metre, APART_M * metre)
+}
+
+/// Returns the degree to which a thing is below another and within its outline.
+fn under(thing: &Solid, cover: &Solid, metre: f64) -> f64 {
+    if thing.centre.z >= cover.centre.z || thing.top() > cover.top() {
+        return 0.0;
+    }
+    let smaller = thing.area().min(cover.area()).max(f64::MIN_POSITIVE);
+    let share = thing.shared_area(cover) / smaller;
+    // Under a table, not in the middle of a cupboard: it begins near the cover's bottom or below it.
+    let raised = thing.bottom() - cover.bottom();
+    let low = falling(raised, TOUCHES_M * metre, (APART_M * metre).max(0.3 * cover.height()));
+    falling(-share, -OVER[0], -OVER[1]) * low
+}
+
+/// Distance of the surfaces, in metres, that is near beyond doubt.
+const NEAR_M: f64 = 0.5;
+/// Distance that is not near any more; large things are near from farther away.
+const FAR_M: f64 = 1.5;
+/// Share of the smaller thing's size that is added to both.
+const OF_SIZE: f64 = 0.5;
+/// The same for things beside each other.
+const BESIDE_M: [f64; 2] = [0.4, 1.2];
+/// Share of the lower thing's height that both must have in common.
+const LEVEL: [f64; 2] = [0.5, 0.1];
+/// A thing between two others is off the line from one to the other by at most this share of its length.
+const OFF_LINE: [f64; 2] = [0.2, 0.5];
+
+/// Returns the degree to which two things are near each other.
+fn near(thing: &Solid, other: &Solid, metre: f64) -> f64 {
+    let more = OF_SIZE * thing.half.max_element().min(other.half.max_element());
+    falling(thing.gap(other), NEAR_M * metre + more, FAR_M * metre + more)
+}
+
+/// Returns the degree to which two things stand side by side.
+fn beside(thing: &Solid, other: &Solid, metre: f64) -> f64 {
+    let lower = thing.height().min(other.height()).max(f64::MIN_POSITIVE);
+    let level = falling(-thing.shared_height(other) / lower, -LEVEL[0], -LEVEL[1]);
+    let smaller = thing.area().min(other.area()).max(f64::MIN_POSITIVE);
+    let apart = falling(thing.shared_area(other) / smaller, 0.2, 0.6);
+    level * apart * falling(thing.horizontal_gap(other), BESIDE_M[0] * metre, BESIDE_M[1] * metre)
+}
+
+/// Returns the degree to which a thing is between two others.
+pub fn between(thing: &Solid, one: &Solid, other: &Solid) -> f64 {
+    let (from, to) = (one.centre.truncate(), other.centre.truncate());
+    let length = from.distance(to);
+    if length <= f64::MIN_POSITIVE {
+        return 0.0;
+    }
+    let at = thing.centre.truncate();
+    let share = (at - from).dot(to - from) / (length * length);
+    // Full in the middle, none beyond the ends.
+    let inside = falling((share - 0.5).abs(), 0.35, 0.5);
+    inside * falling(to_segment(at, (from, to)) / length, OFF_LINE[0], OFF_LINE[1])
+}
+
+/// Metres by which a thing may stick out of the box that it is in.
+const SLACK_M: f64 = 0.1;
+/// Shares of a thing's box that lie inside: the relation holds fully from the first, not at all from the second.
+const INSIDE: [f64; 2] = [0.8, 0.4];
+/// A thing is smaller than this share of what it is in.
+const SMALLER: f64 = 0.5;
+
+/// Returns the degree to which a thing is inside another.
+fn inside(thing: &Solid, container: &Solid, metre: f64) -> f64 {
+    if thing.volume() >= SMALLER * container.volume() {
+        return 0.0;
+    }
+    let container = container.grown(SLACK_M * metre);
+    let of_outline = thing.shared_area(&container) / thing.area().max(f64::MIN_POSITIVE);
+    let of_height = thing.shared_height(&container).max(0.0) / thing.height().max(f64::MIN_POSITIVE);
+    falling(-(of_outline * of_height).min(1.0), -INSIDE[0], -INSIDE[1])
+}
+
+/// Angles from the direction that is meant, in degrees: the relation holds fully up to the first, not at all from
+/// the second.
+const OFF_DEG: [f64; 2] = [30.0, 70.0];
+/// Distances of the outlines, in metres, from which the degree falls, and at which half of it is left: a thing at
+/// the far end of a hall is no answer to "left of the door" if there is another beside it.
+const REACH_M: [f64; 2] = [3.0, 12.0];
+
+/// Where the asker is, and where it looks.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Viewer {
+    pub position_in_world: DVec3,
+    /// Its heading, from the world's x axis towards y, radians.
+    pub heading_rad: Option<f64>,
+}
+
+/// Returns the degree to which a thing is left of another, right of it, in front of it or behind it.
+///
+/// Seen from the asker, who looks at the other thing; beside the asker itself, from its heading.
+fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, metre: f64) -> f64 {
+    let anchor = of.centre.truncate();
+    let sight = anchor - viewer.position_in_world.truncate();
+    let heading = viewer.heading_rad.map(DVec2::from_angle);
+    let is_asker = of.half == DVec3::ZERO && sight.length() <= f64::EPSILON;
+    // What is in front of a thing is on the asker's side of it; what is in front of the asker is where it looks.
+    let Some(away) = (if is_asker { heading.map(|ahead| -ahead) } else { sight.try_normalize() }) else {
+        return 0.0;
+    };
+    let meant = match is {
+        Relation::LeftOf => {
+            if is_asker {
+                -away.perp()
+            } else {
+                away.perp()
+            }
+        }
+        Relation::RightOf => {
+            if is_asker {
+                away.perp()
+            } else {
+                -away.perp()
+            }
+        }
+        Relation::InFrontOf => -away,
+        _ => away,
+    };
+    let offset = thing.centre.truncate() - anchor;
+    // A thing that does not reach past the other's middle is in the same place.
+    let past = offset.dot(meant) - 0.5 * of.reach(meant);
+    if past <= 0.0 {
+        return 0.0;
+    }
+    let angle = offset.angle_to(meant).abs().min(FRAC_PI_2).to_degrees();
+    let gap = thing.horizontal_gap(of) / metre;
+    let reach = 1.0 - 0.5 * (1.0 - falling(gap, REACH_M[0], REACH_M[1]));
+    falling(angle, OFF_DEG[0], OFF_DEG[1]) * reach
 }
 
 #[cfg(test)]

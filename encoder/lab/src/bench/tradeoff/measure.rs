@@ -110,7 +110,6 @@ fn file_name(scene: &SceneFiles, point: &Point, programs: &Programs) -> String {
     format!("{}-{}.json", scene.name, &blake3::hash(key.as_bytes()).to_hex()[..16])
 }
 
-/// The programs' runs for one point.
 struct Run<'a> {
     programs: &'a Programs,
     scene: &'a SceneFiles,
@@ -183,7 +182,6 @@ impl Run<'_> {
     }
 }
 
-/// Returns a figure that a program printed.
 fn figure(printed: &Value, name: &str) -> Result<f64> {
     let missing = || format!("no {name} in the JSON: the flags leave nothing to measure");
     printed[name].as_f64().with_context(missing)

@@ -2,9 +2,8 @@
 //! free, and the poses that the robot's program gives for each thing.
 
 mod truth;
-mod voxels;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -15,10 +14,12 @@ use glam::DVec3;
 use serde::Serialize;
 use serde_json::Value;
 use slag_common::objects::public_id;
+use slag_common::occupancy::BLOCK_EDGE;
 use slag_encoder::objects::NONE;
 use slag_encoder::progress::Progress;
 use slag_encoder::query::PublishedObjects;
 use slag_encoder::store::StoreReader;
+use truth::{HEIGHT_M, MIN_SHOWN, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
 
 use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
@@ -26,8 +27,6 @@ use crate::generate::grammar::{NOUNS, SceneKind};
 use crate::harness::Times;
 use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
-use truth::{HEIGHT_M, MIN_SHOWN, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
-use voxels::Voxels;
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
@@ -81,7 +80,7 @@ pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport
 }
 
 fn judge(args: &GoalArgs, dir: &Path, layout: &Layout, report: &mut GoalReport) -> Result<()> {
-    report.voxels.add(voxels::compare(layout, &dir.join("store"))?);
+    report.voxels.add(compare_voxels(layout, &dir.join("store"))?);
     let views = layout.photos(args.walk, args.n_views);
     let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
     let truth = Truth::new(layout, args.radius_m, cameras)?;
@@ -183,7 +182,6 @@ impl Verdict {
         matches!(self, Self::Pose { shown, .. } if *shown >= MIN_SHOWN)
     }
 
-    /// Returns whether it is wrong.
     fn is_fault(&self, is_reachable: bool) -> bool {
         if is_reachable { !self.is_shown() } else { matches!(self, Self::Pose { .. }) }
     }
@@ -263,6 +261,80 @@ impl fmt::Display for GoalReport {
         row("requests", times.n.to_string(), millis);
         write!(f, "{table}")
     }
+}
+
+/// Distance of the surface points that are looked at.
+const SPACING_M: f64 = 0.012;
+
+/// Free voxels, and those that are not.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+struct Voxels {
+    n_free: u64,
+    /// Those with a true surface inside, or inside a solid.
+    n_false: u64,
+    len_bytes: u64,
+}
+
+impl Voxels {
+    fn add(&mut self, other: Self) {
+        self.n_free += other.n_free;
+        self.n_false += other.n_false;
+        self.len_bytes += other.len_bytes;
+    }
+}
+
+fn compare_voxels(layout: &Layout, store: &Path) -> Result<Voxels> {
+    let reader = StoreReader::open(store)?;
+    let mut found = Voxels::default();
+    let mut surfaces: Option<HashSet<[i32; 3]>> = None;
+    for cell in &reader.manifest().cells {
+        let Some(record) = cell.shards.values().next() else { continue };
+        let shard = reader.read_shard(record)?;
+        let Some(occupancy) = shard.layout.occupancy(&shard.bytes) else { continue };
+        let voxel = occupancy.header.voxel;
+        let surfaces = surfaces.get_or_insert_with(|| surface_voxels(layout, voxel));
+        found.len_bytes += occupancy.sections().iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
+        for run in occupancy.runs() {
+            for block in run.blocks.clone() {
+                let [_, free] = run.masks_of(block);
+                let at = occupancy.block_at(block);
+                for bit in (0..64).filter(|bit| free >> bit & 1 == 1) {
+                    let offset = [bit / 16, bit / 4 % 4, bit % 4];
+                    let place = [0, 1, 2].map(|axis| at[axis] * BLOCK_EDGE + offset[axis]);
+                    let centre = (DVec3::from(place.map(f64::from)) + 0.5) * voxel;
+                    found.n_free += 1;
+                    found.n_false += u64::from(surfaces.contains(&place) || is_solid(layout, centre));
+                }
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Returns the voxels with a point of a true surface.
+fn surface_voxels(layout: &Layout, voxel: f64) -> HashSet<[i32; 3]> {
+    let mut voxels = HashSet::new();
+    for placed in &layout.placed {
+        for part in &placed.object.parts {
+            for surfel in part.surfels(SPACING_M) {
+                let at = placed.world_from_object.transform_point3(surfel.position) / voxel;
+                voxels.insert(at.floor().to_array().map(|v| v as i32));
+            }
+        }
+    }
+    voxels
+}
+
+fn is_solid(layout: &Layout, point: DVec3) -> bool {
+    // A ceiling is a box around its whole room, of which only the surface is a thing.
+    let things = layout.placed.iter().filter(|placed| !placed.shell);
+    let near = things.filter(|placed| placed.bounds.contains(point));
+    near.flat_map(|placed| placed.object.parts.iter().map(move |part| (placed, part))).any(
+        |(placed, part)| {
+            let world_from_part = placed.world_from_object * part.object_from_part;
+            part.shape.contains(world_from_part.inverse().transform_point3(point))
+        },
+    )
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use serde::Serialize;
 use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::RasterView;
 
-use super::counts::{Ious, MIN_PX, areas};
+use super::segments::{Ious, MIN_PX, areas};
 
 /// Largest relative difference between a point's depth and that of the splat where it is drawn: more is hidden.
 const MAX_DEPTH_ERROR: f64 = 0.03;

@@ -2,7 +2,6 @@
 //! all photos by the share of the scene that masks cover, and by agreement between views.
 
 mod agreement;
-mod counts;
 mod segments;
 
 use std::fmt;
@@ -36,8 +35,7 @@ use crate::programs::flag_value;
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure, percent};
 use agreement::{Agreement, Seen};
-use counts::{Ious, MIN_PX};
-use segments::Segments;
+use segments::{Ious, MIN_PX, Segments};
 
 /// Opacity from which a pixel has splat behind it.
 const MIN_COVERAGE: f32 = 0.5;

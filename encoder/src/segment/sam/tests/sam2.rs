@@ -1,6 +1,6 @@
 //! Automatic masks of Segment Anything 2: photos are stretched, prompts without an object give no mask.
 
-use slag_common::{Distortion, Intrinsics, View};
+use slag_common::{View, pinhole};
 
 use super::*;
 use crate::segment::SegmentInput;
@@ -30,12 +30,7 @@ fn all(points_per_side: u32) -> SamSettings {
 }
 
 fn segment(segmenter: &SamSegmenter, image: &image::RgbImage) -> Vec<Mask> {
-    let (width_px, height_px) = image.dimensions();
-    let (focal_x_px, focal_y_px) = (100.0, 100.0);
-    let (centre_x_px, centre_y_px) = (f64::from(width_px) / 2.0, f64::from(height_px) / 2.0);
-    let distortion = Distortion::None;
-    let intrinsics =
-        Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, distortion };
+    let intrinsics = pinhole(image.dimensions().into(), 100.0);
     let camera_from_world = glam::DAffine3::IDENTITY;
     let view = View { name: "photo".into(), image_path: "photo".into(), intrinsics, camera_from_world };
     let input = SegmentInput { view: &view, image, valid: None, undistorter: None, depth: None, pool: None };
