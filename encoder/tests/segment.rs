@@ -83,7 +83,7 @@ fn load(
     let (view, image) = (view("left/a.jpg", 8, 6), RgbImage::new(8, 6));
     let input =
         SegmentInput { view: &view, image: &image, valid: None, undistorter, depth: None, pool: None };
-    let given = GivenMasks::open(dir, ignore_ids.to_vec()).unwrap();
+    let given = GivenMasks::open(dir, ignore_ids.to_vec())?;
     let loaded = given.load(&input);
     if let Ok(masks) = &loaded {
         assert_eq!(given.covers(&view), masks.is_some());

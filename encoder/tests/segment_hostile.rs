@@ -64,7 +64,7 @@ fn survive(name: &str, bytes: &[u8], whole: bool) {
             }
         }
     }
-    assert!(n_read > 5 && n_errors > 200, "{name}: {n_read} read, {n_errors} errors");
+    assert!(n_read > 0 && n_errors > 200, "{name}: {n_read} read, {n_errors} errors");
 }
 
 #[test]

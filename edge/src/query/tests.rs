@@ -378,11 +378,11 @@ fn boxes_bound_what_is_searched() {
         ask(&yard, |request, _| request.region.bounds = bounds([-6.0, -1.0, -1.0], [-4.501, 1.0, 1.0]));
     // Points at -5, -4.99, ..: 50 of them lie below -4.501.
     assert_eq!((answers.searched.n_matching, answers.searched.area_fetched), (50, Some(true)));
-    let far = ask(&yard, |request, _| request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]));
+    let far = ask(&yard, |request, _| request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 1.0]));
     assert_eq!(far.searched.area_fetched, Some(false));
     // The intersection of box and ball was fetched if either was.
     let both = ask(&yard, |request, _| {
-        request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]);
+        request.region.bounds = bounds([0.0; 3], [40.0, 40.0, 1.0]);
         request.region.ball = Some(Ball { centre_in_world: DVec3::new(20.0, 0.0, 0.0), radius: 0.105 });
     });
     assert_eq!((both.searched.area_fetched, both.searched.n_matching), (Some(true), 11));

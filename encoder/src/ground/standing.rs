@@ -1,6 +1,6 @@
 //! What stands on the ground: voxels above it that touch each other.
 
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 use slag_common::{Gaussians, View};
 use slag_math::stats::median;
@@ -115,9 +115,16 @@ impl Things {
         let (voxels, of_voxel, is_narrow) = (Vec::new(), Vec::new(), Vec::new());
         let mut things = Self { upright_from_world, ground, resolution, voxels, of_voxel, is_narrow };
         let solid = (0..scene.len()).into_par_iter().filter(|i| is_surface(i) && is_fine(i));
-        let mut voxels: Vec<u64> = solid.filter_map(|i| things.voxel_of(upright(i))).collect();
-        voxels.par_sort_unstable();
-        things.join(&voxels);
+        let touched = |i: usize| {
+            let (things, mean) = (&things, scene.means_in_world[i]);
+            reaches(scene, i, VOXEL * resolution).into_iter().filter_map(move |reach| {
+                let voxel = things.voxel_of(upright_from_world * (mean + reach))?;
+                Some((voxel, reach == DVec3::ZERO))
+            })
+        };
+        let mut touched: Vec<(u64, bool)> = solid.flat_map_iter(touched).collect();
+        touched.par_sort_unstable();
+        things.join(&touched);
         Some(things)
     }
 
@@ -134,10 +141,12 @@ impl Things {
         self.voxels.binary_search(&voxel).ok().map(|at| self.of_voxel[at])
     }
 
-    /// Joins the voxels of all Gaussians, ascending, that touch each other.
-    fn join(&mut self, of_gaussians: &[u64]) {
+    /// Joins voxels that touch each other. `touched`: ascending, and whether it is that of a Gaussian's mean.
+    fn join(&mut self, touched: &[(u64, bool)]) {
+        let of_voxel =
+            |same: &[(u64, bool)]| (same[0].0, same.iter().filter(|(_, has_mean)| *has_mean).count() as u32);
         let (voxels, n_gaussians): (Vec<u64>, Vec<u32>) =
-            of_gaussians.chunk_by(|a, b| a == b).map(|same| (same[0], same.len() as u32)).unzip();
+            touched.chunk_by(|a, b| a.0 == b.0).map(of_voxel).unzip();
         let mut sets = UnionFind::new(voxels.len());
         for (i, voxel) in (0u32..).zip(&voxels) {
             for other in steps().filter_map(|step| voxels.binary_search(&(voxel + step)).ok()) {
@@ -165,6 +174,25 @@ impl Things {
         (self.voxels, self.of_voxel) =
             voxels.into_iter().zip(of_things.of_item).filter(|(_, thing)| *thing != NO_THING).unzip();
     }
+}
+
+/// Returns the mean of a Gaussian and the places that it reaches a standard deviation from there, as far apart as
+/// voxels: those of a plain wall are larger than voxels, and lie as far apart as they reach.
+fn reaches(scene: &Gaussians, i: usize, side: f64) -> Vec<DVec3> {
+    let scales = scene.scales[i].map(f64::from);
+    let steps = scales.map(|scale| (scale / side + 0.5) as i32);
+    if steps == [0; 3] {
+        return vec![DVec3::ZERO];
+    }
+    let [w, x, y, z] = scene.rotations_wxyz[i].map(f64::from);
+    let world_from_axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+    let along = |axis: usize| {
+        let n = steps[axis];
+        (-n..=n).map(move |k| f64::from(k) * scales[axis] / f64::from(n.max(1)))
+    };
+    let places =
+        along(0).flat_map(|x| along(1).flat_map(move |y| along(2).map(move |z| DVec3::new(x, y, z))));
+    places.map(|place| world_from_axes * place).collect()
 }
 
 /// Returns the steps from a voxel to those after it that share a face or an edge: half of 18.

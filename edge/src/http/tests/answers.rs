@@ -106,7 +106,7 @@ async fn read_large(response: Response) -> (StatusCode, HeaderMap, Value) {
 #[tokio::test]
 async fn several_texts_make_a_batch() {
     let service = Service::new(Some(&many()), Settings::default());
-    for rest in ["&limit=3", "&kind=gaussians&limit=3000&threshold=0.5", "&kind=gaussians&negatives=2"] {
+    for rest in ["&limit=3", "&kind=gaussians&limit=3000&threshold=0.5", "&kind=gaussians&negatives=2%20x"] {
         let (_, _, batch) =
             read_large(service.send("GET", &format!("/query?text=1&text=0&text=2{rest}")).await).await;
         let batch = batch["batch"].as_array().expect("a batch");
