@@ -27,6 +27,8 @@ const MIN_GAUSSIANS: u32 = 10;
 const MAX_WIDTH: f64 = 0.25;
 /// Most Gaussians that the ground is measured by.
 const SAMPLE: usize = 1 << 22;
+/// Standard deviations of a Gaussian that it reaches; with 1 what stands close together is one thing.
+const REACH: f64 = 0.5;
 /// Bits of a voxel's coordinate.
 const BITS: u32 = 21;
 
@@ -97,14 +99,7 @@ impl Things {
         let x_axis = up.any_orthonormal_vector();
         let upright_from_world = DMat3::from_cols(x_axis, up.cross(x_axis), up).transpose();
         let is_surface = |i: &usize| scene.opacities[*i] >= MIN_OPACITY && scene.is_usable(*i);
-        // The two larger axes.
-        let axes = |i: usize| {
-            let [mut a, mut b, c] = scene.scales[i].map(f64::from);
-            if a > b {
-                std::mem::swap(&mut a, &mut b);
-            }
-            [a.max(b.min(c)), b.max(c)]
-        };
+        let axes = |i: usize| larger_axes(scene, i);
         let sample = || (0..scene.len()).step_by(scene.len().div_ceil(SAMPLE).max(1)).filter(is_surface);
         let resolution = median(&mut sample().map(|i| axes(i)[0]).collect::<Vec<f64>>())?;
         let is_fine = |i: &usize| axes(*i)[1] < MAX_SCALE * resolution;
@@ -176,10 +171,19 @@ impl Things {
     }
 }
 
-/// Returns the mean of a Gaussian and the places that it reaches a standard deviation from there, as far apart as
-/// voxels: those of a plain wall are larger than voxels, and lie as far apart as they reach.
+/// Returns the two larger standard deviations of a Gaussian, ascending.
+fn larger_axes(scene: &Gaussians, i: usize) -> [f64; 2] {
+    let mut scales = scene.scales[i].map(f64::from);
+    scales.sort_by(f64::total_cmp);
+    [scales[1], scales[2]]
+}
+
+/// Returns the mean of a Gaussian and places around it, at most as far apart as voxels: those of a plain wall are larger
+/// than voxels.
 fn reaches(scene: &Gaussians, i: usize, side: f64) -> Vec<DVec3> {
-    let scales = scene.scales[i].map(f64::from);
+    // A needle reaches as far as it is wide: along its length it would join what stands close together.
+    let middle = larger_axes(scene, i)[0];
+    let scales = scene.scales[i].map(|scale| f64::from(scale).min(middle));
     let steps = scales.map(|scale| (scale / side + 0.5) as i32);
     if steps == [0; 3] {
         return vec![DVec3::ZERO];
@@ -188,7 +192,7 @@ fn reaches(scene: &Gaussians, i: usize, side: f64) -> Vec<DVec3> {
     let world_from_axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
     let along = |axis: usize| {
         let n = steps[axis];
-        (-n..=n).map(move |k| f64::from(k) * scales[axis] / f64::from(n.max(1)))
+        (-n..=n).map(move |k| f64::from(k) * REACH * scales[axis] / f64::from(n.max(1)))
     };
     let places =
         along(0).flat_map(|x| along(1).flat_map(move |y| along(2).map(move |z| DVec3::new(x, y, z))));

@@ -178,8 +178,8 @@ impl Superpoints {
     pub(crate) fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
         let n = settings.n_neighbours;
         let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);
-        let joined =
-            n * (size_of::<u32>() + size_of::<Edge>()) + size_of::<Look>() + n_scales * 5 * size_of::<u32>();
+        let of_one = size_of::<Look>() + (1 + 5 * n_scales) * size_of::<u32>();
+        let joined = n * (size_of::<u32>() + size_of::<Edge>()) + of_one;
         n_gaussians as u64 * (size_of::<u32>() + searched.max(joined)) as u64
     }
 }

@@ -239,4 +239,18 @@ mod tests {
         // Of 50 Gaussians it sees a fifth, of 51 less.
         assert!(worth(&views(11), 50, 1) > 0.0 && worth(&views(11), 51, 1) == 0.0);
     }
+
+    /// By hand: of two masks that agree as well, one of what stands on the ground counts three quarters.
+    #[test]
+    fn masks_of_what_stands_count_less() {
+        let mut view = NodeView { n: 10, masks: vec![(0, 10), (1, 8)], agreement: 0.0, uncut: 1.0 };
+        let mut agreement = |is_standing: &[bool]| {
+            let (of_masks, uncut_shares) = (&[10, 8][..], &[1.0, 0.5][..]);
+            view.judge(Sizes { of_masks, uncut_shares, is_standing, of_superpoints: &[], min_gaussians: 1 });
+            (view.agreement, view.uncut)
+        };
+        assert_eq!(agreement(&[false, false]), (1.0, 1.0));
+        assert_eq!(agreement(&[true, false]), (0.8, 0.5));
+        assert_eq!(agreement(&[true, true]), (0.75, 1.0));
+    }
 }
