@@ -110,7 +110,7 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     }
     let mut named = MasksOfImage::new();
     for DataSetImage { id, file_name } in images {
-        if let Some(_other) = named.insert(file_name.clone(), rles_of_id.remove(&id).unwrap_or_default()) {
+        if named.insert(file_name.clone(), rles_of_id.remove(&id).unwrap_or_default()).is_some() {
             return Err(inconsistent(format!("two images have the file_name {file_name:?}")));
         }
     }
