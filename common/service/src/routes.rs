@@ -94,7 +94,7 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         summary: &'static str,
         handler: MethodRouter<S, Infallible>,
     ) -> Self {
-        // Where no handler reads the query string, what it says would be ignored in silence.
+        // No handler reads the query string here, so it would be ignored silently.
         let handler = if H::query().is_some() { handler } else { handler.route_layer(from_fn(no_query)) };
         self.router = self.router.route(path, handler);
         self.table.push(Route {

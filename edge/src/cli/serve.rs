@@ -284,7 +284,7 @@ fn tell(news: News) {
 #[cfg(not(unix))]
 fn tell(_: News) {}
 
-/// Says for ever that the service is alive, as long as `is_alive` says so in time; returns at once if nobody
+/// Keeps reporting that the service is alive, as long as `is_alive` says so in time; returns at once if nobody
 /// expects it.
 async fn pulse<A: Future<Output = bool>>(is_alive: impl Fn() -> A) {
     let timeout: Option<Duration> = match () {
