@@ -67,8 +67,9 @@ impl Filters<'_> {
         let lists = self.settings.levels.lists();
         let mut found = vec![Vec::new(); lists.len()];
         for candidate in candidates {
-            let at = lists.iter().position(|list| list.contains(&candidate.level));
-            at.into_iter().for_each(|at| found[at].push(candidate.clone()));
+            if let Some(at) = lists.iter().position(|list| list.contains(&candidate.level)) {
+                found[at].push(candidate);
+            }
         }
         found
     }
@@ -96,7 +97,9 @@ impl Filters<'_> {
                 let healed = candidate.mask.without_small_regions(width_px, height_px, min_region_px);
                 // Unchanged masks have priority.
                 let score = f64::from(u8::from(healed.is_none()));
-                candidate.mask = healed.unwrap_or_else(|| candidate.mask.clone());
+                if let Some(healed) = healed {
+                    candidate.mask = healed;
+                }
                 score
             };
             let scores = candidates.par_iter_mut().map(heal).collect();

@@ -36,8 +36,8 @@ pub use settings::{SamLevels, SamSettings, ScoreFilter};
 /// Opened models on each GPU: while the masks of some photos are filtered, the GPU has others.
 const MODELS_PER_GPU: usize = 2;
 
-/// Photos at a time in an opened model: one is embedded while the points of another are decoded.
-const PHOTOS_PER_MODEL: usize = 2;
+/// Photos at a time in an opened model: one is embedded while the points of others are decoded and filtered.
+const PHOTOS_PER_MODEL: usize = 3;
 
 /// Finds masks with SAM.
 #[derive(Debug)]
