@@ -13,4 +13,4 @@ mod height;
 mod standing;
 pub(crate) mod up;
 
-pub(crate) use standing::{NO_THING, Standing, reserve};
+pub(crate) use standing::{Footprint, NO_THING, Standing, reserve};

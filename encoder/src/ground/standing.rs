@@ -1,6 +1,6 @@
 //! What stands on the ground: voxels above it that touch each other.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use slag_common::{Gaussians, View};
 use slag_math::stats::median;
@@ -25,6 +25,9 @@ const MIN_HEIGHT: f64 = 2.0;
 const MIN_GAUSSIANS: u32 = 10;
 /// A thing is narrower than this share of the ground: of walls and what touches them a room consists.
 const MAX_WIDTH: f64 = 0.25;
+/// A wider patch of ground is no thing but a road, a lawn, a floor: as a share of the ground's width, under the sky and
+/// under a roof, where rugs lie.
+const MAX_PATCH: [f64; 2] = [0.125, 0.35];
 /// Most Gaussians that the ground is measured by.
 const SAMPLE: usize = 1 << 22;
 /// Standard deviations of a Gaussian that it reaches; with 1 what stands close together is one thing.
@@ -49,6 +52,34 @@ struct Things {
     of_voxel: Vec<u32>,
     /// Of each thing, whether it is less wide than what the scene consists of.
     is_narrow: Vec<bool>,
+}
+
+/// What some of the Gaussians cover of the ground.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Footprint {
+    n: u32,
+    n_standing: u32,
+    /// Gaussians on the ground with a wide thing above them.
+    n_roofed: u32,
+    /// Corners of the box around their means, in upright axes.
+    low: DVec2,
+    high: DVec2,
+}
+
+impl Footprint {
+    const NONE: Self =
+        Self { n: 0, n_standing: 0, n_roofed: 0, low: DVec2::INFINITY, high: DVec2::NEG_INFINITY };
+
+    /// Returns what both cover.
+    pub(crate) fn with(self, other: Self) -> Self {
+        Self {
+            n: self.n + other.n,
+            n_standing: self.n_standing + other.n_standing,
+            n_roofed: self.n_roofed + other.n_roofed,
+            low: self.low.min(other.low),
+            high: self.high.max(other.high),
+        }
+    }
 }
 
 /// Reserves the voxels of a scene's things.
@@ -79,6 +110,33 @@ impl Standing {
             things.of(voxel)
         };
         self.0.as_ref().and_then(thing).unwrap_or(NO_THING)
+    }
+
+    /// Returns what each of `n_parts` covers; empty where no ground was found. `part_of`: of each Gaussian.
+    pub(crate) fn footprints(&self, scene: &Gaussians, part_of: &[u32], n_parts: usize) -> Vec<Footprint> {
+        let Some(things) = &self.0 else { return Vec::new() };
+        let lies = |mean: &DVec3| {
+            let point = things.upright_from_world * *mean;
+            let is_standing = things.voxel_of(point).is_some_and(|voxel| things.of(voxel).is_some());
+            (is_standing, !is_standing && things.is_roofed(point))
+        };
+        let lie: Vec<(bool, bool)> = scene.means_in_world.par_iter().map(lies).collect();
+        let mut found = vec![Footprint::NONE; n_parts];
+        for ((mean, (is_standing, is_roofed)), part) in scene.means_in_world.iter().zip(lie).zip(part_of) {
+            let Some(of_part) = found.get_mut(*part as usize) else { continue };
+            let at = (things.upright_from_world * *mean).truncate();
+            let (n_standing, n_roofed) = (u32::from(is_standing), u32::from(is_roofed));
+            *of_part = of_part.with(Footprint { n: 1, n_standing, n_roofed, low: at, high: at });
+        }
+        found
+    }
+
+    /// Returns whether most of what covers this is ground, and wider than things that lie on it.
+    pub(crate) fn is_bare_ground(&self, footprint: &Footprint) -> bool {
+        let Footprint { n, n_standing, n_roofed, low, high } = *footprint;
+        let most = MAX_PATCH[usize::from(2 * n_roofed > n - n_standing)];
+        let is_wide = |things: &Things| (high - low).max_element() > most * things.ground.width;
+        2 * n_standing < n && self.0.as_ref().is_some_and(is_wide)
     }
 
     /// Returns the narrow thing at a point, or beside it as far as a voxel, where a drawing's depth is that exact; or
@@ -125,11 +183,26 @@ impl Things {
 
     /// Returns the voxel of a point in upright axes; `None` on the ground, below it, and far from the scene.
     fn voxel_of(&self, point: DVec3) -> Option<u64> {
+        let is_above = self.ground.height_of(point) >= MIN_HEIGHT * self.resolution;
+        self.place_of(point).filter(|_| is_above)
+    }
+
+    /// Returns the voxel of a point in upright axes, also where none can be; `None` far from the scene.
+    fn place_of(&self, point: DVec3) -> Option<u64> {
         let half = f64::from(1_u32 << (BITS - 1));
         let at = (point / (VOXEL * self.resolution)).floor() + half;
         let is_within = at.min_element() >= 1.0 && at.max_element() < 2.0 * half - 1.0;
-        let is_above = self.ground.height_of(point) >= MIN_HEIGHT * self.resolution;
-        (is_within && is_above).then(|| at.to_array().into_iter().fold(0, |key, at| key << BITS | at as u64))
+        is_within.then(|| at.to_array().into_iter().fold(0, |key, at| key << BITS | at as u64))
+    }
+
+    /// Returns whether the highest thing above a point is wide.
+    fn is_roofed(&self, point: DVec3) -> bool {
+        let Some(place) = self.place_of(point) else { return false };
+        let top_of_column = place | ((1 << BITS) - 1);
+        let n_up_to = self.voxels.partition_point(|voxel| *voxel <= top_of_column);
+        n_up_to.checked_sub(1).is_some_and(|highest| {
+            self.voxels[highest] > place && !self.is_narrow[self.of_voxel[highest] as usize]
+        })
     }
 
     fn of(&self, voxel: u64) -> Option<u32> {
@@ -213,4 +286,34 @@ fn up_by(scene: &Gaussians, views: &[View]) -> DVec3 {
         -(world_from_camera.y_axis + world_from_camera.z_axis).dot(axis)
     };
     if views.iter().map(away).sum::<f64>() < 0.0 { -axis } else { axis }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: a field of 30 x 30 m, half of it under a roof; a Gaussian every 10 cm. An eighth of it are 3.75 m, 0.35
+    /// of it are 10.5 m.
+    #[test]
+    fn a_wide_patch_is_bare_ground_and_under_a_roof_a_wider_one() {
+        let mut scene = Gaussians::default();
+        let field = (0..90_000).map(|i| (f64::from(i % 300) * 0.1, f64::from(i / 300) * 0.1));
+        let roof = field.clone().filter(|(x, _)| *x < 15.0).map(|(x, y)| DVec3::new(x, y, 3.0));
+        scene.means_in_world = field.map(|(x, y)| DVec3::new(x, y, 0.0)).chain(roof).collect();
+        let n = scene.len();
+        scene.rotations_wxyz = vec![[1.0, 0.0, 0.0, 0.0]; n];
+        scene.scales = vec![[0.1, 0.1, 0.01]; n];
+        scene.opacities = vec![0.9; n];
+        scene.sh_dc = vec![[0.0; 3]; n];
+        let standing = Standing(Things::find(&scene, DVec3::Z));
+        let is_bare = |x: f64, width: f64, z: f64| {
+            let is_part = |mean: &DVec3| (x..x + width).contains(&mean.x) && mean.y < 2.0 && mean.z == z;
+            let part_of: Vec<u32> =
+                scene.means_in_world.iter().map(|mean| u32::from(!is_part(mean))).collect();
+            standing.is_bare_ground(&standing.footprints(&scene, &part_of, 1)[0])
+        };
+        assert_eq!([3.5, 4.2].map(|width| is_bare(20.0, width, 0.0)), [false, true]);
+        assert_eq!([10.0, 11.0].map(|width| is_bare(1.0, width, 0.0)), [false, true]);
+        assert!(!is_bare(1.0, 13.0, 3.0), "a roof stands");
+    }
 }

@@ -7,7 +7,8 @@
 //! wins over its parts if views agree on it nearly as well.
 //!
 //! A node without consensus is no object, nor is one that no photo shows whole: of a road, each photo's mask
-//! agrees with all that the photo sees of it, and none tells where it ends.
+//! agrees with all that the photo sees of it, and none tells where it ends. A wide patch of ground is none either, as
+//! from high above photos show whole roads.
 
 use std::collections::BTreeMap;
 
@@ -15,6 +16,7 @@ use rayon::prelude::*;
 
 use super::sightings::{Sightings, ViewSighting};
 use super::tree::Tree;
+use crate::ground::{Footprint, Standing};
 
 /// A view judges a node if it sees at least this share of it, in tenths: one side is enough. What it sees without
 /// an outline is no part of any of its masks.
@@ -62,6 +64,9 @@ pub(super) struct Sizes<'a> {
     pub(super) is_standing: &'a [bool],
     /// `[n]`: Gaussians of each superpoint.
     pub(super) of_superpoints: &'a [u32],
+    /// `[n]`: what each superpoint covers of the ground; empty without any.
+    pub(super) footprints: &'a [Footprint],
+    pub(super) standing: &'a Standing,
     /// Fewest Gaussians of an object.
     pub(super) min_gaussians: u32,
 }
@@ -167,11 +172,13 @@ pub(super) fn objects(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> V
 
 fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
     let Sizes { of_superpoints, min_gaussians, .. } = sizes;
-    let alone = |superpoint: usize| {
-        worth(&views_of(sightings, superpoint, sizes), of_superpoints[superpoint], min_gaussians)
+    let is_ground = |footprint: &Footprint| sizes.standing.is_bare_ground(footprint);
+    let alone = |superpoint: usize| match sizes.footprints.get(superpoint).is_some_and(is_ground) {
+        true => 0.0,
+        false => worth(&views_of(sightings, superpoint, sizes), of_superpoints[superpoint], min_gaussians),
     };
     let mut worths: Vec<f64> = (0..tree.n_leaves).into_par_iter().map(alone).collect();
-    let mut n_of = of_superpoints.to_vec();
+    let (mut n_of, mut footprints) = (of_superpoints.to_vec(), sizes.footprints.to_vec());
     let mut views_of_node: BTreeMap<usize, NodeViews> = BTreeMap::new();
     for node in tree.n_leaves..tree.len() {
         let Some(parts) = tree.parts_of(node) else { continue };
@@ -190,7 +197,11 @@ fn worths(tree: &Tree, sightings: &Sightings, sizes: Sizes<'_>) -> Vec<f64> {
         }
         let n = parts.iter().map(|part| n_of[*part]).sum();
         n_of.push(n);
-        worths.push(worth(&views, n, min_gaussians));
+        let of_parts = parts.map(|part| footprints.get(part).copied());
+        let footprint = of_parts.into_iter().flatten().reduce(Footprint::with);
+        footprints.extend(footprint);
+        let is_ground = footprint.as_ref().is_some_and(is_ground);
+        worths.push(if is_ground { 0.0 } else { worth(&views, n, min_gaussians) });
         views_of_node.insert(node, views);
     }
     worths
@@ -246,7 +257,15 @@ mod tests {
         let mut view = NodeView { n: 10, masks: vec![(0, 10), (1, 8)], agreement: 0.0, uncut: 1.0 };
         let mut agreement = |is_standing: &[bool]| {
             let (of_masks, uncut_shares) = (&[10, 8][..], &[1.0, 0.5][..]);
-            view.judge(Sizes { of_masks, uncut_shares, is_standing, of_superpoints: &[], min_gaussians: 1 });
+            view.judge(Sizes {
+                of_masks,
+                uncut_shares,
+                is_standing,
+                of_superpoints: &[],
+                footprints: &[],
+                standing: &Standing::default(),
+                min_gaussians: 1,
+            });
             (view.agreement, view.uncut)
         };
         assert_eq!(agreement(&[false, false]), (1.0, 1.0));

@@ -62,6 +62,8 @@ pub(super) fn find_among(
         uncut_shares: &uncut_shares,
         is_standing: &is_standing,
         of_superpoints: &n_of_superpoint,
+        footprints: &scene.standing.footprints(scene.gaussians, &superpoints.of_gaussian, superpoints.n),
+        standing: scene.standing,
         min_gaussians: MIN_GAUSSIANS,
     };
     let object_of_superpoint = choice::objects(&tree, &sightings, sizes);
