@@ -2,9 +2,9 @@
 //!
 //! A view's agreement with a node is the best intersection over union between one of its masks and what it sees of
 //! the node. A node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan
-//! et al., CVPR 2024, judges masks), where masks that the photo's edge cuts off count less. The nodes are chosen,
-//! none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: an object
-//! wins over its parts if views agree on it nearly as well.
+//! et al., CVPR 2024, judges masks), where masks that the photo's edge cuts off and views from afar count less. The
+//! nodes are chosen, none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of
+//! Gaussians: an object wins over its parts if views agree on it nearly as well.
 //!
 //! A node without consensus is no object, nor is one that no photo shows whole: of a road, each photo's mask
 //! agrees with all that the photo sees of it, and none tells where it ends. A wide patch of ground is none either, as
@@ -34,6 +34,8 @@ const WHOLE_TENTHS: u64 = 2;
 const JUDGES_PER_WHOLE: usize = 11;
 /// Agreement counts as much with a mask of what stands on the ground: all views agree on it, also where things touch.
 const STANDING_TRUST: f64 = 0.75;
+/// A view of which fewer pixels show the node counts as much less: an outline that is a pixel off spoils a small one.
+const FULL_PX: f64 = 4096.0;
 /// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
 const LEAST_UNCUT: f32 = 0.05;
 
@@ -42,6 +44,8 @@ const LEAST_UNCUT: f32 = 0.05;
 struct NodeView {
     /// Gaussians that the view sees.
     n: u32,
+    /// Their blending weight.
+    weight_px: f64,
     /// Of these, those under each mask, by mask.
     masks: Vec<(u32, u32)>,
     /// The best intersection over union of a mask.
@@ -53,7 +57,7 @@ struct NodeView {
 /// What all views show of a node.
 type NodeViews = BTreeMap<u32, NodeView>;
 
-/// What is known of masks, and numbers of Gaussians.
+/// What is known of masks and superpoints.
 #[derive(Clone, Copy)]
 pub(super) struct Sizes<'a> {
     /// `[n_masks]`: sightings under each mask.
@@ -74,12 +78,13 @@ pub(super) struct Sizes<'a> {
 impl NodeView {
     fn of(of_view: &ViewSighting<'_>) -> Self {
         let masks = of_view.masks.iter().filter(|of| of.n > 0).map(|of| (of.mask, of.n)).collect();
-        Self { n: of_view.n, masks, agreement: 0.0, uncut: 1.0 }
+        Self { n: of_view.n, weight_px: of_view.weight_px, masks, agreement: 0.0, uncut: 1.0 }
     }
 
     /// Adds what the view shows of other Gaussians.
     fn add(&mut self, other: Self) {
         self.n += other.n;
+        self.weight_px += other.weight_px;
         self.masks.extend(other.masks);
         self.masks.sort_unstable_by_key(|(mask, _)| *mask);
         self.masks.dedup_by(|next, kept| {
@@ -126,7 +131,7 @@ fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
     let (mut sum, mut weights, mut n_whole, mut n_judges) = (0.0, 0.0, 0_usize, 0_usize);
     for view in judges {
         let uncut = f64::from(view.uncut.max(LEAST_UNCUT));
-        let weight = uncut * uncut;
+        let weight = uncut * uncut * (view.weight_px / FULL_PX).min(1.0);
         (sum, weights) = (sum + weight * view.agreement, weights + weight);
         n_judges += 1;
         let sees_it = u64::from(view.n) * 10 >= u64::from(n) * WHOLE_TENTHS;
@@ -243,7 +248,7 @@ mod tests {
     /// By hand: of 11 views one shows the node whole, and its edge cuts the others' masks; of 12 that is too few.
     #[test]
     fn one_of_eleven_views_must_show_an_object_whole_and_a_fifth_of_it() {
-        let view = |uncut| NodeView { n: 10, masks: vec![(0, 10)], agreement: 0.9, uncut };
+        let view = |uncut| NodeView { n: 10, weight_px: 4096.0, masks: vec![(0, 10)], agreement: 0.9, uncut };
         let views = |n: u32| (0..n).map(|at| (at, view(if at == 0 { 1.0 } else { 0.5 }))).collect();
         assert!((worth(&views(11), 16, 1) - 0.9_f64.powi(8) * 2.0).abs() < 1e-6);
         assert_eq!(worth(&views(12), 16, 1), 0.0);
@@ -251,10 +256,21 @@ mod tests {
         assert!(worth(&views(11), 50, 1) > 0.0 && worth(&views(11), 51, 1) == 0.0);
     }
 
+    /// By hand: of a view that agrees to 0.9 and one that does to 0.5, a quarter as large, the mean is 0.82.
+    #[test]
+    fn views_from_afar_count_less() {
+        let view =
+            |weight_px, agreement| NodeView { n: 10, weight_px, masks: vec![(0, 10)], agreement, uncut: 1.0 };
+        let views = |far_px| NodeViews::from([(0, view(9000.0, 0.9)), (1, view(far_px, 0.5))]);
+        assert!((worth(&views(1024.0), 16, 1) - 0.82_f64.powi(8) * 2.0).abs() < 1e-9);
+        assert!((worth(&views(4096.0), 16, 1) - 0.7_f64.powi(8) * 2.0).abs() < 1e-9);
+    }
+
     /// By hand: of two masks that agree as well, one of what stands on the ground counts three quarters.
     #[test]
     fn masks_of_what_stands_count_less() {
-        let mut view = NodeView { n: 10, masks: vec![(0, 10), (1, 8)], agreement: 0.0, uncut: 1.0 };
+        let mut view =
+            NodeView { n: 10, weight_px: 4096.0, masks: vec![(0, 10), (1, 8)], agreement: 0.0, uncut: 1.0 };
         let mut agreement = |is_standing: &[bool]| {
             let (of_masks, uncut_shares) = (&[10, 8][..], &[1.0, 0.5][..]);
             view.judge(Sizes {

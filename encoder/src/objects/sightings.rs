@@ -21,6 +21,8 @@ pub(super) struct ViewSighting<'a> {
     pub(super) view: u32,
     /// The superpoint's Gaussians that it sees.
     pub(super) n: u32,
+    /// Their blending weight, and that of those behind others.
+    pub(super) weight_px: f64,
     /// The masks that show it, ascending, but for fillers: their outlines are nobody's.
     pub(super) masks: &'a [MaskSighting],
 }
@@ -40,8 +42,8 @@ pub(super) struct MaskSighting {
 pub(super) struct Sightings {
     /// `[n + 1]`: where each superpoint's views start.
     starts: Vec<usize>,
-    /// View, Gaussians, and where its masks start; one more at the end.
-    views: Vec<(u32, u32, usize)>,
+    /// View, Gaussians, weight, and where its masks start; one more at the end.
+    views: Vec<(u32, u32, f64, usize)>,
     masks: Vec<MaskSighting>,
 }
 
@@ -99,7 +101,8 @@ impl Sightings {
             for of_view in own.chunk_by(|a, b| view_of(a) == view_of(b)) {
                 let first = sightings.masks.len();
                 let n_seen = of_view.iter().map(|entry| entry.n).sum();
-                sightings.views.push((view_of(&of_view[0]), n_seen, first));
+                let weight = of_view.iter().map(|entry| entry.weight).sum();
+                sightings.views.push((view_of(&of_view[0]), n_seen, weight, first));
                 let outlined = of_view.iter().filter(|entry| !table.is_filled(entry.region as usize));
                 let of_entry = |entry: &Entry| {
                     let masks = table.all_masks_of(entry.region as usize).iter();
@@ -120,7 +123,7 @@ impl Sightings {
             }
         }
         sightings.starts.push(sightings.views.len());
-        sightings.views.push((0, 0, sightings.masks.len()));
+        sightings.views.push((0, 0, 0.0, sightings.masks.len()));
         sightings
     }
 
@@ -131,8 +134,8 @@ impl Sightings {
     /// Returns what each view shows of a superpoint, views ascending.
     pub(super) fn of(&self, superpoint: usize) -> impl Iterator<Item = ViewSighting<'_>> {
         (self.starts[superpoint]..self.starts[superpoint + 1]).map(|at| {
-            let (view, n, first) = self.views[at];
-            ViewSighting { view, n, masks: &self.masks[first..self.views[at + 1].2] }
+            let (view, n, weight_px, first) = self.views[at];
+            ViewSighting { view, n, weight_px, masks: &self.masks[first..self.views[at + 1].3] }
         })
     }
 
