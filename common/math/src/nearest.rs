@@ -87,7 +87,9 @@ fn sort(items: &mut [Item], axes: &mut [u8]) {
     let side = |axis: &usize| high[*axis] - low[*axis];
     let axis = (0..3).max_by(|a, b| side(a).total_cmp(&side(b))).unwrap_or(0);
     let middle = items.len() / 2;
-    items.select_nth_unstable_by(middle, |a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1.cmp(&b.1)));
+    // 0 and -0 are one place.
+    let along = |item: &Item| item.0[axis] + 0.0;
+    items.select_nth_unstable_by(middle, |a, b| along(a).total_cmp(&along(b)).then(a.1.cmp(&b.1)));
     axes[middle] = axis as u8;
     let is_parallel = items.len() >= PARALLEL_POINTS;
     let (below, above) = items.split_at_mut(middle);
@@ -113,12 +115,17 @@ impl Tree<'_> {
         let axis = usize::from(self.axes[middle]);
         let beyond = item.0[axis] - self.items[middle].0[axis];
         let (below, above) = ((from, middle), (middle + 1, to));
-        let (near, far) = if beyond < 0.0 { (below, above) } else { (above, below) };
+        let (near, far) = if beyond > 0.0 { (above, below) } else { (below, above) };
         self.search(near.0, near.1, item, n, nearest);
         consider(item, &self.items[middle], n, nearest);
         // Rounding is monotone: no point beyond the plane has a smaller squared distance than the plane. An equal
         // one may have a lower number.
-        if nearest.len() < n || nearest.last().is_some_and(|last| beyond * beyond <= last.0) {
+        let reaches = |last: &(f64, u32)| {
+            // Points at one place, of which an export may have a million, are in the order of their numbers.
+            let is_later = beyond == 0.0 && last.0 == 0.0 && last.1 < self.items[middle].1;
+            beyond * beyond <= last.0 && !is_later
+        };
+        if nearest.len() < n || nearest.last().is_some_and(reaches) {
             self.search(far.0, far.1, item, n, nearest);
         }
     }

@@ -55,3 +55,11 @@ fn threads_do_not_show() {
     };
     assert_eq!(with(1), with(3));
 }
+
+/// An export may keep what was pruned, all at one place: 4e10 comparisons if each looked at each.
+#[test]
+fn a_heap_takes_no_longer_than_spread_points() {
+    let found = Neighbours::new(&vec![[1.0; 3]; 200_000], 8);
+    assert_eq!(found.of(0), [1, 2, 3, 4, 5, 6, 7, 8]);
+    assert_eq!(found.of(199_999), [0, 1, 2, 3, 4, 5, 6, 7]);
+}
