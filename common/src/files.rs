@@ -1,6 +1,6 @@
-//! Opening files that users name.
+//! Files that users name, to read and to write.
 
-use std::io;
+use std::io::{self, Read};
 use std::path::Path;
 
 use fs_err::File;
@@ -15,6 +15,44 @@ pub fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
+/// Reads a file of at most `max_bytes`; of a longer one, a byte more than that.
+pub fn read_short(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// Reads a file.
+pub fn read(path: &Path) -> io::Result<Vec<u8>> {
+    read_short(path, u64::MAX)
+}
+
+/// Checks that a result can be written to a file, before the work that makes it.
+pub fn check_writable(path: &Path) -> io::Result<()> {
+    match fs_err::metadata(path) {
+        // A pipe would wait for its reader.
+        Ok(about) if !about.is_file() && !about.is_dir() => Ok(()),
+        Ok(_) => fs_err::OpenOptions::new().append(true).open(path).map(drop),
+        Err(_) => {
+            fs_err::OpenOptions::new().write(true).create_new(true).open(path)?;
+            fs_err::remove_file(path)
+        }
+    }
+}
+
+/// Returns what often stands in a file's place, by its first bytes, and what to do then.
+pub fn stand_in(start: &[u8]) -> Option<(&'static str, &'static str)> {
+    match start.trim_ascii_start() {
+        [b'v', b'e', b'r', b's', b'i', b'o', b'n', b' ', b'h', b't', b't', b'p', ..] => {
+            Some(("a pointer of Git LFS", "bring the file itself with `git lfs pull`"))
+        }
+        [b'<', b'!' | b'?' | b'h' | b'H', ..] => {
+            Some(("a web page", "the download was refused or needs a login: download the file itself"))
+        }
+        _ => None,
+    }
+}
+
 #[cfg(all(test, unix))]
 mod tests {
     use super::*;
@@ -26,5 +64,29 @@ mod tests {
         assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("runs").success());
         assert!(open(&pipe).expect_err("is refused").to_string().contains("is a pipe"));
         assert!(open(Path::new("/dev/null")).is_ok());
+    }
+
+    #[test]
+    fn what_stands_in_a_files_place_is_named() {
+        let named = |start: &[u8]| stand_in(start).map(|(what, _)| what);
+        assert_eq!(named(b"version https://git-lfs.github.com/spec/v1\n"), Some("a pointer of Git LFS"));
+        assert_eq!(named(b"\n<html><body>Please log in"), Some("a web page"));
+        assert_eq!(named(b"<!DOCTYPE html>"), Some("a web page"));
+        for other in [&b"ply\nformat"[..], b"version 2", b"<svg", b"<", b""] {
+            assert_eq!(named(other), None);
+        }
+    }
+
+    #[test]
+    fn results_are_writable_where_they_can_be() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (new, kept) = (dir.path().join("new"), dir.path().join("kept"));
+        fs_err::write(&kept, "kept").expect("it is writable");
+        assert!(check_writable(&new).is_ok() && !new.exists());
+        assert!(check_writable(&kept).is_ok() && fs_err::read(&kept).expect("it is there") == b"kept");
+        for (wrong, what) in [(dir.path().to_owned(), "directory"), (new.join("below"), "No such file")] {
+            assert!(check_writable(&wrong).expect_err("is refused").to_string().contains(what));
+        }
+        assert!(check_writable(Path::new("/dev/stdout")).is_ok());
     }
 }

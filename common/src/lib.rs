@@ -27,6 +27,7 @@ pub mod retry;
 pub mod shard;
 pub mod similarity;
 pub mod splat;
+mod stderr;
 pub mod tuf;
 
 pub use byte_size::ByteSize;
@@ -35,3 +36,4 @@ pub use error_line::error_line;
 pub use gaussians::Gaussians;
 pub use hash::Hash32;
 pub use similarity::Similarity;
+pub use stderr::note;

@@ -14,6 +14,7 @@ use super::error::{Place, PoseError, PoseProblem};
 use super::paths::{PhotoFinder, parent};
 use super::view_set::{AppliedTransform, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
+use crate::files;
 
 /// Extensions tried, in this order, for a `file_path` without one.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "webp", "PNG", "JPG"];
@@ -59,7 +60,7 @@ struct Transforms {
 }
 
 pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
-    let bytes = null_for_nan(&fs_err::read(path)?);
+    let bytes = null_for_nan(&files::read(path)?);
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
     if text.trim_ascii_start().starts_with(b"[") {
         let what = "this is a list, as the cameras.json of a training run, not a transforms.json";

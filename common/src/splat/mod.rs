@@ -13,7 +13,7 @@
 
 use std::path::Path;
 
-use crate::Gaussians;
+use crate::{Gaussians, files};
 
 mod columns;
 mod dot_splat;
@@ -41,6 +41,9 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Gaussians, SplatError>
         return sog::read_folder(&path.join("meta.json"), *options);
     }
     let mut input = Input::open(path)?;
+    if let Some((format, advice)) = files::stand_in(input.peek(64)?) {
+        return Err(SplatError::Unsupported { path: path.into(), format: format.into(), advice });
+    }
     let start = input.peek(4)?.to_vec();
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
     match (start.as_slice(), extension.as_str()) {
@@ -49,16 +52,6 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Gaussians, SplatError>
         (b"PK\x03\x04", _) => sog::read_bundle(path, *options),
         (_, "splat") => dot_splat::read(input),
         (_, "json") | ([b'{', ..], _) => sog::read_folder(path, *options),
-        (b"vers", _) => Err(SplatError::Unsupported {
-            path: path.into(),
-            format: "a pointer of Git LFS".into(),
-            advice: "bring the file itself with `git lfs pull`",
-        }),
-        ([b'<', ..], _) => Err(SplatError::Unsupported {
-            path: path.into(),
-            format: "a web page".into(),
-            advice: "the download was refused or needs a login: download the file itself",
-        }),
         (_, "ksplat") => Err(SplatError::Unsupported {
             path: path.into(),
             format: ".ksplat".into(),

@@ -13,7 +13,7 @@ use zip::ZipArchive;
 use super::columns::{MAX_SH_DEGREE, ReadOptions, columns, plausible_count};
 use super::error::{Place, SplatError};
 use super::values::{sigmoid, unit_rotation, with_largest};
-use crate::Gaussians;
+use crate::{Gaussians, files};
 
 /// Meta files take about 15 kB, mostly three codebooks of 256 numbers.
 const MAX_META_BYTES: u64 = 1 << 20;
@@ -140,7 +140,7 @@ pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaus
 }
 
 pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
-    let file = crate::files::open(path)?;
+    let file = files::open(path)?;
     let len_bytes = file.metadata()?.len();
     let archive = ZipArchive::new(BufReader::new(file))
         .map_err(|source| SplatError::undecodable(path, Place::Byte(0), "the ZIP directory", source))?;
@@ -195,7 +195,7 @@ impl Sog {
             SplatError::undecodable(path, Place::Part(part.into()), "the part", source)
         };
         if let Parts::Folder(_) = self.parts {
-            let file = fs_err::File::open(self.path_in_folder(part)?)?;
+            let file = files::open(&self.path_in_folder(part)?)?;
             file.take(max_bytes + 1).read_to_end(&mut bytes)?;
         } else if let Parts::Bundle(archive) = &mut self.parts {
             let entry = archive.by_name(part).map_err(|source| {
@@ -311,6 +311,12 @@ impl Sog {
         drop((low, high));
 
         let quats = self.pixels(&meta.quats.files, 0, n_pixels.clone())?;
+        let behind = quats.rgba.as_chunks::<4>().0.get(n..).unwrap_or_default();
+        // What fills up the last rows is alike everywhere.
+        if behind.iter().any(|pixel| *pixel != behind[0] && pixel[3] >= ROTATION_TAG) {
+            let expected = "a number of Gaussians (`count`) that takes in all those of the images";
+            return Err(self.malformed("meta.json", expected, format_args!("{n}, and more behind them")));
+        }
         out.rotations_wxyz.extend(quats.iter(n).map(|[a, b, c, tag]| match tag.checked_sub(ROTATION_TAG) {
             Some(largest) => {
                 let others =

@@ -264,6 +264,18 @@ fn sog_version_1() {
     }
 }
 
+/// A count below that of the images would drop Gaussians in silence.
+#[test]
+fn sog_counts_take_in_all_gaussians() {
+    let folder = tempfile::tempdir().expect("a folder");
+    write_sog_v1(folder.path());
+    let path = folder.path().join("meta.json");
+    let meta = std::fs::read_to_string(&path).expect("was written");
+    std::fs::write(&path, meta.replace("[6, 3]", "[4, 3]")).expect("writes");
+    let error = read_all(folder.path()).expect_err("is refused").to_string();
+    assert!(error.contains("takes in all those of the images, found 4, and more"), "{error}");
+}
+
 #[test]
 fn sog_parts_stay_in_their_folder() {
     let folder = tempfile::tempdir().expect("a folder");
