@@ -335,6 +335,8 @@ fn turned_and_transparent_photos() {
     assert!(loaded.image.get_pixel(80, 119)[0] > 150 && loaded.image.get_pixel(80, 60)[0] < 60);
     fs_err::write(&path, b"\0\0\0\x24ftypheic\0\0\0\0mif1heic").unwrap();
     assert!(matches!(load_image(&view(&path, camera)), Err(IngestError::Heif { .. })));
+    fs_err::write(&path, b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n").unwrap();
+    assert!(load_image(&view(&path, camera)).unwrap_err().to_string().contains("git lfs pull"));
 }
 
 /// Arrays have no names: GeoJSON's order is not ours.

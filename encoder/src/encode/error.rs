@@ -120,6 +120,12 @@ mod tests {
         assert!(EncodeError::from(error).is_of_one_view());
     }
 
+    /// Half precision overflows on some photos only.
+    #[test]
+    fn masks_that_are_no_numbers_are_one_views_fault() {
+        assert!(EncodeError::from(SegmentError::NotFinite { view: "a".into() }).is_of_one_view());
+    }
+
     /// A crop without pixels, or with a vector of no length, is its view's fault; a model that fails on it fails
     /// on others.
     #[test]

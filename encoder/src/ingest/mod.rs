@@ -12,7 +12,7 @@ use std::sync::{Mutex, PoisonError};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
 use serde::Deserialize;
-use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View};
+use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View, files};
 
 use jpeg::Damage;
 
@@ -98,6 +98,8 @@ pub enum IngestError {
         path.display(), size_px[0], size_px[1]
     )]
     TooLarge { path: PathBuf, size_px: [u32; 2], needed: ByteSize, free: ByteSize },
+    #[error("{}: {what}; {advice}", path.display())]
+    StandIn { path: PathBuf, what: &'static str, advice: &'static str },
     #[error("{}: a HEIC or AVIF image; convert the photos to JPEG, for example with heif-convert", path.display())]
     Heif { path: PathBuf },
     #[error(
@@ -203,9 +205,13 @@ fn opaque_pixels(photo: &DynamicImage) -> Vec<bool> {
 /// Returns the pixels, and whether the file has an EXIF orientation that was ignored.
 fn decode(path: &Path, camera: &Intrinsics) -> Result<(DynamicImage, bool), IngestError> {
     let failed = |source| IngestError::Decode { path: path.to_owned(), source };
-    let open = || Ok::<_, IngestError>(io::BufReader::new(fs_err::File::open(path)?));
-    let mut start = open()?;
-    if start.fill_buf()?.get(4..12).is_some_and(|brand| HEIF_BRANDS.contains(&brand)) {
+    let open = || Ok::<_, IngestError>(io::BufReader::new(files::open(path)?));
+    let mut reader = open()?;
+    let start = reader.fill_buf()?;
+    if let Some((what, advice)) = files::stand_in(start) {
+        return Err(IngestError::StandIn { path: path.to_owned(), what, advice });
+    }
+    if start.get(4..12).is_some_and(|brand| HEIF_BRANDS.contains(&brand)) {
         return Err(IngestError::Heif { path: path.to_owned() });
     }
     let reader = ImageReader::new(open()?).with_guessed_format()?;

@@ -119,6 +119,8 @@ pub enum SegmentError {
     },
     #[error("{}: found {found} pixels, expected ids; write a PNG with up to 16 bits of gray, or with a palette", path.display())]
     NotIds { path: PathBuf, found: &'static str },
+    #[error("{}: {what}; {advice}", path.display())]
+    StandIn { path: PathBuf, what: &'static str, advice: &'static str },
     #[error(
         "{}: {source}; expected SAM's list of masks, each with segmentation {{size, counts}}, or a COCO data set",
         path.display()
@@ -156,6 +158,10 @@ pub enum SegmentError {
     Missing { path: PathBuf, view: String, n: usize, of: usize },
     #[error(transparent)]
     Model(Box<SessionError>),
+    #[error(
+        "view {view:?}: the mask model's output is not finite; run it with --provider cpu, or give another"
+    )]
+    NotFinite { view: String },
     #[error(
         "view {view:?}: the masks found exceed {limit_bytes} bytes; lower --points-per-side, or raise \
          --sam-predicted-iou and --sam-stability"

@@ -1,7 +1,9 @@
 //! Ids of mask images.
 
-use std::io::BufReader;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
+
+use slag_common::files;
 
 use super::coco::check_size;
 use crate::segment::segmenter::{SegmentError, SegmentInput};
@@ -14,7 +16,11 @@ pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>
     let failed = |source| SegmentError::Png { path: path.to_owned(), source };
     let n_pixels = input.image.width() as usize * input.image.height() as usize;
     let limits = png::Limits { bytes: 2 * n_pixels + PNG_OVERHEAD_BYTES };
-    let mut decoder = png::Decoder::new_with_limits(BufReader::new(fs_err::File::open(path)?), limits);
+    let mut file = BufReader::new(files::open(path)?);
+    if let Some((what, advice)) = files::stand_in(file.fill_buf()?) {
+        return Err(SegmentError::StandIn { path: path.to_owned(), what, advice });
+    }
+    let mut decoder = png::Decoder::new_with_limits(file, limits);
     decoder.set_transformations(png::Transformations::IDENTITY);
     let (width_px, height_px) = decoder.read_header_info().map_err(failed)?.size();
     check_size(path, [width_px, height_px], input)?;

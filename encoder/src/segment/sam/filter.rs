@@ -116,6 +116,14 @@ impl Filters<'_> {
     }
 }
 
+/// Returns whether all logits and scores are finite: one that is not is on neither side of a threshold.
+pub(super) fn is_finite(decoded: &Decoded) -> bool {
+    let Decoded { predicted_ious, object_logits, logits, .. } = decoded;
+    let scores = predicted_ious.iter().chain(object_logits);
+    logits.par_chunks(1 << 16).all(|part| part.iter().all(|x| x.is_finite()))
+        && scores.into_iter().all(|x| x.is_finite())
+}
+
 fn by_boxes(candidates: Vec<Candidate>, scores: Vec<f64>, most_iou: f64) -> Vec<Candidate> {
     suppress(candidates, scores, |a, b| box_iou(a.mask.box_px(), b.mask.box_px()) > most_iou)
 }
@@ -145,4 +153,25 @@ fn box_iou(a: BoxPx, b: BoxPx) -> f64 {
     let overlap = |low: u32, high: u32| f64::from(high.saturating_sub(low + 1));
     let both = overlap(a.x0.max(b.x0), a.x1.min(b.x1)) * overlap(a.y0.max(b.y0), a.y1.min(b.y1));
     both / (area(a) + area(b) - both)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn logits_and_scores_that_are_no_numbers_are_noticed() {
+        let decoded = Decoded {
+            predicted_ious: vec![0.9; 3],
+            object_logits: vec![1.0],
+            logits: vec![-1.0; 27].into(),
+            logits_px: [3, 3],
+        };
+        assert!(is_finite(&decoded));
+        let mut logits = vec![-1.0; 27];
+        logits[26] = f32::NAN;
+        assert!(!is_finite(&Decoded { logits: logits.into(), ..decoded.clone() }));
+        assert!(!is_finite(&Decoded { predicted_ious: vec![f32::NAN; 3], ..decoded.clone() }));
+        assert!(!is_finite(&Decoded { object_logits: vec![f32::INFINITY], ..decoded }));
+    }
 }

@@ -106,13 +106,16 @@ impl SamSegmenter {
                 let mut found = Vec::new();
                 let mut left_bytes = MAX_MASK_BYTES;
                 for decoded in receiver {
+                    if !input.install(|| filter::is_finite(&decoded)) {
+                        return Err(SegmentError::NotFinite { view: input.view.name.clone() });
+                    }
                     let upsampler = Upsampler::new(letterbox, decoded.logits_px);
                     let candidates = input.install(|| filters.candidates(&decoded, &upsampler, crop));
                     let len_bytes: u64 = candidates.iter().map(|candidate| candidate.mask.len_bytes()).sum();
-                    left_bytes = left_bytes.checked_sub(len_bytes)?;
+                    left_bytes = left_bytes.checked_sub(len_bytes).ok_or_else(|| too_many(input))?;
                     found.extend(candidates);
                 }
-                Some(found)
+                Ok(found)
             });
             for batch in points.chunks(points_per_batch as usize) {
                 let decoded = sam.decode(&embedding, batch.len(), batch, &labels[..batch.len()])?;
@@ -121,9 +124,9 @@ impl SamSegmenter {
                 }
             }
             drop(sender);
-            Ok::<_, SegmentError>(filtered.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            filtered.join().unwrap_or_else(|panic| resume_unwind(panic))
         })?;
-        let lists = filters.lists(found.ok_or_else(|| too_many(input))?);
+        let lists = filters.lists(found);
         Ok(input.install(|| lists.into_iter().map(|list| filters.unique_in_crop(list)).collect()))
     }
 }

@@ -7,6 +7,7 @@ mod sam2;
 
 use std::path::Path;
 
+use slag_common::View;
 use slag_math::random::Random;
 use slag_models::SessionOptions;
 use slag_models::sam::{Decoded, Letterbox};
@@ -16,8 +17,9 @@ use super::filter::Filters;
 use super::runs::{Run, RunMask};
 use super::upsample::Upsampler;
 use super::{SamSegmenter, SamSettings, points};
+use crate::ingest::LoadedImage;
 use crate::masks::{BoxPx, Mask};
-use crate::segment::Segmenter;
+use crate::segment::{SegmentInput, Segmenter};
 
 /// Edges of the square and of the logits, pixels, in SAM's proportion.
 const SIZE_PX: u32 = 256;
@@ -525,4 +527,36 @@ fn enlarged_masks_equal_the_recorded_ones() {
     }
     println!("{n_differing} pixels differ of {n_inside} inside");
     assert!(n_inside > 10_000 && n_differing < 5, "{n_inside} {n_differing}");
+}
+
+/// A pixel value that overflows is no number behind the model, as with models in half precision.
+#[needs_shared]
+#[test]
+fn masks_that_are_no_numbers_fail_the_view() {
+    let from = workspace_root().join("tests/models/sam_tiny");
+    let description = fs_err::read_to_string(from.join("model.toml")).expect("readable");
+    let dir = tempfile::tempdir().expect("a folder");
+    fs_err::create_dir(dir.path().join("sam_tiny")).expect("made");
+    for file in ["vision_encoder.onnx", "prompt_encoder_mask_decoder.onnx"] {
+        fs_err::copy(shared("models/sam_tiny").join(file), dir.path().join("sam_tiny").join(file))
+            .expect("copies");
+    }
+    let wrong = description.replace("../../../../shared/models", ".") + "\nstd = [1e-300, 1e-300, 1e-300]\n";
+    fs_err::write(dir.path().join("model.toml"), wrong).expect("writes");
+    let session = SessionOptions::new(onnx_runtime());
+    let segmenter = SamSegmenter::open(dir.path(), SamSettings::default(), &session, &[0]).expect("opens");
+    let loaded = LoadedImage {
+        view: View {
+            name: "a.jpg".into(),
+            image_path: "a.jpg".into(),
+            intrinsics: crate::raster::pinhole([64, 48], 60.0),
+            camera_from_world: glam::DAffine3::IDENTITY,
+        },
+        image: image::RgbImage::from_pixel(64, 48, image::Rgb([200; 3])),
+        undistorter: None,
+        valid: None,
+        is_rotated: false,
+    };
+    let error = segmenter.segment(&SegmentInput::new(&loaded, None)).expect_err("no numbers").to_string();
+    assert!(error.contains("\"a.jpg\": the mask model's output is not finite"), "{error}");
 }
