@@ -31,6 +31,8 @@ pub(crate) enum FleetError {
         "run {run} was superseded: another `encode --blobs` uses {url}. Let one of them finish, or give the other another prefix"
     )]
     Superseded { run: u64, url: String },
+    #[error("{url}: no encode began within {secs:.0} s; check --blobs, or wait longer with --wait")]
+    NoRun { url: String, secs: f64 },
     #[error("{url}/{key}: {problem}; delete it, and it is made again")]
     Damaged { url: String, key: String, problem: String },
     #[error(transparent)]

@@ -81,6 +81,11 @@ impl Run {
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }
 
+    /// Returns whether the bucket has had no run.
+    pub(super) fn is_first(bucket: &Bucket) -> Result<bool, FleetError> {
+        Ok(Self::newest(bucket)?.is_none())
+    }
+
     pub(super) fn is_open(self, bucket: &Bucket) -> Result<bool, FleetError> {
         Ok(!self.has_ended(bucket)? && bucket.len_of(&self.key(DONE))?.is_none())
     }

@@ -92,6 +92,10 @@ pub(crate) fn work(
             std::thread::sleep(pause(bucket));
         }
     }
+    if report == WorkReport::default() && !context.is_cancelled() && Run::is_first(bucket)? {
+        let (url, secs) = (bucket.url().to_owned(), settings.patience.as_secs_f64());
+        return Err(FleetError::NoRun { url, secs });
+    }
     Ok(report)
 }
 

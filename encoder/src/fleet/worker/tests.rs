@@ -1,4 +1,8 @@
+use slag_models::{ModelDir, SessionOptions};
+
 use super::*;
+use crate::progress::Silent;
+use crate::raster::CpuRasterizer;
 
 /// A folder lives as long as its worker; what a killed worker left goes with the next one, and nothing else does.
 #[test]
@@ -29,4 +33,25 @@ fn folders_go_with_their_workers() {
     assert_eq!(names(), expected);
     drop((first, second));
     assert_eq!(names(), foreign);
+}
+
+/// A worker with another bucket than its coordinator's would be done, without an error, with nothing.
+#[test]
+fn a_worker_that_finds_no_run_says_so() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let bucket = Arc::new(Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens"));
+    let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
+    let settings = WorkerSettings {
+        dispatch: Dispatch::Share { index: 0, of: 1, help_after: Duration::ZERO },
+        n_threads: 1,
+        gpus: Vec::new(),
+        memory_bytes: 0,
+        folder: dir.path().to_owned(),
+        segmenter: None,
+        patience: Duration::from_millis(100),
+        stays: false,
+    };
+    let engines = Engines::new(&models, &session, &CpuRasterizer);
+    let error = work(&bucket, &settings, &engines, &Silent, &AtomicBool::new(false)).expect_err("no run");
+    assert!(error.to_string().contains("no encode began within 0 s; check --blobs"), "{error}");
 }
