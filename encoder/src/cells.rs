@@ -20,6 +20,9 @@ const EXTENT_SIGMAS: f64 = 3.0;
 /// would become a cell.
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
+/// Most cells of a scene: its manifest, which lists them, has then a quarter of the bytes that robots take.
+pub(crate) const MAX_CELLS: usize = 65_536;
+
 /// Most cells that are cut only because positions must be exact. More means that the error is finer than the
 /// scene's coordinates; each cell is a file of some kilobytes.
 pub(crate) const MAX_CELLS_FOR_PRECISION: usize = 4096;

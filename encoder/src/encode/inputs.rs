@@ -63,7 +63,9 @@ impl Inputs {
             tracing::warn!("{}; `slag-encoder check` tells more", suspicion.text);
         });
         let limits = settings.cells.limits;
+        check_cells(scene.len().div_ceil(limits.max_gaussians))?;
         let split = context.time("cells", || context.install(|| cells::split(&scene, limits)));
+        check_cells(split.cells.len())?;
         let n_visible =
             (0..scene.len()).filter(|i| scene.is_usable(*i) && scene.opacities[*i] >= 1.0 / 255.0).count();
         if split.cells.is_empty() || n_visible * MIN_VISIBLE_ONE_IN < scene.len() {
@@ -85,6 +87,17 @@ impl Inputs {
         let standing = Arc::new(context.time("ground", stands));
         Ok(Self { scene, split, standing, views, missing, geo_reference, n_drawn })
     }
+}
+
+fn check_cells(n: usize) -> Result<(), EncodeError> {
+    if n <= cells::MAX_CELLS {
+        return Ok(());
+    }
+    let problem = format!(
+        "the scene would have {n} cells or more, expected at most {}; raise --cell-gaussians and --cell-width-m",
+        cells::MAX_CELLS
+    );
+    Err(EncodeError::Setting { setting: "cells", problem })
 }
 
 /// Reserves the scene's columns.
@@ -197,6 +210,13 @@ fn find_views(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_scene_of_too_many_cells_is_refused() {
+        assert!(check_cells(65_536).is_ok());
+        let error = check_cells(65_537).expect_err("is refused").to_string();
+        assert!(error.contains("--cell-gaussians and --cell-width-m"), "{error}");
+    }
 
     /// By hand: a photo of 400 x 300 pixels, whose file is absent, and two of 40 x 30, which their headers say, of
     /// the same camera. Two are worked on, 15 bytes a pixel; of two more that may wait there is one, 8 bytes a

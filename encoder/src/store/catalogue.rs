@@ -10,7 +10,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
@@ -91,6 +91,10 @@ impl Catalogue {
     /// Opens the database of a store for writing; a damaged one is renamed to `db.damaged`, and an empty one takes
     /// its place. Waits up to `patience` for another writer.
     pub(crate) fn open(store: &Path, patience: Duration) -> Result<Self, StoreError> {
+        if SystemTime::now() < UNIX_EPOCH {
+            // sled panics then.
+            return Err(StoreError::Clock);
+        }
         let path = store.join("db");
         let refused = |fault| match fault {
             Fault::Held => StoreError::Locked { store: store.to_owned() },

@@ -20,6 +20,8 @@ pub enum StoreError {
         path.display()
     )]
     Records { path: PathBuf, cause: sled::Error },
+    #[error("this machine's clock says a time before 1970; set it")]
+    Clock,
     #[error("{} is missing: nothing has been published here yet; run `slag-encoder encode` first", path.display())]
     NotPublished { path: PathBuf },
     #[error("{}: expected 64 hex digits; restore the file from a backup, or remove it: a new key is made, which robots must be told", path.display())]
