@@ -25,6 +25,54 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
     None
 }
 
+/// A logger that ended, `| head`: whoever read what a program says is gone. Its work and its results are not.
+#[test]
+fn programs_go_on_when_nobody_reads_what_they_say() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (store, cache) = (dir.path().join("store"), dir.path().join("cache"));
+    let deaf = |command: &mut Command| {
+        let piped = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = piped.spawn().expect("starts");
+        drop(child.stderr.take());
+        child.wait_with_output().expect("waits")
+    };
+    let encode = deaf(encode_quickly(&generated(&ROOM), &store).args(["--models", "colours"]));
+    assert!(encode.status.success() && store.join("manifest").exists(), "{encode:?}");
+    let service = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
+    assert!(deaf(&mut fetch(&service.url, &cache)).status.success());
+    let query = ["query", "blue", "--models", "colours", "--cache", text(&cache)];
+    let answers = deaf(&mut edge(&query));
+    assert!(answers.status.success() && !answers.stdout.is_empty(), "{answers:?}");
+    assert_eq!(deaf(&mut encoder(&["store", "ls", "--store", text(&cache)])).status.code(), Some(1));
+    for program in [&mut encoder(&["completions", "bash"]), &mut edge(&["completions", "bash"])] {
+        let mut child = program.stdout(Stdio::piped()).spawn().expect("starts");
+        drop(child.stdout.take());
+        assert!(child.wait().expect("waits").success(), "{program:?}");
+    }
+}
+
+/// Under `nohup` an encode outlives its terminal; without, it stops as at ctrl-c.
+#[cfg(unix)]
+#[test]
+fn a_hangup_that_is_ignored_stops_nothing() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    for (trap, expected) in [("trap '' HUP; ", 0), ("", 130)] {
+        let store = dir.path().join(format!("store{expected}"));
+        let encode = encode_quickly(&generated(&ROOM), &store);
+        let line = format!("{trap}exec \"$0\" \"$@\"");
+        let mut command = Command::new("sh");
+        command.args(["-c", &line]).arg(encode.get_program()).args(encode.get_args());
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts");
+        while !store.join("job").exists() {
+            assert!(child.try_wait().expect("waits").is_none(), "it ended before a view");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let kill = Command::new("kill").args(["-HUP", &child.id().to_string()]).status();
+        assert!(kill.expect("runs").success());
+        assert_eq!(child.wait().expect("waits").code(), Some(expected));
+    }
+}
+
 #[test]
 fn killed_encodes_resume_and_show_nothing_half() {
     let n_wanted = trials(4, 100);

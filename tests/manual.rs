@@ -167,3 +167,20 @@ fn examples_of_help_parse() {
     }
     assert_eq!(n_examples, 45);
 }
+
+/// Else they are unknown flags, for which clap has the advice `-- -5`: not true of a flag's value.
+#[test]
+fn negative_numbers_are_values_of_flags() {
+    for (name, line) in [
+        ("slag-encoder", "encode --scene a --store b --cell-gaussians -5"),
+        ("slag-edge", "query mug --limit -5"),
+        ("slag-edge", "serve --scrub-secs -5"),
+        ("slag-lab", "demo --seed -5"),
+        ("slag-mcap", "--text mug --limit -5 a.mcap"),
+        ("slag-ros", "--limit -5"),
+    ] {
+        let output = Command::new(program(name)).args(line.split(' ')).output().expect("starts");
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(told.contains("invalid value '-5' for '--"), "{name} {line}: {told}");
+    }
+}

@@ -66,6 +66,8 @@ fn mistakes_are_named() {
     let (store, absent) = (dir.path().join("store"), dir.path().join("absent"));
     refused(encode_room(&room, &store).arg("--images").arg(&absent), "--images");
     refused(&mut encode_room(&absent, &store), "absent");
+    refused(encode_room(&room, &store).arg("--report").arg(absent.join("report.html")), "report.html");
+    assert!(!store.exists(), "a report that cannot be written is refused before the encode");
     let query = ["query", "red", "--store", text(&absent)];
     refused(&mut encoder(&query), "absent");
     refused(encoder(&query).arg("--models").arg(&absent), "absent");

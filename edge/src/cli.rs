@@ -21,6 +21,7 @@ mod text;
 mod trust;
 
 use std::ffi::OsString;
+use std::io::{self, Write};
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use slag_models::help;
@@ -128,13 +129,9 @@ impl Cli {
             Command::Trust(command) => (command.is_json(), trust::run(command)),
             Command::Models(args) => (args.json, models::run(args)),
             Command::Completions { shell } => {
-                clap_complete::generate(
-                    shell,
-                    &mut help::layered(Self::command()),
-                    "slag-edge",
-                    &mut std::io::stdout(),
-                );
-                return Exit::Done;
+                let mut text = Vec::new();
+                clap_complete::generate(shell, &mut help::layered(Self::command()), "slag-edge", &mut text);
+                (false, io::stdout().write_all(&text).map_err(Into::into))
             }
         };
         match result {

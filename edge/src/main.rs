@@ -15,6 +15,7 @@ fn main() -> ExitCode {
     let ansi = std::io::stderr().is_terminal();
     // Without the names of modules, which mean nothing to who reads it.
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(ansi).with_target(false);
-    log.with_writer(std::io::stderr).init();
+    // It would panic where nobody reads stderr any more.
+    log.log_internal_errors(false).with_writer(std::io::stderr).init();
     cli.run().into()
 }

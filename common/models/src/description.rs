@@ -68,6 +68,7 @@ use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use sha2::Digest;
+use slag_common::files;
 
 use crate::preprocess::{Filter, Preprocess, Resize};
 
@@ -364,7 +365,8 @@ pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T
 }
 
 pub(crate) fn read_text(path: &Path) -> Result<String, DescriptionError> {
-    fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })
+    let text = files::open(path).and_then(std::io::read_to_string);
+    text.map_err(|cause| DescriptionError::Read { cause })
 }
 
 fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, DescriptionError> {

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use slag_common::files;
 use slag_common::retry::{Backoff, Retries};
 use ureq::http::{HeaderName, Method, Request, Response, StatusCode, Uri, header};
 use ureq::tls::{PemItem, RootCerts, TlsConfig, parse_pem};
@@ -502,9 +503,10 @@ impl<'a> Client<'a> {
 /// Returns whose certificates count: those of the authorities in a file (PEM), else the public ones.
 pub fn tls(ca: Option<&Path>) -> Result<TlsConfig, String> {
     let Some(path) = ca else { return Ok(TlsConfig::default()) };
-    let mut pem = Vec::new();
-    let read = std::fs::File::open(path).and_then(|file| file.take(MAX_CA_BYTES).read_to_end(&mut pem));
-    read.map_err(|e| e.to_string())?;
+    let pem = files::read_short(path, MAX_CA_BYTES).map_err(|e| e.to_string())?;
+    if pem.len() as u64 > MAX_CA_BYTES {
+        return Err(format!("longer than {MAX_CA_BYTES} bytes"));
+    }
     let mut authorities = Vec::new();
     for item in parse_pem(&pem) {
         if let PemItem::Certificate(certificate) = item.map_err(|e| e.to_string())? {

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::ser::{Error as _, Serializer};
 use serde::{Deserialize, Serialize};
+use slag_common::files;
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -98,7 +99,7 @@ impl ModelFile {
     pub fn reader(&self) -> io::Result<Box<dyn Read>> {
         Ok(match self.embedded {
             Some(bytes) => Box::new(bytes),
-            None => Box::new(fs_err::File::open(&self.path)?),
+            None => Box::new(files::open(&self.path)?),
         })
     }
 

@@ -14,7 +14,9 @@ pub fn layered(command: Command) -> Command {
     let short =
         Arg::new("help").short('h').long("help").action(ArgAction::HelpShort).help("Prints this help");
     let long = Arg::new("help-all").long("help-all").action(ArgAction::HelpLong);
+    // `--limit -5` is a wrong value, not an unknown flag.
     command
+        .allow_negative_numbers(true)
         .mut_args(first_sentence_first)
         .disable_help_flag(true)
         .help_template(TEMPLATE)
@@ -40,6 +42,15 @@ mod tests {
     use clap::Command;
 
     use super::*;
+
+    /// The advice for an unknown flag, `-- -5`, would be a lie.
+    #[test]
+    fn negative_numbers_are_values() {
+        let limit = Arg::new("limit").long("limit").value_parser(clap::value_parser!(u32));
+        let command = layered(Command::new("slag").subcommand(Command::new("below").arg(limit)));
+        let error = command.try_get_matches_from(["slag", "below", "--limit", "-5"]).expect_err("is refused");
+        assert_eq!(error.kind(), clap::error::ErrorKind::ValueValidation, "{error}");
+    }
 
     #[test]
     fn short_help_has_first_sentences_and_all_has_everything() {

@@ -2,6 +2,8 @@
 
 use std::{collections::HashMap, path::Path, sync::Arc};
 
+use slag_common::files;
+
 use crate::encoder::TextEncoder;
 use crate::error::{InferenceError, ModelError, PhrasesError};
 use crate::synonyms::{KnownPhrases, key, singulars, without_hyphens};
@@ -36,7 +38,8 @@ impl PhraseEncoder {
         (vectors, tensor): (&Path, &str),
         centre: Option<Vec<f32>>,
     ) -> Result<Self, ModelError> {
-        let text = fs_err::read_to_string(phrases).map_err(|cause| PhrasesError::Read { cause })?;
+        let text = files::open(phrases).and_then(std::io::read_to_string);
+        let text = text.map_err(|cause| PhrasesError::Read { cause })?;
         let lines: Vec<String> = text.lines().map(str::to_owned).collect();
         let mut index_of_key = HashMap::new();
         for (index, phrase) in lines.iter().enumerate() {

@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 use axum::extract::Request;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use slag_common::files;
 
 use crate::listen::Listen;
 use crate::problem::Problem;
@@ -39,8 +40,8 @@ pub struct AccessSettings {
 /// The setting that is wrong.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
-    #[error("the token file {} cannot be read: {cause}; write a token of at least {MIN_TOKEN_CHARS} characters into it", path.display())]
-    Unreadable { path: PathBuf, cause: io::Error },
+    #[error("the token file: {cause}; it needs a token of at least {MIN_TOKEN_CHARS} characters")]
+    Unreadable { cause: io::Error },
     #[error(
         "the token file {} holds {found}, expected one line of at least {MIN_TOKEN_CHARS} visible ASCII characters; `openssl rand -hex 32` makes one",
         path.display()
@@ -259,14 +260,14 @@ fn are_equal(a: &[u8], b: &[u8]) -> bool {
 }
 
 fn read_token(path: &Path) -> Result<String, AccessError> {
-    use io::Read;
-
-    let mut text = String::new();
-    let read =
-        std::fs::File::open(path).and_then(|file| file.take(MAX_TOKEN_BYTES).read_to_string(&mut text));
-    read.map_err(|cause| AccessError::Unreadable { path: path.to_owned(), cause })?;
-    let token = text.trim();
+    let bytes =
+        files::read_short(path, MAX_TOKEN_BYTES).map_err(|cause| AccessError::Unreadable { cause })?;
     let refused = |found: String| Err(AccessError::Token { path: path.to_owned(), found });
+    if bytes.len() as u64 > MAX_TOKEN_BYTES {
+        return refused(format!("more than {MAX_TOKEN_BYTES} bytes"));
+    }
+    let text = String::from_utf8_lossy(&bytes);
+    let token = text.trim();
     if token.len() < MIN_TOKEN_CHARS {
         return refused(format!("{} characters", token.len()));
     }

@@ -1,4 +1,4 @@
-//! The signals that stop a service.
+//! The signals that stop a program.
 
 use std::io;
 
@@ -26,6 +26,75 @@ pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
         interrupt.recv().await;
         tracing::info!("stopping: requests in progress are finished first");
     })
+}
+
+/// Calls `stop` whenever a signal asks the program to end: ctrl-c and, on Unix, SIGTERM and SIGHUP.
+pub fn on_stop(mut stop: impl FnMut() + Send + 'static) -> io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let mut signals = runtime.block_on(async { Signals::listen() })?;
+    let listening = move || {
+        runtime.block_on(async {
+            loop {
+                signals.next().await;
+                stop();
+            }
+        });
+    };
+    std::thread::Builder::new().name("signals".to_owned()).spawn(listening).map(drop)
+}
+
+#[cfg(unix)]
+struct Signals {
+    interrupt: tokio::signal::unix::Signal,
+    terminate: tokio::signal::unix::Signal,
+    hangup: Option<tokio::signal::unix::Signal>,
+}
+
+#[cfg(unix)]
+impl Signals {
+    fn listen() -> io::Result<Self> {
+        use tokio::signal::unix::{SignalKind, signal};
+        // Under `nohup`, which ignores it, the program goes on after its terminal.
+        let hangup = (!ignores_hangup()).then(|| signal(SignalKind::hangup())).transpose()?;
+        let (interrupt, terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        Ok(Self { interrupt, terminate, hangup })
+    }
+
+    async fn next(&mut self) {
+        let hangup = async {
+            match &mut self.hangup {
+                Some(hangup) => hangup.recv().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+            _ = hangup => {}
+        }
+    }
+}
+
+/// Returns whether this program was started with SIGHUP, number 1, ignored; where the system does not tell, not.
+#[cfg(unix)]
+fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
+}
+
+#[cfg(windows)]
+struct Signals(tokio::signal::windows::CtrlC);
+
+#[cfg(windows)]
+impl Signals {
+    fn listen() -> io::Result<Self> {
+        tokio::signal::windows::ctrl_c().map(Self)
+    }
+
+    async fn next(&mut self) {
+        self.0.recv().await;
+    }
 }
 
 #[cfg(all(test, unix))]

@@ -4,7 +4,6 @@
 //! aside with a warning, and the one before it stays in use.
 
 use std::fmt;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::SystemTime;
@@ -15,6 +14,7 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::server::{ClientHello, ResolvesServerCert};
 use rustls::sign::CertifiedKey;
 use rustls::{ConfigBuilder, ServerConfig, WantsVerifier};
+use slag_common::files;
 use tokio_rustls::TlsAcceptor;
 
 /// The certificate's files.
@@ -39,6 +39,9 @@ pub enum TlsError {
 
 /// The versions of both files, read without their content.
 type Stamps = [Option<(SystemTime, u64)>; 2];
+
+/// Most bytes of a file: ten times the longest chain in use.
+const MAX_BYTES: u64 = 1 << 20;
 
 /// A certificate with its key, as last read.
 struct ReadPair {
@@ -132,20 +135,14 @@ fn read_pem<T>(
     parse: impl FnOnce(&[u8]) -> Result<T, pem::Error>,
 ) -> Result<T, TlsError> {
     let file = |cause: String| TlsError::File { path: path.to_owned(), expected, cause };
-    let bytes = read_short(path).map_err(|e| file(e.to_string()))?;
+    let bytes = files::read_short(path, MAX_BYTES).map_err(|e| file(e.to_string()))?;
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(file(format!("longer than {MAX_BYTES} bytes")));
+    }
     parse(&bytes).map_err(|e| match e {
         pem::Error::NoItemsFound => file("none is there".to_owned()),
         e => file(e.to_string()),
     })
-}
-
-/// Reads a file of at most a megabyte, ten times the longest chain in use.
-fn read_short(path: &Path) -> io::Result<Vec<u8>> {
-    use io::Read;
-
-    let mut bytes = Vec::new();
-    std::fs::File::open(path)?.take(1 << 20).read_to_end(&mut bytes)?;
-    Ok(bytes)
 }
 
 #[cfg(test)]

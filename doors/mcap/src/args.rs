@@ -7,7 +7,7 @@ use slag_robot::RobotArgs;
 
 /// Writes a robot's answers and the ground around it to an MCAP file, which Foxglove and its libraries read.
 #[derive(Debug, Parser)]
-#[command(name = "slag-mcap", version)]
+#[command(name = "slag-mcap", version, allow_negative_numbers = true)]
 pub struct Args {
     /// The robot to ask.
     #[command(flatten)]

@@ -25,7 +25,7 @@ pub fn record(args: &Args) -> Result<usize> {
         let stamp = Stamp { time_ns, frame: &reply.frame };
         for found in &reply.results {
             if let Some(none) = &found.none {
-                eprintln!("{text}: {}", none.detail);
+                slag_robot::note(format_args!("{text}: {}", none.detail));
             }
             let things = messages::things(stamp, text, &found.answers);
             messages.push((format!("/slag/things/{text}"), file::THINGS, things));

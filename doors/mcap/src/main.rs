@@ -1,5 +1,6 @@
 //! `slag-mcap`: a robot's answers and map as an MCAP file.
 
+use std::io::{self, Write};
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -9,11 +10,11 @@ fn main() -> ExitCode {
     let args = Args::parse();
     match record(&args) {
         Ok(n_messages) => {
-            println!("{n_messages} messages in {}", args.out.display());
+            let _ = writeln!(io::stdout(), "{n_messages} messages in {}", args.out.display());
             ExitCode::SUCCESS
         }
         Err(error) => {
-            eprintln!("slag-mcap: {error:#}");
+            slag_robot::note(format_args!("slag-mcap: {error:#}"));
             ExitCode::FAILURE
         }
     }

@@ -6,7 +6,7 @@ use slag_service::listen::Listen;
 
 /// Lets language models ask a robot, over the Model Context Protocol: on stdin and stdout, or over HTTP.
 #[derive(Debug, Parser)]
-#[command(name = "slag-mcp", version)]
+#[command(name = "slag-mcp", version, allow_negative_numbers = true)]
 pub struct Args {
     /// The robot to ask.
     #[command(flatten)]

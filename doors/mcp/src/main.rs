@@ -18,11 +18,13 @@ const MAX_QUESTIONS: usize = 8;
 
 fn main() -> ExitCode {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).with_writer(io::stderr).init();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false);
+    // It would panic where nobody reads stderr any more.
+    log.log_internal_errors(false).with_writer(io::stderr).init();
     match run(Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("slag-mcp: {error:#}");
+            slag_robot::note(format_args!("slag-mcp: {error:#}"));
             ExitCode::FAILURE
         }
     }
@@ -42,7 +44,7 @@ fn run(args: Args) -> Result<()> {
                 let stop = stop_signal()?;
                 let listener = bind(&listen).await?;
                 // For scripts that let the system choose a port.
-                writeln!(io::stdout(), "listening on {}{}", listener.url()?, http::PATH)?;
+                let _ = writeln!(io::stdout(), "listening on {}{}", listener.url()?, http::PATH);
                 http::serve(tools, listener, http::hosts(&listen, args.host), stop).await
             }
         }

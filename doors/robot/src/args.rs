@@ -1,11 +1,15 @@
 //! The flags of every door that say which robot it asks.
 
-use std::io;
+use std::io::{self, Read};
 use std::path::PathBuf;
 
 use clap::Args;
+use slag_common::files;
 
 use crate::client::Robot;
+
+/// More than any token that a robot accepts.
+const MAX_TOKEN_BYTES: u64 = 8192;
 
 /// The robot to ask.
 #[derive(Clone, Debug, Args)]
@@ -21,7 +25,8 @@ pub struct RobotArgs {
 impl RobotArgs {
     /// Returns the robot, with the token of the file. Nothing is asked yet.
     pub fn open(&self) -> io::Result<Robot> {
-        let token = self.token_file.as_ref().map(fs_err::read_to_string).transpose()?;
+        let read = |path: &PathBuf| io::read_to_string(files::open(path)?.take(MAX_TOKEN_BYTES));
+        let token = self.token_file.as_ref().map(read).transpose()?;
         Ok(Robot::new(&self.robot, token.as_deref().map(str::trim)))
     }
 }

@@ -8,7 +8,7 @@ use slag_robot::RobotArgs;
 
 /// Puts a robot's answers on ROS 2 topics and services, without a ROS installation.
 #[derive(Debug, Parser)]
-#[command(name = "slag-ros", version)]
+#[command(name = "slag-ros", version, allow_negative_numbers = true)]
 pub struct Args {
     /// The robot to ask.
     #[command(flatten)]

@@ -15,11 +15,13 @@ const ASYNC_THREADS: usize = 2;
 fn main() -> ExitCode {
     let default = "warn,slag_ros=info";
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(default));
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).with_writer(io::stderr).init();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false);
+    // It would panic where nobody reads stderr any more.
+    log.log_internal_errors(false).with_writer(io::stderr).init();
     match run(Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("slag-ros: {error:#}");
+            slag_robot::note(format_args!("slag-ros: {error:#}"));
             ExitCode::FAILURE
         }
     }

@@ -43,7 +43,7 @@ impl CacheArgs {
 #[derive(Debug, Args)]
 pub struct DownloadArgs {
     /// Radius around the robot within which cells are kept, world units (metres in a metric scene).
-    #[arg(long, default_value_t = 50.0, value_parser = parse_radius, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 50.0, value_parser = parse_radius)]
     pub radius: f64,
     /// Profile of the shards.
     #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]

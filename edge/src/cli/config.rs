@@ -7,10 +7,11 @@
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::io::{self, Read};
+use std::io;
 use std::path::PathBuf;
 
 use clap::{Arg, ArgAction, ArgMatches, Command, parser::ValueSource};
+use slag_common::files;
 use toml::{Table, Value};
 
 /// The file that is read if it is there and no other is named.
@@ -28,8 +29,8 @@ const MAX_FILE_BYTES: u64 = 1 << 20;
 /// Why the command line, the environment and the file do not make a command.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    #[error("the configuration {} cannot be read: {cause}", path.display())]
-    Unreadable { path: PathBuf, cause: io::Error },
+    #[error("the configuration: {cause}")]
+    Unreadable { cause: io::Error },
     #[error("{place}: {what}")]
     Wrong { place: String, what: String },
     #[error(transparent)]
@@ -74,18 +75,16 @@ fn read(
     }
     let is_default = named.is_none();
     let path = named.unwrap_or_else(|| DEFAULT_FILE.into());
-    let mut text = String::new();
-    let read =
-        std::fs::File::open(&path).and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_string(&mut text));
-    match read {
+    let bytes = match files::read_short(&path, MAX_FILE_BYTES) {
         Err(cause) if is_default && cause.kind() == io::ErrorKind::NotFound => return Ok(None),
-        Err(cause) => return Err(ConfigError::Unreadable { path, cause }),
-        Ok(_) => {}
-    }
+        read => read.map_err(|cause| ConfigError::Unreadable { cause })?,
+    };
     let wrong = |what: String| ConfigError::Wrong { place: path.display().to_string(), what };
-    if text.len() as u64 > MAX_FILE_BYTES {
+    if bytes.len() as u64 > MAX_FILE_BYTES {
         return Err(wrong(format!("longer than {MAX_FILE_BYTES} bytes, expected a few lines of flags")));
     }
+    let text =
+        String::from_utf8(bytes).map_err(|_| wrong("not text in UTF-8; save it as such".to_owned()))?;
     let table = text.parse::<Table>().map_err(|e| wrong(e.to_string().trim_end().to_owned()))?;
     Ok(Some(File { path, table }))
 }

@@ -9,6 +9,7 @@ use crate::query::parse_point;
 use anyhow::anyhow;
 use clap::Args;
 use glam::DVec3;
+use slag_service::stop::on_stop;
 
 use super::args::{CacheArgs, DownloadArgs};
 use super::failure::Failure;
@@ -67,7 +68,7 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     let cache = args.cache.open()?;
     let cancel = Arc::new(AtomicBool::new(false));
     let on_signal = Arc::clone(&cancel);
-    ctrlc::set_handler(move || on_signal.store(true, Ordering::Relaxed))
+    on_stop(move || on_signal.store(true, Ordering::Relaxed))
         .map_err(|e| Failure::Failed("signals", e.into()))?;
     let bar = Bar::new(!quiet && !args.json && io::stderr().is_terminal());
     if args.watch {

@@ -10,6 +10,7 @@ use serde::de::value::{Error, StrDeserializer};
 use serde::de::{DeserializeOwned, IntoDeserializer};
 use slag_api::objects::{Name, ObjectOnBoard, ObjectPage};
 use slag_common::frames::Aabb;
+use slag_common::note;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius, parse_reach};
 use super::failure::{Failure, store_failure};
@@ -35,13 +36,13 @@ pub struct ListArgs {
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true, requires = "radius")]
     pub near: Option<DVec3>,
     /// The radius, world units.
-    #[arg(long, requires = "near", value_parser = parse_reach, allow_negative_numbers = true)]
+    #[arg(long, requires = "near", value_parser = parse_reach)]
     pub radius: Option<f64>,
     /// List only within the box between two corners, world frame.
     #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]
     pub bounds: Option<Aabb>,
     /// Least length of a thing's longest edge, world units.
-    #[arg(long, default_value_t = 0.0, value_parser = parse_radius, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0, value_parser = parse_radius)]
     pub min_size: f64,
     /// Order: name, area (the largest face first) or id.
     #[arg(long, value_name = "ORDER", default_value = "name", value_parser = named::<ObjectOrder>)]
@@ -83,7 +84,7 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
     let limit = args.limit.map_or(usize::MAX, NonZeroUsize::get);
     let page = engine.objects(&on_board, &filter, limit, NAMES_WAIT, &Budget::default())?;
     if let Err(error) = on_board.check() {
-        writeln!(io::stderr(), "without names: {error}")?;
+        note(format_args!("without names: {error}"));
     }
     match format {
         Some(format) => {
@@ -98,11 +99,10 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
 fn print_page(page: &ObjectPage) -> Result<(), Failure> {
     let ObjectPage { n_objects, scene, generation, unit, .. } = page;
     let listed = page.objects.len();
-    writeln!(
-        io::stderr(),
+    note(format_args!(
         "{listed} of {n_objects} things of {}, generation {generation}; in per cent: the chance of a name",
         visible(scene)
-    )?;
+    ));
     let three = |p: DVec3, between: &str| format!("{:.2}{between}{:.2}{between}{:.2}", p.x, p.y, p.z);
     let row = |object: &ObjectOnBoard| {
         let name = |name: &Name| format!("{} {:.0} %", visible(&name.name), name.confidence * 100.0);

@@ -1,10 +1,10 @@
 //! `locate`.
 
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::DVec3;
+use slag_common::files;
 use slag_locate::Prior;
 
 use crate::locate::{Answer, Camera, LocateError, MAX_PHOTO_BYTES, PhotoFile, Pose, Verification, answer};
@@ -89,8 +89,7 @@ fn located(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer,
         LocateError::Version { .. } => Failure::Failed("store", error.into()),
         error => Failure::Failed("photo", anyhow::anyhow!("{}: {error}", photo.display())),
     };
-    let mut bytes = Vec::new();
-    fs_err::File::open(photo)?.take(MAX_PHOTO_BYTES as u64 + 1).read_to_end(&mut bytes)?;
+    let bytes = files::read_short(photo, MAX_PHOTO_BYTES as u64)?;
     if bytes.len() > MAX_PHOTO_BYTES {
         let error =
             anyhow::anyhow!("{}: longer than {MAX_PHOTO_BYTES} bytes; make it smaller", photo.display());

@@ -11,6 +11,7 @@ use crate::score::{Ball, Budget, Precision, Region};
 use clap::Args;
 use glam::DVec3;
 use slag_common::frames::Aabb;
+use slag_common::note;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
@@ -125,12 +126,13 @@ fn print_reply(reply: &Reply) -> Result<(), Failure> {
 
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     for (word, asked) in &answers.asked_as {
-        writeln!(io::stderr(), "{word}: asked as {asked}")?;
+        note(format_args!("{word}: asked as {asked}"));
     }
     if let Some(reason) = &answers.reason {
-        return Ok(writeln!(io::stderr(), "{}", reason.detail)?);
+        note(&reason.detail);
+        return Ok(());
     }
-    write!(io::stderr(), "{}", notes(&answers.searched))?;
+    note(notes(&answers.searched).trim_end());
     let row = |rank: usize, at: DVec3, of: [String; 4], from: Option<f64>| {
         let [size, score, count, id] = of;
         let distance = from.map_or_else(|| "-".to_owned(), |d| format!("{d:.2}"));

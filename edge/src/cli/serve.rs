@@ -120,7 +120,7 @@ async fn serve(
     let listener = listener.with_tls(tls);
     // For scripts that let the system choose a port.
     let url = listener.url()?;
-    writeln!(io::stdout(), "listening on {url}")?;
+    let _ = writeln!(io::stdout(), "listening on {url}");
     let following = args.follow.is_some().then(Arc::<Following>::default);
     let app = App::following(engine, settings, following.clone());
     let follower = match following {

@@ -6,6 +6,7 @@ use std::sync::atomic::AtomicBool;
 use crate::fetch::{AddedRoot, FirstRoot, accepted, add_root};
 use anyhow::anyhow;
 use clap::{ArgGroup, Args, Subcommand};
+use slag_common::files;
 use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
 
 use super::args::CacheArgs;
@@ -118,9 +119,7 @@ fn show(args: ShowArgs) -> Result<(), Failure> {
 }
 
 fn read_root(path: &std::path::Path) -> Result<Vec<u8>, Failure> {
-    use std::io::Read;
-    let mut bytes = Vec::new();
-    fs_err::File::open(path)?.take(MAX_ROOT_BYTES + 1).read_to_end(&mut bytes)?;
+    let bytes = files::read_short(path, MAX_ROOT_BYTES)?;
     match bytes.len() as u64 > MAX_ROOT_BYTES {
         true => Err(Failure::Usage(anyhow!(
             "{}: longer than {MAX_ROOT_BYTES} bytes; expected a root such as metadata/1.root.json of a store",

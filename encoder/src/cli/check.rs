@@ -6,7 +6,7 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use image::GrayImage;
 use slag_common::poses::SplatFrame;
-use slag_common::{View, durable, poses, splat};
+use slag_common::{View, durable, files, poses, splat};
 
 use super::common::{Exit, InputArgs, print};
 use super::memory::free_memory_bytes;
@@ -58,6 +58,7 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         .views
         .as_ref()
         .context("check compares the splat with photos; give their poses with --views")?;
+    args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;
     let mut set = poses::read(views, input.images.as_deref())?;
     let mut notes = set.notes.clone();
     let drawn_from = ingest::drawn_from(views);

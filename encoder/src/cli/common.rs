@@ -1,7 +1,8 @@
 //! Shared by the commands: exit codes; flags of output, models and inputs; logging, printing, interruption.
 
+use std::ffi::OsStr;
 use std::fmt::Display;
-use std::io::{IsTerminal, Write};
+use std::io::{ErrorKind, IsTerminal, Write};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -13,11 +14,12 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde::Serialize;
+use slag_common::note;
 use slag_common::shard::Profile;
 use slag_models::commands::{self, RunArgs};
 use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
-use slag_service::stop::stop_signal;
+use slag_service::stop::{on_stop, stop_signal};
 use tracing_subscriber::EnvFilter;
 
 use crate::ingest::{Activated, FrameChoice};
@@ -77,6 +79,8 @@ impl OutputArgs {
             .with_ansi(std::io::stderr().is_terminal())
             .with_target(false)
             .without_time()
+            // It would panic where nobody reads stderr any more.
+            .log_internal_errors(false)
             .init();
     }
 
@@ -159,33 +163,46 @@ pub(crate) fn parse_secs(text: &str) -> Result<Duration, String> {
 
 /// Prints the result: as one JSON object, or as lines for people.
 pub fn print(json: bool, value: &impl Serialize, lines: impl Display) -> Result<()> {
-    let mut out = std::io::stdout().lock();
-    match json {
-        true => writeln!(out, "{}", serde_json::to_string(value)?)?,
-        false => write!(out, "{lines}")?,
-    }
-    Ok(out.flush()?)
+    let text = if json { serde_json::to_string(value)? + "\n" } else { lines.to_string() };
+    to_stdout(&text)
 }
 
-/// Returns a flag that ctrl-c or SIGTERM sets; a second one ends the program at once.
+/// The reader of stdout is gone (`| head`), which is no failure.
+#[derive(Debug, thiserror::Error)]
+#[error("nobody reads what is printed")]
+pub struct ReaderGone;
+
+pub(super) fn to_stdout(text: &str) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    out.write_all(text.as_bytes()).and_then(|()| out.flush()).map_err(|error| match error.kind() {
+        ErrorKind::BrokenPipe => ReaderGone.into(),
+        _ => anyhow!("stdout: {error}"),
+    })
+}
+
+/// Returns a flag that a signal to stop sets; a second one ends the program at once.
 pub fn cancel_flag() -> Result<Arc<AtomicBool>> {
     let flag = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&flag);
-    ctrlc::set_handler(move || {
+    on_stop(move || {
         if seen.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }
-        eprintln!("stopping after the views in work; press ctrl-c again to stop at once");
+        note("stopping after the views in work; press ctrl-c again to stop at once");
     })
     .context("cannot listen for ctrl-c")?;
     Ok(flag)
 }
 
 /// Returns the time to sign, seconds since 1970: SOURCE_DATE_EPOCH if it is set, else the present.
-pub fn now_unix_secs() -> u64 {
+pub fn now_unix_secs() -> Result<u64> {
     // The convention of reproducible-builds.org.
-    let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
-    given.unwrap_or_else(clock_unix_secs)
+    std::env::var_os("SOURCE_DATE_EPOCH").map_or_else(|| Ok(clock_unix_secs()), |text| parse_epoch(&text))
+}
+
+fn parse_epoch(text: &OsStr) -> Result<u64> {
+    let secs = text.to_str().and_then(|text| text.parse().ok());
+    secs.with_context(|| format!("SOURCE_DATE_EPOCH is {text:?}, expected seconds since 1970; unset it"))
 }
 
 /// Warns of metadata of a store that expires soon: robots then refuse the store.
@@ -261,4 +278,18 @@ pub fn runtime() -> Result<tokio::runtime::Runtime> {
 /// Returns the parser of profiles, whose names the help text lists.
 pub(crate) fn profile_parser() -> impl TypedValueParser<Value = Profile> {
     PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wrong_time_to_sign_is_refused() {
+        assert_eq!(parse_epoch(OsStr::new("1700000000")).expect("seconds"), 1_700_000_000);
+        for wrong in ["", "yesterday", "-1", "1.5"] {
+            let error = parse_epoch(OsStr::new(wrong)).expect_err("is refused").to_string();
+            assert!(error.contains("expected seconds since 1970"), "{error}");
+        }
+    }
 }

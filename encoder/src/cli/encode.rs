@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
 use clap::{Args, FromArgMatches};
-use slag_common::ByteSize;
 use slag_common::shard::Profile;
+use slag_common::{ByteSize, files};
 use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
@@ -227,7 +227,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     cells.landmarks = args.locate;
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     output.scene_name = args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into());
-    output.created_unix_secs = now_unix_secs();
+    output.created_unix_secs = now_unix_secs()?;
     output.models = args.models.models.as_deref().map(lasting_name);
     output.text_model = args.text_model;
     Ok(settings)
@@ -254,6 +254,7 @@ fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expe
 }
 
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    args.report.iter().try_for_each(|path| files::check_writable(path))?;
     let (mut settings, expected) = settings_and_target(args)?;
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());

@@ -21,10 +21,12 @@ mod store;
 mod summary;
 mod view;
 
+use std::io::{self, Write};
+
 use anyhow::Result;
 use clap::{CommandFactory, Parser, Subcommand};
 use serde_json::json;
-use slag_common::error_line;
+use slag_common::{error_line, note};
 use slag_models::commands::{self, ModelsCommand};
 use slag_models::help;
 use slag_models::hub::Side;
@@ -34,7 +36,7 @@ use crate::encode::EncodeError;
 use crate::publish::qdrant;
 use crate::raster::devices::DeviceChoice;
 pub use common::Exit;
-use common::{OutputArgs, print};
+use common::{OutputArgs, ReaderGone, print, to_stdout};
 #[cfg(feature = "qdrant")]
 use push::PushCommand;
 
@@ -143,9 +145,9 @@ pub fn run(cli: Cli) -> Exit {
         Command::Push(PushCommand::Qdrant(args)) => push::run(&args, progress.as_ref(), json),
         Command::Devices => devices::run(json),
         Command::Completions { shell } => {
-            let mut command = help::layered(Cli::command());
-            clap_complete::generate(shell, &mut command, "slag-encoder", &mut std::io::stdout());
-            Ok(Exit::Done)
+            let (mut command, mut text) = (help::layered(Cli::command()), Vec::new());
+            clap_complete::generate(shell, &mut command, "slag-encoder", &mut text);
+            to_stdout(&String::from_utf8_lossy(&text)).map(|()| Exit::Done)
         }
     };
     exit_of(result, json)
@@ -166,37 +168,35 @@ fn models(command: &ModelsCommand, json: bool) -> Result<Exit> {
 pub fn exit_of(result: Result<Exit>, json: bool) -> Exit {
     match result {
         Ok(exit) => exit,
-        Err(error) if is_broken_pipe(&error) => Exit::Done,
+        Err(error) if error.is::<ReaderGone>() => Exit::Done,
         Err(error) => {
             let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }));
             #[cfg(feature = "qdrant")]
             let interrupted =
                 interrupted || matches!(error.downcast_ref(), Some(qdrant::PushError::Cancelled));
             if json {
-                println!(
-                    "{}",
-                    json!({"error": {"message": error_line(&*error), "interrupted": interrupted}})
-                );
+                let error = json!({"error": {"message": error_line(&*error), "interrupted": interrupted}});
+                let _ = writeln!(io::stdout(), "{error}");
             } else {
                 let kind = if interrupted { "interrupted" } else { "error" };
-                eprintln!("{kind}: {}", error_line(&*error));
+                note(format_args!("{kind}: {}", error_line(&*error)));
             }
             if interrupted { Exit::Interrupted } else { Exit::Failed }
         }
     }
 }
 
-/// Returns whether the reader of stdout is gone (`| head`), which is no failure.
-fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    error
-        .chain()
-        .filter_map(|e| e.downcast_ref::<std::io::Error>())
-        .any(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A bucket or database that hangs up breaks a pipe, too.
+    #[test]
+    fn only_the_reader_of_stdout_may_leave() {
+        let of_network = io::Error::from(io::ErrorKind::BrokenPipe);
+        assert_eq!(exit_of(Err(of_network.into()), false), Exit::Failed);
+        assert_eq!(exit_of(Err(ReaderGone.into()), false), Exit::Done);
+    }
 
     #[test]
     fn flags_are_consistent_and_checked() {

@@ -5,6 +5,7 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use slag_common::note;
 
 use crate::progress::{Progress, Silent};
 
@@ -62,7 +63,7 @@ impl Progress for TerminalProgress {
             bar.enable_steady_tick(Duration::from_millis(200));
             stage.bar = Some(bar);
         } else {
-            eprintln!("{name}: {done} of {total}");
+            note(format_args!("{name}: {done} of {total}"));
         }
     }
 
@@ -75,10 +76,10 @@ impl Progress for TerminalProgress {
                 let seconds = stage.started.map_or(0.0, |t| t.elapsed().as_secs_f64());
                 let rate = (stage.done - stage.first) as f64 / seconds.max(1e-9);
                 let eta_secs = stage.total.saturating_sub(stage.done) as f64 / rate.max(1e-9);
-                eprintln!(
+                note(format_args!(
                     "{}: {} of {}, {rate:.1}/s, ETA {eta_secs:.0} s",
                     stage.name, stage.done, stage.total
-                );
+                ));
                 stage.last_line = Some(Instant::now());
             }
             None => {}

@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::json;
 use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
-use slag_common::{Gaussians, npy};
+use slag_common::{Gaussians, files, npy};
 use slag_models::words_to_find;
 
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
@@ -52,6 +52,7 @@ pub struct QueryArgs {
 }
 
 pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
+    args.scores.iter().chain(&args.ply).try_for_each(|path| files::check_writable(path))?;
     let reader = StoreReader::open(&args.store)?;
     let manifest = reader.manifest();
     let threshold = args.threshold.unwrap_or(manifest.encoder.default_threshold);

@@ -1,10 +1,12 @@
 //! `serve`: publishes a store over HTTP.
 
+use std::io::{self, Write};
 use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Result;
 use clap::Args;
+use slag_common::note;
 use slag_service::listen::Listen;
 use slag_service::tls::TlsFiles;
 
@@ -59,11 +61,11 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
     runtime()?.block_on(async {
         // On stdout: with port 0 this is where a script learns the port.
         let listening = |url: String| {
-            println!("listening on {url}");
+            let _ = writeln!(io::stdout(), "listening on {url}");
             if tracing::enabled!(tracing::Level::INFO)
                 && let Ok(lines) = next::of_robot(&args.store, &url)
             {
-                eprint!("{lines}");
+                note(lines.trim_end());
             }
         };
         let limits = serve::Limits::default();

@@ -1,5 +1,6 @@
 //! `view`: a page that draws a store or a splat, and asks it.
 
+use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
@@ -83,7 +84,7 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
     runtime()?.block_on(async {
         let opened = |url: String| {
             let link = link(&url, args.ask.as_deref());
-            println!("{link}");
+            let _ = writeln!(io::stdout(), "{link}");
             if !args.no_open {
                 open_browser(&link);
             }

@@ -4,9 +4,11 @@
 //! number, the others with the number of Gaussians. Photos of another size, other models or another machine need a
 //! front of their own.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use slag_common::files;
 use slag_common::shard::Profile;
 
 /// Settings that no other beats, and what they cost.
@@ -67,7 +69,7 @@ pub enum FrontError {
 
 impl Front {
     pub fn read(path: &Path) -> Result<Self, FrontError> {
-        Self::parse(&fs_err::read_to_string(path)?, path)
+        Self::parse(&io::read_to_string(files::open(path)?)?, path)
     }
 
     fn parse(text: &str, path: &Path) -> Result<Self, FrontError> {

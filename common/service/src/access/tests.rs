@@ -128,7 +128,13 @@ fn writes_beyond_this_machine_need_the_token() {
 
 #[test]
 fn wrong_settings_are_named() {
-    for token in ["", "short", "0123456789abcdef 0123456789abcdef", "0123456789abcdé0123456789abcdef"] {
+    for token in [
+        "",
+        "short",
+        "0123456789abcdef 0123456789abcdef",
+        "0123456789abcdé0123456789abcdef",
+        &"a".repeat(5000),
+    ] {
         let error = access("127.0.0.1:1", &[], &[], Some(token)).expect_err(token).to_string();
         assert!(error.contains("slag-token") && (token.is_empty() || !error.contains(token)), "{error}");
     }

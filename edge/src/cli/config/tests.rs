@@ -94,8 +94,13 @@ fn errors_name_the_file_and_the_key() {
     let error = parsed("slag-edge serve", &environment, "").expect_err("no address").to_string();
     assert!(error.starts_with("SLAG_EDGE_SERVE_LISTEN: ") && error.contains("IP:PORT"), "{error}");
     let error = parsed("slag-edge --config nowhere.toml status", &[], "").expect_err("no file").to_string();
-    assert!(error.contains("nowhere.toml cannot be read"), "{error}");
+    assert!(error.contains("nowhere.toml`: No such file"), "{error}");
     assert!(parsed("slag-edge status", &[("SLAG_EDGE_CONFIG", "")], "[no").is_ok(), "no file is read");
+    let dir = tempfile::tempdir().expect("a folder");
+    let pipe = dir.path().join("pipe");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("runs").success());
+    let line = format!("slag-edge --config {} status", pipe.display());
+    assert!(parsed(&line, &[], "").expect_err("nobody writes").to_string().contains("is a pipe"));
     let line = ["slag-edge", "--config", "", "status"].map(OsString::from);
     let named = |name: &str| (name == "SLAG_EDGE_CONFIG").then(|| "nowhere.toml".into());
     assert!(parse(Cli::command(), &line, &named).is_ok(), "no file is read");

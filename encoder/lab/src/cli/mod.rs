@@ -81,7 +81,7 @@ fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit
         seed: args.seed,
         session: session_options(&args.how)?,
         edge,
-        created_unix_secs: now_unix_secs(),
+        created_unix_secs: now_unix_secs()?,
     };
     let demo = runtime()?.block_on(async { demo::run(&options, progress, cancel_flag()?.as_ref()).await })?;
     print(json, &demo.report, &demo.report)?;

@@ -77,7 +77,7 @@ pub(crate) struct JudgeSettings {
     #[arg(long, value_name = "NAME")]
     pub(crate) profile: Option<Profile>,
     /// Lowest score of a match [default: the store's].
-    #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
+    #[arg(long, value_name = "COSINE")]
     pub(crate) threshold: Option<f32>,
     /// What is scored [default: objects, where the scene has them].
     #[arg(long, value_enum)]
