@@ -15,10 +15,13 @@ pub fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Reads a file of at most `max_bytes`; of a longer one, a byte more than that.
+/// Reads a file of at most `max_bytes`; of a longer one, a byte more than that. What a shell puts in a file's place,
+/// `--token-file <(pass show robot)`, is read, too: it has no name, but a writer.
 pub fn read_short(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
+    let has_name = std::fs::canonicalize(path).is_ok();
+    let file = if has_name { open(path)? } else { File::open(path)? };
     let mut bytes = Vec::new();
-    open(path)?.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
+    file.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
     Ok(bytes)
 }
 
@@ -63,7 +66,20 @@ mod tests {
         let pipe = dir.path().join("pipe");
         assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("runs").success());
         assert!(open(&pipe).expect_err("is refused").to_string().contains("is a pipe"));
+        assert!(read_short(&pipe, 9).expect_err("is refused").to_string().contains("is a pipe"));
         assert!(open(Path::new("/dev/null")).is_ok());
+    }
+
+    #[test]
+    fn a_shells_pipe_is_read() {
+        use std::io::Write;
+        use std::os::fd::AsRawFd;
+
+        let (reader, mut writer) = io::pipe().expect("a pipe");
+        writer.write_all(b"secret").expect("it takes some bytes");
+        drop(writer);
+        let path = format!("/dev/fd/{}", reader.as_raw_fd());
+        assert_eq!(read_short(Path::new(&path), 100).expect("it is read"), b"secret");
     }
 
     #[test]

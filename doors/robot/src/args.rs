@@ -1,6 +1,6 @@
 //! The flags of every door that say which robot it asks.
 
-use std::io::{self, Read};
+use std::io;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -25,7 +25,7 @@ pub struct RobotArgs {
 impl RobotArgs {
     /// Returns the robot, with the token of the file. Nothing is asked yet.
     pub fn open(&self) -> io::Result<Robot> {
-        let read = |path: &PathBuf| io::read_to_string(files::open(path)?.take(MAX_TOKEN_BYTES));
+        let read = |path: &PathBuf| io::read_to_string(&files::read_short(path, MAX_TOKEN_BYTES)?[..]);
         let token = self.token_file.as_ref().map(read).transpose()?;
         Ok(Robot::new(&self.robot, token.as_deref().map(str::trim)))
     }
