@@ -31,7 +31,11 @@ pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
 /// Calls `stop` whenever a signal asks the program to end: ctrl-c and, on Unix, SIGTERM and SIGHUP.
 pub fn on_stop(mut stop: impl FnMut() + Send + 'static) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let mut signals = runtime.block_on(async { Signals::listen() })?;
+    // It may be called from within another runtime, where none can be driven.
+    let mut signals = {
+        let _context = runtime.enter();
+        Signals::listen()?
+    };
     let listening = move || {
         runtime.block_on(async {
             loop {
