@@ -25,7 +25,7 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
     None
 }
 
-/// A logger that ended, `| head`: whoever read what a program says is gone. Its work and its results are not.
+/// Whoever reads what a program says may leave (a logger that ends, `| head`). The work goes on and its results stay.
 #[test]
 fn programs_go_on_when_nobody_reads_what_they_say() {
     let dir = tempfile::tempdir().expect("a temporary folder");

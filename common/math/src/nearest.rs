@@ -121,7 +121,7 @@ impl Tree<'_> {
         // Rounding is monotone: no point beyond the plane has a smaller squared distance than the plane. An equal
         // one may have a lower number.
         let reaches = |last: &(f64, u32)| {
-            // Points at one place, of which an export may have a million, are in the order of their numbers.
+            // An export may have a million points at one place. They are found in the order of their numbers.
             let is_later = beyond == 0.0 && last.0 == 0.0 && last.1 < self.items[middle].1;
             beyond * beyond <= last.0 && !is_later
         };

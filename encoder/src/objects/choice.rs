@@ -34,7 +34,7 @@ const WHOLE_TENTHS: u64 = 2;
 const JUDGES_PER_WHOLE: usize = 11;
 /// Agreement counts as much with a mask of what stands on the ground: all views agree on it, also where things touch.
 const STANDING_TRUST: f64 = 0.75;
-/// A view of which fewer pixels show the node counts as much less: an outline that is a pixel off spoils a small one.
+/// A view that shows the node in fewer pixels counts proportionally less: one pixel of error spoils a small outline.
 const FULL_PX: f64 = 4096.0;
 /// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
 const LEAST_UNCUT: f32 = 0.05;

@@ -56,7 +56,7 @@ fn threads_do_not_show() {
     assert_eq!(with(1), with(3));
 }
 
-/// An export may keep what was pruned, all at one place: 4e10 comparisons if each looked at each.
+/// Some exports move pruned Gaussians to one place. Comparing all pairs of these would take 4e10 comparisons.
 #[test]
 fn a_heap_takes_no_longer_than_spread_points() {
     let found = Neighbours::new(&vec![[1.0; 3]; 200_000], 8);
