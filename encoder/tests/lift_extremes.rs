@@ -223,7 +223,7 @@ fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (
         profiles: vec![Profile::Exact],
         codebook: CodebookSettings::default(),
         input_indices: false,
-        appearance: false,
+        compact_appearance: false,
     };
     let score_context = ScoreMetricContext { metric, bank, spread };
     let builder = ShardBuilder {

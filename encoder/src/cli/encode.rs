@@ -129,8 +129,8 @@ pub struct EncodeArgs {
     /// do: at most 4 bytes a Gaussian, 2.5 in a scene of a million.
     #[arg(long, help_heading = "Output", hide_short_help = true)]
     input_indices: bool,
-    /// Shards tell how their Gaussians look, so that the page at /view shows colours on a robot, too: 10 bytes a
-    /// Gaussian in every profile.
+    /// Compact shards tell how their Gaussians look, too, as balanced and exact ones always do: 10 bytes a Gaussian,
+    /// for a robot's page in colours, and to verify where it is.
     #[arg(long, help_heading = "Output")]
     appearance: bool,
     /// Shards say which places are free, occupied or unknown, so that robots find places to stand; with a value:
@@ -221,7 +221,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
         cells.limits.position_error = PositionError::Within(error);
     }
     cells.shards.input_indices = args.input_indices;
-    cells.shards.appearance = args.appearance;
+    cells.shards.compact_appearance = args.appearance;
     cells.occupancy = args.occupancy.map(|voxel_m| OccupancySettings { voxel_m });
     cells.photo_poses = args.photo_poses;
     cells.landmarks = args.locate;

@@ -290,7 +290,7 @@ impl EncodeSettings {
                     profiles: Profile::ALL.to_vec(),
                     codebook: CodebookSettings::default(),
                     input_indices: false,
-                    appearance: false,
+                    compact_appearance: false,
                 },
                 objects: true,
                 occupancy: None,

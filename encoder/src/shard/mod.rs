@@ -55,8 +55,8 @@ pub struct ShardSettings {
     pub codebook: CodebookSettings,
     /// Whether compact and balanced shards have the indices of their Gaussians in the input splat file, too.
     pub input_indices: bool,
-    /// Whether shards tell how their Gaussians look.
-    pub appearance: bool,
+    /// Whether compact shards tell how their Gaussians look, as the others do.
+    pub compact_appearance: bool,
 }
 
 /// The embeddings of a cell's Gaussians.
@@ -164,17 +164,20 @@ impl ShardBuilder<'_> {
         };
         let objects = extras.objects.map(of_cell);
         let objects = objects.as_ref().map(CellObjects::view);
-        let appearance = settings.appearance.then(|| AppearanceColumns::of(self.scene, &order.in_input()));
+        let appearance = AppearanceColumns::of(self.scene, &order.in_input());
         let additions = Additions {
             objects: objects.as_ref(),
-            appearance: appearance.as_ref().map(AppearanceColumns::view),
+            appearance: Some(appearance.view()),
             occupancy: extras.occupancy.as_ref(),
             photo_poses: extras.photo_poses,
             landmarks: extras.landmarks,
         };
         let chosen = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
         let shards = chosen.map(|profile| match profile {
-            Profile::Compact => built(profile, &compact, additions),
+            Profile::Compact => {
+                let appearance = additions.appearance.filter(|_| settings.compact_appearance);
+                built(profile, &compact, Additions { appearance, ..additions })
+            }
             Profile::Balanced => built(profile, &balanced, additions),
             Profile::Exact => {
                 let exact = Some(ExactColumns {

@@ -7,7 +7,7 @@ use slag_view::{Cell, CellState, Description, Photo, ScoresMessage, Step, cell_m
 
 use super::answers::Things;
 use super::error::ViewError;
-use super::shards::{combined, photos_of, scores_of, smallest_shard};
+use super::shards::{combined, photos_of, scores_of, smallest_shard, smallest_with_appearance};
 use super::splat::{PROGRAM, Splat};
 use crate::lift::published::{read_field, read_regions};
 use crate::lift::{CellField, RegionTable};
@@ -96,7 +96,7 @@ impl Generation {
         match (&self.scored, splat) {
             (Scored::Fields(_, fields), Some(splat)) => Ok(splat.message(&fields[at].input_indices, step)),
             _ => {
-                let shard = smallest_shard(&self.reader, &manifest.cells[at])?;
+                let shard = smallest_with_appearance(&self.reader, &manifest.cells[at])?;
                 let shard = shard.ok_or(ViewError::NoCell { cell_id })?;
                 let view = shard.view();
                 let n_gaussians = view.header.n_gaussians as usize;

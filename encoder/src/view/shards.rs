@@ -43,3 +43,24 @@ pub(super) fn smallest_shard(
 ) -> Result<Option<StoredShard>, StoreError> {
     cell.shards.values().next().map(|record| reader.read_shard(record)).transpose()
 }
+
+/// Reads a cell's smallest shard that tells how its Gaussians look, or else the smallest. The order of Gaussians is the
+/// same in all.
+pub(super) fn smallest_with_appearance(
+    reader: &StoreReader,
+    cell: &CellRecord,
+) -> Result<Option<StoredShard>, StoreError> {
+    let mut shards = cell.shards.values().map(|record| reader.read_shard(record));
+    let smallest = shards.next().transpose()?;
+    let tells = |shard: &StoredShard| shard.layout.appearance(&shard.bytes).is_some();
+    if smallest.as_ref().is_none_or(tells) {
+        return Ok(smallest);
+    }
+    for shard in shards {
+        let shard = shard?;
+        if tells(&shard) {
+            return Ok(Some(shard));
+        }
+    }
+    Ok(smallest)
+}

@@ -32,7 +32,7 @@ pub(super) fn publish(
         profiles,
         codebook: CodebookSettings::default(),
         input_indices: false,
-        appearance: false,
+        compact_appearance: false,
     };
     let field = Field::new(n_gaussians, dim);
     let store = Store::create_or_open(dir)?;

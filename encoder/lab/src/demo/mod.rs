@@ -178,7 +178,7 @@ fn encode(
     settings.run.memory_bytes = 1 << 30;
     settings.run.strict = true;
     // The page then shows colours on the robot, too.
-    settings.cells.shards.appearance = true;
+    settings.cells.shards.compact_appearance = true;
     // Small cells, so that the demo has several.
     settings.cells.limits = CellLimits { max_gaussians: 16_384, ..settings.cells.limits };
     let engines = Engines::new(models, &options.session, &CpuRasterizer);

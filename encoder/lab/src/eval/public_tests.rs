@@ -87,7 +87,7 @@ impl Wall {
                 profiles: vec![Profile::Compact],
                 codebook: CodebookSettings::default(),
                 input_indices: false,
-                appearance: false,
+                compact_appearance: false,
             },
             objects: false,
             occupancy: None,
