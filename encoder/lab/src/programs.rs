@@ -94,8 +94,17 @@ impl Service {
 
     /// Sends JSON and returns the JSON of the answer, whatever its status.
     pub(crate) fn post(&self, path: &str, body: &Value) -> Result<Value> {
-        let request = agent().post(format!("{}{path}", self.url)).content_type("application/json");
-        let body = request.send(body.to_string())?.body_mut().read_to_string()?;
+        self.send(path, "application/json", body.to_string().as_bytes())
+    }
+
+    /// Sends a PNG as [`Self::post`] sends JSON.
+    pub(crate) fn post_image(&self, path: &str, png: &[u8]) -> Result<Value> {
+        self.send(path, "image/png", png)
+    }
+
+    fn send(&self, path: &str, media_type: &str, body: &[u8]) -> Result<Value> {
+        let request = agent().post(format!("{}{path}", self.url)).content_type(media_type);
+        let body = request.send(body)?.body_mut().read_to_string()?;
         serde_json::from_str(&body).with_context(|| path.to_owned())
     }
 }

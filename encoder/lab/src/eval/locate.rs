@@ -15,13 +15,14 @@ use serde::Serialize;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::landmarks::BuiltLandmarks;
 use slag_common::splat::{self, ReadOptions};
-use slag_common::{Gaussians, View, poses};
+use slag_common::{Gaussians, Intrinsics, View, poses};
 use slag_encoder::ingest;
 use slag_encoder::landmarks::{self, SceneRenderer};
 use slag_encoder::progress::Progress;
-use slag_encoder::raster::{CpuRasterizer, Rasterizer};
+use slag_encoder::raster::{CpuRasterizer, LoadedScene, RasterView, Rasterizer};
 use slag_locate::{Grey, Map, MappingView, Outcome, Photo, Renderer, locate};
 
+use super::truth::Truth;
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure};
 
@@ -37,6 +38,9 @@ const DARK_FACTOR: f32 = 0.4;
 const POSITION_STEP_M: f64 = 0.02;
 /// Width of the square of [`Change::Covered`], as a share of each side: 20 % of the area.
 const COVERED_SIDE: f64 = 0.447;
+/// Of so many things of [`Change::Moved`] one stands elsewhere, so many metres away.
+const MOVED_THINGS: u16 = 3;
+const MOVED_M: f64 = 1.0;
 
 /// `eval locate`.
 #[derive(Debug, Args)]
@@ -74,6 +78,10 @@ enum Change {
     Focal,
     /// A grey square hides 20 % of the photo.
     Covered,
+    /// The splat drawn in the photo's place.
+    Drawn,
+    /// The same, with a third of the labelled things 1 m from where the map has them.
+    Moved,
 }
 
 /// A scene, its map and its queries.
@@ -85,6 +93,8 @@ struct Located {
     len_bytes: u64,
     map_secs: f64,
     queries: Vec<View>,
+    /// What queries show instead of their photos.
+    drawn: Option<Gaussians>,
 }
 
 /// A query's result: errors in metres and degrees, where it was found.
@@ -138,7 +148,10 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         let loaded = CpuRasterizer.load(&scene.gaussians)?;
         let renderer = SceneRenderer(loaded.as_ref());
         let renderer = (!args.unverified).then_some(&renderer as &(dyn Renderer + Sync));
-        let attempt = |view: &View| attempt(scene, view, args.change, renderer);
+        let drawn = scene.drawn.as_ref().map(|drawn| CpuRasterizer.load(drawn)).transpose()?;
+        let attempt = |view: &View| -> Result<Try> {
+            Ok(attempt(scene, &query(view, args.change, drawn.as_deref())?, renderer))
+        };
         let mut tries = Vec::new();
         for view in &scene.queries {
             let one = attempt(view)?;
@@ -181,6 +194,11 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
         .collect::<Result<_>>()?;
     drop(loaded);
     let found = landmarks::landmarks(&mapping, gaussians.len());
+    let drawn = match args.change {
+        Change::Drawn => Some(gaussians.clone()),
+        Change::Moved => Some(moved(&gaussians, &Truth::read(&files.dir, gaussians.len())?)),
+        _ => None,
+    };
     let built = BuiltLandmarks::pack(slag_locate::CODE_VERSION, &found);
     let mut queries: Vec<View> =
         views.iter().enumerate().filter(|(at, _)| is_query(*at)).map(|(_, view)| view.clone()).collect();
@@ -195,7 +213,20 @@ fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
         map_secs: start.elapsed().as_secs_f64(),
         gaussians: on_board(&gaussians),
         queries,
+        drawn,
     })
+}
+
+/// Returns a scene with some of its things moved sideways, each its own way.
+fn moved(scene: &Gaussians, truth: &Truth) -> Gaussians {
+    let mut moved = scene.clone();
+    let is_thing = |id: u16| truth.things.iter().any(|thing| thing.id == id);
+    for (mean, id) in moved.means_in_world.iter_mut().zip(&truth.id_of_gaussian) {
+        if id % MOVED_THINGS == 0 && is_thing(*id) {
+            *mean += MOVED_M * glam::DVec2::from_angle(f64::from(*id)).extend(0.0);
+        }
+    }
+    moved
 }
 
 /// Returns a scene as a robot has it, without harmonics and rounded.
@@ -209,25 +240,38 @@ fn on_board(scene: &Gaussians) -> Gaussians {
     on_board
 }
 
-/// Locates a photo in a scene's map.
-fn attempt(
-    scene: &Located,
-    view: &View,
-    change: Change,
-    renderer: Option<&(dyn Renderer + Sync)>,
-) -> Result<Try> {
+/// A photo as the robot has it.
+struct Query {
+    grey: Grey,
+    intrinsics: Intrinsics,
+    camera_from_world: glam::DAffine3,
+}
+
+/// Reads a query's photo, or draws it, and changes it.
+fn query(view: &View, change: Change, drawn: Option<&dyn LoadedScene>) -> Result<Query> {
     let loaded = ingest::load_image(view).with_context(|| view.name.clone())?;
-    let (width, height) = loaded.image.dimensions();
-    let mut grey = Grey::from_rgb8(width as usize, height as usize, loaded.image.as_raw());
     let mut intrinsics = loaded.view.intrinsics;
+    let camera_from_world = view.camera_from_world;
+    let image = match drawn {
+        Some(scene) => scene.draw(&RasterView { camera_from_world, intrinsics }, [0.5; 3])?.image(),
+        None => loaded.image,
+    };
+    let (width, height) = image.dimensions();
+    let mut grey = Grey::from_rgb8(width as usize, height as usize, image.as_raw());
     changed(change, &mut grey, &mut intrinsics);
-    let photo = Photo { grey: &grey, intrinsics: &intrinsics, gravity_in_camera: None, prior: None };
+    Ok(Query { grey, intrinsics, camera_from_world })
+}
+
+/// Locates a photo in a scene's map.
+fn attempt(scene: &Located, query: &Query, renderer: Option<&(dyn Renderer + Sync)>) -> Try {
+    let photo =
+        Photo { grey: &query.grey, intrinsics: &query.intrinsics, gravity_in_camera: None, prior: None };
     let start = Instant::now();
     let outcome = locate(&scene.map, &photo, renderer.map(|renderer| renderer as &dyn Renderer));
     let secs = start.elapsed().as_secs_f64();
     let found = match outcome {
         Outcome::Found(found) => {
-            let (truth, pose) = (view.camera_from_world, found.camera_from_world);
+            let (truth, pose) = (query.camera_from_world, found.camera_from_world);
             let metres = truth.inverse().translation.distance(pose.inverse().translation);
             let between = glam::DQuat::from_mat3(&(pose.matrix3 * truth.matrix3.transpose()));
             let degrees = between.to_axis_angle().1.to_degrees();
@@ -236,13 +280,13 @@ fn attempt(
         Outcome::Unsure(_) => Err("unsure".into()),
         Outcome::Lost(reason) => Err(reason.to_string()),
     };
-    Ok(Try { found, secs })
+    Try { found, secs }
 }
 
-fn changed(change: Change, grey: &mut Grey, intrinsics: &mut slag_common::Intrinsics) {
+fn changed(change: Change, grey: &mut Grey, intrinsics: &mut Intrinsics) {
     let (width, height) = (grey.width, grey.height);
     match change {
-        Change::None => {}
+        Change::None | Change::Drawn | Change::Moved => {}
         Change::Dark => grey.values.iter_mut().for_each(|v| *v = (*v * DARK_FACTOR * 255.0).round() / 255.0),
         Change::Blurred => {
             let sharp = grey.values.clone();

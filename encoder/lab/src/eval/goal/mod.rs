@@ -1,6 +1,7 @@
 //! `eval goal`: places to stand, judged on generated scenes by their true surfaces: the voxels that are called
 //! free, and the poses that the robot's program gives for each thing.
 
+mod road;
 mod truth;
 
 use std::collections::{BTreeMap, HashSet};
@@ -11,6 +12,7 @@ use std::time::Instant;
 use anyhow::{Result, anyhow};
 use clap::Args;
 use glam::DVec3;
+use road::Road;
 use serde::Serialize;
 use serde_json::Value;
 use slag_common::objects::public_id;
@@ -19,7 +21,7 @@ use slag_encoder::objects::NONE;
 use slag_encoder::progress::Progress;
 use slag_encoder::query::PublishedObjects;
 use slag_encoder::store::StoreReader;
-use truth::{HEIGHT_M, MIN_SHOWN, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
+use truth::{HEIGHT_M, MIN_SHOWN, MIN_VISIBLE, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
 
 use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
@@ -30,8 +32,6 @@ use crate::table::{Table, percent};
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
-/// Least share of the thing's Gaussians that must be seen. From one side hardly half of them are.
-const MIN_VISIBLE: f64 = 0.02;
 /// Clearance by which a pose may fall short: a cell of the true map on either side.
 const TOLERANCE_M: f64 = 0.03;
 
@@ -56,6 +56,9 @@ pub(crate) struct GoalArgs {
     /// Radius of the robot.
     #[arg(long, value_name = "M", default_value_t = 0.3)]
     radius_m: f64,
+    /// Goes the whole road instead: from photos that no map has seen to what words name, with masks of the encoder's own.
+    #[arg(long)]
+    from_photos: bool,
     /// Tell each thing and pose that was not as it should be.
     #[arg(long)]
     list: bool,
@@ -64,14 +67,18 @@ pub(crate) struct GoalArgs {
 /// Judges every scene.
 pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport> {
     let mut report = GoalReport::default();
+    // The objects' outlines are the true ones where places are judged, not segmentation.
+    let encode_flags: &[&str] = match args.from_photos {
+        true => &["--occupancy", "--locate", "--appearance"],
+        false => &["--occupancy", "--masks", "SCENE/gt/masks"],
+    };
     let scenes = Prepared {
         out: &args.out,
         kinds: &args.kind,
         seeds: &args.seeds,
         n_views: args.n_views,
         walk: args.walk,
-        // The objects' outlines are the true ones: places are judged here, not segmentation.
-        encode_flags: &["--occupancy", "--masks", "SCENE/gt/masks"],
+        encode_flags,
     };
     report.scenes = scenes.judge(progress, |kind, seed, dir| {
         judge(args, dir, &Layout::new(&[kind], seed, &|_, _| true), &mut report)
@@ -84,8 +91,12 @@ fn judge(args: &GoalArgs, dir: &Path, layout: &Layout, report: &mut GoalReport) 
     let views = layout.photos(args.walk, args.n_views);
     let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
     let truth = Truth::new(layout, args.radius_m, cameras)?;
-    let labels = labels(&dir.join("scene"), &dir.join("store"))?;
     let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
+    if args.from_photos {
+        let road = report.road.get_or_insert_default();
+        return road.add(&dir.join("scene"), layout, &truth, &service, args.radius_m);
+    }
+    let labels = labels(&dir.join("scene"), &dir.join("store"))?;
     let start = truth.start();
     for (index, placed) in layout.placed.iter().enumerate().filter(|(_, placed)| !placed.shell) {
         let Some(label) = labels.get(index).filter(|label| label.n_pixels >= MIN_PIXELS) else { continue };
@@ -190,6 +201,9 @@ impl Verdict {
 #[derive(Clone, Debug, Default, Serialize)]
 pub(crate) struct GoalReport {
     scenes: Vec<String>,
+    /// In place of the other figures, where they were not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    road: Option<Road>,
     voxels: Voxels,
     /// Things that the robot truly reaches: places within reach from which they are shown.
     n_reachable: usize,
@@ -242,6 +256,13 @@ impl fmt::Display for GoalReport {
         writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
         let mut table = Table::new(["figure", "n", "of them"]);
         let mut row = |name: &str, n: String, of: String| table.row([name.to_owned(), n, of]);
+        if let Some(Road { n_photos, n_located, n_runs, n_shown, n_hidden }) = self.road {
+            row("photos", n_photos.to_string(), format!("{n_located} located"));
+            let shown = percent(n_shown as u64, n_runs as u64);
+            let ends = format!("{n_shown} end where it is shown: {shown}; {n_hidden} where it is not");
+            row("runs, a photo and a word each", n_runs.to_string(), ends);
+            return write!(f, "{table}");
+        }
         row("free voxels", n_free.to_string(), format!("{n_false} false: {}", percent(n_false, n_free)));
         row("bytes of occupancy in each profile", len_bytes.to_string(), String::new());
         let share = percent(self.n_shown as u64, self.n_reachable as u64);

@@ -15,6 +15,8 @@ pub(super) const REACH_M: f64 = 0.8;
 pub(super) const SENSOR_HEIGHT_M: f64 = 0.4;
 pub(super) const HEIGHT_M: f64 = 0.5;
 pub(super) const STEP_M: f64 = 0.1;
+/// Least share of the thing's Gaussians that must be seen. From one side hardly half of them are.
+pub(super) const MIN_VISIBLE: f64 = 0.02;
 /// Least share of the thing's outline that must truly be shown.
 pub(super) const MIN_SHOWN: f64 = 0.1;
 /// Edge of a cell of the true map.
