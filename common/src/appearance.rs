@@ -8,7 +8,6 @@ use glam::{DVec3, Vec3};
 use crate::Gaussians;
 use crate::gaussians::SH_C0;
 
-/// Bytes of a Gaussian's appearance.
 pub const BYTES: usize = 10;
 /// Natural logarithm of the smallest size.
 const LN_SIZE_MIN: f32 = -12.0;
@@ -51,7 +50,6 @@ impl Appearance<'_> {
     }
 }
 
-/// The appearance of some Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct AppearanceColumns {
     colours: Vec<[u8; 4]>,

@@ -27,17 +27,12 @@ pub enum Distortion {
 
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
-    /// Image width, pixels.
     pub width_px: u32,
-    /// Image height, pixels.
     pub height_px: u32,
-    /// Focal length along x, pixels.
     pub focal_x_px: f64,
-    /// Focal length along y, pixels.
     pub focal_y_px: f64,
     /// Principal point, x, pixels (the centre of the first pixel is 0.5).
     pub centre_x_px: f64,
-    /// Principal point, y, pixels.
     pub centre_y_px: f64,
     pub distortion: Distortion,
 }
@@ -165,7 +160,6 @@ impl Intrinsics {
         self.scaled_to(width_px, height_px)
     }
 
-    /// Returns the camera as an ideal pinhole.
     pub fn without_distortion(&self) -> Self {
         Self { distortion: Distortion::None, ..*self }
     }

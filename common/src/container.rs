@@ -17,7 +17,6 @@ pub const MAX_SECTIONS: u32 = 64;
 #[cfg(target_endian = "big")]
 compile_error!("the on-disk columns are used in place and are little-endian");
 
-/// The fault of a container, and its place.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ContainerError {
     #[error(
@@ -240,7 +239,6 @@ impl AlignedBytes {
         Self::read_from(file, len)
     }
 
-    /// Reads exactly `len` bytes.
     pub fn read_from(mut reader: impl io::Read, len: usize) -> io::Result<Self> {
         let mut blocks = vec![Block([0; ALIGNMENT_BYTES]); len.div_ceil(ALIGNMENT_BYTES)];
         reader.read_exact(&mut bytemuck::cast_slice_mut::<Block, u8>(&mut blocks)[..len])?;

@@ -131,7 +131,6 @@ impl TextService {
         self.known.as_ref()?.asked_as(&words_to_find(text).ok()?)
     }
 
-    /// Returns whether the encoder runs.
     pub(crate) fn is_alive(&self) -> bool {
         self.is_alive.load(Ordering::Relaxed)
     }

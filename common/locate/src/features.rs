@@ -38,7 +38,6 @@ pub struct Feature {
     pub descriptor: Descriptor,
 }
 
-/// The pictures of an octave.
 struct Octave {
     layers: Vec<Grey>,
     /// Width of its pixels, in the photo's.
@@ -113,7 +112,6 @@ fn blurred_layers(base: Grey) -> Vec<Grey> {
     layers
 }
 
-/// The differences of an octave's pictures.
 struct Differences<'a> {
     layers: &'a [Grey],
     width: usize,

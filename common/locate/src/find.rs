@@ -74,7 +74,6 @@ impl Photo<'_> {
 /// Standard deviations of a [`Prior`] within which poses lie.
 const PRIOR_SIGMAS: f64 = 3.0;
 
-/// A camera that was found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
     pub camera_from_world: DAffine3,

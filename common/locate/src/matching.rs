@@ -35,7 +35,6 @@ impl Query {
         Match { feature, landmark, at: self.at[feature], point_in_world }
     }
 
-    /// Matches each feature with all landmarks.
     pub(crate) fn match_all(&self, map: &Map) -> Vec<Match> {
         let all: Vec<u32> = (0..map.landmarks.len() as u32).collect();
         self.match_among(map, &all, MAX_RATIO)

@@ -26,7 +26,6 @@ pub struct Rendering {
     pub depth: Vec<f32>,
 }
 
-/// Draws the scene.
 pub trait Renderer {
     /// Draws what an ideal pinhole sees; `None` where that cannot be drawn.
     fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering>;

@@ -239,7 +239,6 @@ pub struct Verified {
     files: Vec<String>,
 }
 
-/// Shows a report to people.
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

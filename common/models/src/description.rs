@@ -79,7 +79,6 @@ pub const FILE_NAME: &str = "model.toml";
 /// Most patches along a side of the square.
 const MAX_PATCHES_PER_SIDE: u16 = 256;
 
-/// Error of reading a description or the files that it names.
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
     #[error("{cause}; put the file there or correct the description")]
@@ -96,7 +95,6 @@ pub enum DescriptionError {
     NoHash { path: PathBuf },
 }
 
-/// A model directory's description.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
@@ -124,7 +122,6 @@ pub(crate) fn here() -> PathBuf {
     ".".into()
 }
 
-/// The image side of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageDescription {
@@ -179,7 +176,6 @@ impl ImageDescription {
     }
 }
 
-/// The text side of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum TextDescription {
@@ -455,7 +451,6 @@ pub struct ScoreDescription {
     probability: Option<f64>,
 }
 
-/// Shows the fields that are given.
 impl fmt::Display for ScoreDescription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { threshold, logit_scale, logit_bias, probability } = *self;

@@ -15,7 +15,6 @@ const MAX_CA_BYTES: u64 = 1 << 20;
 /// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(50);
 
-/// Network timeouts and retry limits.
 #[derive(Clone, Debug)]
 pub struct NetworkLimits {
     /// Failures in a row, without progress, before a download is given up.
@@ -72,7 +71,6 @@ pub trait Watch: Sync {
     }
 }
 
-/// Reasons for a failed attempt.
 #[derive(Debug, thiserror::Error)]
 pub enum DownloadFailure {
     #[error("{0}")]
@@ -118,7 +116,6 @@ impl DownloadFailure {
     }
 }
 
-/// Reasons for which a download ends.
 #[derive(Debug, thiserror::Error)]
 pub enum DownloadError {
     #[error("{failure} ({attempts} attempts)")]

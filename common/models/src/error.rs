@@ -22,7 +22,6 @@ pub enum ModelError {
     Tensors(#[from] TensorsError),
 }
 
-/// Error of turning text into tokens.
 #[derive(Debug, thiserror::Error)]
 pub enum TokenizerError {
     #[error("{cause}; put the tokenizer there or correct the description")]
@@ -48,7 +47,6 @@ pub enum TokenizerError {
     Encode { path: PathBuf, reason: String },
 }
 
-/// Error of reading a list of phrases.
 #[derive(Debug, thiserror::Error)]
 pub enum PhrasesError {
     #[error("{cause}; put the file there or correct the description")]

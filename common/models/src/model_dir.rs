@@ -143,7 +143,6 @@ impl ModelDir {
         &self.id
     }
 
-    /// Returns the number of components of a vector.
     pub fn dim(&self) -> usize {
         self.id.dim as usize
     }

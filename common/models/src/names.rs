@@ -6,7 +6,6 @@
 
 use crate::everyday_nouns;
 
-/// Names that a thing has at most.
 pub const MAX_NAMES: usize = 3;
 /// Most words that things are named by: lists of phrases for people are shorter.
 const MAX_WORDS: usize = 4096;
@@ -51,7 +50,6 @@ pub struct Spread {
 }
 
 impl Spread {
-    /// Takes some scores.
     pub fn add(&mut self, scores: &[f32]) {
         for score in scores.iter().copied().map(f64::from) {
             (self.sum, self.squares, self.n) = (self.sum + score, self.squares + score * score, self.n + 1.0);

@@ -136,7 +136,6 @@ impl WeightSink for PixelSink<'_> {
 pub struct ViewCounters {
     /// Gaussians with a pixel of the image in their footprint; they may be occluded.
     pub visible: usize,
-    /// Number of (Gaussian, tile) pairs.
     pub pairs: usize,
     /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once
     /// projected.

@@ -21,7 +21,6 @@ impl RasterView {
     }
 }
 
-/// What cannot be drawn.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum InputError {
     #[error("scene column {column} has {found} values, expected {expected}; read the scene again")]

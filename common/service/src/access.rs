@@ -124,7 +124,6 @@ impl Access {
         Self { reads, ..self }
     }
 
-    /// Returns whether anybody may write.
     pub fn takes_writes(&self) -> bool {
         !matches!(self.writes, Writes::None)
     }

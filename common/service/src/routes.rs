@@ -46,7 +46,6 @@ impl Parameter {
     }
 }
 
-/// What the body of a request is.
 #[derive(Clone, Debug)]
 pub(crate) struct BodyOf {
     pub(crate) media_types: &'static [&'static str],

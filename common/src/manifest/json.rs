@@ -4,7 +4,6 @@ use super::records::{MAX_BYTES, MAX_TEXT_FILES, Manifest, VERSION};
 use crate::frames::Aabb;
 use crate::shard::MAX_DIM;
 
-/// Why a manifest is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ManifestError {
     #[error(

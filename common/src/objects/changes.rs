@@ -51,7 +51,6 @@ pub struct Moved {
     pub distance: f64,
 }
 
-/// The changes from one list of things to another.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Changes {
     /// Things of exactly the same Gaussians.

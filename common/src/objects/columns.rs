@@ -11,12 +11,10 @@ use crate::quantise::quantise;
 
 /// Marks a run of Gaussians that belong to no object.
 pub const NO_OBJECT: u16 = u16::MAX;
-/// Largest number of vectors of an object.
 pub const MAX_VECTORS: u32 = 16;
 /// Longest photo name, bytes.
 pub const MAX_PHOTO_BYTES: usize = 1024;
 
-/// Section ids.
 pub mod section {
     /// [`super::ObjectsHeader`].
     pub const HEADER: u32 = 20;
@@ -34,7 +32,6 @@ pub mod section {
     pub const PHOTOS: u32 = 26;
 }
 
-/// The fixed-size header of the objects.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ObjectsHeader {
@@ -217,7 +214,6 @@ impl ObjectsLayout {
         Ok(Some(Self { header, columns }))
     }
 
-    /// Returns the columns of the bytes that were checked.
     pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Objects<'a> {
         let [records, vectors, steps, run_ends, run_objects, photos] =
             self.columns.each_ref().map(|range| &bytes[range.clone()]);

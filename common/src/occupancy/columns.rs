@@ -11,7 +11,6 @@ pub const BLOCK_EDGE: i32 = 4;
 /// Bits of a stored run that name its kind.
 pub(super) const KIND_BITS: u32 = 2;
 
-/// Section ids.
 pub mod section {
     /// [`super::OccupancyHeader`].
     pub const HEADER: u32 = 50;
@@ -21,7 +20,6 @@ pub mod section {
     pub const MASKS: u32 = 52;
 }
 
-/// The fixed-size header of the occupancy.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct OccupancyHeader {
@@ -50,7 +48,6 @@ pub enum VoxelState {
     Occupied,
 }
 
-/// The state of the blocks of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunKind {
     Free = 1,
@@ -68,7 +65,6 @@ pub struct StoredRun {
 }
 
 impl StoredRun {
-    /// Returns the kind; `None` if there is no such kind.
     pub(super) fn kind(self) -> Option<RunKind> {
         match self.len_and_kind & ((1 << KIND_BITS) - 1) {
             1 => Some(RunKind::Free),
@@ -181,7 +177,6 @@ impl Occupancy<'_> {
 const MAX_BLOCKS: u64 = 1 << 27;
 /// Farthest block from the world's origin: voxels are numbered in 32 bits.
 const MAX_BLOCK: i64 = 1 << 28;
-/// Largest edge of a voxel.
 const MAX_VOXEL: f64 = 1e6;
 
 /// Where the columns of a shard's checked occupancy lie.
@@ -230,7 +225,6 @@ impl OccupancyLayout {
         Ok(Some(Self { header, columns: [runs, masks] }))
     }
 
-    /// Returns the columns of the bytes that were checked.
     pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Occupancy<'a> {
         let [runs, masks] = self.columns.each_ref().map(|range| &bytes[range.clone()]);
         Occupancy {
@@ -331,12 +325,10 @@ impl BuiltOccupancy {
         Self { header, runs, masks }
     }
 
-    /// Returns the columns as readers see them.
     pub fn view(&self) -> Occupancy<'_> {
         Occupancy { header: self.header, runs: &self.runs, masks: &self.masks }
     }
 
-    /// Returns the bytes that the columns take.
     pub fn len_bytes(&self) -> u64 {
         self.view().sections().iter().map(|(_, bytes)| bytes.len() as u64).sum()
     }

@@ -46,7 +46,6 @@ impl Positions<'_> {
     }
 }
 
-/// The basis of a cell's centroids.
 #[derive(Clone, Copy, Debug)]
 pub struct Basis<'a> {
     /// `[dim]`.
@@ -174,7 +173,6 @@ impl ShardView<'_> {
         self.centroid_starts.partition_point(|start| *start as usize <= index) - 1
     }
 
-    /// Returns the number of Gaussians that have an embedding.
     pub fn n_with_evidence(&self) -> usize {
         self.centroid_starts[self.header.n_centroids as usize] as usize
     }

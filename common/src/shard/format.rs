@@ -17,7 +17,6 @@ pub const MAX_SUBSPACES: usize = 128;
 /// Largest `dim` accepted: more than any text-image model has.
 pub const MAX_DIM: usize = 8192;
 
-/// Ids of a shard's sections.
 pub mod section {
     /// [`super::ShardHeader`].
     pub const HEADER: u32 = 1;
@@ -88,7 +87,6 @@ pub struct ScoreErrors {
     pub spread: f32,
 }
 
-/// The fixed-size header of a shard.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ShardHeader {

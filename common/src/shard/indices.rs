@@ -6,11 +6,9 @@
 
 use bytemuck::{Pod, Zeroable};
 
-/// The fixed-size header of the column.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct IndicesHeader {
-    /// Smallest index.
     pub least: u32,
     /// Bits of an index, 0..=32.
     pub width_bits: u32,

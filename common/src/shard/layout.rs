@@ -214,7 +214,6 @@ fn check_errors(errors: &ScoreErrors) -> Result<(), String> {
     Ok(())
 }
 
-/// Checks the columns of a shard whose header is checked.
 struct Checker<'a> {
     bytes: &'a [u8],
     layout: &'a Layout,

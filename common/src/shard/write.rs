@@ -36,7 +36,6 @@ impl ShardView<'_> {
         self.write_with(out, Additions::default())
     }
 
-    /// Writes the shard and its additions.
     pub fn write_with<'a>(&self, out: impl io::Write, additions: impl Into<Additions<'a>>) -> io::Result<()> {
         let Additions { objects, appearance, occupancy, photo_poses, landmarks } = additions.into();
         let mut sections = vec![

@@ -126,7 +126,6 @@ impl Pixels {
     }
 }
 
-/// Reads a SOG folder, given its meta file.
 pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let folder = meta_path.parent().unwrap_or(Path::new("")).to_path_buf();
     let len_bytes = fs_err::metadata(meta_path)?.len();
@@ -188,7 +187,6 @@ impl Sog {
         }
     }
 
-    /// Returns the bytes of a part, at most `max_bytes`.
     fn bytes(&mut self, part: &str, max_bytes: u64) -> Result<Vec<u8>, SplatError> {
         let mut bytes = Vec::new();
         let failed = |path: &Path, source: std::io::Error| {

@@ -15,7 +15,6 @@ use super::time::{format_utc, parse_utc};
 /// What all metadata begins with.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Head {
-    /// Kind of metadata.
     #[serde(rename = "_type")]
     pub kind: String,
     pub spec_version: String,

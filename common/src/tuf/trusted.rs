@@ -39,17 +39,14 @@ impl Trusted {
         &self.root
     }
 
-    /// Returns the timestamp, once there is one.
     pub fn timestamp(&self) -> Option<&SignedMetadata<Timestamp>> {
         self.timestamp.as_ref()
     }
 
-    /// Returns the snapshot, once there is one.
     pub fn snapshot(&self) -> Option<&SignedMetadata<Snapshot>> {
         self.snapshot.as_ref()
     }
 
-    /// Returns the targets metadata, once there is some.
     pub fn targets(&self) -> Option<&SignedMetadata<Targets>> {
         self.targets.as_ref()
     }
@@ -153,7 +150,6 @@ impl Trusted {
         Ok(())
     }
 
-    /// Returns what the snapshot states of the targets metadata.
     pub(super) fn targets_meta(&self) -> Result<&FileMeta, TufError> {
         let order = || TufError::Order { role: Targets::TYPE.into() };
         Ok(&self.snapshot.as_ref().ok_or_else(order)?.body.meta["targets.json"])

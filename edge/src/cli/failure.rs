@@ -29,7 +29,6 @@ impl From<Exit> for ExitCode {
 
 /// Reasons for ending a run early.
 pub enum Failure {
-    /// Invalid request.
     Usage(anyhow::Error),
     /// Failure; the string is the kind of error for programs.
     Failed(&'static str, anyhow::Error),

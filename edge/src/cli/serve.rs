@@ -107,7 +107,6 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     served
 }
 
-/// Serves until a signal to stop.
 async fn serve(
     args: ServeArgs,
     tls: Option<Tls>,

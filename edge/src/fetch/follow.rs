@@ -80,7 +80,6 @@ impl Follower {
         Self { settings, covered: None, attempted: None, n_failures: 0, retry_at: Duration::ZERO }
     }
 
-    /// Returns the radius to fetch, world units.
     pub fn fetch_radius(&self) -> f64 {
         self.settings.radius + self.settings.margin
     }
@@ -169,7 +168,6 @@ pub struct Following {
 }
 
 impl Following {
-    /// Posts the robot's position.
     pub fn post(&self, position: Position) {
         let mut inbox = self.lock();
         inbox.status.position = Some(position);
@@ -208,7 +206,6 @@ impl Following {
         inbox.n_failures_in_a_row
     }
 
-    /// Records that following begins again.
     pub(crate) fn note_restart(&self) {
         self.lock().status.n_restarts += 1;
     }

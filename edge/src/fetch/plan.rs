@@ -19,7 +19,6 @@ pub struct Held {
     pub last_used: u64,
 }
 
-/// The set of cells wanted on board.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wanted {
     pub profile: Profile,

@@ -105,7 +105,6 @@ impl Records {
         Ok(Self { copies, version, record, damage, _lock: lock })
     }
 
-    /// Returns the error of damaged records, if both copies are damaged.
     pub fn damage(&self) -> Option<RecordsError> {
         let what = self.damage.clone()?;
         Some(RecordsError::Damaged { path: self.copies.dir().to_owned(), what })
@@ -124,7 +123,6 @@ impl Records {
         self.record.kept.as_ref()
     }
 
-    /// Returns the SHA-256 of the root that was trusted first, hex.
     pub(crate) fn first_root_sha256(&self) -> Option<&str> {
         self.record.first_root_sha256.as_deref()
     }

@@ -63,7 +63,6 @@ pub trait Progress: Sync {
 
 impl Progress for () {}
 
-/// The surroundings of a fetch.
 pub struct Environment<'a> {
     pub now_unix_secs: u64,
     /// Set to end the fetch; the next one resumes what arrived.
@@ -77,7 +76,6 @@ pub struct Environment<'a> {
     pub limits: NetworkLimits,
 }
 
-/// Number and length of some shards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Tally {
     pub n_shards: usize,
@@ -116,7 +114,6 @@ pub struct FetchReport {
     pub encoder_id: Hash32,
     pub encoder_name: String,
     pub profile: Profile,
-    /// Centre, world frame.
     pub centre_in_world: DVec3,
     /// Radius, world units.
     pub radius: f64,

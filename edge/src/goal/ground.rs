@@ -27,7 +27,6 @@ pub enum Floor {
 pub struct Ground {
     /// `[n_x][n_y]`.
     pub floors: Vec<Floor>,
-    /// Cells along y.
     pub n_y: usize,
     /// `[n_x][n_y]`: surfaces with headroom; bit z is the surface whose highest voxel is z.
     surfaces: Vec<u128>,

@@ -15,7 +15,6 @@ use crate::score::Budget;
 /// The ground around a robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FloorMap {
-    /// Edge of a cell, metres.
     pub cell_m: f64,
     /// Corner of the first cell: the least x and y.
     pub origin_in_world: DVec3,

@@ -26,7 +26,6 @@ pub const RANGE_M: [f64; 2] = [1.0, 50.0];
 pub const MIN_VISIBLE: [f64; 2] = [0.01, 1.0];
 pub const MAX_POSES: usize = 20;
 
-/// The thing to go to.
 #[derive(Clone, Debug, PartialEq)]
 pub enum GoalTarget {
     /// What matches a text, best first; a text may name relations, as in `/v1/query`.
@@ -37,7 +36,6 @@ pub enum GoalTarget {
 /// A request for places to stand. Lengths in metres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GoalRequest {
-    /// The thing to go to.
     pub target: GoalTarget,
     /// Where the robot is, world frame; the centre of the area on board if absent.
     pub near: Option<DVec3>,
@@ -85,7 +83,6 @@ impl GoalRequest {
         self.step_m.unwrap_or((LEAST_STEP_VOXELS * voxel).clamp(0.1, 0.15))
     }
 
-    /// Returns the robot's height.
     pub fn height(&self) -> f64 {
         self.height_m.unwrap_or(self.sensor_height_m + 0.1)
     }
@@ -120,7 +117,6 @@ impl GoalRequest {
     }
 }
 
-/// Why a request has no reply.
 #[derive(Debug, thiserror::Error)]
 pub enum GoalError {
     #[error(transparent)]

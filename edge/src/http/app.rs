@@ -185,12 +185,9 @@ impl App {
 /// Time for a request and for sending its answer, besides that for the query.
 const STALL_BEYOND_QUERY: Duration = Duration::from_secs(50);
 
-/// Bounds of the service.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Bounds of the connections.
     pub connections: ConnectionLimits,
-    /// Who may ask.
     pub access: Access,
     /// Queries in progress; further ones get 503.
     pub max_queries: usize,
@@ -240,9 +237,7 @@ impl Default for Settings {
 const QUERY_BOUNDS_SECS: [f64; 11] =
     [0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.512, 2.048];
 
-/// The counters of this service.
 pub struct Metrics {
-    /// Responses by route and status.
     pub responses: Arc<ResponseCounts>,
     /// Times of queries, refused ones too.
     pub query_times: Histogram,

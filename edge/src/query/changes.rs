@@ -27,7 +27,6 @@ pub struct ChangesRequest {
     pub texts: Vec<String>,
 }
 
-/// Why generations are not compared.
 #[derive(Debug, thiserror::Error)]
 pub enum ChangesError {
     #[error(transparent)]

@@ -108,7 +108,6 @@ impl OnBoard {
         })
     }
 
-    /// Returns whether the text model runs.
     pub(crate) fn text_is_alive(&self) -> bool {
         self.text.is_alive()
     }
@@ -119,7 +118,6 @@ impl OnBoard {
         Ok(self.text.encode(thing.as_deref().unwrap_or(text))?)
     }
 
-    /// Returns the vectors of a request's negatives.
     pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {
         let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
         negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)
@@ -181,7 +179,6 @@ impl Engine {
         &self.cache
     }
 
-    /// Returns the text encoder in use.
     pub fn encoder(&self) -> EncoderInfo {
         self.text().info().clone()
     }
@@ -233,7 +230,6 @@ impl Engine {
         }
     }
 
-    /// Returns the loaded generation.
     pub fn snapshot(&self) -> Result<Arc<Snapshot>, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         loaded.snapshot.clone().ok_or(QueryError::NoScene)

@@ -41,7 +41,6 @@ impl Names {
         self.of(object).map(|(name, of)| Name { name: name.to_owned(), confidence: digits(of) }).collect()
     }
 
-    /// Returns the number of objects.
     pub fn len(&self) -> usize {
         self.of_object.len()
     }

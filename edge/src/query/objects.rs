@@ -15,7 +15,6 @@ use crate::store::objects::Part;
 
 #[derive(Clone, Copy)]
 pub struct FoundObject<'a> {
-    /// Its index in the object index.
     pub object: usize,
     pub record: &'a ObjectRecord,
     pub score: f32,

@@ -79,7 +79,6 @@ impl Outcome {
         }
     }
 
-    /// Returns the number of answers.
     pub fn len(&self) -> usize {
         match self {
             Self::Plain(answers) => answers.answers.len(),
@@ -87,7 +86,6 @@ impl Outcome {
         }
     }
 
-    /// Returns whether there is no answer.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

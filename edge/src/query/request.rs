@@ -59,14 +59,12 @@ impl FromStr for AnswerKind {
     }
 }
 
-/// Negative prompts.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(from = "Vec<String>")]
 pub enum Negatives {
     /// None: scores are cosines.
     #[default]
     None,
-    /// [`CANONICAL_NEGATIVES`].
     Canonical,
     Phrases(Vec<String>),
 }
@@ -193,7 +191,6 @@ pub fn unit_vector(vector: &[f32]) -> Option<Vec<f32>> {
 pub struct QueryRequest {
     /// What is looked for; each is answered separately.
     pub asked: Vec<Asked>,
-    /// Negative prompts.
     pub negatives: Negatives,
     /// Most answers to each question; [`DEFAULT_LIMIT`] if absent.
     pub limit: Option<usize>,

@@ -34,7 +34,6 @@ pub struct Region {
 }
 
 impl Region {
-    /// Returns whether a point lies inside.
     pub fn contains(&self, point: DVec3) -> bool {
         self.ball.is_none_or(|ball| ball.contains(point))
             && self.bounds.is_none_or(|bounds| bounds.contains(point))

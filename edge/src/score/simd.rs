@@ -19,7 +19,6 @@ pub const ROWS: usize = 4;
 /// One byte column of a block of Gaussians, or the codewords of a subspace for each half of a byte shuffle.
 pub type Column = [u8; BLOCK];
 
-/// The kernels of an instruction set.
 pub trait Kernels: Copy {
     /// Returns the products of rows with a vector. All have the same length, a multiple of [`PAD`].
     fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];

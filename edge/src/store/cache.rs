@@ -90,7 +90,6 @@ impl EdgeCache {
         self.dir.join("shards").join(hash.to_string())
     }
 
-    /// Returns the folder of the marks of damaged shards.
     pub(super) fn damaged_dir(&self) -> PathBuf {
         self.dir.join("damaged")
     }

@@ -60,7 +60,6 @@ impl ObjectIndex {
         self.starts.len().saturating_sub(1)
     }
 
-    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -45,7 +45,6 @@ pub struct Trial {
     pub psnr_db: f64,
 }
 
-/// Result of the search for a mistake.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Diagnosis {
     /// PSNR of the sampled views with the inputs as given, dB.
@@ -178,7 +177,6 @@ struct Search<'a> {
     given_psnr_db: f64,
     /// Pairs that may yet be drawn.
     pairs_left: Cell<usize>,
-    /// Mistakes that the data suggest.
     suspected: Vec<Mistake>,
 }
 

@@ -34,11 +34,8 @@ impl ViewCheck {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {
     pub views: Vec<ViewCheck>,
-    /// Mean of `psnr_db` over the views, dB.
     pub mean_psnr_db: f64,
-    /// Mean of `flat_psnr_db` over the views, dB.
     pub(crate) mean_flat_psnr_db: f64,
-    /// Mean of `covered_share` over the views.
     pub mean_covered_share: f64,
     /// Largest number of Gaussians that cannot be drawn in a view.
     pub unusable_gaussians: usize,

@@ -21,10 +21,8 @@ const OFF_CENTRE: f64 = 0.15;
 /// The worlds of splat and cameras are apart if their middles are this many of their sizes from each other.
 const APART: f64 = 10.0;
 
-/// Something that looks wrong.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Suspicion {
-    /// A sentence for the user.
     pub text: String,
     /// The mistake that would explain it; drawings tell.
     pub mistake: Option<Mistake>,

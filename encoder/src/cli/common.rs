@@ -254,7 +254,6 @@ pub fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn
     Ok(models.text_encoder(&session)?)
 }
 
-/// Returns the number of cores.
 pub(crate) fn available_threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }

@@ -60,7 +60,6 @@ pub struct ViewArgs {
     pub(crate) no_open: bool,
 }
 
-/// Parses an axis of the world.
 fn parse_axis(text: &str) -> Result<Vec3, String> {
     let (sign, axis) = text.strip_prefix('-').map_or((1.0, text), |axis| (-1.0, axis));
     match axis {

@@ -36,7 +36,6 @@ impl Decoder<'_> {
         Panels::new(self.m, self.dim, |c, i| f32::from(self.basis[c * self.dim + i]) * self.steps[c])
     }
 
-    /// Returns the length of each basis vector.
     pub(super) fn lengths(&self) -> Vec<f32> {
         let length = |(vector, step): (&[i8], &f32)| {
             vector.iter().map(|v| f32::from(*v).powi(2)).sum::<f32>().sqrt() * step

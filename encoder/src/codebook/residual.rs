@@ -120,7 +120,6 @@ impl ResidualCode {
         self.subspace_starts.len() - 1
     }
 
-    /// Returns the components that codewords cover.
     pub fn n_components(&self) -> usize {
         self.subspace_starts[self.n_subspaces()] as usize
     }

@@ -40,9 +40,7 @@ pub struct FrontSetting {
 /// What a user accepts; at least one of the two.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Target {
-    /// Seconds of the encode at most.
     pub seconds: Option<f64>,
-    /// Bytes of the profile's shards at most.
     pub bytes: Option<u64>,
 }
 
@@ -51,7 +49,6 @@ pub struct Target {
 pub struct Expectation {
     pub setting: FrontSetting,
     pub seconds: f64,
-    /// Expected bytes of the profile's shards.
     pub bytes: f64,
 }
 

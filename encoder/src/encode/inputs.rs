@@ -100,7 +100,6 @@ fn check_cells(n: usize) -> Result<(), EncodeError> {
     Err(EncodeError::Setting { setting: "cells", problem })
 }
 
-/// Reserves the scene's columns.
 pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
     memory.reserve(Phase::Always, "the scene", scene.len_bytes());
 }

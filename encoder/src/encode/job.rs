@@ -19,7 +19,6 @@ const PUBLISHED_KEY: &[u8] = b"published";
 const STEP_KEY: &[u8] = b"step";
 /// Followed by the view's identity.
 const VIEW_PREFIX: &str = "view/";
-/// Folder of the views' files in the job's.
 const VIEWS_FOLDER: &str = "views";
 
 /// What a store knows of the encode that it keeps views of.

@@ -40,7 +40,6 @@ pub struct EncodeSettings {
     pub aggregation: Aggregation,
     /// How embeddings become shards.
     pub cells: CellSettings,
-    /// What is published, and where.
     pub output: OutputSettings,
     /// How the run goes: none of it changes what is made of a given set of views.
     pub run: RunSettings,
@@ -75,7 +74,6 @@ pub struct InputSettings {
 /// How a view becomes contributions: all of it is part of the encode's identity.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewSettings {
-    /// Where masks come from.
     pub masks: Masks,
     /// Masks with fewer pixels are left out, but for those of what stands on the ground.
     pub min_mask_px: u32,

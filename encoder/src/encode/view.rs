@@ -181,7 +181,6 @@ impl ViewTools<'_> {
         models.preprocess().is_none() || wants_patches
     }
 
-    /// Reserves the photos in memory, in all stages and between them.
     pub(crate) fn reserve_photos(&self, memory: &mut MemoryPlan, views: &[View]) {
         let stages = self.stages();
         let at = |name| stages.iter().position(|stage| stage.name == name).unwrap_or(0);
@@ -355,7 +354,6 @@ impl<'a> ViewStages<'a> {
         wanted.then(|| Windows::new(models.windows(), photo.width(), photo.height()))
     }
 
-    /// Makes the regions of a view's masks.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
         let width = self.tools.settings.raster_width;
         let raster_view = raster_view(loaded, width.px(loaded.view.intrinsics.width_px));

@@ -81,7 +81,6 @@ impl Run {
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }
 
-    /// Returns whether the bucket has had no run.
     pub(super) fn is_first(bucket: &Bucket) -> Result<bool, FleetError> {
         Ok(Self::newest(bucket)?.is_none())
     }

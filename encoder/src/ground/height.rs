@@ -24,7 +24,6 @@ const ROUNDS: usize = 2;
 /// Share of the Gaussians beyond the tiles at each end.
 const TRIMMED: f64 = 0.005;
 
-/// The height of the ground at each place.
 #[derive(Debug)]
 pub(super) struct Ground {
     tile: f64,
@@ -90,7 +89,6 @@ impl Ground {
     }
 }
 
-/// Returns the level of a tile's ground.
 fn ground_level(areas: &BTreeMap<i64, f64>) -> Option<f64> {
     let at = |level: i64| areas.get(&level).copied().unwrap_or(0.0);
     let around = |level: &i64| (*level, at(level - 1) + at(*level) + at(level + 1));

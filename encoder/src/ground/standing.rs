@@ -82,7 +82,6 @@ impl Footprint {
     }
 }
 
-/// Reserves the voxels of a scene's things.
 pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     let bytes_per_voxel = size_of::<u64>() + size_of::<u32>();
     memory.reserve(Phase::Always, "what stands on the ground", (n_gaussians * bytes_per_voxel) as u64);
@@ -94,7 +93,6 @@ impl Standing {
         Self(Things::find(scene, up_by(scene, views)))
     }
 
-    /// Returns whether nothing does.
     pub(crate) fn is_empty(&self) -> bool {
         self.0.as_ref().is_none_or(|things| things.voxels.is_empty())
     }

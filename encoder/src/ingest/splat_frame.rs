@@ -64,7 +64,6 @@ pub(crate) fn find_frame(
 }
 
 impl FoundFrame {
-    /// Returns the transform from the world of the poses to the splat's.
     pub fn splat_from_poses(&self) -> Similarity {
         self.stated.similarity
     }

@@ -89,7 +89,6 @@ impl PackedEntry {
         (self.key >> REGION_BITS) as usize
     }
 
-    /// Returns the view's region.
     pub(super) fn region(self) -> u32 {
         self.key & (MAX_REGIONS as u32 - 1)
     }
@@ -224,7 +223,6 @@ pub struct ContributionFile {
     runs: Vec<Run>,
 }
 
-/// The regions of a view, and their masks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewRegions {
     /// Components of a mask vector.
@@ -282,7 +280,6 @@ impl ContributionFile {
         &self.path
     }
 
-    /// Returns the runs, ascending by (cell, slice).
     pub fn runs(&self) -> &[Run] {
         &self.runs
     }

@@ -151,14 +151,12 @@ impl ContributionIndex {
         self.views.iter().map(|view| view.file.n_entries())
     }
 
-    /// Returns the bytes that the index takes in memory.
     pub fn len_bytes(&self) -> u64 {
         let per_run = size_of::<Run>() + size_of::<u32>();
         let n_runs: usize = self.views.iter().map(|view| view.slices.len()).sum();
         (n_runs * per_run + self.parts.len() * size_of::<Part>() + size_of_val(&*self.locals_of_slice)) as u64
     }
 
-    /// Reserves the index's bytes.
     pub(crate) fn reserve(&self, memory: &mut MemoryPlan) {
         memory.reserve(Phase::Always, "the index of contributions", self.len_bytes());
     }

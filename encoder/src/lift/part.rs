@@ -50,7 +50,6 @@ impl PartContributions {
         }
     }
 
-    /// Returns the range of a Gaussian's entries.
     #[inline(always)]
     pub(crate) fn entries_of(&self, k: usize) -> Range<usize> {
         self.starts[k] as usize..self.starts[k + 1] as usize

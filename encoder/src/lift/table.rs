@@ -55,7 +55,6 @@ impl RegionTable {
         }
     }
 
-    /// Returns the components of a vector.
     pub fn dim(&self) -> usize {
         self.dim
     }
@@ -72,13 +71,11 @@ impl RegionTable {
         self.mask_vectors.len() / self.dim
     }
 
-    /// Returns the bytes that the table takes in memory.
     pub fn len_bytes(&self) -> u64 {
         let numbers = size_of_val(&*self.starts) + size_of_val(&*self.masks) + size_of_val(&*self.shares);
         (size_of_val(&*self.mask_vectors) + numbers + self.levels.len()) as u64
     }
 
-    /// Reserves the table's bytes.
     pub(crate) fn reserve(&self, memory: &mut MemoryPlan) {
         memory.reserve(Phase::Always, "masks and regions of all views", self.len_bytes());
     }
@@ -132,7 +129,6 @@ impl RegionTable {
         Ok(number)
     }
 
-    /// Returns the vectors of the masks, one per row.
     pub fn mask_vectors(&self) -> Rows<'_> {
         Rows::all(&self.mask_vectors, self.dim)
     }

@@ -40,7 +40,6 @@ pub struct Reservation {
     phase: Phase,
 }
 
-/// The budget is too small.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MemoryError {
     pub available_bytes: u64,
@@ -105,7 +104,6 @@ impl MemoryPlan {
         self.available_bytes.saturating_sub(self.reserved_bytes(phase))
     }
 
-    /// Returns the bytes that are set aside during a phase.
     fn reserved_bytes(&self, phase: Phase) -> u64 {
         self.of_phase(phase).fold(0u64, |sum, r| sum.saturating_add(r.len_bytes))
     }

@@ -71,7 +71,6 @@ pub(super) struct Sizes<'a> {
     /// `[n]`: what each superpoint covers of the ground; empty without any.
     pub(super) footprints: &'a [Footprint],
     pub(super) standing: &'a Standing,
-    /// Fewest Gaussians of an object.
     pub(super) min_gaussians: u32,
 }
 

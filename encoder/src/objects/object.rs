@@ -58,7 +58,6 @@ pub struct SceneObjects {
     pub object_of: Vec<Vec<u32>>,
     /// Mean and spread of the text bank's scores over the objects.
     pub calibration: Calibration,
-    /// Counts for the summary.
     pub report: ObjectsReport,
 }
 

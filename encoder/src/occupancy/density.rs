@@ -35,7 +35,6 @@ const MAX_TILES: i32 = 8;
 /// background: the Gaussians of a surface are thin.
 const MAX_THICKNESS: f32 = 0.2;
 
-/// The occupied voxels of a scene.
 pub(super) struct Occupied {
     /// By place: voxels of each block with at least one.
     pub(super) blocks: Vec<(BlockAt, u64)>,

@@ -32,7 +32,6 @@ impl AdapterReport {
     }
 }
 
-/// Options for the use of a device.
 #[derive(Clone, Copy, Debug)]
 pub struct GpuOptions {
     /// Upper limit for a buffer, bytes; the limit of the device applies as well.

@@ -20,7 +20,6 @@ impl GpuSlots {
     }
 }
 
-/// A backend that rasterises scenes.
 pub trait Rasterizer: Send + Sync {
     /// Returns a text that differs where contributions differ in their last bits.
     fn identity(&self) -> String;

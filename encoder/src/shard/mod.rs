@@ -32,7 +32,6 @@ pub struct BuiltShard {
     pub score_errors: ScoreErrors,
 }
 
-/// A cell's shards.
 pub struct BuiltCell {
     /// One per profile.
     pub shards: Vec<BuiltShard>,
@@ -59,7 +58,6 @@ pub struct ShardSettings {
     pub appearance: bool,
 }
 
-/// The embeddings of a cell's Gaussians.
 pub struct CellEmbeddings {
     /// Components of an embedding.
     pub dim: usize,
@@ -82,7 +80,6 @@ pub(crate) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
     largest.map_or(0, |n_gaussians| working_bytes(n_gaussians, dim))
 }
 
-/// Reserves the bytes of the largest cell.
 pub(crate) fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
@@ -288,7 +285,6 @@ pub fn landmarks(split: &CellSplit, code_version: u32, all: &[Landmark]) -> Vec<
     of_cells.iter().map(|landmarks| BuiltLandmarks::pack(code_version, landmarks)).collect()
 }
 
-/// A cell's positions, on the cell's grid.
 struct QuantisedPositions {
     /// Largest distance of a stored position from the mean, per axis: half a step, unless the doubles of readers
     /// are coarser.

@@ -52,7 +52,6 @@ pub(crate) struct KeysStatus {
     pub(crate) root_expires_unix_secs: u64,
     /// Root's keys that must sign a change.
     pub(crate) threshold: u32,
-    /// All keys, by role.
     pub(crate) keys: Vec<KeyStatus>,
     /// When the timestamp expires, seconds since 1970; absent before the first publication.
     pub(crate) timestamp_expires_unix_secs: Option<u64>,

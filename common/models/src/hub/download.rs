@@ -28,7 +28,6 @@ pub struct HubOptions {
     pub hub: Option<String>,
     /// Proxy, in the format of `HTTPS_PROXY`.
     pub proxy: Option<String>,
-    /// Timeout of connections and reads.
     pub timeout: Duration,
     /// Wait before the second attempt; doubled before each further one.
     pub first_backoff: Duration,
@@ -73,7 +72,6 @@ pub(super) fn client(options: &HubOptions) -> Result<Client<'static>, DownloadFa
     Ok(Client::new(limits, TlsConfig::default(), proxy, concat!("slag/", env!("CARGO_PKG_VERSION")), &Log))
 }
 
-/// Requests a file's metadata.
 pub(super) fn ask(client: &Client<'_>, url: &str) -> Result<Advertised, DownloadError> {
     let host = |url: &str| url.parse::<ureq::http::Uri>().ok().and_then(|uri| uri.authority().cloned());
     let own = host(url);

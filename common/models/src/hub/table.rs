@@ -70,7 +70,6 @@ const FIRST_OF_TEXT: usize = 3;
 #[serde(deny_unknown_fields)]
 pub struct Known {
     pub len_bytes: u64,
-    /// Its SHA-256.
     pub sha256: Sha256,
 }
 
@@ -89,7 +88,6 @@ impl Entry {
         [self.files.get("image"), self.data.get("image")].into_iter().flatten().map(String::as_str).collect()
     }
 
-    /// Returns whether it finds masks.
     pub fn is_segmenter(&self) -> bool {
         self.files.contains_key("mask_decoder")
     }

@@ -22,7 +22,6 @@ pub fn row(id: u32) -> [f32; DIM] {
 /// The image model's weights, `[3][DIM]`.
 pub const WEIGHTS: [f32; 3 * DIM] = [1.0, 0.5, -0.25, 0.0, 0.0, 1.0, 0.5, -0.5, 0.25, 0.0, 1.0, 1.0];
 
-/// Variations of the text model.
 #[derive(Clone, Copy)]
 pub struct TextKind {
     pub ids: Element,

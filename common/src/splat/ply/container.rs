@@ -122,14 +122,12 @@ pub(super) struct Ply {
     pub input: Input,
     encoding: Encoding,
     pub elements: Vec<Element>,
-    /// Index of the next element.
     next: usize,
     /// Lines read so far.
     line: u64,
 }
 
 impl Ply {
-    /// Reads the header.
     pub fn open(mut input: Input) -> Result<Self, SplatError> {
         let mut header = Header { encoding: None, elements: Vec::new() };
         let mut bytes = Vec::new();

@@ -19,9 +19,7 @@ use crate::http::problem::query_problem;
 use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError, object_id};
 use crate::score::MAX_COORDINATE;
 
-/// Objects in a page unless the request says otherwise.
 const DEFAULT_PAGE: usize = 100;
-/// Most objects in a page.
 const MAX_PAGE: usize = 1000;
 
 /// Which objects are listed.

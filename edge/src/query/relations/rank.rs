@@ -73,7 +73,6 @@ struct Anchor {
     object: Option<usize>,
 }
 
-/// What relations are measured by.
 struct Measure<'a, 'b> {
     things: &'a Things<'b>,
     viewer: Option<&'a Viewer>,

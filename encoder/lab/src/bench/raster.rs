@@ -85,7 +85,6 @@ struct RasterCase {
     relative_l1: f64,
 }
 
-/// Opens the devices, measures all of them, and reports.
 pub(crate) fn run(args: &RasterArgs, progress: &dyn Progress) -> Result<RasterReport> {
     let threads = args.threads.map_or(0, |n| n as usize);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("cannot start threads")?;

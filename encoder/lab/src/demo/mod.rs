@@ -65,7 +65,6 @@ pub struct DemoReport {
     pub downloaded_bytes: u64,
     /// The model's description of itself.
     pub about_model: String,
-    /// The questions, in order.
     pub questions: Vec<Question>,
 }
 
@@ -101,7 +100,6 @@ struct Tally {
 }
 
 impl DemoReport {
-    /// Returns whether every answer is correct.
     pub fn all_right(&self) -> bool {
         self.questions.iter().all(|q| q.right)
     }

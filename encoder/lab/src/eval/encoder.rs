@@ -108,7 +108,6 @@ impl Texts {
     }
 }
 
-/// Evaluates an encoder on the crops of scenes.
 pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<EncoderReport> {
     let (models, session) = open_models(&args.models)?;
     let (nouns, seeds) = (&NOUNS[..], args.seed..args.seed + args.n_scenes);

@@ -231,7 +231,6 @@ fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
     }
 }
 
-/// Figures of a thing on a frame.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ThingReport {
     pub(super) frame: String,

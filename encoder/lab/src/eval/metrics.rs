@@ -54,7 +54,6 @@ pub(super) struct Confusion {
 }
 
 impl Confusion {
-    /// Returns an empty matrix.
     pub(super) fn new(n_classes: usize) -> Self {
         Self { n_classes, counts: vec![0; n_classes * (n_classes + 1)] }
     }

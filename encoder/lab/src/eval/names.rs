@@ -80,7 +80,6 @@ struct Row {
     log_loss: f64,
 }
 
-/// The figures of each scene, then of all.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct NamesReport {
     rows: Vec<Row>,

@@ -356,7 +356,6 @@ impl Area {
     }
 }
 
-/// Returns the box around parts.
 fn bounds(parts: &[Part], world_from_object: DAffine3) -> Aabb {
     let mut bounds = Aabb::EMPTY;
     for part in parts {
@@ -393,7 +392,6 @@ fn around_z(yaw_rad: f64, at: DVec3) -> DAffine3 {
     DAffine3::from_mat3_translation(DMat3::from_rotation_z(yaw_rad), at)
 }
 
-/// Returns the intrinsics of a scene's photos.
 pub fn photo_intrinsics() -> Intrinsics {
     pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD)
 }

@@ -54,7 +54,6 @@ pub struct Label {
     pub held_out: bool,
     /// Height divided by the larger horizontal edge.
     pub slenderness: f64,
-    /// Pixels of the mask.
     pub area_px: u32,
     /// Visible share of the thing.
     pub shown: f64,

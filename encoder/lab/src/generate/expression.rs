@@ -14,7 +14,6 @@ pub enum Expression {
     Binary(Operator, Box<[Expression; 2]>),
 }
 
-/// An operator with two operands.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Operator {
     /// `+`

@@ -12,7 +12,6 @@ const TILE_PX: u32 = 16;
 /// Distance from the surface at which shadow rays start.
 const OFF_SURFACE_M: f64 = 1e-4;
 
-/// Light source of a scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Light {
     /// From a direction; unit length.

@@ -220,7 +220,6 @@ impl Collection<'_> {
         self.count(Filter::must_not([Condition::matches("scene", self.manifest.scene.clone())])).await
     }
 
-    /// Counts the points that pass a filter.
     pub(super) async fn count(&self, filter: Filter) -> Result<u64, PushError> {
         let count = || {
             let request = CountPointsBuilder::new(&self.name).exact(true).filter(filter.clone());

@@ -131,7 +131,6 @@ pub(crate) struct Background {
     pub padding: u32,
 }
 
-/// Capacities of the buffers of a workspace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Capacities {
     pub visible: u32,

@@ -44,7 +44,6 @@ pub struct GpuRasterizer {
 }
 
 impl GpuRasterizer {
-    /// Creates a backend from an opened device.
     pub fn new(device: Device, options: GpuOptions) -> Self {
         Self { device: Arc::new(device), options }
     }
@@ -387,7 +386,6 @@ impl Drop for LentWorkspace<'_, '_> {
 struct Rows {
     /// Row-major range within the image.
     px: Range<usize>,
-    /// Whether the band is the whole image.
     is_whole: bool,
 }
 

@@ -33,7 +33,6 @@ pub const NONE: u32 = u32::MAX;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(crate) enum Counter {
-    /// Gaussians visible in the band.
     Visible,
     /// Visible Gaussians that were not visible in an earlier band.
     FirstVisible,
@@ -165,7 +164,6 @@ pub(crate) struct Kernels {
 }
 
 impl Kernels {
-    /// Compiles all stages.
     pub fn new(device: &wgpu::Device, precision: Precision) -> Self {
         let with_constants = |stage: &str, entry: &str, constants: &[(&str, f64)]| {
             let descriptor = wgpu::ShaderModuleDescriptor {

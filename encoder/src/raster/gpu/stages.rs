@@ -290,7 +290,6 @@ pub(crate) fn dispatch_indirect(
     pass.dispatch_workgroups_indirect(sizes, offset);
 }
 
-/// Size of a Gaussian in device memory, bytes.
 pub(crate) const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
 
 pub(crate) struct SceneChunk {

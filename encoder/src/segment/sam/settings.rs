@@ -44,7 +44,6 @@ pub struct ScoreFilter {
 }
 
 impl ScoreFilter {
-    /// LangSplat's own thresholds.
     pub const LANGSPLAT: Self = Self { min_score: 0.7, max_iou: 0.8, max_contained: 0.5 };
 }
 
