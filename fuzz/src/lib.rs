@@ -28,8 +28,8 @@ macro_rules! targets {
 }
 
 targets! {
-    formats: container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
-    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, geo, query, position,
+    formats: container, shard, manifest, current, ply, splat, spz, sog, sog_folder, colmap_text, colmap_bin, transforms,
+    scannet, splat_frame, rle, coco, id_image, model_toml, tensors, phrases, contributions, region_table, cell_field, geo, query, position,
     grammar;
     services: http_request, v1, tuf;
 }

@@ -20,6 +20,9 @@ use slag_edge::store::EdgeCache;
 /// Longest shared file used: in longer ones mutations rarely hit anything that matters.
 const MAX_SHARED_BYTES: usize = 100_000;
 
+/// Columns and rows of the photo with masks.
+pub const MASKED_PX: [u32; 2] = [4, 3];
+
 /// The embedding space of the scene.
 pub const ENCODER: Hash32 = Hash32([9; 32]);
 
@@ -75,9 +78,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "ply" => text(PLY),
         "splat" => vec![vec![0x40; 96]],
         "spz" => vec![spz()],
-        "sog_meta" => text(
-            r#"{"version":2,"count":4,"antialias":false,"means":{"mins":[0,0,0],"maxs":[1,1,1],"files":["means_l.webp","means_u.webp"]},"scales":{"codebook":[0.5],"files":["scales.webp"]},"quats":{"files":["quats.webp"]},"sh0":{"codebook":[0.1],"files":["sh0.webp"]}}"#,
-        ),
+        "sog_folder" => sog_folders(),
         "colmap_text" => text(
             "# cameras\n1 PINHOLE 640 480 500.0 500.0 320.0 240.0\n2 SIMPLE_RADIAL 64 48 50 32 24 0.01\n====\n1 1 0 0 0 0.5 0.25 2 1 a.jpg\n10 10 -1\n2 0 1 0 0 1 2 3 2 b.jpg\n\n",
         ),
@@ -93,6 +94,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "coco" => text(
             r#"{"images":[{"id":1,"file_name":"a.jpg","width":4,"height":3}],"annotations":[{"id":1,"image_id":1,"segmentation":{"size":[3,4],"counts":"453"}},{"id":2,"image_id":1,"segmentation":{"size":[3,4],"counts":[4,5,3]}}]}"#,
         ),
+        "id_image" => id_images(),
         "model_toml" => vec![
             include_bytes!("../../tests/models/clip_tiny/model.toml").to_vec(),
             include_bytes!("../../tests/models/conse/model.toml").to_vec(),
@@ -142,7 +144,6 @@ fn shared_files(target: &str) -> &'static [&'static str] {
             "fixtures/formats/gsplatrs_minimal_v4_degree0.spz",
         ],
         "sog" => &["fixtures/formats/playbot_lod6.sog"],
-        "sog_meta" => &["fixtures/formats/playbot_lod3_sog/meta.json"],
         _ => &[],
     }
 }
@@ -223,7 +224,7 @@ fn shard(is_exact: bool) -> Vec<u8> {
     let occupancy = places.view();
     let mut photos = BuiltPhotoPoses::default();
     for name in ["a.jpg", "b.jpg"] {
-        photos.push(DVec3::ONE, &photo(name));
+        photos.push(DVec3::ONE, &photo(name, [64, 48]));
     }
     let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 5, view: 1 };
     let landmarks = BuiltLandmarks::pack(1, &[landmark(0.0), landmark(2.0)]);
@@ -238,8 +239,8 @@ fn shard(is_exact: bool) -> Vec<u8> {
     out
 }
 
-fn photo(name: &str) -> View {
-    let intrinsics = pinhole([64, 48], 50.0);
+pub fn photo(name: &str, size_px: [u32; 2]) -> View {
+    let intrinsics = pinhole(size_px, 50.0);
     View { name: name.into(), image_path: name.into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 
@@ -253,6 +254,35 @@ fn spz() -> Vec<u8> {
     bytes.extend([2, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 0]);
     bytes.extend([0; 19]);
     bytes
+}
+
+/// Folders of versions 1 and 2 whose images are all the same one.
+fn sog_folders() -> Vec<Vec<u8>> {
+    // Small, so that any of its pixels is a label, and any of its rows a quaternion.
+    let pixels =
+        image::RgbaImage::from_fn(192, 2, |x, y| image::Rgba([x as u8 % 100, 0, y as u8, 252 + x as u8 % 4]));
+    let mut webp = Vec::new();
+    let encoder = image::codecs::webp::WebPEncoder::new_lossless(&mut webp);
+    pixels.write_with_encoder(encoder).expect("writes to memory");
+    let metas = [
+        r#"{"means":{"shape":[384,3],"mins":[-2,-1,0],"maxs":[2,3,1],"files":["x.webp","x.webp"]},"scales":{"mins":[-9,-8,-7],"maxs":[-1,0,1],"files":["x.webp"]},"quats":{"files":["x.webp"]},"sh0":{"mins":[-1,-2,-3,-8],"maxs":[1,2,3,8],"files":["x.webp"]},"shN":{"mins":-0.5,"maxs":1.5,"files":["x.webp","x.webp"]}}"#,
+        r#"{"version":2,"count":384,"antialias":false,"means":{"mins":[0,0,0],"maxs":[1,1,1],"files":["x.webp","x.webp"]},"scales":{"codebook":[0.5],"files":["x.webp"]},"quats":{"files":["x.webp"]},"sh0":{"codebook":[0.1],"files":["x.webp"]}}"#,
+    ];
+    metas.map(|meta| [meta.as_bytes(), b"\n====\n", &webp].concat()).into()
+}
+
+/// Ids of 8 and of 16 bits.
+fn id_images() -> Vec<Vec<u8>> {
+    let [width, height] = MASKED_PX;
+    let narrow = image::GrayImage::from_fn(width, height, |x, y| image::Luma([(x / 2 + y) as u8]));
+    let wide = image::ImageBuffer::from_fn(width, height, |x, y| image::Luma([(x / 2 + y) as u16 * 4_000]));
+    [image::DynamicImage::from(narrow), wide.into()]
+        .map(|ids| {
+            let mut png = std::io::Cursor::new(Vec::new());
+            ids.write_to(&mut png, image::ImageFormat::Png).expect("writes to memory");
+            png.into_inner()
+        })
+        .into()
 }
 
 fn colmap_bin() -> Vec<u8> {

@@ -1,6 +1,5 @@
-//! Splat files: recorded values of other readers, oracles of our own, and damage.
+//! Splat files: recorded values of other readers, and oracles of our own.
 
-mod damage;
 mod formats;
 mod generated;
 mod memory;

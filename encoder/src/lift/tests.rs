@@ -300,6 +300,14 @@ fn foreign_files_are_refused() {
     for message in [refused(6, &[5000]), refused(5, &[4096]), refused(5, &[]), refused(5, &[4990])] {
         assert!(message.contains(".contributions") && message.contains("delete it"), "{message}");
     }
+    // The entries have checksums of their own.
+    let mut bytes = fs_err::read(&scene.paths[0]).expect("reads");
+    *bytes.last_mut().expect("entries") ^= 1;
+    let path = scene.paths[0].with_file_name("flipped.contributions");
+    fs_err::write(&path, bytes).expect("writes");
+    let opened = ContributionIndex::open(&[path], 5, &[5000]);
+    let read = opened.and_then(|(index, _)| index.read(0..index.parts().len()).map(drop));
+    assert!(read.expect_err("refused").to_string().contains("flipped.contributions"));
     let mut view = ViewContributions {
         dim: 1,
         mask_vectors: vec![1.0],
