@@ -69,9 +69,6 @@ impl Gaussians {
     }
 
     /// Returns some of the Gaussians, in the order of `indices`.
-    ///
-    /// # Panics
-    /// If an index is not below [`Gaussians::len`].
     pub fn select(&self, indices: &[u32]) -> Self {
         fn pick<T: Copy>(column: &[T], indices: &[u32]) -> Vec<T> {
             indices.iter().map(|index| column[*index as usize]).collect()

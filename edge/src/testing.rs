@@ -89,7 +89,7 @@ impl BuiltShard {
         let objects = objects.iter().map(object).collect();
         let objects = SampleObjects { objects, score_mean, score_spread, score_error_bound: 0.005 };
         let occupancy = places.map(BuiltOccupancy::view);
-        Self::read(&objects.add_to(&self.view(), occupancy.as_ref()), self.embeddings.clone())
+        Self::read(&objects.add_to(&self.view(), occupancy), self.embeddings.clone())
     }
 
     fn read(bytes: &[u8], embeddings: Vec<Vec<f32>>) -> Self {

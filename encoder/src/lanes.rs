@@ -73,9 +73,6 @@ impl<T> Lanes<T> {
     }
 
     /// Takes a lane, and waits for one where none is free.
-    ///
-    /// # Panics
-    /// If there is none.
     pub fn take(&self) -> Lane<'_, T> {
         self.take_if_any().expect("a lane")
     }

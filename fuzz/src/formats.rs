@@ -101,17 +101,18 @@ pub fn shard(data: &[u8]) -> bool {
     }
     std::hint::black_box(view.scores(&vec![1.0; view.header.dim as usize]));
     std::hint::black_box((view.bounds(), view.encoder_id()));
-    if let Some(appearance) = layout.appearance(&bytes) {
+    let additions = layout.additions(&bytes);
+    if let Some(appearance) = additions.appearance {
         let columns = [appearance.colours.len(), appearance.sizes.len(), appearance.rotations.len()];
         assert_eq!(columns, [view.header.n_gaussians as usize; 3]);
     }
-    for (pose, name) in layout.photo_poses(&bytes).iter().flat_map(|photos| photos.iter()) {
+    for (pose, name) in additions.photo_poses.iter().flat_map(|photos| photos.iter()) {
         assert!(pose.offset.iter().all(|c| c.is_finite()) && pose.focal_px > 0.0 && name.len() <= 1024);
     }
-    for landmark in layout.landmarks(&bytes).iter().flat_map(|landmarks| landmarks.iter()) {
+    for landmark in additions.landmarks.iter().flat_map(|landmarks| landmarks.iter()) {
         assert!(landmark.position_in_world.is_finite());
     }
-    if let Some(occupancy) = layout.occupancy(&bytes) {
+    if let Some(occupancy) = additions.occupancy {
         let n_blocks: u32 = occupancy.header.n_blocks.iter().product();
         let mut end = 0;
         for run in occupancy.runs() {
@@ -125,7 +126,7 @@ pub fn shard(data: &[u8]) -> bool {
             }
         }
     }
-    if let Some(objects) = layout.objects(&bytes) {
+    if let Some(objects) = additions.objects {
         let n: u32 = objects.runs().map(|(run, object)| object.map_or(0, |_| run.len() as u32)).sum();
         assert_eq!(n, objects.records.iter().map(|record| record.n_gaussians_here).sum::<u32>());
         assert!(

@@ -35,9 +35,6 @@ targets! {
 }
 
 /// Runs a target by name.
-///
-/// # Panics
-/// If no target has that name.
 pub fn run(name: &str, data: &[u8]) -> bool {
     let target = TARGETS.iter().find(|target| target.name == name).expect("a target of that name");
     (target.run)(data)

@@ -229,9 +229,9 @@ fn shard(is_exact: bool) -> Vec<u8> {
     let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 5, view: 1 };
     let landmarks = BuiltLandmarks::pack(1, &[landmark(0.0), landmark(2.0)]);
     let additions = Additions {
-        objects: is_exact.then_some(&objects),
+        objects: is_exact.then_some(objects),
         appearance: is_exact.then_some(appearance),
-        occupancy: is_exact.then_some(&occupancy),
+        occupancy: is_exact.then_some(occupancy),
         photo_poses: photos.view().filter(|_| is_exact),
         landmarks: landmarks.view().filter(|_| is_exact),
     };

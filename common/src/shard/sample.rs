@@ -102,7 +102,7 @@ impl SampleObjects {
     const N_VECTORS: usize = 3;
 
     /// Writes a shard again with these objects.
-    pub fn add_to(&self, shard: &ShardView<'_>, occupancy: Option<&Occupancy<'_>>) -> Vec<u8> {
+    pub fn add_to(&self, shard: &ShardView<'_>, occupancy: Option<Occupancy<'_>>) -> Vec<u8> {
         let mut object_of = vec![NO_OBJECT; shard.header.n_gaussians as usize];
         let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
         for (number, object) in (0u16..).zip(&self.objects) {
@@ -143,7 +143,7 @@ impl SampleObjects {
             run_objects: &run_objects,
             photos: photos.as_bytes(),
         };
-        let additions = Additions { objects: Some(&objects), occupancy, ..Additions::default() };
+        let additions = Additions { objects: Some(objects), occupancy, ..Additions::default() };
         let mut bytes = Vec::new();
         shard.write_with(&mut bytes, additions).expect("writes to memory");
         bytes

@@ -111,7 +111,7 @@ impl<'a> Surroundings<'a> {
         budget: &'a Budget,
     ) -> Result<Self, GoalError> {
         let occupancies: Vec<Occupancy<'_>> =
-            snapshot.shards.iter().filter_map(|shard| shard.occupancy()).collect();
+            snapshot.shards.iter().filter_map(|shard| shard.additions().occupancy).collect();
         Self::of(&occupancies, request, centre, budget)
     }
 

@@ -251,7 +251,8 @@ impl Engine {
     ) -> T {
         let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
-        let objects: Vec<Option<Objects<'_>>> = snapshot.shards.iter().map(|shard| shard.objects()).collect();
+        let objects: Vec<Option<Objects<'_>>> =
+            snapshot.shards.iter().map(|shard| shard.additions().objects).collect();
         let (index, manifest) = (&snapshot.objects, &snapshot.manifest);
         let bad_cells = &snapshot.bad_cells;
         let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched, bad_cells };

@@ -187,7 +187,8 @@ mod tests {
             let ids = [(10..80).rev().collect::<Vec<u64>>(), vec![5], (70..90).collect()];
             let built: Vec<BuiltShard> = ids.iter().map(|ids| built(&mut random, shape, ids)).collect();
             let shards = views(&built);
-            let mut objects: Vec<_> = built.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
+            let mut objects: Vec<_> =
+                built.iter().map(|shard| shard.layout.additions(&shard.bytes).objects).collect();
             objects[1] = None;
             let index = ObjectIndex::new(&objects);
             let mut questions: Vec<Question> =

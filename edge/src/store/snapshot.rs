@@ -109,7 +109,7 @@ impl Snapshot {
         }
         bad_cells.sort_by_key(|bad| bad.cell_id);
         shards.sort_by_key(|shard| shard.cell.cell_id);
-        let objects = shards.iter().map(|shard| shard.objects()).collect::<Vec<_>>();
+        let objects = shards.iter().map(|shard| shard.additions().objects).collect::<Vec<_>>();
         let objects = ObjectIndex::new(&objects);
         Ok(Self { current, current_stat, manifest, shards, bad_cells, may_recover, objects })
     }

@@ -163,9 +163,9 @@ impl ShardBuilder<'_> {
         let objects = objects.as_ref().map(CellObjects::view);
         let appearance = settings.appearance.then(|| AppearanceColumns::of(self.scene, &order.in_input()));
         let additions = Additions {
-            objects: objects.as_ref(),
+            objects,
             appearance: appearance.as_ref().map(AppearanceColumns::view),
-            occupancy: extras.occupancy.as_ref(),
+            occupancy: extras.occupancy,
             photo_poses: extras.photo_poses,
             landmarks: extras.landmarks,
         };

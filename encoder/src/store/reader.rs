@@ -182,7 +182,7 @@ impl StoredShard {
     }
 
     pub fn objects(&self) -> Option<Objects<'_>> {
-        self.layout.objects(&self.bytes)
+        self.layout.additions(&self.bytes).objects
     }
 }
 

@@ -101,7 +101,7 @@ impl Generation {
                 let view = shard.view();
                 let n_gaussians = view.header.n_gaussians as usize;
                 let positions = step.indices(n_gaussians).map(|at| view.position_in_world(at));
-                let appearance = shard.layout.appearance(&shard.bytes);
+                let appearance = shard.layout.additions(&shard.bytes).appearance;
                 Ok(cell_message(&positions.collect::<Vec<DVec3>>(), appearance, step))
             }
         }

@@ -9,7 +9,7 @@ use crate::store::{StoreError, StoreReader, StoredShard};
 
 pub(super) fn photos_of(shard: &StoredShard) -> Vec<Photo> {
     let origin = DVec3::from(shard.layout.header.origin_in_world);
-    let photos = shard.layout.photo_poses(&shard.bytes);
+    let photos = shard.layout.additions(&shard.bytes).photo_poses;
     photos.into_iter().flat_map(|photos| Photo::of_shard(origin, photos)).collect()
 }
 

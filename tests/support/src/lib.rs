@@ -46,9 +46,6 @@ pub fn shared(path: &str) -> PathBuf {
 }
 
 /// Returns the path of the ONNX Runtime library that `scripts/setup.sh` installs.
-///
-/// # Panics
-/// If it does not exist.
 pub fn onnx_runtime() -> PathBuf {
     let library = format!("target/onnxruntime/{}/libonnxruntime.so", std::env::consts::ARCH);
     let library = workspace_root().join(library);

@@ -290,7 +290,7 @@ fn compare_voxels(layout: &Layout, store: &Path) -> Result<Voxels> {
     for cell in &reader.manifest().cells {
         let Some(record) = cell.shards.values().next() else { continue };
         let shard = reader.read_shard(record)?;
-        let Some(occupancy) = shard.layout.occupancy(&shard.bytes) else { continue };
+        let Some(occupancy) = shard.layout.additions(&shard.bytes).occupancy else { continue };
         let voxel = occupancy.header.voxel;
         let surfaces = surfaces.get_or_insert_with(|| surface_voxels(layout, voxel));
         found.len_bytes += occupancy.sections().iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
