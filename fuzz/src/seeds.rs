@@ -1,5 +1,6 @@
 //! Valid inputs to start from.
 
+use std::ops::Range;
 use std::path::Path;
 
 use glam::{DAffine3, DVec3};
@@ -7,12 +8,12 @@ use half::f16;
 use slag_common::appearance::Appearance;
 use slag_common::frames::Aabb;
 use slag_common::landmarks::{BuiltLandmarks, Landmark};
-use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::occupancy::{Block, BuiltOccupancy};
 use slag_common::photo_poses::BuiltPhotoPoses;
+use slag_common::shard::sample::{self, SampleObject, SampleObjects};
 use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors,
-    ShardHeader, ShardView, sample,
+    ShardHeader, ShardView,
 };
 use slag_common::{Hash32, View, container, pinhole};
 use slag_edge::store::EdgeCache;
@@ -42,6 +43,14 @@ const V1_BODIES: &[&str] = &[
     r#"{"vectors":[[1,0,0.5]],"kind":"gaussians","min_score":-1,"precision":"centroids","time_budget_ms":500}"#,
     r#"{"phrases":[{"thing":"a","relation":{"is":"near","of":{"thing":"b"}}}],"relations":false,"min_count":1}"#,
     r#"{"texts":["a"],"kind":"clusters","voxel":0.5,"negatives":["b","c"],"region":{"ball":{"centre":[1,2,3],"radius":9},"box":{"from":[0,0,0],"to":[9,9,9]},"polygon":[[0,0],[9,0],[9,9]]}}"#,
+];
+
+/// Texts that name relations, and a phrase as JSON.
+const PHRASES: &[&str] = &[
+    "where is the second largest red mug on a table near the window?",
+    "chair between the sofa and the lamp in front of me",
+    "third pallet from the gate",
+    r#"{"thing":"mug","pick":{"by":"nearest","n":2,"from":{"thing":"gate"}},"relation":{"is":"on","of":{"thing":"me"}}}"#,
 ];
 
 /// Writes the cache of a robot with a scene of one cell with objects, in the space of [`ENCODER`] and of three
@@ -108,14 +117,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "query" => text(
             "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&kind=gaussians&voxel=0.2&min_count=3",
         ),
-        "grammar" => [
-            "where is the second largest red mug on a table near the window?",
-            "chair between the sofa and the lamp in front of me",
-            "third pallet from the gate",
-            r#"{"thing":"mug","pick":{"by":"nearest","n":2,"from":{"thing":"gate"}},"relation":{"is":"on","of":{"thing":"me"}}}"#,
-        ]
-        .map(|text| text.as_bytes().to_vec())
-        .into(),
+        "grammar" => PHRASES.iter().map(|phrase| phrase.as_bytes().to_vec()).collect(),
         "v1" => V1_BODIES.iter().map(|body| body.as_bytes().to_vec()).collect(),
         "tuf" => super::repository::seeds(),
         "http_request" => HTTP_REQUESTS.iter().map(|request| request.as_bytes().to_vec()).collect(),
@@ -160,7 +162,6 @@ fn shard(is_exact: bool) -> Vec<u8> {
         ..sample::header(5, 6, 2, 3, bounds)
     };
     let embeddings = [f16::from_f32(0.5); 15];
-    let mut out = Vec::new();
     let (mean, codewords) = ([f16::from_f32(0.1); 3], [f16::from_f32(0.25); 32]);
     let positions = [[0, 0, 0], [1, 2, 3], [65535, 65535, 65535], [4, 4, 4], [5, 5, 5], [6, 6, 6]];
     let indices = IndexColumn::pack(&[10, 11, 12, 13, 14, 1500]);
@@ -190,53 +191,44 @@ fn shard(is_exact: bool) -> Vec<u8> {
         }),
         packed_indices: (!is_exact).then(|| indices.view()),
     };
-    let record = |id: u64, n_gaussians_here: u32| ObjectRecord {
+    if is_exact {
+        return with_additions(&view);
+    }
+    let mut out = Vec::new();
+    view.write(&mut out).expect("writes to memory");
+    out
+}
+
+/// Returns a shard of six Gaussians with all that it may carry besides.
+fn with_additions(view: &ShardView<'_>) -> Vec<u8> {
+    let object = |id: u64, runs: &[Range<u32>]| SampleObject {
         id,
-        position_in_world: [1.0, 2.0, 3.0],
-        box_min: [0.5, 1.5, 2.5],
-        box_max: [1.5, 2.5, 4.5],
+        position_in_world: DVec3::new(1.0, 2.0, 3.0),
+        bounds: Aabb { min: DVec3::new(0.5, 1.5, 2.5), max: DVec3::new(1.5, 2.5, 4.5) },
+        vectors: vec![1.0, 0.0, 0.5, -0.5, 0.0, 1.0],
+        runs: runs.to_vec(),
         n_gaussians: 40,
-        n_gaussians_here,
+        photo: "a.jpg".into(),
         photo_box_px: [10, 20, 110, 70],
-        photo_start: 0,
-        photo_bytes: 5,
     };
-    let objects = Objects {
-        header: ObjectsHeader {
-            n_objects: 2,
-            n_vectors: 2,
-            n_runs: 4,
-            photos_bytes: 5,
-            score_mean: 0.02,
-            score_spread: 0.1,
-            score_error_bound: 0.02,
-        },
-        records: &[record(1, 2), record(7, 3)],
-        vectors: &[100, 0, 0, 50, 0, 120, 1, 2],
-        steps: &[0.01, 0.02, 0.005, 0.0],
-        run_ends: &[2, 3, 5, 6],
-        run_objects: &[1, NO_OBJECT, 0, 1],
-        photos: b"a.jpg",
-    };
-    let appearance = Appearance { colours: &[[1; 4]; 6], sizes: &[[2; 3]; 6], rotations: &[[3; 3]; 6] };
+    let objects = vec![object(1, &[3..5]), object(7, &[0..2, 5..6])];
+    let objects = SampleObjects { objects, score_mean: 0.02, score_spread: 0.1, score_error_bound: 0.02 };
     let block = |z, occupied, free| Block { at: [0, 0, z], occupied, free };
     let places = BuiltOccupancy::pack(0.05, 0.1, 2, &[block(0, 1, 2), block(1, 0, !0), block(5, !0, 0)]);
-    let occupancy = places.view();
     let mut photos = BuiltPhotoPoses::default();
     for name in ["a.jpg", "b.jpg"] {
         photos.push(DVec3::ONE, &photo(name, [64, 48]));
     }
     let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 5, view: 1 };
     let landmarks = BuiltLandmarks::pack(1, &[landmark(0.0), landmark(2.0)]);
-    let additions = Additions {
-        objects: is_exact.then_some(objects),
-        appearance: is_exact.then_some(appearance),
-        occupancy: is_exact.then_some(occupancy),
-        photo_poses: photos.view().filter(|_| is_exact),
-        landmarks: landmarks.view().filter(|_| is_exact),
+    let others = Additions {
+        objects: None,
+        appearance: Some(Appearance { colours: &[[1; 4]; 6], sizes: &[[2; 3]; 6], rotations: &[[3; 3]; 6] }),
+        occupancy: Some(places.view()),
+        photo_poses: photos.view(),
+        landmarks: landmarks.view(),
     };
-    view.write_with(&mut out, additions).expect("writes to memory");
-    out
+    objects.add_to(view, others)
 }
 
 pub fn photo(name: &str, size_px: [u32; 2]) -> View {

@@ -279,24 +279,7 @@ impl QueryRequest {
         let refuse = |parameter: &str, found: &dyn ToString, expected: String| {
             Err(RequestError::new(parameter, &found.to_string(), expected))
         };
-        if !(1..=MAX_TEXTS).contains(&self.asked.len()) {
-            return refuse(
-                "text",
-                &format!("{} of them", self.asked.len()),
-                format!("1 to {MAX_TEXTS} texts"),
-            );
-        }
-        let negatives = self.negatives.phrases();
-        if negatives.len() > MAX_NEGATIVES {
-            let found = format!("{} of them", negatives.len());
-            return refuse("negatives", &found, format!("at most {MAX_NEGATIVES} phrases"));
-        }
-        negatives.iter().try_for_each(|text| check_text("negatives", text))?;
-        // Everything is as near to a text as to itself.
-        let mut texts = self.asked.iter().filter(|of| !matches!(of, Asked::Vector { .. })).map(Asked::label);
-        if let Some(text) = texts.find(|text| negatives.iter().any(|of| of.trim() == text.trim())) {
-            return refuse("negatives", &text, "words other than those asked for".into());
-        }
+        self.check_texts()?;
         self.asked.iter().try_for_each(|asked| asked.check(self))?;
         self.check_page()?;
         let (thresholds, expected) = match self.negatives {
@@ -337,6 +320,26 @@ impl QueryRequest {
             return refuse("min_count", &0, "at least 1".into());
         }
         Ok(())
+    }
+
+    fn check_texts(&self) -> Result<(), RequestError> {
+        let n_of_them = |n: usize| format!("{n} of them");
+        let n = self.asked.len();
+        if !(1..=MAX_TEXTS).contains(&n) {
+            return Err(RequestError::new("text", &n_of_them(n), format!("1 to {MAX_TEXTS} texts")));
+        }
+        let negatives = self.negatives.phrases();
+        if negatives.len() > MAX_NEGATIVES {
+            let expected = format!("at most {MAX_NEGATIVES} phrases");
+            return Err(RequestError::new("negatives", &n_of_them(negatives.len()), expected));
+        }
+        negatives.iter().try_for_each(|text| check_text("negatives", text))?;
+        // Everything is as near to a text as to itself.
+        let mut texts = self.asked.iter().filter(|of| !matches!(of, Asked::Vector { .. })).map(Asked::label);
+        match texts.find(|text| negatives.iter().any(|of| of.trim() == text.trim())) {
+            Some(text) => Err(RequestError::new("negatives", text, "words other than those asked for")),
+            None => Ok(()),
+        }
     }
 
     fn check_page(&self) -> Result<(), RequestError> {

@@ -10,7 +10,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::{self, Manifest};
 use slag_common::shard::sample::{self, SampleObject, SampleObjects, SampleShard};
-use slag_common::shard::{Profile, ShardHeader, ShardLayout, quantise};
+use slag_common::shard::{Additions, Profile, ShardHeader, ShardLayout, quantise};
 use slag_common::tuf::{
     FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, format_utc, sign,
 };
@@ -103,7 +103,7 @@ fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
     };
     let objects = (0..).zip(things).map(object).collect();
     let objects = SampleObjects { objects, score_mean: 0.0, score_spread: 0.1, score_error_bound: 0.01 };
-    objects.add_to(&layout.view(&bytes), None)
+    objects.add_to(&layout.view(&bytes), Additions::default())
 }
 
 impl Published {
