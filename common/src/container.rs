@@ -232,7 +232,6 @@ pub struct AlignedBytes {
 struct Block([u8; ALIGNMENT_BYTES]);
 
 impl AlignedBytes {
-    /// Reads a whole file.
     pub fn read(path: &std::path::Path) -> io::Result<Self> {
         let file = fs_err::File::open(path)?;
         let len = file.metadata()?.len() as usize;

@@ -132,7 +132,6 @@ impl Aabb {
         self.max = self.max.max(centre + DVec3::splat(radius));
     }
 
-    /// Returns the smallest box around both.
     pub fn union(self, other: Self) -> Self {
         Self { min: self.min.min(other.min), max: self.max.max(other.max) }
     }

@@ -76,7 +76,6 @@ impl<'a> Landmarks<'a> {
     }
 }
 
-/// The landmarks of a shard, to be written.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BuiltLandmarks {
     header: LandmarksHeader,

@@ -25,7 +25,6 @@ impl Element for f32 {
     const DESCRIPTION: &str = "<f4";
 }
 
-/// Writes an array to a new file, see [`write`].
 pub fn write_file<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> io::Result<()> {
     let mut file = BufWriter::new(File::create(path)?);
     write(&mut file, shape, values)?;

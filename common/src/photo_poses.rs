@@ -55,7 +55,6 @@ impl<'a> PhotoPoses<'a> {
     }
 }
 
-/// The photos of a shard, to be written.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BuiltPhotoPoses {
     poses: Vec<PhotoPose>,

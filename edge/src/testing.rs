@@ -22,7 +22,6 @@ use slag_models::{InferenceError, TextEncoder};
 use crate::store::{Current, CurrentCell, EdgeCache};
 use crate::text::{EncoderInfo, TextService};
 
-/// A Gaussian of a test shard.
 #[derive(Clone, Debug)]
 pub struct Member {
     pub steps: [u16; 3],

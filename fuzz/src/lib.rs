@@ -12,7 +12,6 @@ pub mod seeds;
 #[path = "services.rs"]
 mod services;
 
-/// A decoder to fuzz.
 pub struct Target {
     pub name: &'static str,
     /// Decodes the bytes and returns whether they were accepted. It must neither panic nor take memory out of

@@ -24,7 +24,6 @@ const MAX_SHARED_BYTES: usize = 100_000;
 /// Columns and rows of the photo with masks.
 pub const MASKED_PX: [u32; 2] = [4, 3];
 
-/// The embedding space of the scene.
 pub const ENCODER: Hash32 = Hash32([9; 32]);
 
 /// Requests of all kinds, and one whose body is no JSON.

@@ -4,7 +4,6 @@
 use crate::describe::{Descriptor, Keypoint, describe, orientations};
 use crate::grey::Grey;
 
-/// Features of a photo that are matched.
 pub const MAX_FEATURES: usize = 1200;
 /// Scales an octave (Lowe 2004, 3.1).
 const SCALES: usize = 3;

@@ -32,7 +32,6 @@ pub trait Renderer {
 }
 
 impl Rendering {
-    /// Takes the picture and the surfaces of a drawing.
     pub fn of(drawing: &Drawing) -> Self {
         let surface = drawing.depth.iter().zip(&drawing.coverage);
         let depth =

@@ -76,7 +76,6 @@ pub use crate::file_ref::{FileRef, Sha256};
 
 pub const FILE_NAME: &str = "model.toml";
 
-/// Most patches along a side of the square.
 const MAX_PATCHES_PER_SIDE: u16 = 256;
 
 #[derive(Debug, thiserror::Error)]
@@ -102,7 +101,6 @@ pub struct Description {
     /// What the model recognises and what not, for people.
     #[serde(default, skip_serializing)]
     pub about: String,
-    /// Components of a vector.
     pub dim: u32,
     #[serde(skip_serializing)]
     pub licence: String,
@@ -113,7 +111,6 @@ pub struct Description {
     pub text: TextDescription,
     /// The mean subtracted from text vectors.
     pub text_centre: Option<CentreDescription>,
-    /// The interpretation of scores.
     #[serde(default, skip_serializing)]
     pub score: Option<ScoreDescription>,
 }
@@ -149,7 +146,6 @@ pub struct ImageDescription {
     /// the photo's edge over the window's. Not used where the model has patches.
     #[serde(default, skip_serializing)]
     pub windows: Vec<u8>,
-    /// The vectors of patches, if the model has them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub patches: Option<PatchDescription>,
 }
@@ -180,7 +176,6 @@ impl ImageDescription {
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum TextDescription {
     Onnx(OnnxText),
-    /// Vectors of fixed phrases.
     Phrases(PhrasesText),
 }
 
@@ -218,7 +213,6 @@ pub struct Padding {
     pub token_id: u32,
 }
 
-/// A text encoder of fixed phrases.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PhrasesText {
@@ -229,7 +223,6 @@ pub struct PhrasesText {
     pub tensor: String,
 }
 
-/// The mean subtracted from text vectors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CentreDescription {
@@ -279,7 +272,6 @@ impl Description {
         files
     }
 
-    /// Mutable [`Self::files_by_role`].
     pub(crate) fn files_mut(&mut self) -> Vec<(&'static str, &mut FileRef)> {
         let mut files = vec![("image.model", &mut self.image.file)];
         match &mut self.text {
@@ -413,7 +405,6 @@ pub(crate) fn check_common(
 #[serde(deny_unknown_fields)]
 pub struct EncoderId {
     pub name: String,
-    /// Components of a vector.
     pub dim: u32,
     /// The description of the model as JSON, with the SHA-256 of each file in place of its path and without the
     /// fields that do not affect vectors; empty for the built-in stand-in.

@@ -128,7 +128,6 @@ pub enum DownloadError {
     Cancelled,
 }
 
-/// How an attempt failed.
 pub enum Stop {
     /// Another attempt may help.
     Failed(DownloadFailure),
@@ -219,7 +218,6 @@ pub struct Client<'a> {
     agent: ureq::Agent,
     limits: NetworkLimits,
     watch: &'a dyn Watch,
-    /// Bytes left by earlier downloads.
     pub resumed_bytes: AtomicU64,
     /// Attempts beyond the first.
     pub retries: AtomicU64,

@@ -7,7 +7,6 @@ use crate::placement::Placement;
 use crate::provider::{Provider, names};
 use crate::tensors::TensorsError;
 
-/// Error of opening an encoder.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     #[error(transparent)]
@@ -57,7 +56,6 @@ pub enum PhrasesError {
     NoDirection { path: PathBuf, line: usize, phrase: String },
 }
 
-/// Error of encoding a text or crops.
 #[derive(Debug, thiserror::Error)]
 pub enum InferenceError {
     #[error("the text names nothing; say what to look for")]
@@ -90,7 +88,6 @@ fn suggestion(near: &[String]) -> String {
     }
 }
 
-/// Error of opening or running a model.
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
     #[error("{}: no such ONNX Runtime library; `scripts/get-onnxruntime.sh` downloads one and prints its path, which --runtime takes", path.display())]

@@ -94,7 +94,6 @@ impl ModelFile {
         self.embedded
     }
 
-    /// Opens it for reading from its start.
     pub fn reader(&self) -> io::Result<Box<dyn Read>> {
         Ok(match self.embedded {
             Some(bytes) => Box::new(bytes),

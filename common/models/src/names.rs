@@ -58,7 +58,6 @@ impl Spread {
 }
 
 impl Confidence {
-    /// Takes the name of the encoder, and the scores of the scene.
     pub fn new(encoder: &str, scores: Spread) -> Self {
         let fit = if encoder.starts_with("slag-embedded") { EMBEDDED } else { OTHERS };
         let Spread { sum, squares, n } = scores;
@@ -86,7 +85,6 @@ pub struct Naming {
 }
 
 impl Naming {
-    /// Takes the score of the next word.
     pub fn add(&mut self, word: u32, score: f32, confidence: &Confidence) {
         self.sum += confidence.weight(score);
         let at = self.best[..self.n].iter().position(|best| best.0 < score).unwrap_or(self.n);

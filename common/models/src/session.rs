@@ -260,7 +260,6 @@ impl Model {
         self.expect("output", self.session.outputs(), name.into(), element, shape)
     }
 
-    /// Checks that the model has no inputs except `names`.
     pub(crate) fn expect_no_input_but(&self, names: &[&str]) -> Result<(), SessionError> {
         match self.session.inputs().iter().find(|input| !names.contains(&input.name())) {
             None => Ok(()),

@@ -10,7 +10,6 @@ use crate::constants::MAX_IMAGE_PX;
 pub struct RasterView {
     /// Rigid transform from world to camera (OpenCV axes).
     pub camera_from_world: DAffine3,
-    /// Intrinsics of the camera, without distortion.
     pub intrinsics: Intrinsics,
 }
 

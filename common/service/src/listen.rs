@@ -168,7 +168,6 @@ async fn bind_unix(_: &std::path::Path) -> io::Result<Socket> {
 }
 
 impl Listener {
-    /// Speaks TLS on the connections.
     #[must_use]
     pub fn with_tls(mut self, tls: Option<Tls>) -> Self {
         self.tls = tls;

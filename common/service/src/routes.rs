@@ -73,7 +73,6 @@ pub struct Route {
     pub(crate) replies: fn(&mut SchemaGenerator) -> Vec<Reply>,
 }
 
-/// Routes under construction.
 pub struct Routes<S> {
     router: Router<S>,
     table: Vec<Route>,

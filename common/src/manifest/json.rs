@@ -17,7 +17,6 @@ pub enum ManifestError {
 }
 
 impl Manifest {
-    /// Returns the JSON text.
     pub fn to_bytes(&self) -> Vec<u8> {
         serde_json::to_vec(self).expect("a manifest has no map with other keys than strings")
     }

@@ -27,7 +27,6 @@ pub struct OccupancyHeader {
     pub voxel: f64,
     /// Smallest block along each axis: block b begins at voxel 4 b.
     pub first_block: [i32; 3],
-    /// Blocks along each axis.
     pub n_blocks: [u32; 3],
     pub n_runs: u32,
     /// Blocks with masks of their own.
@@ -38,7 +37,6 @@ pub struct OccupancyHeader {
     pub min_views: u32,
 }
 
-/// What is known of a voxel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum VoxelState {
     /// Nothing: no view has looked there.
@@ -269,7 +267,6 @@ pub struct Block {
 /// Most blocks along an axis of a shard: the box of all blocks stays within the format's limit.
 const MAX_EDGE: i32 = 512;
 
-/// The occupancy of a shard, to be written.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BuiltOccupancy {
     header: OccupancyHeader,

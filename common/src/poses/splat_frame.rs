@@ -106,7 +106,6 @@ impl SplatFrame {
     }
 }
 
-/// A transform from the world of the poses to the splat's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SplatFromPoses {
     pub similarity: Similarity,

@@ -4,7 +4,6 @@ use bytemuck::{Pod, Zeroable};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// First bytes of a shard.
 pub const MAGIC: [u8; 8] = *b"SLAGSHRD";
 /// Version of the shard format that is written and read.
 pub const VERSION: u32 = 2;

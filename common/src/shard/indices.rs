@@ -61,7 +61,6 @@ pub(super) fn n_words(n: usize, width_bits: u32) -> Option<usize> {
     (width_bits <= 32).then(|| (n as u64 * u64::from(width_bits)).div_ceil(32) as usize)
 }
 
-/// A packed column, to be written.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct IndexColumn {
     header: IndicesHeader,

@@ -98,7 +98,6 @@ impl Quantised {
     }
 }
 
-/// The source of a SOG's files.
 enum Parts {
     Folder(PathBuf),
     Bundle(Box<ZipArchive<BufReader<fs_err::File>>>),

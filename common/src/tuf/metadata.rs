@@ -175,7 +175,6 @@ impl TargetFile {
 /// Targets: the files. Delegations to other roles are not followed.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Targets {
-    /// Files by path.
     pub targets: BTreeMap<String, TargetFile>,
 }
 
@@ -233,7 +232,6 @@ pub struct Key {
 }
 
 impl Key {
-    /// Returns the public half of a signing key.
     pub fn of(key: &SigningKey) -> Self {
         let public = hex::encode(key.verifying_key().to_bytes());
         let keyval = BTreeMap::from([("public".to_owned(), Value::String(public))]);

@@ -31,7 +31,6 @@ pub use time::{format_utc, parse_utc};
 pub use trusted::{Kept, Offered, Trusted};
 pub use update::{Source, refresh};
 
-/// Version of the specification that is written.
 pub const SPEC_VERSION: &str = "1.0.31";
 pub const MAX_ROOT_BYTES: u64 = 256 << 10;
 pub const MAX_TIMESTAMP_BYTES: u64 = 16 << 10;

@@ -18,7 +18,6 @@ pub enum Offered {
     Same,
 }
 
-/// The metadata that is trusted at present.
 #[derive(Clone, Debug)]
 pub struct Trusted {
     root: SignedMetadata<Root>,
@@ -51,7 +50,6 @@ impl Trusted {
         self.targets.as_ref()
     }
 
-    /// Returns a file that the targets metadata lists.
     pub fn target(&self, path: &str) -> Option<&TargetFile> {
         self.targets.as_ref()?.body.targets.get(path)
     }

@@ -76,7 +76,6 @@ struct Locating {
 /// The action that drives, if goals are sent there.
 struct Navigation {
     navigator: Navigator,
-    /// How the newest goal stands.
     state: Publisher<Text>,
     /// Cancels the newest goal with a message, and ends with that goal. If it is dropped, another goal takes its
     /// place.

@@ -56,7 +56,6 @@ pub fn parse(
     Ok(command.try_get_matches_from(line)?)
 }
 
-/// A file, or none.
 struct File {
     path: PathBuf,
     table: Table,

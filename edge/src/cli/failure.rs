@@ -40,7 +40,6 @@ pub enum Failure {
 }
 
 impl Failure {
-    /// Returns a function that wraps an error with its kind.
     pub fn of(kind: &'static str) -> impl Fn(anyhow::Error) -> Self {
         move |error| Self::Failed(kind, error)
     }

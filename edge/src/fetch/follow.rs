@@ -37,7 +37,6 @@ pub struct FollowSettings {
     pub refresh: Option<Duration>,
     /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
     pub first_backoff: Duration,
-    /// Longest wait after a failure.
     pub longest_backoff: Duration,
 }
 
@@ -111,7 +110,6 @@ impl Follower {
         self.covered = None;
     }
 
-    /// Records a successful fetch and its start.
     pub fn fetched(&mut self, began: Duration, centre_in_world: DVec3) {
         (self.covered, self.attempted) = (Some((centre_in_world, began)), Some(began));
         (self.n_failures, self.retry_at) = (0, Duration::ZERO);
@@ -248,7 +246,6 @@ impl Following {
 
 pub struct FollowEnvironment<'a> {
     pub fetch: &'a mut dyn FnMut(&FetchRequest) -> Result<FetchReport, FetchError>,
-    /// Receives the outcome of each fetch.
     pub report: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a dyn Fn() -> f64,

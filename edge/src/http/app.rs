@@ -20,13 +20,10 @@ use crate::query::Engine;
 use crate::score::{Budget, OverBudget, Pool};
 use crate::store::Snapshot;
 
-/// The service's state.
 pub struct App {
     pub(super) engine: Engine,
     pub(super) settings: Settings,
-    /// A permit for each query in progress.
     pub(super) permits: Arc<Semaphore>,
-    /// Memory of the queries in progress.
     query_memory: Arc<Pool>,
     pub(super) metrics: Metrics,
     pub(super) following: Option<Arc<Following>>,
@@ -34,7 +31,6 @@ pub struct App {
     pub(super) listeners: Arc<Semaphore>,
     /// Whether the service stops: what never ends by itself ends then.
     pub(super) stopping: watch::Sender<bool>,
-    /// Held while a generation is loaded.
     loading: Mutex<()>,
     /// Unreadable shards for which a fetch was asked.
     asked: Mutex<BTreeSet<Hash32>>,
@@ -199,7 +195,6 @@ pub struct Settings {
     pub query_bytes: u64,
     /// Memory that all queries in progress may use; one that exceeds it gets 503.
     pub all_queries_bytes: u64,
-    /// Time for sending a long answer.
     pub stream_timeout: Duration,
 }
 
@@ -241,11 +236,9 @@ pub struct Metrics {
     pub responses: Arc<ResponseCounts>,
     /// Times of queries, refused ones too.
     pub query_times: Histogram,
-    /// Questions without an answer.
     pub empty_answers: AtomicU64,
     /// Generations put in place.
     pub reloads: AtomicU64,
-    /// Generations that did not open.
     pub reload_failures: AtomicU64,
 }
 

@@ -113,7 +113,6 @@ fn known(cache: &EdgeCache, manifest: &Manifest) -> Vec<u64> {
     known
 }
 
-/// Returns what the robot knows of a generation.
 fn generation(
     cache: &EdgeCache,
     snapshot: &Snapshot,

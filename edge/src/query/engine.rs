@@ -138,7 +138,6 @@ pub struct Engine {
     /// Options to open the text models with that scenes carry; absent if the text model is given.
     carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
-    /// Vectors of the words that things are named by.
     pub(super) words: Mutex<Option<Arc<Words>>>,
     /// Buffers of finished answers, one for each answer computed at a time.
     idle: Mutex<Vec<Scratch>>,
@@ -331,7 +330,6 @@ mod tests {
     use super::*;
     use crate::testing::{Axes, Member, TestShard, write_cache};
 
-    /// A scene and the text model of its encoder.
     fn loaded(encoder: u8) -> Loaded {
         let (dir, id) = (tempfile::tempdir().expect("a folder"), Hash32([encoder; 32]));
         let shard = TestShard::new(vec![vec![Member { steps: [0; 3], embedding: vec![1.0, 0.0] }]]);

@@ -20,7 +20,6 @@ pub struct Reply {
 }
 
 impl Reply {
-    /// Returns the manifest of the generation that answered.
     pub fn manifest(&self) -> &Manifest {
         &self.snapshot.manifest
     }
@@ -45,7 +44,6 @@ impl Reply {
     }
 }
 
-/// The answers to one question.
 pub enum Outcome {
     /// To a text or a vector.
     Plain(Answers),
@@ -55,7 +53,6 @@ pub enum Outcome {
 pub struct RelatedAnswers {
     /// What was asked in place of words that the model does not know.
     pub asked_as: BTreeMap<String, String>,
-    /// What was found for each thing of the phrase.
     pub parts: Vec<relations::Found>,
     /// The part that failed, if nothing was found.
     pub miss: Option<Miss>,

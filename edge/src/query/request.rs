@@ -128,12 +128,17 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
 
 #[derive(Clone, Debug, PartialEq)]
 pub enum Asked {
-    /// A text, for the text model.
     Text(String),
     /// A vector of the scene's embedding space, by its place in the request; its length does not count.
-    Vector { at: usize, vector: Vec<f32> },
+    Vector {
+        at: usize,
+        vector: Vec<f32>,
+    },
     /// Things by their relations, and the text that was understood so.
-    Phrase { text: Option<String>, phrase: Phrase },
+    Phrase {
+        text: Option<String>,
+        phrase: Phrase,
+    },
 }
 
 impl Asked {
@@ -205,7 +210,6 @@ pub struct QueryRequest {
     pub near: Option<DVec3>,
     /// The asker's heading, from x towards y, radians.
     pub heading_rad: Option<f64>,
-    /// The part of space to search.
     pub region: Region,
     /// Kind of answers; if absent, objects, and clusters for a question that no object answers.
     pub kind: Option<AnswerKind>,
@@ -262,7 +266,6 @@ impl QueryRequest {
         Ok(())
     }
 
-    /// Returns the answers to each question of a page.
     pub fn page(&self) -> usize {
         self.limit.unwrap_or(DEFAULT_LIMIT)
     }

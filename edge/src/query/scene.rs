@@ -23,7 +23,6 @@ pub struct Scene<'a> {
     pub objects: &'a [Option<Objects<'a>>],
     pub index: &'a ObjectIndex,
     pub manifest: &'a Manifest,
-    /// Centre and radius of the last fetch.
     pub fetched: (DVec3, f64),
     /// Cells within it whose shards could not be fetched.
     pub bad_cells: &'a [BadCell],

@@ -16,7 +16,6 @@ use crate::store::Snapshot;
 
 /// Below every cosine, and below every difference of two cosines.
 const BELOW_ALL: f32 = -4.0;
-/// The program's name in a description.
 const PROGRAM: &str = "slag-edge";
 
 impl Engine {

@@ -52,7 +52,6 @@ pub(super) struct Cut {
     pub least: f32,
 }
 
-/// Matches of one shard, and buffers.
 #[derive(Default)]
 pub(super) struct ShardGather {
     pub found: Matches,

@@ -22,12 +22,10 @@ const TOGETHER: usize = 64;
 /// Rounding of two cosines and their mean to f32: half a step each, at 2 or less.
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 
-/// Scores of one question over the objects of a generation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ObjectScores {
     /// By object, in the order of the index.
     pub scores: Vec<f32>,
-    /// Bound on the error of every score.
     pub error_bound: f32,
 }
 

@@ -8,11 +8,9 @@ use slag_common::frames::Aabb;
 
 use super::budget::MAX_COORDINATE;
 
-/// A ball in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ball {
     pub centre_in_world: DVec3,
-    /// Its radius, world units.
     pub radius: f64,
 }
 

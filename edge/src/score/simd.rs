@@ -103,7 +103,6 @@ impl<K: Kernels, F: FnMut(usize, i32)> Work<K> for MatrixTimesVector<'_, F> {
 
 /// Sums the values of a block's codes, see [`Kernels::block_sums`].
 pub struct BlockSums<'a> {
-    /// Byte columns of the block.
     pub columns: &'a [Column],
     /// Values of the subspaces in the low halves.
     pub low: &'a [Column],
@@ -171,7 +170,6 @@ impl<K: Kernels> Work<K> for FindSums<'_> {
     }
 }
 
-/// Multiplies some rows of a matrix with a vector.
 pub struct SomeRowsTimesVector<'a> {
     /// `[n][n_components]`.
     pub rows: &'a [i8],

@@ -24,7 +24,6 @@ pub struct Current {
     /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
     pub profile: Profile,
-    /// Centre of the fetch, world frame.
     pub centre_in_world: DVec3,
     /// Radius of the fetch, world units.
     pub radius: f64,
@@ -81,7 +80,6 @@ impl EdgeCache {
         &*self.files
     }
 
-    /// Returns the path of the generation pointer.
     pub fn current_path(&self) -> PathBuf {
         self.dir.join("current")
     }

@@ -40,7 +40,6 @@ const STEPS: u32 = 3;
 pub struct Record {
     pub scene: String,
     pub generation: u64,
-    /// When it was made, Unix seconds.
     pub created_unix_secs: u64,
     /// The space of the vectors.
     pub encoder_id: Hash32,
@@ -51,7 +50,6 @@ pub struct Record {
     places: Vec<Place>,
     /// The objects, by id.
     pub things: Vec<Thing>,
-    /// Components of a vector.
     dim: u32,
 }
 

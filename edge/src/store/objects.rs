@@ -64,7 +64,6 @@ impl ObjectIndex {
         self.len() == 0
     }
 
-    /// Returns the parts of an object, at least one.
     pub fn parts(&self, object: usize) -> &[Part] {
         &self.parts[self.starts[object] as usize..self.starts[object + 1] as usize]
     }

@@ -13,7 +13,6 @@ use super::error::StoreError;
 use super::files::Stat;
 use super::mmap::FileBytes;
 
-/// A mapped and checked shard.
 #[derive(Debug)]
 pub struct OpenShard {
     pub cell: CellRecord,
@@ -33,7 +32,6 @@ impl OpenShard {
         self.layout.additions(&self.bytes)
     }
 
-    /// Returns the hash of its bytes, by the manifest.
     pub fn hash(&self, profile: Profile) -> Option<Hash32> {
         self.cell.shards.get(&profile).map(|shard| shard.hash)
     }

@@ -124,11 +124,9 @@ impl Snapshot {
     }
 }
 
-/// Opens the shards of a generation.
 struct Opener<'a> {
     cache: &'a EdgeCache,
     profile: Profile,
-    /// Shards that were found damaged.
     marked: BTreeSet<Hash32>,
     /// Shards that an earlier snapshot has open, by cell.
     held: &'a [Arc<OpenShard>],

@@ -38,7 +38,6 @@ pub struct Published {
     pub manifest: Manifest,
     /// The manifest's bytes.
     pub listed: Vec<u8>,
-    /// Metadata files by name.
     pub metadata: BTreeMap<String, Vec<u8>>,
     pub objects: BTreeMap<Hash32, Vec<u8>>,
 }
@@ -84,7 +83,6 @@ pub struct TestThing {
     pub axis: usize,
 }
 
-/// Writes a shard again, with things.
 fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
     let bytes = AlignedBytes::copy_of(bytes);
     let layout = ShardLayout::check(&bytes).expect("sound");

@@ -96,7 +96,6 @@ impl Server {
         *self.shared.published.lock().expect("sound") = published;
     }
 
-    /// Sets the function that chooses the fault for each request.
     pub fn faults(&self, chooser: impl FnMut(&Seen) -> Fault + Send + 'static) {
         *self.shared.chooser.lock().expect("sound") = Box::new(chooser);
     }

@@ -9,7 +9,6 @@ use super::diagnosis::Diagnosis;
 /// A drawing with this PSNR looks much like its photo.
 const ALIKE_DB: f64 = 25.0;
 
-/// Comparison of one view with its photo.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ViewCheck {
     pub name: String,

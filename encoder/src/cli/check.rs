@@ -148,7 +148,6 @@ fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
     Ok((report, is_partial))
 }
 
-/// Returns the views whose photos are there, and notes how many are not.
 fn with_photos(views: Vec<View>, is_strict: bool, notes: &mut Vec<String>) -> Result<Vec<View>> {
     let (missing, there): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| !v.image_path.is_file());
     if let Some(first) = missing.first() {

@@ -84,7 +84,6 @@ impl OutputArgs {
             .init();
     }
 
-    /// Returns whether progress may be shown.
     pub fn shows_progress(self) -> bool {
         !self.quiet && !self.json
     }
@@ -266,7 +265,6 @@ pub async fn stopped() {
     }
 }
 
-/// Starts the threads of the services.
 pub fn runtime() -> Result<tokio::runtime::Runtime> {
     tokio::runtime::Builder::new_multi_thread()
         .enable_all()

@@ -8,7 +8,6 @@ use slag_math::matrix::{Panels, Rows};
 use super::measure;
 use super::members::Members;
 
-/// Embeddings decoded at a time.
 const CHUNK: usize = 1024;
 
 /// Decodes components to vectors, as readers do.

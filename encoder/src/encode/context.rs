@@ -45,7 +45,6 @@ impl<'a> RunContext<'a> {
         Ok(Self { start, progress, cancel, times: StageTimes::default(), phases, workers })
     }
 
-    /// Ends the present phase and begins the next.
     pub(super) fn begin_phase(&self, phase: Phase) {
         // Before anything of the phase is there, so that phases do not come on top of each other.
         memory::give_back();

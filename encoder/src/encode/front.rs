@@ -33,7 +33,6 @@ pub struct FrontSetting {
     pub seconds_per_view: f64,
     pub seconds_per_million_gaussians: f64,
     pub bytes_per_gaussian: f64,
-    /// Multi-class mIoU.
     pub miou: f64,
 }
 
@@ -44,7 +43,6 @@ pub struct Target {
     pub bytes: Option<u64>,
 }
 
-/// A chosen setting.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Expectation {
     pub setting: FrontSetting,

@@ -88,7 +88,6 @@ pub struct StageReport {
     pub gpus: Vec<GpuReport>,
 }
 
-/// The load of a GPU by the models of one stage.
 #[derive(Clone, Debug, Serialize)]
 pub struct GpuReport {
     /// The GPU, as CUDA numbers it.
@@ -132,7 +131,6 @@ pub(crate) enum Phase {
     Superpoints,
     Objects,
     Refine,
-    /// Cells become codebooks and shards.
     Cells,
     Publish,
 }
@@ -150,12 +148,10 @@ pub(crate) struct PhaseReport {
 pub struct EncodeSummary {
     pub generation: u64,
     pub n_gaussians: u64,
-    /// Gaussians without an embedding.
     pub n_without_evidence: u64,
     /// Unusable Gaussians, which are in no cell.
     pub n_rejected: u64,
     pub n_views: usize,
-    /// Views whose photo exists.
     pub n_views_with_photo: usize,
     /// Views whose image is a drawing of the splat, no photo.
     pub n_views_drawn: usize,
@@ -179,7 +175,6 @@ pub struct EncodeSummary {
     pub n_entries: u64,
     pub n_cells: usize,
     pub n_centroids: u64,
-    /// The search for objects, if there was one.
     pub objects: Option<ObjectsReport>,
     /// Free and occupied places, if they were asked for.
     pub occupancy: Option<OccupancyReport>,
@@ -194,7 +189,6 @@ pub struct EncodeSummary {
     pub(crate) phases: Vec<PhaseReport>,
     /// Seconds from the first view to the last.
     pub views_secs: f64,
-    /// Seconds from start to end.
     pub wall_secs: f64,
     /// The device that ran the image model; absent where no view was left to do, or the model needs no runtime.
     pub(crate) images_on: Option<String>,

@@ -31,7 +31,6 @@ use crate::memory::MemoryPlan;
 use crate::raster::{GpuSlots, LoadedScene, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
 
-/// Width of pictures of masks for people.
 const PICTURE_WIDTH_PX: u32 = 480;
 
 /// What every view needs on its way.
@@ -49,7 +48,6 @@ pub(crate) struct ViewTools<'a> {
     pub(crate) sink: &'a dyn ViewSink,
 }
 
-/// The stages of a view, with what every view needs.
 pub(crate) struct ViewStages<'a> {
     tools: ViewTools<'a>,
     context: &'a RunContext<'a>,
@@ -235,7 +233,6 @@ impl<'a> ViewStages<'a> {
         self.images_on.get().cloned().flatten()
     }
 
-    /// Warns of what views left out.
     pub(super) fn warn(&self) {
         self.rotated.warn();
         let n = self.n_unrepresentable.load(Ordering::Relaxed);
@@ -278,7 +275,6 @@ impl<'a> ViewStages<'a> {
         Ok(Photo { loaded, depth: None })
     }
 
-    /// Draws the depth of the scene.
     fn add_depth(&self, view: &View, photo: Photo) -> Result<Photo, EncodeError> {
         let loaded = photo.loaded;
         let width = self.tools.settings.raster_width;
@@ -307,7 +303,6 @@ impl<'a> ViewStages<'a> {
         Ok(Segmented { loaded, masks })
     }
 
-    /// Makes the regions of a view and the crops of its masks.
     fn crop(&self, view: &View, segmented: Segmented) -> Result<Cropped, EncodeError> {
         let Segmented { loaded, mut masks } = segmented;
         let (patches, regions) = self.patches(&loaded.image, &masks);
@@ -399,7 +394,6 @@ impl<'a> ViewStages<'a> {
         Ok(Embedded { vectors, partition })
     }
 
-    /// Calls `work` with an encoder of its own.
     fn with_encoder<T>(&self, work: impl FnOnce(&mut dyn ImageEncoder) -> T) -> Result<T, ModelError> {
         let idle = match &self.encoders {
             Encoders::Shared(encoders) => return encoders.with_encoder(work),

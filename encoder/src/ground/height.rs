@@ -7,7 +7,6 @@ use slag_math::stats::{median, trimmed_range};
 
 /// Side of a tile, in resolutions of the splat: 2.5 m in a survey from 40 m.
 const TILE: f64 = 36.0;
-/// Most tiles along a side.
 const MAX_TILES: f64 = 512.0;
 /// Height of a level, in which surfaces are added up, resolutions.
 const LEVEL: f64 = 1.5;

@@ -21,7 +21,6 @@ const MAX_SCALE: f64 = 30.0;
 const VOXEL: f64 = 4.0;
 /// Height from which a place is above the ground, resolutions.
 const MIN_HEIGHT: f64 = 2.0;
-/// Fewest Gaussians of a thing.
 const MIN_GAUSSIANS: u32 = 10;
 /// A thing is narrower than this share of the ground: of walls and what touches them a room consists.
 const MAX_WIDTH: f64 = 0.25;

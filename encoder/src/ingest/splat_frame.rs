@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use slag_common::poses::{AppliedTransform, FRAME_FILE, PoseError, PoseSource, SplatFrame, SplatFromPoses};
 use slag_common::{Gaussians, Similarity};
 
-/// Where the splat's frame is stated.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum FrameChoice {
     /// By `dataparser_transforms.json` beside the splat, if there is one.

@@ -94,10 +94,8 @@ impl PackedEntry {
     }
 }
 
-/// One view's part of the lift.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewContributions {
-    /// Components of a mask vector.
     pub dim: usize,
     /// `[n_masks][dim]`, unit.
     pub mask_vectors: Vec<f32>,
@@ -217,7 +215,6 @@ pub struct ContributionFile {
     path: PathBuf,
     n_regions: usize,
     n_entries: u64,
-    /// Offset of the first entry.
     entries_at_bytes: u64,
     /// By (cell, slice), ascending.
     runs: Vec<Run>,
@@ -225,7 +222,6 @@ pub struct ContributionFile {
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewRegions {
-    /// Components of a mask vector.
     pub dim: usize,
     /// `[n_masks][dim]`, unit.
     pub mask_vectors: Vec<f32>,
@@ -296,7 +292,6 @@ impl ContributionFile {
         self.runs[run].start..self.runs.get(run + 1).map_or(self.n_entries, |next| next.start)
     }
 
-    /// Reads and checks the entries of some runs.
     pub(super) fn read(&self, runs: Range<usize>) -> Result<Vec<PackedEntry>, ContributionError> {
         let bytes = self.bytes_of_runs(runs.clone());
         let mut entries =

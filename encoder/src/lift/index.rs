@@ -166,7 +166,6 @@ impl ContributionIndex {
         self.parts.iter().map(part_bytes).max().unwrap_or(0)
     }
 
-    /// Returns the bytes of all parts, transposed.
     pub(super) fn kept_bytes(&self) -> u64 {
         let of_part = |part: &Part| {
             part.n_entries * BYTES_PER_TRANSPOSED_ENTRY + part.locals.len() as u64 * BYTES_PER_GAUSSIAN
@@ -194,7 +193,6 @@ impl ContributionIndex {
         groups
     }
 
-    /// Reads and checks the entries of some parts.
     pub fn read(&self, parts: Range<usize>) -> Result<RawGroup, ContributionError> {
         let slices = self.slices_of(&parts);
         let runs_of = |view: &IndexedView| {

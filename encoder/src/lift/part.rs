@@ -8,7 +8,6 @@ use crate::cells::CellSplit;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Part {
     pub cell_id: u32,
-    /// Number of the part within the cell.
     pub number: u32,
     /// Its Gaussians, by their index within the cell.
     pub(crate) locals: Range<usize>,

@@ -26,7 +26,6 @@ fn first_number(n: usize, n_more: usize, what: &'static str) -> Result<u32, Cont
     if fits { Ok(n as u32) } else { Err(ContributionError::TooManyInAll { what }) }
 }
 
-/// The masks of every region of the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionTable {
     dim: usize,
@@ -111,7 +110,6 @@ impl RegionTable {
         self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
     }
 
-    /// Sets the level of each mask, `[n_masks]`.
     pub(crate) fn set_levels(&mut self, levels: Vec<u8>) {
         self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
     }

@@ -52,7 +52,6 @@ pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
     open(&(0..n_views).map(view).collect::<Vec<_>>(), dim, &[n_gaussians as usize], u64::MAX)
 }
 
-/// Reads and transposes a scene within a budget.
 fn transpose(scene: &Scene, budget_bytes: u64) -> Vec<PartContributions> {
     scene.index.transposed_parts(&scene.table, budget_bytes).collect::<Result<_, _>>().expect("transposes")
 }

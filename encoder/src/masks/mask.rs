@@ -29,7 +29,6 @@ impl BoxPx {
 /// A set of pixels of an image; masks may overlap.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mask {
-    /// The tight bounding box.
     pub box_px: BoxPx,
     /// Membership, row-major within the box.
     pub inside: Vec<bool>,

@@ -11,7 +11,6 @@ use super::mask::{BoxPx, Mask};
 /// Most digits of a number with 32 bits and a sign, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;
 
-/// A run-length encoded mask.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Rle {
     width_px: u32,

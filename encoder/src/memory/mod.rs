@@ -32,7 +32,6 @@ pub enum Phase {
 
 const PHASES: [Phase; 5] = [Phase::Views, Phase::Superpoints, Phase::Objects, Phase::Refine, Phase::Cells];
 
-/// Memory set aside for one purpose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reservation {
     pub purpose: &'static str,
@@ -93,7 +92,6 @@ impl MemoryPlan {
         self.reservations.push(Reservation { purpose, len_bytes, phase });
     }
 
-    /// Marks the views as done: later reservations depend on their results.
     pub(crate) fn views_are_done(&mut self) {
         self.is_before_views = false;
     }

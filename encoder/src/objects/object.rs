@@ -61,7 +61,6 @@ pub struct SceneObjects {
     pub report: ObjectsReport,
 }
 
-/// Counts of objects and masks, for the summary.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ObjectsReport {
     pub n_objects: usize,

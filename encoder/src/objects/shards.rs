@@ -152,7 +152,6 @@ impl CellObjects {
         cell
     }
 
-    /// Adds an object with `n_gaussians_here` Gaussians in the cell.
     fn add(&mut self, object: &Object, n_gaussians_here: u32, basis: &CentroidBasis<'_>) {
         let name = plain(&object.photo);
         // Many objects share the photo that shows them best.

@@ -26,7 +26,6 @@ pub(crate) const VOXEL_VARIANCE: f64 = 0.15;
 
 /// Blocks along an edge of a tile: its sums, 1 MiB, stay in a core's cache.
 const TILE_BLOCKS: i32 = 16;
-/// Voxels along an edge of a tile.
 const TILE_EDGE: usize = (TILE_BLOCKS * BLOCK_EDGE) as usize;
 /// Tiles along an axis that a Gaussian may reach into: larger ones are sky and other background that no robot
 /// drives into.

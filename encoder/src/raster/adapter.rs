@@ -2,7 +2,6 @@
 
 use serde::Serialize;
 
-/// Precision of the projection on a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {

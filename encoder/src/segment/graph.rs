@@ -277,7 +277,6 @@ const _: () = assert!(NOT_NUMBERED == NO_REGION);
 /// An edge of the grid: its pixel times 4, plus the index of the neighbour.
 type Edge = u32;
 
-/// The working image.
 struct Raster {
     width_px: u32,
     height_px: u32,

@@ -57,7 +57,6 @@ pub trait Segmenter: Sync {
 pub struct SegmentInput<'a> {
     /// The view, with the intrinsics of `image` (an ideal pinhole).
     pub view: &'a View,
-    /// The undistorted photo.
     pub image: &'a RgbImage,
     /// Pixels inside the lens image, row-major; `None` if all are.
     pub valid: Option<&'a [bool]>,

@@ -26,9 +26,7 @@ use crate::objects::shards::{CellObjects, CentroidBasis};
 pub struct BuiltShard {
     pub profile: Profile,
     pub bytes: Vec<u8>,
-    /// Hard bound of a score's error.
     pub score_error_bound: f32,
-    /// Measured errors of scores.
     pub score_errors: ScoreErrors,
 }
 
@@ -36,13 +34,9 @@ pub struct BuiltCell {
     /// One per profile.
     pub shards: Vec<BuiltShard>,
     pub n_centroids: u32,
-    /// Subspaces of the residual code.
     pub n_subspaces: u32,
-    /// Largest error of a position, world units.
     pub position_error: f64,
-    /// Moments of the scores of all texts.
     pub moments: ScoreMoments,
-    /// Gaussians without an embedding.
     pub n_without_evidence: usize,
 }
 
@@ -59,11 +53,9 @@ pub struct ShardSettings {
 }
 
 pub struct CellEmbeddings {
-    /// Components of an embedding.
     pub dim: usize,
     /// `[N][dim]`: unit, or zeros where there is no evidence.
     pub vectors: Vec<f32>,
-    /// `[N]`: whether there is evidence.
     pub has_evidence: Vec<bool>,
 }
 
@@ -330,7 +322,6 @@ impl QuantisedPositions {
         Self { error, columns }
     }
 
-    /// Returns the columns to write.
     fn view(&self) -> Positions<'_> {
         match &self.columns {
             Columns::Packed(words) => Positions::Packed(words),

@@ -170,7 +170,6 @@ impl StoreReader {
     }
 }
 
-/// A shard as it was read.
 pub struct StoredShard {
     pub bytes: AlignedBytes,
     pub layout: ShardLayout,

@@ -30,7 +30,6 @@ enum Scored {
 }
 
 impl Generation {
-    /// Opens a generation: its objects, and its fields if there is a splat.
     pub(super) fn open(reader: StoreReader, splat: Option<&Splat>) -> Result<Self, ViewError> {
         let (mut things, mut photos) = (Things::default(), Vec::new());
         for cell in &reader.manifest().cells {

@@ -19,7 +19,6 @@ const MAX_REDIRECTS: usize = 5;
 /// Limit on consecutive attempts without progress.
 const MAX_ATTEMPTS: u32 = 5;
 
-/// Options of reaching the hub and keeping its models.
 #[derive(Clone, Debug)]
 pub struct HubOptions {
     /// Folder of the models, see [`models_folder`](super::models_folder).
@@ -48,7 +47,6 @@ impl Watch for Log {
     }
 }
 
-/// The hub's metadata of a file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Advertised {
     pub revision: Option<String>,
@@ -92,7 +90,6 @@ pub(super) fn ask(client: &Client<'_>, url: &str) -> Result<Advertised, Download
 }
 
 impl Advertised {
-    /// Adds the metadata of a response of the hub.
     fn take(&mut self, response: &Response<ureq::Body>) {
         let text = |name| header_text(response, HeaderName::from_static(name));
         let revision = text("x-repo-commit");

@@ -65,7 +65,6 @@ pub struct Entry {
 const ROLES: [&str; 5] = ["image_encoder", "mask_decoder", "image", "text", "tokenizer"];
 const FIRST_OF_TEXT: usize = 3;
 
-/// The known length and hash of a file.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {

@@ -6,7 +6,6 @@ use serde::Deserialize;
 
 use crate::description::{DescriptionError, FileRef, check_common, read_toml, require};
 
-/// The description of a segmenter's directory.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SamDescription {
@@ -43,7 +42,6 @@ impl SegmentDescription {
     }
 }
 
-/// The files of SAM and its image preprocessing.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SamFiles {

@@ -33,7 +33,6 @@ pub(super) struct Link {
     pub(super) input: String,
 }
 
-/// The decoder's inputs by their use.
 #[derive(Default)]
 struct Inputs {
     points: Vec<String>,

@@ -4,11 +4,9 @@ use std::path::Path;
 
 use super::onnx::{Element, Graph, constant, model, node, value};
 
-/// Components of a vector.
 pub const DIM: usize = 4;
 /// Tokens that the text model knows; the tokenizer has [`VOCABULARY`].
 pub const N_TOKENS: usize = 8;
-/// Edge of the images, pixels.
 pub const SIZE_PX: u32 = 8;
 /// The tokenizer's vocabulary, by id; 1 ends a text, as in SigLIP's.
 pub const VOCABULARY: [&str; 8] = ["<pad>", "</s>", "<unk>", "▁a", "▁red", "▁chair", "▁", "s"];

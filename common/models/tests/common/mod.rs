@@ -34,7 +34,6 @@ pub fn image(npz: &Path, name: &str) -> image::RgbImage {
     image::RgbImage::from_raw(shape[1] as u32, shape[0] as u32, levels).expect("it is RGB")
 }
 
-/// The vector scaled to unit length, in f64.
 pub fn unit(vector: &[f32]) -> Vec<f64> {
     let norm = vector.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
     vector.iter().map(|&x| f64::from(x) / norm).collect()

@@ -61,7 +61,6 @@ fn unpack_rotation(word: u32) -> [f64; 4] {
     with_largest((word >> 30) as usize, others)
 }
 
-/// Reads the chunks' ranges.
 fn read_chunks(ply: &mut Ply) -> Result<Vec<Chunk>, SplatError> {
     let chunk = ply.require_element("chunk", EXPORT_AGAIN)?;
     let mut properties = ply.properties(chunk, &RANGES, EXPORT_AGAIN)?;

@@ -89,7 +89,6 @@ struct Property {
     kind: Kind,
 }
 
-/// A table of a PLY file.
 #[derive(Debug)]
 pub(super) struct Element {
     pub name: String,
@@ -123,7 +122,6 @@ pub(super) struct Ply {
     encoding: Encoding,
     pub elements: Vec<Element>,
     next: usize,
-    /// Lines read so far.
     line: u64,
 }
 
@@ -169,7 +167,6 @@ impl Ply {
         self.elements.iter().position(|e| e.name == name)
     }
 
-    /// Returns the index of an element, or an error if it is missing.
     pub fn require_element(&self, name: &str, advice: &'static str) -> Result<usize, SplatError> {
         let missing = || self.missing(format!("a header with an element {name:?}"), advice);
         self.element(name).ok_or_else(missing)

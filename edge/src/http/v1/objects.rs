@@ -76,7 +76,6 @@ impl ListParams {
         forms::area(ball, self.bounds.take(), self.polygon.take(), self.polygon_lat_lon.take())
     }
 
-    /// Returns which objects of a generation are asked for.
     fn filter(mut self, manifest: &Manifest) -> Result<ObjectFilter, RequestError> {
         let refuse =
             |parameter, found: String, expected: String| Err(RequestError::new(parameter, &found, expected));
@@ -111,7 +110,6 @@ pub async fn list(
     Ok(As::new(([(header::CONTENT_TYPE, format.media_type())], listing.await?)))
 }
 
-/// A list of objects in any format.
 pub struct ListFormats;
 
 impl Described for ListFormats {

@@ -284,7 +284,6 @@ impl Asker<'_> {
     }
 }
 
-/// Lowest scores of a match.
 struct Thresholds {
     of_gaussians: f32,
     of_objects: f32,

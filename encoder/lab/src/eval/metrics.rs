@@ -83,7 +83,6 @@ impl Confusion {
     }
 }
 
-/// Returns the mean of the values that are present; `None` without any.
 pub(super) fn mean(values: impl IntoIterator<Item = Option<f64>>) -> Option<f64> {
     let (sum, n) = values.into_iter().flatten().fold((0.0, 0), |(sum, n), v| (sum + v, n + 1));
     (n > 0).then(|| sum / f64::from(n))

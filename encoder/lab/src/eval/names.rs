@@ -56,7 +56,6 @@ pub(crate) struct NamesArgs {
     models: ModelArgs,
 }
 
-/// The names of an object.
 #[derive(Clone, Copy, Debug)]
 struct Named {
     /// The best name's score.

@@ -54,9 +54,7 @@ struct Piece {
 pub struct Solids {
     things: Vec<Thing>,
     light: Light,
-    /// Share of ambient light.
     ambient: f64,
-    /// Colour of the light.
     tint: [f64; 3],
 }
 
@@ -82,7 +80,6 @@ struct Hit {
 }
 
 impl Thing {
-    /// Places parts of the object's frame in the world.
     pub fn new(parts: &[Part], world_from_object: DAffine3) -> Self {
         let pieces: Vec<Piece> = parts
             .iter()

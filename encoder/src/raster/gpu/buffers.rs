@@ -24,7 +24,6 @@ pub(crate) fn regions_bytes(n_px: usize) -> u64 {
 /// Sizes for which buffers are created.
 #[derive(Clone, Copy)]
 pub struct Size {
-    /// Capacities for the output of the shaders.
     pub(crate) capacities: Capacities,
     pub(crate) n_tiles: u32,
     /// Pixels of a band.

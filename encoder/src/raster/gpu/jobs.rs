@@ -75,7 +75,6 @@ pub(crate) fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
     (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
 }
 
-/// Returns the number of bits of the numbers below `n`.
 pub(crate) fn bits_of(n: u32) -> u32 {
     u32::BITS - n.saturating_sub(1).leading_zeros()
 }

@@ -48,7 +48,6 @@ impl GpuRasterizer {
         Self { device: Arc::new(device), options }
     }
 
-    /// Returns the description of the device.
     pub fn report(&self) -> &AdapterReport {
         &self.device.report
     }
@@ -84,7 +83,6 @@ struct GpuScene<'s> {
     returned: Condvar,
 }
 
-/// Workspaces that are not in use.
 struct Pool {
     idle: Vec<Workspace>,
     n_made: usize,
@@ -330,7 +328,6 @@ impl<'s> GpuScene<'s> {
         Err(self.device.capacity_error(what))
     }
 
-    /// Uploads the colours of all Gaussians seen from a view.
     fn colours(&self, view: &RasterView) -> Result<wgpu::Buffer, RasterError> {
         let position_in_world = view.camera_from_world.inverse().translation;
         let colours: Vec<[f32; 3]> = (0..self.scene.len())

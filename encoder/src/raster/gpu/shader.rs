@@ -26,7 +26,6 @@ pub const SUM_FRACTION_BITS: u32 = 35;
 pub(crate) const REGION_BITS: u32 = 16;
 /// Most items of a buffer: counts above it do not fit, and stay far below 2^32.
 pub(crate) const MAX_CAPACITY: u32 = 1 << 31;
-/// Stands for "no counter".
 pub const NONE: u32 = u32::MAX;
 
 /// Counters that shaders increment; the host reads them after each band.

@@ -50,7 +50,6 @@ impl ScoreFilter {
 /// Settings for the prompts and the filters of masks. The defaults are those of the reference implementation.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct SamSettings {
-    /// Points along each side of the grid.
     pub points_per_side: u32,
     /// Points that the decoder processes at once. Memory: 0.8 MB per point, twice.
     pub points_per_batch: u32,

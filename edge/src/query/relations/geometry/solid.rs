@@ -55,7 +55,6 @@ impl Solid {
         8.0 * self.half.x * self.half.y * self.half.z
     }
 
-    /// Returns the area of its outline on the ground.
     pub fn area(&self) -> f64 {
         4.0 * self.half.x * self.half.y
     }

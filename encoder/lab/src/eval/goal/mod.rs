@@ -61,7 +61,6 @@ pub(crate) struct GoalArgs {
     list: bool,
 }
 
-/// Judges every scene.
 pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport> {
     let mut report = GoalReport::default();
     let scenes = Prepared {
@@ -135,7 +134,6 @@ struct Label {
     object: Option<String>,
 }
 
-/// Returns the things of a scene and its store, in the order of the layout.
 fn labels(scene: &Path, store: &Path) -> Result<Vec<Label>> {
     let reader = StoreReader::open(store)?;
     let objects = PublishedObjects::read(&reader)?;
@@ -266,7 +264,6 @@ impl fmt::Display for GoalReport {
 /// Distance of the surface points that are looked at.
 const SPACING_M: f64 = 0.012;
 
-/// Free voxels, and those that are not.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 struct Voxels {
     n_free: u64,
@@ -311,7 +308,6 @@ fn compare_voxels(layout: &Layout, store: &Path) -> Result<Voxels> {
     Ok(found)
 }
 
-/// Returns the voxels with a point of a true surface.
 fn surface_voxels(layout: &Layout, voxel: f64) -> HashSet<[i32; 3]> {
     let mut voxels = HashSet::new();
     for placed in &layout.placed {

@@ -17,7 +17,6 @@ pub(super) const HEIGHT_M: f64 = 0.5;
 pub(super) const STEP_M: f64 = 0.1;
 /// Least share of the thing's outline that must truly be shown.
 pub(super) const MIN_SHOWN: f64 = 0.1;
-/// Edge of a cell of the true map.
 const CELL_M: f64 = 0.02;
 /// Distance of the surface points that are looked at.
 const SPACING_M: f64 = 0.01;
@@ -28,7 +27,6 @@ const FIELD_OF_VIEW_RAD: f64 = 110.0 * PI / 180.0;
 /// Least pixels that a thing must have.
 const MIN_SHOWN_PX: u32 = 12;
 
-/// The truth about a layout, for a robot.
 pub(super) struct Truth<'a> {
     layout: &'a Layout,
     solids: Solids,
@@ -148,7 +146,6 @@ impl<'a> Truth<'a> {
     }
 }
 
-/// Returns points on a thing's surface, world frame.
 fn surface(layout: &Layout, thing: usize, spacing_m: f64) -> impl Iterator<Item = DVec3> + '_ {
     let placed = &layout.placed[thing];
     let surfels = placed.object.parts.iter().flat_map(move |part| part.surfels(spacing_m));
