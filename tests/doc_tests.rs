@@ -7,7 +7,6 @@ use clap::CommandFactory;
 use slag_tests::root;
 use syn::visit::{self, Visit};
 
-/// Most words of all documents together.
 const MAX_WORDS: usize = 22_000;
 /// Most characters of a line, of a row of a table, and most columns.
 const MAX_LINE: usize = 120;
@@ -50,7 +49,6 @@ fn files(folder: &Path, extension: &str) -> Vec<PathBuf> {
     found
 }
 
-/// Fails with the faults that `faults` finds in each document.
 fn check(faults: impl Fn(&Path, &str) -> Vec<String>) {
     let found: Vec<String> = documents()
         .iter()

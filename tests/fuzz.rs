@@ -23,9 +23,11 @@ const N_MUTATIONS: u64 = 3000;
 const INTERESTING: [u64; 12] =
     [0, 1, 2, 0x7f, 0x80, 0xff, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, u64::MAX >> 1, u64::MAX];
 
-/// Mutates a seed as fuzzers do: bits, numbers, digits, truncation, copies, pieces of another seed.
-fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
-    let mut bytes = seeds[random.below(seeds.len())].clone();
+/// Mutates a seed as fuzzers do: bits, numbers, digits, truncation, copies, pieces of another seed. Half of the time
+/// one of the first `n_valid`: few mutations of refused inputs are accepted.
+fn mutated(seeds: &[Vec<u8>], n_valid: usize, random: &mut Random) -> Vec<u8> {
+    let n = if random.below(2) == 0 { n_valid } else { seeds.len() };
+    let mut bytes = seeds[random.below(n)].clone();
     for _ in 0..1 + random.below(4) {
         let at = random.below(bytes.len());
         match random.below(9) {
@@ -95,10 +97,11 @@ fn no_decoder_panics() {
         if n_accepted == 0 {
             without_valid_seed.push(target.name);
         }
+        let n_valid = seeds.len();
         let mut corpus = corpus(target.name);
         seeds.extend_from_slice(&corpus);
         while !corpus.is_empty() || budget.map_or(n < N_MUTATIONS, |budget| start.elapsed() < budget) {
-            let input = corpus.pop().unwrap_or_else(|| mutated(&seeds, &mut random));
+            let input = corpus.pop().unwrap_or_else(|| mutated(&seeds, n_valid, &mut random));
             let run = || catch_unwind(AssertUnwindSafe(|| targets::run(target.name, &input)));
             let (ended, taken) = memory_of(run);
             let peak_bytes = taken.peak_bytes;

@@ -141,7 +141,6 @@ fn a_gpu_gives_the_field_of_the_cpu() {
     assert!(relative_l1 < 2e-5 && largest < 0.01, "{relative_l1:e} {largest:e}");
 }
 
-/// Reads an array of an archive.
 fn array<T: npyz::Deserialize>(npz: &mut Npz, name: &str) -> Vec<T> {
     let member = npz.array(name).expect("readable").expect("there");
     npyz::NpyFile::new(member).expect("an array").into_vec().expect("of that type")

@@ -81,7 +81,6 @@ fn a_field(store: &Path) -> String {
     hash.expect("a hash").to_owned()
 }
 
-/// Returns all files of a folder and of those in it, by path, with their content.
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     for entry in fs_err::read_dir(folder).expect("there") {

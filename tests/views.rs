@@ -5,7 +5,6 @@ use std::path::Path;
 use serde_json::Value;
 use slag_tests::*;
 
-/// The room of these tests.
 const VIEWS: [&str; 4] = ["--n-views", "10", "--seed", "31"];
 
 /// Encodes the room's scene with its true masks, and returns the summary.

@@ -8,7 +8,6 @@ use glam::{DVec3, Vec3};
 use crate::Gaussians;
 use crate::gaussians::SH_C0;
 
-/// Bytes of a Gaussian's appearance.
 pub const BYTES: usize = 10;
 /// Natural logarithm of the smallest size.
 const LN_SIZE_MIN: f32 = -12.0;
@@ -38,9 +37,6 @@ impl Appearance<'_> {
     }
 
     /// Adds the Gaussian at an index, as it looks from everywhere, to a scene without harmonics above degree 0.
-    ///
-    /// # Panics
-    /// If the index is not below the number of Gaussians.
     pub fn add_to(&self, scene: &mut Gaussians, index: usize, mean_in_world: DVec3) {
         let [r, g, b, opacity] = self.colours[index].map(|code| f32::from(code) / LARGEST);
         scene.means_in_world.push(mean_in_world);
@@ -51,7 +47,6 @@ impl Appearance<'_> {
     }
 }
 
-/// The appearance of some Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct AppearanceColumns {
     colours: Vec<[u8; 4]>,
@@ -61,9 +56,6 @@ pub struct AppearanceColumns {
 
 impl AppearanceColumns {
     /// Rounds the appearance of some of a scene's Gaussians, in the order of `indices`.
-    ///
-    /// # Panics
-    /// If an index is not below [`Gaussians::len`].
     pub fn of(scene: &Gaussians, indices: &[u32]) -> Self {
         let at = |index: &u32| *index as usize;
         let colour = |index: &u32| {

@@ -4,7 +4,6 @@ use std::fmt;
 use std::num::IntErrorKind;
 use std::str::FromStr;
 
-/// A number of bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ByteSize(pub u64);
 

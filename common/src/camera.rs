@@ -27,17 +27,12 @@ pub enum Distortion {
 
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
-    /// Image width, pixels.
     pub width_px: u32,
-    /// Image height, pixels.
     pub height_px: u32,
-    /// Focal length along x, pixels.
     pub focal_x_px: f64,
-    /// Focal length along y, pixels.
     pub focal_y_px: f64,
     /// Principal point, x, pixels (the centre of the first pixel is 0.5).
     pub centre_x_px: f64,
-    /// Principal point, y, pixels.
     pub centre_y_px: f64,
     pub distortion: Distortion,
 }
@@ -132,12 +127,10 @@ impl Intrinsics {
         self.distortion.distort(normalised)
     }
 
-    /// Returns the image position, pixels, of a distorted normalised point.
     pub fn pixel_from_distorted(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         [x * self.focal_x_px + self.centre_x_px, y * self.focal_y_px + self.centre_y_px]
     }
 
-    /// Returns the distorted normalised point of an image position, pixels.
     pub fn distorted_from_pixel(&self, [u, v]: [f64; 2]) -> [f64; 2] {
         [(u - self.centre_x_px) / self.focal_x_px, (v - self.centre_y_px) / self.focal_y_px]
     }
@@ -165,18 +158,15 @@ impl Intrinsics {
         self.scaled_to(width_px, height_px)
     }
 
-    /// Returns the camera as an ideal pinhole.
     pub fn without_distortion(&self) -> Self {
         Self { distortion: Distortion::None, ..*self }
     }
 }
 
-/// A posed image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
     /// Its name, unique in the set: the image's path relative to the image folder, with `/` as separator.
     pub name: String,
-    /// The expected path of the image file.
     pub image_path: PathBuf,
     pub intrinsics: Intrinsics,
     /// The rigid transform from world to camera (OpenCV axes).
@@ -184,7 +174,6 @@ pub struct View {
 }
 
 impl View {
-    /// Returns the centre of the camera.
     pub fn position_in_world(&self) -> DVec3 {
         self.camera_from_world.inverse().translation
     }

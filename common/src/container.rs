@@ -17,7 +17,6 @@ pub const MAX_SECTIONS: u32 = 64;
 #[cfg(target_endian = "big")]
 compile_error!("the on-disk columns are used in place and are little-endian");
 
-/// The fault of a container, and its place.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ContainerError {
     #[error(
@@ -233,14 +232,12 @@ pub struct AlignedBytes {
 struct Block([u8; ALIGNMENT_BYTES]);
 
 impl AlignedBytes {
-    /// Reads a whole file.
     pub fn read(path: &std::path::Path) -> io::Result<Self> {
         let file = fs_err::File::open(path)?;
         let len = file.metadata()?.len() as usize;
         Self::read_from(file, len)
     }
 
-    /// Reads exactly `len` bytes.
     pub fn read_from(mut reader: impl io::Read, len: usize) -> io::Result<Self> {
         let mut blocks = vec![Block([0; ALIGNMENT_BYTES]); len.div_ceil(ALIGNMENT_BYTES)];
         reader.read_exact(&mut bytemuck::cast_slice_mut::<Block, u8>(&mut blocks)[..len])?;

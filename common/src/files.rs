@@ -25,7 +25,6 @@ pub fn read_short(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads a file.
 pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     read_short(path, u64::MAX)
 }

@@ -127,13 +127,11 @@ impl Aabb {
     /// The empty box: extended by a point, it becomes that point.
     pub const EMPTY: Self = Self { min: DVec3::INFINITY, max: DVec3::NEG_INFINITY };
 
-    /// Extends the box to contain a ball.
     pub fn extend_ball(&mut self, centre: DVec3, radius: f64) {
         self.min = self.min.min(centre - DVec3::splat(radius));
         self.max = self.max.max(centre + DVec3::splat(radius));
     }
 
-    /// Returns the smallest box around both.
     pub fn union(self, other: Self) -> Self {
         Self { min: self.min.min(other.min), max: self.max.max(other.max) }
     }
@@ -157,7 +155,6 @@ impl Aabb {
         (self.min + self.max) * 0.5
     }
 
-    /// Returns the edge lengths.
     pub fn size(&self) -> DVec3 {
         self.max - self.min
     }

@@ -14,7 +14,6 @@ const MAX_COORDINATE: f64 = f32::MAX as f64;
 /// logs), rotations are unit quaternions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
-    /// Means, world frame.
     pub means_in_world: Vec<DVec3>,
     /// Rotations (world from the Gaussian's own axes), `wxyz`, unit length.
     pub rotations_wxyz: Vec<[f32; 4]>,
@@ -48,12 +47,10 @@ impl Gaussians {
         self.means_in_world.len()
     }
 
-    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.means_in_world.is_empty()
     }
 
-    /// Returns the bytes that the columns take.
     pub fn len_bytes(&self) -> u64 {
         let Self { means_in_world, rotations_wxyz, scales, opacities, sh_dc, sh_rest, sh_degree: _ } = self;
         let shape = size_of_val(&**means_in_world) + size_of_val(&**rotations_wxyz) + size_of_val(&**scales);
@@ -72,9 +69,6 @@ impl Gaussians {
     }
 
     /// Returns some of the Gaussians, in the order of `indices`.
-    ///
-    /// # Panics
-    /// If an index is not below [`Gaussians::len`].
     pub fn select(&self, indices: &[u32]) -> Self {
         fn pick<T: Copy>(column: &[T], indices: &[u32]) -> Vec<T> {
             indices.iter().map(|index| column[*index as usize]).collect()
@@ -120,7 +114,6 @@ impl Gaussians {
         }
     }
 
-    /// Returns the decoded size of `count` Gaussians of degree `sh_degree`, bytes.
     pub fn decoded_bytes(count: usize, sh_degree: u8) -> usize {
         count * (24 + 16 + 12 + 4 + 12 + 12 * Self::sh_rest_per_channel(sh_degree))
     }

@@ -8,7 +8,6 @@ use glam::DVec3;
 
 use crate::container::{ContainerError, Layout, damaged};
 
-/// Ids of the sections.
 pub mod section {
     /// One [`super::LandmarksHeader`].
     pub const HEADER: u32 = 70;
@@ -77,7 +76,6 @@ impl<'a> Landmarks<'a> {
     }
 }
 
-/// The landmarks of a shard, to be written.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BuiltLandmarks {
     header: LandmarksHeader,
@@ -148,7 +146,6 @@ impl LandmarksLayout {
         Ok(Some(Self { header: at, records }))
     }
 
-    /// Returns the columns of the bytes that were checked.
     pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Landmarks<'a> {
         Landmarks {
             header: bytemuck::from_bytes(&bytes[self.header.clone()]),

@@ -25,13 +25,6 @@ impl Element for f32 {
     const DESCRIPTION: &str = "<f4";
 }
 
-/// Writes an array to a new file, see [`write`].
-///
-/// # Errors
-/// If the file cannot be written.
-///
-/// # Panics
-/// If the number of values is not that of the shape.
 pub fn write_file<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> io::Result<()> {
     let mut file = BufWriter::new(File::create(path)?);
     write(&mut file, shape, values)?;
@@ -39,12 +32,6 @@ pub fn write_file<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> io:
 }
 
 /// Writes an array, row-major and little-endian.
-///
-/// # Errors
-/// Errors of the writer.
-///
-/// # Panics
-/// If the number of values is not that of the shape.
 pub fn write<T: Element>(mut out: impl Write, shape: &[usize], values: &[T]) -> io::Result<()> {
     assert_eq!(values.len(), shape.iter().product::<usize>(), "values of an array of {shape:?}");
     // Python writes a tuple of one element with a comma behind it.

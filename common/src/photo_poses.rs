@@ -10,7 +10,6 @@ use crate::View;
 use crate::container::{ContainerError, Layout, damaged};
 use crate::objects::MAX_PHOTO_BYTES;
 
-/// Ids of the sections.
 pub mod section {
     /// `[n]` [`super::PhotoPose`].
     pub const POSES: u32 = 60;
@@ -21,10 +20,8 @@ pub mod section {
 /// Largest difference of a rotation's length from 1: rounding to f32, with room.
 const MAX_LENGTH_ERROR: f32 = 1e-3;
 
-/// Largest number of an f32.
 const LARGEST: f64 = f32::MAX as f64;
 
-/// A photo's camera.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct PhotoPose {
@@ -58,7 +55,6 @@ impl<'a> PhotoPoses<'a> {
     }
 }
 
-/// The photos of a shard, to be written.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BuiltPhotoPoses {
     poses: Vec<PhotoPose>,
@@ -129,7 +125,6 @@ impl PhotoPosesLayout {
         Ok(Some(Self { poses, names }))
     }
 
-    /// Returns the columns of the bytes that were checked.
     pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> PhotoPoses<'a> {
         let names = std::str::from_utf8(&bytes[self.names.clone()]).unwrap_or_default();
         PhotoPoses { poses: bytemuck::cast_slice(&bytes[self.poses.clone()]), names }

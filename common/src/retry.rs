@@ -30,7 +30,6 @@ pub struct Retries {
 }
 
 impl Retries {
-    /// Allows `max_attempts` attempts in a row without progress.
     pub fn new(max_attempts: u32, backoff: Backoff) -> Self {
         Self { backoff, max_attempts, n_failures: 0 }
     }

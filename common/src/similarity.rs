@@ -16,7 +16,6 @@ pub struct Similarity {
 }
 
 impl Similarity {
-    /// The transform that changes nothing.
     pub const IDENTITY: Self = Self { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
 
     pub fn from_rotation(rotation: DQuat) -> Self {

@@ -34,10 +34,10 @@ fn appearances_come_back() {
     let appearance = Appearance { colours: &COLOURS, sizes: &SIZES, rotations: &ROTATIONS };
     let bytes = AlignedBytes::copy_of(&written(Some(appearance)));
     let layout = ShardLayout::check(&bytes).expect("valid");
-    let found = layout.appearance(&bytes).expect("an appearance");
+    let found = layout.additions(&bytes).appearance.expect("an appearance");
     assert_eq!((found.colours, found.sizes, found.rotations), (&COLOURS[..], &SIZES[..], &ROTATIONS[..]));
     let bytes = AlignedBytes::copy_of(&written(None));
-    assert!(ShardLayout::check(&bytes).expect("valid").appearance(&bytes).is_none());
+    assert!(ShardLayout::check(&bytes).expect("valid").additions(&bytes).appearance.is_none());
 }
 
 #[test]

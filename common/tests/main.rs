@@ -4,7 +4,6 @@ mod appearance;
 mod fine;
 mod format_doc;
 mod poses;
-mod poses_hostile;
 mod scannet;
 mod splat;
 mod tuf;

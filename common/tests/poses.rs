@@ -12,7 +12,6 @@ fn largest_difference(a: &View, b: &View) -> f64 {
     columns(a).iter().zip(columns(b)).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max)
 }
 
-/// Writes files into a fresh folder and reads the poses there.
 fn read_files(files: &[(&str, &[u8])]) -> Result<ViewSet, PoseError> {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in files {

@@ -114,7 +114,6 @@ impl Cli {
         }
     }
 
-    /// Runs the command and returns its exit code.
     pub fn run(self) -> Exit {
         let (json, result) = match self.command {
             Command::Fetch(args) => (args.json, fetch::run(args, self.quiet)),
@@ -183,7 +182,7 @@ mod tests {
         assert_eq!(query.kind, Some(AnswerKind::Gaussians));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         let Command::Goal(goal) = command("slag-edge goal chair --near 1,-2,0") else { panic!("goal") };
-        assert_eq!((goal.radius_m, goal.limit), (0.3, 3));
+        assert_eq!((goal.robot.radius_m, goal.stand.limit), (0.3, 3));
         let Command::List(list) = command("slag-edge list --near 1,-2,0 --radius 3 --sort area --format csv")
         else {
             panic!("list")

@@ -16,7 +16,6 @@ use crate::store::Snapshot;
 
 mod render;
 
-/// Longest file of a photo.
 pub const MAX_PHOTO_BYTES: usize = 32 << 20;
 /// Largest side of a photo, pixels, and most pixels.
 const MAX_SIDE_PX: u32 = 16_384;
@@ -85,16 +84,15 @@ impl<'a> PhotoFile<'a> {
     }
 }
 
-/// Returns the bytes that the landmarks on board take as a map.
 pub fn map_working_bytes(snapshot: &Snapshot) -> usize {
-    let landmarks = snapshot.shards.iter().filter_map(|shard| shard.landmarks());
+    let landmarks = snapshot.shards.iter().filter_map(|shard| shard.additions().landmarks);
     map_bytes(landmarks.map(|landmarks| landmarks.len()).sum())
 }
 
 pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
     let mut all = Vec::new();
     for shard in &snapshot.shards {
-        let Some(landmarks) = shard.landmarks() else { continue };
+        let Some(landmarks) = shard.additions().landmarks else { continue };
         let found = landmarks.header.code_version;
         if found != CODE_VERSION {
             return Err(LocateError::Version { cell_id: shard.cell.cell_id, found });

@@ -15,14 +15,13 @@ use slag_common::manifest::{Calibration, Manifest};
 use slag_common::occupancy::BuiltOccupancy;
 use slag_common::shard::sample::{self, SampleObject, SampleObjects};
 use slag_common::shard::{
-    ExactColumns, IndexColumn, Positions, Profile, ShardHeader, ShardLayout, ShardView, quantise,
+    Additions, ExactColumns, IndexColumn, Positions, Profile, ShardHeader, ShardLayout, ShardView, quantise,
 };
 use slag_models::{InferenceError, TextEncoder};
 
 use crate::store::{Current, CurrentCell, EdgeCache};
 use crate::text::{EncoderInfo, TextService};
 
-/// A Gaussian of a test shard.
 #[derive(Clone, Debug)]
 pub struct Member {
     pub steps: [u16; 3],
@@ -88,8 +87,8 @@ impl BuiltShard {
         let Calibration { score_mean, score_spread } = calibration;
         let objects = objects.iter().map(object).collect();
         let objects = SampleObjects { objects, score_mean, score_spread, score_error_bound: 0.005 };
-        let occupancy = places.map(BuiltOccupancy::view);
-        Self::read(&objects.add_to(&self.view(), occupancy.as_ref()), self.embeddings.clone())
+        let others = Additions { occupancy: places.map(BuiltOccupancy::view), ..Additions::default() };
+        Self::read(&objects.add_to(&self.view(), others), self.embeddings.clone())
     }
 
     fn read(bytes: &[u8], embeddings: Vec<Vec<f32>>) -> Self {

@@ -25,7 +25,6 @@ const REOPEN_PAUSE: Duration = Duration::from_secs(1);
 /// Cached vectors (2 MB at 512 components).
 const MAX_CACHED: usize = 1024;
 
-/// Reasons for which a text cannot be encoded.
 #[derive(Debug, thiserror::Error)]
 pub enum TextError {
     #[error(transparent)]
@@ -36,7 +35,6 @@ pub enum TextError {
     Stopped,
 }
 
-/// Reasons for which a text encoder cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum TextOpenError {
     #[error(transparent)]
@@ -75,7 +73,6 @@ pub struct TextService {
     is_alive: Arc<AtomicBool>,
 }
 
-/// Opens the encoder again.
 type Reopen = Box<dyn FnMut() -> Result<Box<dyn TextEncoder>, ModelError> + Send>;
 
 impl TextService {
@@ -131,7 +128,6 @@ impl TextService {
         self.known.as_ref()?.asked_as(&words_to_find(text).ok()?)
     }
 
-    /// Returns whether the encoder runs.
     pub(crate) fn is_alive(&self) -> bool {
         self.is_alive.load(Ordering::Relaxed)
     }
@@ -209,7 +205,6 @@ fn run(
     }
 }
 
-/// The vectors of recent texts.
 #[derive(Default)]
 struct Cache {
     clock: u64,

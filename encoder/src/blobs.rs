@@ -120,7 +120,6 @@ impl Bucket {
         }
     }
 
-    /// Returns an object; `None` if it is not there.
     pub(crate) fn get(&self, key: &str) -> Result<Option<Bytes>, BlobError> {
         let at = self.key(key);
         match self.ask(|| async { self.store.get(&at).await?.bytes().await }) {
@@ -135,7 +134,6 @@ impl Bucket {
         self.get(key)?.ok_or_else(missing)
     }
 
-    /// Returns the length of an object; `None` if it is not there.
     pub(crate) fn len_of(&self, key: &str) -> Result<Option<u64>, BlobError> {
         let at = self.key(key);
         match self.ask(|| self.store.head(&at)) {
@@ -170,7 +168,6 @@ impl Bucket {
         Ok(self.put_new(key, bytes.clone())? || self.require(key)? == bytes)
     }
 
-    /// Puts an object in place of what is there.
     pub(crate) fn put(&self, key: &str, bytes: impl Into<Bytes>) -> Result<(), BlobError> {
         self.put_with(key, bytes.into(), PutMode::Overwrite).map(drop)
     }

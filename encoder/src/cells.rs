@@ -57,7 +57,6 @@ impl PositionError {
     }
 }
 
-/// Limits of a cell's size.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CellLimits {
     pub max_gaussians: usize,
@@ -129,7 +128,6 @@ fn packed_bits(size: [f64; 3]) -> Option<[u8; 3]> {
     (bits != [16; 3]).then_some(bits)
 }
 
-/// A piece of the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
     /// Its Gaussians: indices in the input, along a Morton curve.
@@ -142,7 +140,6 @@ pub struct Cell {
     pub grid: PositionGrid,
 }
 
-/// The partition of a scene into cells.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CellSplit {
     /// The cells; a cell's id is its index.

@@ -16,7 +16,6 @@ const GAUSSIANS: usize = 400;
 /// Widest drawing, pixels: splats show no more of a photo than that.
 const MAX_DRAWING_WIDTH_PX: u32 = 1600;
 
-/// Why a photo has no features.
 #[derive(Debug, thiserror::Error)]
 pub enum LandmarkError {
     #[error(transparent)]

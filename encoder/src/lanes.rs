@@ -22,13 +22,8 @@ pub struct GpuLoad {
 /// Things of which each works on one piece at a time, by GPU.
 #[derive(Debug)]
 pub struct Lanes<T> {
-    state: Mutex<State<T>>,
+    gpus: Mutex<Vec<Gpu<T>>>,
     freed: Condvar,
-}
-
-#[derive(Debug)]
-struct State<T> {
-    gpus: Vec<Gpu<T>>,
 }
 
 #[derive(Debug)]
@@ -61,40 +56,37 @@ impl<T> Lanes<T> {
             busy: Duration::ZERO,
         };
         let gpus = gpus.into_iter().map(gpu).collect();
-        Self { state: Mutex::new(State { gpus }), freed: Condvar::new() }
+        Self { gpus: Mutex::new(gpus), freed: Condvar::new() }
     }
 
-    fn state(&self) -> MutexGuard<'_, State<T>> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    fn gpus(&self) -> MutexGuard<'_, Vec<Gpu<T>>> {
+        self.gpus.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub fn len(&self) -> usize {
-        self.state().gpus.iter().map(|gpu| gpu.n_lanes).sum()
+        self.gpus().iter().map(|gpu| gpu.n_lanes).sum()
     }
 
     /// Takes a lane, and waits for one where none is free.
-    ///
-    /// # Panics
-    /// If there is none.
     pub fn take(&self) -> Lane<'_, T> {
         self.take_if_any().expect("a lane")
     }
 
     /// Takes a lane, and waits for one where none is free; `None` once all GPUs are left out.
     pub fn take_if_any(&self) -> Option<Lane<'_, T>> {
-        let mut state = self.state();
-        while state.gpus.iter().any(|gpu| !gpu.is_left_out) {
-            match self.take_of(&mut state) {
+        let mut gpus = self.gpus();
+        while gpus.iter().any(|gpu| !gpu.is_left_out) {
+            match self.take_of(&mut gpus) {
                 Some(lane) => return Some(lane),
-                None => state = self.freed.wait(state).unwrap_or_else(PoisonError::into_inner),
+                None => gpus = self.freed.wait(gpus).unwrap_or_else(PoisonError::into_inner),
             }
         }
         None
     }
 
-    fn take_of(&self, state: &mut State<T>) -> Option<Lane<'_, T>> {
+    fn take_of(&self, gpus: &mut [Gpu<T>]) -> Option<Lane<'_, T>> {
         // The first of equals: `max_by_key` returns the last.
-        let (gpu, of_gpu) = state.gpus.iter_mut().enumerate().rev().max_by_key(|(_, gpu)| gpu.free.len())?;
+        let (gpu, of_gpu) = gpus.iter_mut().enumerate().rev().max_by_key(|(_, gpu)| gpu.free.len())?;
         let held = of_gpu.free.pop()?;
         of_gpu.busy_since.get_or_insert_with(Instant::now);
         Some(Lane { lanes: self, gpu, held: Some(held) })
@@ -107,22 +99,22 @@ impl<T> Lanes<T> {
             busy_secs: (gpu.busy + gpu.busy_since.map_or(Duration::ZERO, |since| since.elapsed()))
                 .as_secs_f64(),
         };
-        self.state().gpus.iter().map(load).collect()
+        self.gpus().iter().map(load).collect()
     }
 }
 
 impl<T> Lane<'_, T> {
     pub fn gpu(&self) -> u32 {
-        self.lanes.state().gpus[self.gpu].number
+        self.lanes.gpus()[self.gpu].number
     }
 
     /// Leaves the lane's GPU out from now on; returns how many others remain, the first time.
     pub fn leave_out(self) -> Option<usize> {
-        let mut state = self.lanes.state();
-        state.gpus[self.gpu].free.clear();
-        let was_left_out = std::mem::replace(&mut state.gpus[self.gpu].is_left_out, true);
-        let n_others = state.gpus.iter().filter(|gpu| !gpu.is_left_out).count();
-        drop(state);
+        let mut gpus = self.lanes.gpus();
+        gpus[self.gpu].free.clear();
+        let was_left_out = std::mem::replace(&mut gpus[self.gpu].is_left_out, true);
+        let n_others = gpus.iter().filter(|gpu| !gpu.is_left_out).count();
+        drop(gpus);
         // Those that wait must see that there may be no GPU.
         self.lanes.freed.notify_all();
         (!was_left_out).then_some(n_others)
@@ -145,13 +137,13 @@ impl<T> DerefMut for Lane<'_, T> {
 
 impl<T> Drop for Lane<'_, T> {
     fn drop(&mut self) {
-        let mut state = self.lanes.state();
-        let gpu = &mut state.gpus[self.gpu];
+        let mut gpus = self.lanes.gpus();
+        let gpu = &mut gpus[self.gpu];
         gpu.free.extend(self.held.take().filter(|_| !gpu.is_left_out));
         if gpu.free.len() == gpu.n_lanes {
             gpu.busy += gpu.busy_since.take().map_or(Duration::ZERO, |since| since.elapsed());
         }
-        drop(state);
+        drop(gpus);
         self.lanes.freed.notify_one();
     }
 }
@@ -168,7 +160,7 @@ mod tests {
         assert_eq!(lanes.len(), 4);
         let mut held: Vec<_> = (0..4).map(|_| lanes.take()).collect();
         assert_eq!(held.iter().map(Lane::gpu).collect::<Vec<_>>(), [4, 7, 4, 7]);
-        assert!(lanes.take_of(&mut lanes.state()).is_none());
+        assert!(lanes.take_of(&mut lanes.gpus()).is_none());
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| lanes.take().gpu());
             held.remove(1);

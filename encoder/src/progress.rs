@@ -21,7 +21,6 @@ pub trait Progress: Sync {
     fn objects(&self, _objects: &mut dyn Iterator<Item = FoundObject>) {}
 }
 
-/// A thing that an encode found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FoundObject {
     /// Its id, as answers name it.
@@ -35,7 +34,6 @@ pub struct FoundObject {
     pub photo: String,
 }
 
-/// Discards progress events.
 pub struct Silent;
 
 impl Progress for Silent {

@@ -50,7 +50,6 @@ fn with_exact(profile: Profile) -> String {
     }
 }
 
-/// Scores every Gaussian against a unit query vector.
 pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError> {
     check_dim(reader, query)?;
     let table = read_regions(reader)?;

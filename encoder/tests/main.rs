@@ -1,14 +1,12 @@
 //! The encoder's tests, but for one that needs a process of its own.
 
 mod embed;
-mod files_hostile;
 mod graph;
 mod ingest;
 mod lift_extremes;
 #[cfg(feature = "gpu")]
 mod raster;
 mod segment;
-mod segment_hostile;
 mod viewpoints;
 
 #[global_allocator]

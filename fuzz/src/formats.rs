@@ -8,14 +8,18 @@ use slag_common::container::{AlignedBytes, Layout, PREAMBLE_BYTES, SECTION_ROW_B
 use slag_common::manifest::{CellIndex, Manifest};
 use slag_common::shard::{self, ShardLayout};
 use slag_common::splat::{self, ReadOptions};
-use slag_common::{Hash32, poses};
+use slag_common::{Gaussians, Hash32, poses};
 use slag_edge::query::relations::{self, Phrase};
 use slag_edge::store::EdgeCache;
 use slag_encoder::ingest::read_geo_reference;
-use slag_encoder::lift::{CellField, ContributionFile, RegionTable};
+use slag_encoder::lift::{CellField, ContributionFile, ContributionIndex, RegionTable};
+use slag_encoder::masks::Mask;
 use slag_encoder::masks::rle::Rle;
-use slag_encoder::segment::GivenMasks;
+use slag_encoder::segment::{GivenMasks, SegmentInput};
+use slag_models::TextEncoder;
 use slag_models::description::Description;
+
+use super::seeds::{self, MASKED_PX};
 
 /// Separates the files of an input that consists of several.
 const SEPARATOR: &[u8] = b"\n====\n";
@@ -33,6 +37,13 @@ fn in_folder(work: impl FnOnce(&Path) -> bool) -> bool {
         });
         work(folder.path())
     })
+}
+
+/// Returns whether a file was read; an error must name it, or the folder that it lies in.
+fn is_read<T>(result: Result<T, impl std::fmt::Display>, path: &Path) -> bool {
+    let error = result.map_or_else(|error| error.to_string(), |_| String::new());
+    assert!(error.is_empty() || error.contains(&path.display().to_string()), "{error}");
+    error.is_empty()
 }
 
 fn in_file(name: &str, data: &[u8], work: impl FnOnce(&Path) -> bool) -> bool {
@@ -90,17 +101,18 @@ pub fn shard(data: &[u8]) -> bool {
     }
     std::hint::black_box(view.scores(&vec![1.0; view.header.dim as usize]));
     std::hint::black_box((view.bounds(), view.encoder_id()));
-    if let Some(appearance) = layout.appearance(&bytes) {
+    let additions = layout.additions(&bytes);
+    if let Some(appearance) = additions.appearance {
         let columns = [appearance.colours.len(), appearance.sizes.len(), appearance.rotations.len()];
         assert_eq!(columns, [view.header.n_gaussians as usize; 3]);
     }
-    for (pose, name) in layout.photo_poses(&bytes).iter().flat_map(|photos| photos.iter()) {
+    for (pose, name) in additions.photo_poses.iter().flat_map(|photos| photos.iter()) {
         assert!(pose.offset.iter().all(|c| c.is_finite()) && pose.focal_px > 0.0 && name.len() <= 1024);
     }
-    for landmark in layout.landmarks(&bytes).iter().flat_map(|landmarks| landmarks.iter()) {
+    for landmark in additions.landmarks.iter().flat_map(|landmarks| landmarks.iter()) {
         assert!(landmark.position_in_world.is_finite());
     }
-    if let Some(occupancy) = layout.occupancy(&bytes) {
+    if let Some(occupancy) = additions.occupancy {
         let n_blocks: u32 = occupancy.header.n_blocks.iter().product();
         let mut end = 0;
         for run in occupancy.runs() {
@@ -114,7 +126,7 @@ pub fn shard(data: &[u8]) -> bool {
             }
         }
     }
-    if let Some(objects) = layout.objects(&bytes) {
+    if let Some(objects) = additions.objects {
         let n: u32 = objects.runs().map(|(run, object)| object.map_or(0, |_| run.len() as u32)).sum();
         assert_eq!(n, objects.records.iter().map(|record| record.n_gaussians_here).sum::<u32>());
         assert!(
@@ -151,13 +163,20 @@ pub fn current(data: &[u8]) -> bool {
 }
 
 fn read_splat(name: &str, data: &[u8]) -> bool {
-    in_file(name, data, |path| match splat::read(path, &ReadOptions { with_sh_rest: true }) {
-        Ok(gaussians) => {
-            assert_eq!(gaussians.means_in_world.len(), gaussians.opacities.len());
-            true
-        }
-        Err(_) => false,
-    })
+    in_file(name, data, |path| read_splat_at(path, path))
+}
+
+/// `named`: what an error must name.
+fn read_splat_at(path: &Path, named: &Path) -> bool {
+    let read = splat::read(path, &ReadOptions { with_sh_rest: true });
+    if let Ok(gaussians) = &read {
+        let n = gaussians.len();
+        let lengths = [gaussians.rotations_wxyz.len(), gaussians.scales.len(), gaussians.opacities.len()];
+        assert_eq!((lengths, gaussians.sh_dc.len()), ([n; 3], n));
+        let n_rest = 3 * Gaussians::sh_rest_per_channel(gaussians.sh_degree);
+        assert_eq!(gaussians.sh_rest.len(), n * n_rest);
+    }
+    is_read(read, named)
 }
 
 /// Plain and compressed PLY files.
@@ -182,11 +201,13 @@ pub fn sog(data: &[u8]) -> bool {
     read_splat("x.sog", data)
 }
 
-/// The meta file of a folder without its images: accepted if the error is the missing images.
-pub fn sog_meta(data: &[u8]) -> bool {
-    in_file("meta.json", data, |path| {
-        let read = splat::read(path, &ReadOptions { with_sh_rest: true });
-        read.is_err_and(|e| matches!(e, splat::SplatError::Io { .. }))
+/// The meta file of a folder, and an image that stands for each of its images.
+pub fn sog_folder(data: &[u8]) -> bool {
+    let (meta, image) = two_parts(data);
+    in_folder(|folder| {
+        fs_err::write(folder.join("x.webp"), image).expect("the file is written");
+        fs_err::write(folder.join("meta.json"), meta).expect("the file is written");
+        read_splat_at(&folder.join("meta.json"), folder)
     })
 }
 
@@ -195,13 +216,22 @@ fn two_parts(data: &[u8]) -> (&[u8], &[u8]) {
     at.map_or((data, &[]), |at| (&data[..at], &data[at + SEPARATOR.len()..]))
 }
 
+fn read_poses(path: &Path, images: Option<&Path>) -> bool {
+    let read = poses::read(path, images);
+    for view in read.iter().flat_map(|set| &set.views) {
+        assert!(view.camera_from_world.is_finite() && !view.name.is_empty());
+        assert!(view.intrinsics.focal_x_px > 0.0);
+    }
+    is_read(read, path.parent().expect("it lies in a folder"))
+}
+
 fn colmap(data: &[u8], extension: &str) -> bool {
     let (cameras, images) = two_parts(data);
     in_folder(|folder| {
         let path = |stem: &str| folder.join(stem).with_extension(extension);
         fs_err::write(path("cameras"), cameras).expect("the file is written");
         fs_err::write(path("images"), images).expect("the file is written");
-        poses::read(&path("cameras"), Some(folder)).is_ok()
+        read_poses(&path("cameras"), Some(folder))
     })
 }
 
@@ -214,7 +244,7 @@ pub fn colmap_bin(data: &[u8]) -> bool {
 }
 
 pub fn transforms(data: &[u8]) -> bool {
-    in_file("transforms.json", data, |path| poses::read(path, None).is_ok())
+    in_file("transforms.json", data, |path| read_poses(path, None))
 }
 
 /// The camera matrix and a pose of a ScanNet scene whose one photo is whole.
@@ -231,7 +261,7 @@ pub fn scannet(data: &[u8]) -> bool {
         }
         fs_err::write(scene.join("intrinsic/intrinsic_color.txt"), camera).expect("the file is written");
         fs_err::write(scene.join("pose/0.txt"), pose).expect("the file is written");
-        poses::read(&scene, None).is_ok()
+        read_poses(&scene, None)
     })
 }
 
@@ -254,7 +284,35 @@ pub fn rle(data: &[u8]) -> bool {
 }
 
 pub fn coco(data: &[u8]) -> bool {
-    in_file("masks.json", data, |path| GivenMasks::open(path, Vec::new()).is_ok())
+    in_file("masks.json", data, read_masks)
+}
+
+/// The ids of the masks of a photo.
+pub fn id_image(data: &[u8]) -> bool {
+    in_folder(|folder| {
+        let ids = folder.join("ids");
+        fs_err::create_dir_all(&ids).expect("the folder is made");
+        fs_err::write(ids.join("a.png"), data).expect("the file is written");
+        read_masks(&ids)
+    })
+}
+
+/// Reads the masks of the photo that the seeds have masks of.
+fn read_masks(path: &Path) -> bool {
+    let view = seeds::photo("a.jpg", MASKED_PX);
+    let image = image::RgbImage::new(MASKED_PX[0], MASKED_PX[1]);
+    let input =
+        SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None, pool: None };
+    let read = GivenMasks::open(path, Vec::new()).and_then(|masks| masks.load(&input));
+    read.iter().flatten().flatten().for_each(check_mask);
+    is_read(read, path)
+}
+
+fn check_mask(mask: &Mask) {
+    let (at, [width, height]) = (&mask.box_px, MASKED_PX);
+    assert!(at.x0 < at.x1 && at.x1 <= width && at.y0 < at.y1 && at.y1 <= height);
+    assert_eq!(mask.inside.len(), (at.width_px() * at.height_px()) as usize);
+    assert_eq!(mask.inside.iter().filter(|inside| **inside).count(), mask.area_px as usize);
 }
 
 pub fn model_toml(data: &[u8]) -> bool {
@@ -263,7 +321,7 @@ pub fn model_toml(data: &[u8]) -> bool {
 
 pub fn tensors(data: &[u8]) -> bool {
     in_file("x.safetensors", data, |path| {
-        let read = |n_centroids| slag_models::tensors::read(path, "vectors", n_centroids, 3).is_ok();
+        let read = |n_centroids| is_read(slag_models::tensors::read(path, "vectors", n_centroids, 3), path);
         read(Some(2)) | read(None)
     })
 }
@@ -274,7 +332,12 @@ pub fn phrases(data: &[u8]) -> bool {
         let (text, tensors) = (folder.join("phrases.txt"), folder.join("x.safetensors"));
         fs_err::write(&text, phrases).expect("the file is written");
         fs_err::write(&tensors, vectors).expect("the file is written");
-        slag_models::phrases::PhraseEncoder::open("x", 3, &text, (&tensors, "vectors"), None).is_ok()
+        let opened = slag_models::phrases::PhraseEncoder::open("x", 3, &text, (&tensors, "vectors"), None);
+        opened.is_ok_and(|mut encoder| {
+            let vector = encoder.encode("chair").unwrap_or_default();
+            assert!(vector.iter().all(|v| v.is_finite()));
+            true
+        })
     })
 }
 
@@ -284,12 +347,19 @@ pub fn contributions(data: &[u8]) -> bool {
     let at = stated.map_or(data.len(), |at| (at as usize).min(data.len()));
     let bytes = [with_checksums(&data[..at]).as_slice(), &data[at..]].concat();
     in_file("x.contributions", &bytes, |path| {
-        let Ok((file, regions)) = ContributionFile::open(path) else { return false };
-        std::hint::black_box(regions.masks_of_region().map(<[u32]>::len).sum::<usize>());
-        for run in 0..file.runs().len() {
-            std::hint::black_box(file.entries_of_run(run));
+        let opened = ContributionFile::open(path);
+        if let Ok((file, regions)) = &opened {
+            std::hint::black_box(regions.masks_of_region().map(<[u32]>::len).sum::<usize>());
+            for run in 0..file.runs().len() {
+                std::hint::black_box(file.entries_of_run(run));
+            }
         }
-        true
+        // As an encode reads it.
+        let transposed = ContributionIndex::open(&[path.to_owned()], 2, &[4]).and_then(|(index, table)| {
+            let entries = index.read(0..index.parts().len())?;
+            index.transpose(&entries, &table)
+        });
+        is_read(opened, path) & is_read(transposed, path)
     })
 }
 
@@ -302,7 +372,13 @@ pub fn cell_field(data: &[u8]) -> bool {
 }
 
 pub fn geo(data: &[u8]) -> bool {
-    in_file("geo.json", data, |path| read_geo_reference(path).is_ok())
+    in_file("geo.json", data, |path| {
+        let read = read_geo_reference(path);
+        assert!(
+            read.iter().all(|geo| geo.origin.latitude_deg.abs() <= 90.0 && geo.origin.height_m.is_finite())
+        );
+        is_read(read, path)
+    })
 }
 
 /// The query string of `/query`.

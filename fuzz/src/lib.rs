@@ -12,7 +12,6 @@ pub mod seeds;
 #[path = "services.rs"]
 mod services;
 
-/// A decoder to fuzz.
 pub struct Target {
     pub name: &'static str,
     /// Decodes the bytes and returns whether they were accepted. It must neither panic nor take memory out of
@@ -28,16 +27,13 @@ macro_rules! targets {
 }
 
 targets! {
-    formats: container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
-    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, geo, query, position,
+    formats: container, shard, manifest, current, ply, splat, spz, sog, sog_folder, colmap_text, colmap_bin, transforms,
+    scannet, splat_frame, rle, coco, id_image, model_toml, tensors, phrases, contributions, region_table, cell_field, geo, query, position,
     grammar;
     services: http_request, v1, tuf;
 }
 
 /// Runs a target by name.
-///
-/// # Panics
-/// If no target has that name.
 pub fn run(name: &str, data: &[u8]) -> bool {
     let target = TARGETS.iter().find(|target| target.name == name).expect("a target of that name");
     (target.run)(data)

@@ -1,5 +1,6 @@
 //! Valid inputs to start from.
 
+use std::ops::Range;
 use std::path::Path;
 
 use glam::{DAffine3, DVec3};
@@ -7,12 +8,12 @@ use half::f16;
 use slag_common::appearance::Appearance;
 use slag_common::frames::Aabb;
 use slag_common::landmarks::{BuiltLandmarks, Landmark};
-use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::occupancy::{Block, BuiltOccupancy};
 use slag_common::photo_poses::BuiltPhotoPoses;
+use slag_common::shard::sample::{self, SampleObject, SampleObjects};
 use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors,
-    ShardHeader, ShardView, sample,
+    ShardHeader, ShardView,
 };
 use slag_common::{Hash32, View, container, pinhole};
 use slag_edge::store::EdgeCache;
@@ -20,7 +21,9 @@ use slag_edge::store::EdgeCache;
 /// Longest shared file used: in longer ones mutations rarely hit anything that matters.
 const MAX_SHARED_BYTES: usize = 100_000;
 
-/// The embedding space of the scene.
+/// Columns and rows of the photo with masks.
+pub const MASKED_PX: [u32; 2] = [4, 3];
+
 pub const ENCODER: Hash32 = Hash32([9; 32]);
 
 /// Requests of all kinds, and one whose body is no JSON.
@@ -39,6 +42,14 @@ const V1_BODIES: &[&str] = &[
     r#"{"vectors":[[1,0,0.5]],"kind":"gaussians","min_score":-1,"precision":"centroids","time_budget_ms":500}"#,
     r#"{"phrases":[{"thing":"a","relation":{"is":"near","of":{"thing":"b"}}}],"relations":false,"min_count":1}"#,
     r#"{"texts":["a"],"kind":"clusters","voxel":0.5,"negatives":["b","c"],"region":{"ball":{"centre":[1,2,3],"radius":9},"box":{"from":[0,0,0],"to":[9,9,9]},"polygon":[[0,0],[9,0],[9,9]]}}"#,
+];
+
+/// Texts that name relations, and a phrase as JSON.
+const PHRASES: &[&str] = &[
+    "where is the second largest red mug on a table near the window?",
+    "chair between the sofa and the lamp in front of me",
+    "third pallet from the gate",
+    r#"{"thing":"mug","pick":{"by":"nearest","n":2,"from":{"thing":"gate"}},"relation":{"is":"on","of":{"thing":"me"}}}"#,
 ];
 
 /// Writes the cache of a robot with a scene of one cell with objects, in the space of [`ENCODER`] and of three
@@ -75,9 +86,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "ply" => text(PLY),
         "splat" => vec![vec![0x40; 96]],
         "spz" => vec![spz()],
-        "sog_meta" => text(
-            r#"{"version":2,"count":4,"antialias":false,"means":{"mins":[0,0,0],"maxs":[1,1,1],"files":["means_l.webp","means_u.webp"]},"scales":{"codebook":[0.5],"files":["scales.webp"]},"quats":{"files":["quats.webp"]},"sh0":{"codebook":[0.1],"files":["sh0.webp"]}}"#,
-        ),
+        "sog_folder" => sog_folders(),
         "colmap_text" => text(
             "# cameras\n1 PINHOLE 640 480 500.0 500.0 320.0 240.0\n2 SIMPLE_RADIAL 64 48 50 32 24 0.01\n====\n1 1 0 0 0 0.5 0.25 2 1 a.jpg\n10 10 -1\n2 0 1 0 0 1 2 3 2 b.jpg\n\n",
         ),
@@ -93,6 +102,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "coco" => text(
             r#"{"images":[{"id":1,"file_name":"a.jpg","width":4,"height":3}],"annotations":[{"id":1,"image_id":1,"segmentation":{"size":[3,4],"counts":"453"}},{"id":2,"image_id":1,"segmentation":{"size":[3,4],"counts":[4,5,3]}}]}"#,
         ),
+        "id_image" => id_images(),
         "model_toml" => vec![
             include_bytes!("../../tests/models/clip_tiny/model.toml").to_vec(),
             include_bytes!("../../tests/models/conse/model.toml").to_vec(),
@@ -106,14 +116,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "query" => text(
             "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&kind=gaussians&voxel=0.2&min_count=3",
         ),
-        "grammar" => [
-            "where is the second largest red mug on a table near the window?",
-            "chair between the sofa and the lamp in front of me",
-            "third pallet from the gate",
-            r#"{"thing":"mug","pick":{"by":"nearest","n":2,"from":{"thing":"gate"}},"relation":{"is":"on","of":{"thing":"me"}}}"#,
-        ]
-        .map(|text| text.as_bytes().to_vec())
-        .into(),
+        "grammar" => PHRASES.iter().map(|phrase| phrase.as_bytes().to_vec()).collect(),
         "v1" => V1_BODIES.iter().map(|body| body.as_bytes().to_vec()).collect(),
         "tuf" => super::repository::seeds(),
         "http_request" => HTTP_REQUESTS.iter().map(|request| request.as_bytes().to_vec()).collect(),
@@ -142,7 +145,6 @@ fn shared_files(target: &str) -> &'static [&'static str] {
             "fixtures/formats/gsplatrs_minimal_v4_degree0.spz",
         ],
         "sog" => &["fixtures/formats/playbot_lod6.sog"],
-        "sog_meta" => &["fixtures/formats/playbot_lod3_sog/meta.json"],
         _ => &[],
     }
 }
@@ -159,7 +161,6 @@ fn shard(is_exact: bool) -> Vec<u8> {
         ..sample::header(5, 6, 2, 3, bounds)
     };
     let embeddings = [f16::from_f32(0.5); 15];
-    let mut out = Vec::new();
     let (mean, codewords) = ([f16::from_f32(0.1); 3], [f16::from_f32(0.25); 32]);
     let positions = [[0, 0, 0], [1, 2, 3], [65535, 65535, 65535], [4, 4, 4], [5, 5, 5], [6, 6, 6]];
     let indices = IndexColumn::pack(&[10, 11, 12, 13, 14, 1500]);
@@ -189,57 +190,48 @@ fn shard(is_exact: bool) -> Vec<u8> {
         }),
         packed_indices: (!is_exact).then(|| indices.view()),
     };
-    let record = |id: u64, n_gaussians_here: u32| ObjectRecord {
-        id,
-        position_in_world: [1.0, 2.0, 3.0],
-        box_min: [0.5, 1.5, 2.5],
-        box_max: [1.5, 2.5, 4.5],
-        n_gaussians: 40,
-        n_gaussians_here,
-        photo_box_px: [10, 20, 110, 70],
-        photo_start: 0,
-        photo_bytes: 5,
-    };
-    let objects = Objects {
-        header: ObjectsHeader {
-            n_objects: 2,
-            n_vectors: 2,
-            n_runs: 4,
-            photos_bytes: 5,
-            score_mean: 0.02,
-            score_spread: 0.1,
-            score_error_bound: 0.02,
-        },
-        records: &[record(1, 2), record(7, 3)],
-        vectors: &[100, 0, 0, 50, 0, 120, 1, 2],
-        steps: &[0.01, 0.02, 0.005, 0.0],
-        run_ends: &[2, 3, 5, 6],
-        run_objects: &[1, NO_OBJECT, 0, 1],
-        photos: b"a.jpg",
-    };
-    let appearance = Appearance { colours: &[[1; 4]; 6], sizes: &[[2; 3]; 6], rotations: &[[3; 3]; 6] };
-    let block = |z, occupied, free| Block { at: [0, 0, z], occupied, free };
-    let places = BuiltOccupancy::pack(0.05, 0.1, 2, &[block(0, 1, 2), block(1, 0, !0), block(5, !0, 0)]);
-    let occupancy = places.view();
-    let mut photos = BuiltPhotoPoses::default();
-    for name in ["a.jpg", "b.jpg"] {
-        photos.push(DVec3::ONE, &photo(name));
+    if is_exact {
+        return with_additions(&view);
     }
-    let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 5, view: 1 };
-    let landmarks = BuiltLandmarks::pack(1, &[landmark(0.0), landmark(2.0)]);
-    let additions = Additions {
-        objects: is_exact.then_some(&objects),
-        appearance: is_exact.then_some(appearance),
-        occupancy: is_exact.then_some(&occupancy),
-        photo_poses: photos.view().filter(|_| is_exact),
-        landmarks: landmarks.view().filter(|_| is_exact),
-    };
-    view.write_with(&mut out, additions).expect("writes to memory");
+    let mut out = Vec::new();
+    view.write(&mut out).expect("writes to memory");
     out
 }
 
-fn photo(name: &str) -> View {
-    let intrinsics = pinhole([64, 48], 50.0);
+/// Returns a shard of six Gaussians with all that it may carry besides.
+fn with_additions(view: &ShardView<'_>) -> Vec<u8> {
+    let object = |id: u64, runs: &[Range<u32>]| SampleObject {
+        id,
+        position_in_world: DVec3::new(1.0, 2.0, 3.0),
+        bounds: Aabb { min: DVec3::new(0.5, 1.5, 2.5), max: DVec3::new(1.5, 2.5, 4.5) },
+        vectors: vec![1.0, 0.0, 0.5, -0.5, 0.0, 1.0],
+        runs: runs.to_vec(),
+        n_gaussians: 40,
+        photo: "a.jpg".into(),
+        photo_box_px: [10, 20, 110, 70],
+    };
+    let objects = vec![object(1, &[3..5]), object(7, &[0..2, 5..6])];
+    let objects = SampleObjects { objects, score_mean: 0.02, score_spread: 0.1, score_error_bound: 0.02 };
+    let block = |z, occupied, free| Block { at: [0, 0, z], occupied, free };
+    let places = BuiltOccupancy::pack(0.05, 0.1, 2, &[block(0, 1, 2), block(1, 0, !0), block(5, !0, 0)]);
+    let mut photos = BuiltPhotoPoses::default();
+    for name in ["a.jpg", "b.jpg"] {
+        photos.push(DVec3::ONE, &photo(name, [64, 48]));
+    }
+    let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 5, view: 1 };
+    let landmarks = BuiltLandmarks::pack(1, &[landmark(0.0), landmark(2.0)]);
+    let others = Additions {
+        objects: None,
+        appearance: Some(Appearance { colours: &[[1; 4]; 6], sizes: &[[2; 3]; 6], rotations: &[[3; 3]; 6] }),
+        occupancy: Some(places.view()),
+        photo_poses: photos.view(),
+        landmarks: landmarks.view(),
+    };
+    objects.add_to(view, others)
+}
+
+pub fn photo(name: &str, size_px: [u32; 2]) -> View {
+    let intrinsics = pinhole(size_px, 50.0);
     View { name: name.into(), image_path: name.into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 
@@ -253,6 +245,35 @@ fn spz() -> Vec<u8> {
     bytes.extend([2, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 0]);
     bytes.extend([0; 19]);
     bytes
+}
+
+/// Folders of versions 1 and 2 whose images are all the same one.
+fn sog_folders() -> Vec<Vec<u8>> {
+    // Small, so that any of its pixels is a label, and any of its rows a quaternion.
+    let pixels =
+        image::RgbaImage::from_fn(192, 2, |x, y| image::Rgba([x as u8 % 100, 0, y as u8, 252 + x as u8 % 4]));
+    let mut webp = Vec::new();
+    let encoder = image::codecs::webp::WebPEncoder::new_lossless(&mut webp);
+    pixels.write_with_encoder(encoder).expect("writes to memory");
+    let metas = [
+        r#"{"means":{"shape":[384,3],"mins":[-2,-1,0],"maxs":[2,3,1],"files":["x.webp","x.webp"]},"scales":{"mins":[-9,-8,-7],"maxs":[-1,0,1],"files":["x.webp"]},"quats":{"files":["x.webp"]},"sh0":{"mins":[-1,-2,-3,-8],"maxs":[1,2,3,8],"files":["x.webp"]},"shN":{"mins":-0.5,"maxs":1.5,"files":["x.webp","x.webp"]}}"#,
+        r#"{"version":2,"count":384,"antialias":false,"means":{"mins":[0,0,0],"maxs":[1,1,1],"files":["x.webp","x.webp"]},"scales":{"codebook":[0.5],"files":["x.webp"]},"quats":{"files":["x.webp"]},"sh0":{"codebook":[0.1],"files":["x.webp"]}}"#,
+    ];
+    metas.map(|meta| [meta.as_bytes(), b"\n====\n", &webp].concat()).into()
+}
+
+/// Ids of 8 and of 16 bits.
+fn id_images() -> Vec<Vec<u8>> {
+    let [width, height] = MASKED_PX;
+    let narrow = image::GrayImage::from_fn(width, height, |x, y| image::Luma([(x / 2 + y) as u8]));
+    let wide = image::ImageBuffer::from_fn(width, height, |x, y| image::Luma([(x / 2 + y) as u16 * 4_000]));
+    [image::DynamicImage::from(narrow), wide.into()]
+        .map(|ids| {
+            let mut png = std::io::Cursor::new(Vec::new());
+            ids.write_to(&mut png, image::ImageFormat::Png).expect("writes to memory");
+            png.into_inner()
+        })
+        .into()
 }
 
 fn colmap_bin() -> Vec<u8> {

@@ -7,14 +7,12 @@ use super::network::Network;
 use super::support::*;
 use slag_tests::*;
 
-/// A nats-server, killed when dropped.
 pub struct Server {
     running: Running,
     port: u16,
 }
 
 impl Server {
-    /// Starts a server on a port, with its files in the test's folder.
     fn start(scene: &Scene, port: u16) -> Self {
         let (at, folder) = (port.to_string(), scene.path("nats"));
         let args = ["--jetstream", "--addr", "127.0.0.1", "--port", &at, "--store_dir", text(&folder)];
@@ -30,7 +28,6 @@ fn url(port: u16) -> String {
     format!("nats://127.0.0.1:{port}")
 }
 
-/// A fleet over a queue and a folder.
 pub struct Fleet {
     pub scene: Scene,
     bucket: String,

@@ -45,7 +45,6 @@ impl S3s {
         Self { runtime: Some(runtime), dir, port }
     }
 
-    /// Returns the number of objects whose key starts with a prefix that ends with `/` or is a key.
     fn n_objects(&self, prefix: &str) -> usize {
         let path = self.dir.path().join("scenes").join(prefix);
         if path.is_file() { 1 } else { n_objects(&path) }

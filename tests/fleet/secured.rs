@@ -47,7 +47,6 @@ impl Secured {
         self.scene.path(name)
     }
 
-    /// Lets a command speak to the server, with a key.
     fn with_key(&self, mut command: Command, key: &str) -> Command {
         command.args(["--fleet", &format!("tls://127.0.0.1:{}", self.port)]);
         command.args(["--nats-ca", text(&self.authority.file), "--nats-nkey", text(&self.path(key))]);

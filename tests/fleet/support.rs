@@ -8,7 +8,6 @@ use std::time::Duration;
 use serde_json::Value;
 use slag_tests::*;
 
-/// Flags that coordinator and workers share.
 const MODELS: [&str; 4] = ["--models", "colours", "--device", "cpu"];
 
 /// Flags of the encode: one profile, so that codebooks take less time than views.
@@ -49,7 +48,6 @@ impl Scene {
         self.dir.path().join(name)
     }
 
-    /// Returns the command that encodes the room into a store.
     pub fn encode(&self, store: &str) -> Command {
         let mut command = encode_room(&Self::room().0, &self.path(store));
         command.args(MODELS).args(ENCODE);
@@ -111,18 +109,15 @@ impl Running {
         self.child = None;
     }
 
-    /// Returns the number of its process.
     pub fn id(&mut self) -> String {
         self.child().id().to_string()
     }
 
-    /// Sends it a signal, such as STOP.
     pub fn signal(&mut self, name: &str) {
         let id = self.id();
         run(Command::new("kill").args(["-s", name, &id]));
     }
 
-    /// Waits for its end.
     pub fn output(mut self) -> Output {
         self.child.take().expect("it runs").wait_with_output().expect("waits")
     }

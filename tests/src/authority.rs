@@ -6,7 +6,6 @@ use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
 
 use crate::text;
 
-/// A certificate authority, and the file of its certificate.
 pub struct Authority {
     issuer: Issuer<'static, KeyPair>,
     /// Its certificate, PEM.

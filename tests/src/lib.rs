@@ -18,7 +18,6 @@ pub use made::{encoded, encoded_into, generated, made};
 pub use python::{judge, python_with};
 pub use site::{ROOM, SITE, Site};
 
-/// Returns the project's root.
 pub fn root() -> PathBuf {
     slag_test_support::workspace_root()
 }
@@ -141,7 +140,6 @@ pub fn copy_dir(from: &Path, to: &Path) {
 /// A service, stopped when dropped.
 pub struct Service {
     child: Child,
-    /// Where it listens.
     pub url: String,
 }
 
@@ -177,7 +175,6 @@ impl Service {
         Self::start_as(python.stderr(Stdio::null()))
     }
 
-    /// Returns a resource as JSON.
     pub fn get(&self, path: &str) -> Value {
         let text =
             ureq::get(format!("{}{path}", self.url)).call().expect("answers").body_mut().read_to_string();
@@ -193,12 +190,10 @@ impl Drop for Service {
     }
 }
 
-/// Returns a path as text, for a command line.
 pub fn text(path: &Path) -> &str {
     path.to_str().expect("test paths are UTF-8")
 }
 
-/// Reads a NumPy array.
 pub fn read_npy<T: npyz::Deserialize>(path: &Path) -> Vec<T> {
     let bytes = fs_err::read(path).expect("the array is there");
     npyz::NpyFile::new(&bytes[..]).expect("a NumPy array").into_vec().expect("of the type asked for")

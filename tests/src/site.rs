@@ -18,7 +18,6 @@ pub struct Site {
 }
 
 impl Site {
-    /// Serves and fetches the room.
     pub fn new() -> Self {
         Self::of(&ROOM, &SITE)
     }
@@ -42,7 +41,6 @@ impl Site {
         run(edge(&["fetch", "--cache"]).arg(self.cache()));
     }
 
-    /// Returns the robot's storage.
     pub fn cache(&self) -> PathBuf {
         self.dir.path().join("cache")
     }

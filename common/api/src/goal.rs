@@ -109,7 +109,6 @@ pub struct GoalReply {
 }
 
 impl GoalReply {
-    /// Returns a reply without poses.
     pub fn empty(scene: &str, generation: u64, voxel_m: f64, near_in_world: DVec3) -> Self {
         Self {
             scene: scene.to_owned(),

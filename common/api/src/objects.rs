@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::{FRAME, Geographic, UNITS};
 
-/// Most names of a thing.
 pub const MAX_NAMES: usize = 3;
 
 /// An object on board.

@@ -4,7 +4,6 @@ use std::io::{self, Write};
 
 use slag_locate::{Grey, features};
 
-/// Features of a photo.
 const LIMIT: usize = 800;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

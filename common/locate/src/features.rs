@@ -4,7 +4,6 @@
 use crate::describe::{Descriptor, Keypoint, describe, orientations};
 use crate::grey::Grey;
 
-/// Features of a photo that are matched.
 pub const MAX_FEATURES: usize = 1200;
 /// Scales an octave (Lowe 2004, 3.1).
 const SCALES: usize = 3;
@@ -38,7 +37,6 @@ pub struct Feature {
     pub descriptor: Descriptor,
 }
 
-/// The pictures of an octave.
 struct Octave {
     layers: Vec<Grey>,
     /// Width of its pixels, in the photo's.
@@ -113,7 +111,6 @@ fn blurred_layers(base: Grey) -> Vec<Grey> {
     layers
 }
 
-/// The differences of an octave's pictures.
 struct Differences<'a> {
     layers: &'a [Grey],
     width: usize,

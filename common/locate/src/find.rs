@@ -34,7 +34,6 @@ const MIN_PATCH_SHARE: f64 = 0.04;
 /// Renderings for one proposed pose, and proposed poses for which there are renderings.
 const MAX_RENDERINGS: usize = 2;
 const MAX_PROPOSALS: usize = 4;
-/// Fewest inliers of a proposed pose.
 const MIN_PROPOSED_INLIERS: usize = 5;
 /// Least spread of the inliers on the photo: standard deviation along their shorter axis, as a share of its width.
 const MIN_SPREAD: f64 = 0.04;
@@ -74,7 +73,6 @@ impl Photo<'_> {
 /// Standard deviations of a [`Prior`] within which poses lie.
 const PRIOR_SIGMAS: f64 = 3.0;
 
-/// A camera that was found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
     pub camera_from_world: DAffine3,
@@ -93,7 +91,6 @@ pub enum Outcome {
     Lost(Reason),
 }
 
-/// Why a photo has no place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
     EmptyMap,
@@ -169,7 +166,6 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
     }
 }
 
-/// Seed of all random choices.
 const SEED: u64 = 47;
 
 /// What renderings at proposed poses say.
@@ -179,7 +175,6 @@ enum Verified {
     NotDrawn,
 }
 
-/// A photo that is being located.
 struct Search<'a> {
     map: &'a Map,
     photo: &'a Photo<'a>,

@@ -15,9 +15,6 @@ const KERNEL_SIGMAS: f32 = 4.0;
 
 impl Grey {
     /// Takes the luma (ITU-R BT.601) of 8-bit RGB.
-    ///
-    /// # Panics
-    /// If `rgb` has not three bytes a pixel.
     pub fn from_rgb8(width: usize, height: usize, rgb: &[u8]) -> Self {
         assert_eq!(rgb.len(), width * height * 3, "three bytes a pixel");
         let luma = |[r, g, b]: &[u8; 3]| {

@@ -45,7 +45,6 @@ impl Map {
         views.iter().take(n).flat_map(|(view, _)| self.of_views[view].iter().copied()).collect()
     }
 
-    /// Returns the number of landmarks.
     pub fn len(&self) -> usize {
         self.landmarks.len()
     }

@@ -17,7 +17,6 @@ const MAX_RATIO_OF_VIEWS: f32 = 0.9;
 const MAX_GUIDED_DISTANCE: u32 = 44;
 /// Pixels around a feature in which its landmark lies, given the pose.
 const GUIDED_PX: f64 = 12.0;
-/// Views that are matched together.
 const N_VIEWS: usize = 8;
 /// Views around which landmarks are matched by themselves.
 const N_PLACES: usize = 8;
@@ -35,7 +34,6 @@ impl Query {
         Match { feature, landmark, at: self.at[feature], point_in_world }
     }
 
-    /// Matches each feature with all landmarks.
     pub(crate) fn match_all(&self, map: &Map) -> Vec<Match> {
         let all: Vec<u32> = (0..map.landmarks.len() as u32).collect();
         self.match_among(map, &all, MAX_RATIO)

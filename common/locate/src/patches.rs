@@ -21,14 +21,12 @@ const SQUARE_PX: f64 = 4.0;
 const MIN_DEVIATION: f32 = 0.01;
 /// The same of a part of the rendering, which is smoother.
 const MIN_RENDERED_DEVIATION: f32 = 0.005;
-/// Least correlation of a match.
 const MIN_CORRELATION: f32 = 0.7;
 /// Blur of both pictures, against noise.
 const SIGMA: f32 = 0.8;
 
 /// What was found of the patches around a photo's features.
 pub(crate) struct Found {
-    /// Patches that were looked for.
     pub(crate) n_tried: usize,
     /// Features, and where the rendering shows their patches, its pixels.
     pub(crate) matches: Vec<(usize, DVec2)>,
@@ -136,7 +134,6 @@ mod tests {
     use super::*;
     use crate::describe::DIM;
 
-    /// A smooth picture of waves, moved.
     fn waves(seed: f64, moved: DVec2) -> Grey {
         let (width, height) = (160, 120);
         let value = |x: f64, y: f64| {
@@ -151,7 +148,6 @@ mod tests {
         Grey { width: width as usize, height: height as usize, values }
     }
 
-    /// A picture that is moved by a part of a pixel is found there; another is found nowhere.
     #[test]
     fn patches_are_found_where_a_picture_moved_to() {
         let moved = DVec2::new(3.4, -2.7);

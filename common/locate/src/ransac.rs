@@ -7,7 +7,6 @@ use slag_math::random::Random;
 
 use crate::pose::{Match, Pinhole, refine};
 
-/// Error of an inlier, pixels.
 pub(crate) const INLIER_PX: f64 = 5.0;
 /// Samples tried at most: 12 % inliers are found with probability 0.9997.
 const MAX_SAMPLES: usize = 5000;

@@ -26,14 +26,12 @@ pub struct Rendering {
     pub depth: Vec<f32>,
 }
 
-/// Draws the scene.
 pub trait Renderer {
     /// Draws what an ideal pinhole sees; `None` where that cannot be drawn.
     fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering>;
 }
 
 impl Rendering {
-    /// Takes the picture and the surfaces of a drawing.
     pub fn of(drawing: &Drawing) -> Self {
         let surface = drawing.depth.iter().zip(&drawing.coverage);
         let depth =

@@ -61,7 +61,6 @@ mod tests {
         assert_eq!(raised, [2.0, 0.0, 0.0, 4.0, 0.5, 0.0, 1.0, 2.0, 5.0f64.sqrt()]);
     }
 
-    /// A pivot is dropped at the share, and kept above it.
     #[test]
     fn the_share_itself_is_dropped() {
         let pivot = |share| cholesky(vec![1.0, 0.0, 1.0, 2.0], 2, SmallPivots::Drop(share))[3];

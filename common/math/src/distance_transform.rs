@@ -7,9 +7,6 @@ pub const FAR: u32 = u32::MAX;
 
 /// Writes the squared distance of each cell of a row to the nearest source of the row, in cells; [`FAR`] without a
 /// source.
-///
-/// # Panics
-/// If `out` is not as long as the row, or the row has more than 65,535 cells.
 pub fn along_row(is_source: impl ExactSizeIterator<Item = bool>, out: &mut [u32]) {
     assert!(is_source.len() == out.len() && out.len() <= usize::from(u16::MAX), "a row of another length");
     let mut since = FAR;
@@ -34,9 +31,6 @@ pub struct Envelope {
 
 impl Envelope {
     /// Writes the least `(p - q)^2 + heights[q]` over q to each place p; [`FAR`] heights count nothing.
-    ///
-    /// # Panics
-    /// If `out` is not as long as `heights`.
     pub fn lowest(&mut self, heights: &[u32], out: &mut [u32]) {
         assert_eq!(heights.len(), out.len(), "a line of another length");
         self.parabolas.clear();

@@ -61,7 +61,6 @@ impl Components {
         true
     }
 
-    /// Joins the components of an edge's ends if one of them has fewer than `min_size` vertices.
     pub fn join_if_small(&mut self, a: u32, b: u32, min_size: u32) {
         let (a, b) = (self.root(a), self.root(b));
         if a != b && self.sizes[a as usize].min(self.sizes[b as usize]) < min_size {

@@ -28,12 +28,10 @@ impl<'a> Rows<'a> {
         Self { values, width, index: None }
     }
 
-    /// Returns the number of rows.
     pub fn len(&self) -> usize {
         self.index.map_or(self.values.len() / self.width, <[u32]>::len)
     }
 
-    /// Returns whether there is none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

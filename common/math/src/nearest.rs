@@ -10,7 +10,6 @@ pub const NO_POINT: u32 = u32::MAX;
 const LEAF_POINTS: usize = 12;
 /// Smaller ranges are sorted by one thread.
 const PARALLEL_POINTS: usize = 1 << 12;
-/// Points that a thread takes at once.
 const POINTS_PER_TASK: usize = 1 << 10;
 
 /// Bytes that the search takes for each point: tree, and neighbours in the order of the tree and in the given one.
@@ -62,7 +61,6 @@ impl Neighbours {
     }
 }
 
-/// A point and its number.
 type Item = ([f64; 3], u32);
 
 struct Tree<'a> {

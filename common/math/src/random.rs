@@ -19,12 +19,10 @@ pub fn mix64(index: u64) -> u64 {
 pub struct Random(SplitMix64);
 
 impl Random {
-    /// Starts the sequence of a seed.
     pub fn new(seed: u64) -> Self {
         Self(SplitMix64::from_seed(seed.to_le_bytes()))
     }
 
-    /// Returns the next 64 bits.
     pub fn bits(&mut self) -> u64 {
         self.0.next_u64()
     }
@@ -68,7 +66,6 @@ impl Random {
 pub struct Xorshift(u64);
 
 impl Xorshift {
-    /// Starts the sequence of a seed.
     pub fn new(seed: u64) -> Self {
         // Mixed (SplitMix64, Steele et al. 2014), so that neighbouring seeds have nothing in common.
         Self(Random::new(seed).bits() | 1)
@@ -81,7 +78,6 @@ impl Xorshift {
         self.0.wrapping_mul(0x2545_f491_4f6c_dd1d)
     }
 
-    /// Returns the next 32 bits.
     pub fn next_u32(&mut self) -> u32 {
         (self.next_u64() >> 32) as u32
     }

@@ -16,7 +16,6 @@ use pulp::{NullaryFnOnce, Scalar};
 /// `run` and all functions that it calls must be `inline(always)`; otherwise they are compiled for the baseline
 /// instruction set.
 pub trait Work<S> {
-    /// Result of the work.
     type Output;
     fn run(self, simd: S) -> Self::Output;
 }
@@ -83,7 +82,6 @@ impl InstructionSet {
         &AVAILABLE
     }
 
-    /// Returns the widest instruction set of this processor.
     pub fn widest() -> Self {
         Self::available().last().copied().unwrap_or(Self::Portable)
     }

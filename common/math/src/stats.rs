@@ -26,7 +26,6 @@ impl Rank {
 
 /// Numbers with a total order: floats as of IEEE 754, so that a NaN is beyond the infinities.
 pub trait Ordered: Copy {
-    /// Compares two numbers.
     fn order(&self, other: &Self) -> Ordering;
 }
 

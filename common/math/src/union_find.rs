@@ -42,7 +42,6 @@ impl UnionFind {
         item
     }
 
-    /// Joins the set of the root `child` to the set of the root `root`, which remains a root.
     pub fn attach(&mut self, child: u32, root: u32) {
         self.parents[child as usize] = root;
     }

@@ -11,7 +11,6 @@ use ort::value::{DynTensor, DynTensorValueType};
 use crate::placement::DeviceMemory;
 use crate::session::{Model, SessionError};
 
-/// Where an output is left.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Place {
     /// In memory that the processor reads.
@@ -31,7 +30,6 @@ pub(crate) struct Turns {
     is_free: Condvar,
 }
 
-/// A turn, until it is dropped.
 pub(crate) struct Turn<'a>(&'a Turns);
 
 impl Turns {

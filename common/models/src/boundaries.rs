@@ -32,7 +32,6 @@ pub const N_NEIGHBOURS: usize = 4;
 pub struct Boundaries(Model);
 
 impl Boundaries {
-    /// Opens the embedded model.
     pub fn open(options: &SessionOptions) -> Result<Self, SessionError> {
         let model = Model::open(&ModelFile::embedded(Path::new("segment.onnx"), SEGMENT), options)?;
         model.expect_input(INPUT, TensorElementType::Float32, &[1, N_CHANNELS as i64, -1, -1])?;

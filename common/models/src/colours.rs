@@ -84,7 +84,6 @@ const SYNONYMS: [(&str, &str); 24] = [
 const STOP_WORDS: &str = "a an the and or of with in is are that this some any all thing things object objects item items \
     coloured colored photo something anything everything one ones find where there";
 
-/// Returns the words of colours and shapes.
 fn known() -> Vec<String> {
     COLOURS.iter().chain(&SHAPES).map(|&word| word.to_owned()).collect()
 }

@@ -86,11 +86,9 @@ impl RunArgs {
 
 /// The calling program's side of the commands.
 pub struct Context<'a> {
-    /// Looks up an environment variable.
     pub variable: &'a dyn Fn(&str) -> Option<std::ffi::OsString>,
     /// Which files of a model are pulled.
     pub side: Side,
-    /// Asks the user a yes-or-no question.
     pub ask: &'a dyn Fn(&str) -> bool,
 }
 
@@ -198,15 +196,11 @@ fn pull(hub: &Hub, name: &str, accepted: &[String], context: &Context<'_>) -> Re
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Report {
-    /// Result of `list`.
     Models(Vec<Listed>),
-    /// Result of `pull`.
     Pulled(Vec<Pulled>),
-    /// Result of `verify`.
     Verified(Vec<Verified>),
 }
 
-/// A model of the table.
 #[derive(Debug, Serialize)]
 pub struct Listed {
     name: String,
@@ -239,7 +233,6 @@ pub struct Verified {
     files: Vec<String>,
 }
 
-/// Shows a report to people.
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

@@ -76,10 +76,8 @@ pub use crate::file_ref::{FileRef, Sha256};
 
 pub const FILE_NAME: &str = "model.toml";
 
-/// Most patches along a side of the square.
 const MAX_PATCHES_PER_SIDE: u16 = 256;
 
-/// Error of reading a description or the files that it names.
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
     #[error("{cause}; put the file there or correct the description")]
@@ -96,7 +94,6 @@ pub enum DescriptionError {
     NoHash { path: PathBuf },
 }
 
-/// A model directory's description.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
@@ -104,7 +101,6 @@ pub struct Description {
     /// What the model recognises and what not, for people.
     #[serde(default, skip_serializing)]
     pub about: String,
-    /// Components of a vector.
     pub dim: u32,
     #[serde(skip_serializing)]
     pub licence: String,
@@ -115,7 +111,6 @@ pub struct Description {
     pub text: TextDescription,
     /// The mean subtracted from text vectors.
     pub text_centre: Option<CentreDescription>,
-    /// The interpretation of scores.
     #[serde(default, skip_serializing)]
     pub score: Option<ScoreDescription>,
 }
@@ -124,7 +119,6 @@ pub(crate) fn here() -> PathBuf {
     ".".into()
 }
 
-/// The image side of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageDescription {
@@ -152,7 +146,6 @@ pub struct ImageDescription {
     /// the photo's edge over the window's. Not used where the model has patches.
     #[serde(default, skip_serializing)]
     pub windows: Vec<u8>,
-    /// The vectors of patches, if the model has them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub patches: Option<PatchDescription>,
 }
@@ -179,12 +172,10 @@ impl ImageDescription {
     }
 }
 
-/// The text side of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum TextDescription {
     Onnx(OnnxText),
-    /// Vectors of fixed phrases.
     Phrases(PhrasesText),
 }
 
@@ -222,7 +213,6 @@ pub struct Padding {
     pub token_id: u32,
 }
 
-/// A text encoder of fixed phrases.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PhrasesText {
@@ -233,7 +223,6 @@ pub struct PhrasesText {
     pub tensor: String,
 }
 
-/// The mean subtracted from text vectors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CentreDescription {
@@ -283,7 +272,6 @@ impl Description {
         files
     }
 
-    /// Mutable [`Self::files_by_role`].
     pub(crate) fn files_mut(&mut self) -> Vec<(&'static str, &mut FileRef)> {
         let mut files = vec![("image.model", &mut self.image.file)];
         match &mut self.text {
@@ -417,7 +405,6 @@ pub(crate) fn check_common(
 #[serde(deny_unknown_fields)]
 pub struct EncoderId {
     pub name: String,
-    /// Components of a vector.
     pub dim: u32,
     /// The description of the model as JSON, with the SHA-256 of each file in place of its path and without the
     /// fields that do not affect vectors; empty for the built-in stand-in.
@@ -455,7 +442,6 @@ pub struct ScoreDescription {
     probability: Option<f64>,
 }
 
-/// Shows the fields that are given.
 impl fmt::Display for ScoreDescription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { threshold, logit_scale, logit_bias, probability } = *self;

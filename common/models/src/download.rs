@@ -15,7 +15,6 @@ const MAX_CA_BYTES: u64 = 1 << 20;
 /// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(50);
 
-/// Network timeouts and retry limits.
 #[derive(Clone, Debug)]
 pub struct NetworkLimits {
     /// Failures in a row, without progress, before a download is given up.
@@ -72,7 +71,6 @@ pub trait Watch: Sync {
     }
 }
 
-/// Reasons for a failed attempt.
 #[derive(Debug, thiserror::Error)]
 pub enum DownloadFailure {
     #[error("{0}")]
@@ -118,7 +116,6 @@ impl DownloadFailure {
     }
 }
 
-/// Reasons for which a download ends.
 #[derive(Debug, thiserror::Error)]
 pub enum DownloadError {
     #[error("{failure} ({attempts} attempts)")]
@@ -131,7 +128,6 @@ pub enum DownloadError {
     Cancelled,
 }
 
-/// How an attempt failed.
 pub enum Stop {
     /// Another attempt may help.
     Failed(DownloadFailure),
@@ -222,7 +218,6 @@ pub struct Client<'a> {
     agent: ureq::Agent,
     limits: NetworkLimits,
     watch: &'a dyn Watch,
-    /// Bytes left by earlier downloads.
     pub resumed_bytes: AtomicU64,
     /// Attempts beyond the first.
     pub retries: AtomicU64,
@@ -321,24 +316,19 @@ impl<'a> Client<'a> {
         if matches!(expected, Expected::Exactly(0)) {
             return Ok(part.write_from(0, &[])?);
         }
-        let mut offset = part.len_bytes()?;
-        let mut ranges = Vec::new();
-        match part.etag().filter(|_| *may_resume && offset > 0) {
-            Some(_) if matches!(expected, Expected::Exactly(bytes) if bytes == offset) => return Ok(()),
-            Some(etag) => {
-                ranges = vec![(header::RANGE, format!("bytes={offset}-")), (header::IF_RANGE, etag)]
-            }
-            None => offset = 0,
+        let here_bytes = part.len_bytes()?;
+        let etag = part.etag().filter(|_| *may_resume && here_bytes > 0);
+        if etag.is_some() && matches!(expected, Expected::Exactly(bytes) if bytes == here_bytes) {
+            return Ok(());
         }
+        let mut offset = if etag.is_some() { here_bytes } else { 0 };
+        let range = |etag| [(header::RANGE, format!("bytes={offset}-")), (header::IF_RANGE, etag)];
+        let ranges: Vec<_> = etag.into_iter().flat_map(range).collect();
         let response = self.request(Method::GET, url, expected.most_bytes(), &ranges, &mut |_, _| {})?;
         let content_range = header_text(&response, header::CONTENT_RANGE);
         let content_bytes = response.body().content_length();
         let total = match response.status() {
-            StatusCode::PARTIAL_CONTENT if offset > 0 => {
-                let total = content_range.rsplit_once('/').and_then(|(_, total)| total.parse::<u64>().ok());
-                let rest = |total: &u64| format!("bytes {offset}-{}/{total}", total.wrapping_sub(1));
-                total.filter(|total| content_range == rest(total))
-            }
+            StatusCode::PARTIAL_CONTENT if offset > 0 => total_of_rest(&content_range, offset),
             StatusCode::OK if content_range.is_empty() => {
                 offset = 0;
                 content_bytes
@@ -372,10 +362,7 @@ impl<'a> Client<'a> {
             part.begin(if etag.starts_with('"') { &etag } else { "" })?;
             part.write_from(0, &[])?;
         }
-        let end = match expected {
-            Expected::Exactly(bytes) => Some(bytes),
-            Expected::AtMost(_) => total,
-        };
+        let end = if let Expected::Exactly(bytes) = expected { Some(bytes) } else { total };
         self.write_body(response, part, offset, end, expected.most_bytes())
     }
 
@@ -524,6 +511,12 @@ pub(crate) fn refusal(response: &Response<ureq::Body>) -> DownloadFailure {
     let asked = || header_text(response, header::RETRY_AFTER).trim().parse().ok().map(Duration::from_secs);
     let may_ask = matches!(status, StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE);
     DownloadFailure::Status { status: status.as_u16(), retry_after: may_ask.then(asked).flatten() }
+}
+
+/// Returns the length of the whole file, if a range is all of it from `offset` on.
+fn total_of_rest(content_range: &str, offset: u64) -> Option<u64> {
+    let total = content_range.rsplit_once('/')?.1.parse::<u64>().ok()?;
+    (content_range == format!("bytes {offset}-{}/{total}", total.wrapping_sub(1))).then_some(total)
 }
 
 /// Returns a header as text, cut to 200 characters; empty if it is absent or not text.

@@ -7,7 +7,6 @@ use crate::placement::Placement;
 use crate::provider::{Provider, names};
 use crate::tensors::TensorsError;
 
-/// Error of opening an encoder.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     #[error(transparent)]
@@ -22,7 +21,6 @@ pub enum ModelError {
     Tensors(#[from] TensorsError),
 }
 
-/// Error of turning text into tokens.
 #[derive(Debug, thiserror::Error)]
 pub enum TokenizerError {
     #[error("{cause}; put the tokenizer there or correct the description")]
@@ -48,7 +46,6 @@ pub enum TokenizerError {
     Encode { path: PathBuf, reason: String },
 }
 
-/// Error of reading a list of phrases.
 #[derive(Debug, thiserror::Error)]
 pub enum PhrasesError {
     #[error("{cause}; put the file there or correct the description")]
@@ -59,7 +56,6 @@ pub enum PhrasesError {
     NoDirection { path: PathBuf, line: usize, phrase: String },
 }
 
-/// Error of encoding a text or crops.
 #[derive(Debug, thiserror::Error)]
 pub enum InferenceError {
     #[error("the text names nothing; say what to look for")]
@@ -92,7 +88,6 @@ fn suggestion(near: &[String]) -> String {
     }
 }
 
-/// Error of opening or running a model.
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
     #[error("{}: no such ONNX Runtime library; `scripts/get-onnxruntime.sh` downloads one and prints its path, which --runtime takes", path.display())]

@@ -14,7 +14,6 @@ use slag_common::files;
 pub struct FileRef {
     /// Its path below `files_root`.
     pub path: PathBuf,
-    /// Its SHA-256.
     pub sha256: Option<Sha256>,
     /// The weights of an ONNX file that keeps them in a file of its own (`.onnx_data`), which it names relative to
     /// its own folder.
@@ -95,7 +94,6 @@ impl ModelFile {
         self.embedded
     }
 
-    /// Opens it for reading from its start.
     pub fn reader(&self) -> io::Result<Box<dyn Read>> {
         Ok(match self.embedded {
             Some(bytes) => Box::new(bytes),

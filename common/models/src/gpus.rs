@@ -12,7 +12,6 @@ use crate::{Provider, SessionOptions};
 /// Where the driver of Linux lists a machine's GPUs.
 const DRIVER_LIST: &str = "/proc/driver/nvidia/gpus";
 
-/// Which GPUs share the work.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum GpuChoice {
     /// All that the runtime can use.
@@ -45,7 +44,6 @@ impl GpuChoice {
         }
     }
 
-    /// Returns whether the runtime opens a model on a GPU.
     fn opens(gpu: u32, options: &SessionOptions) -> bool {
         let preprocess = Preprocess::new(1, Resize::Stretch, Filter::Bilinear, [0.0; 3], [1.0; 3]);
         let options = SessionOptions { gpu, ..options.clone() };

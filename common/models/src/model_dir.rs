@@ -40,7 +40,6 @@ enum Source {
     Files { files: Files, description: Box<Documented>, batch: Arc<Mutex<Option<usize>>> },
 }
 
-/// A description and its text.
 #[derive(Clone, Debug)]
 struct Documented {
     /// TOML; empty for one from a store, which has no image side to encode with.
@@ -56,7 +55,6 @@ impl std::ops::Deref for Documented {
     }
 }
 
-/// The location of a description's files.
 #[derive(Clone, Debug)]
 enum Files {
     Embedded,
@@ -110,7 +108,6 @@ impl ModelDir {
         Self::with(described, Files::Folder(folder.to_owned()))
     }
 
-    /// Returns the text side, for a store to carry.
     pub fn text_side(&self) -> Result<TextSide, TextSideError> {
         let built_in = || TextSideError::BuiltIn { model: self.id.name.clone() };
         let Source::Files { files: files @ Files::Folder(root), description, .. } = &self.source else {
@@ -143,7 +140,6 @@ impl ModelDir {
         &self.id
     }
 
-    /// Returns the number of components of a vector.
     pub fn dim(&self) -> usize {
         self.id.dim as usize
     }

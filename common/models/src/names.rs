@@ -6,7 +6,6 @@
 
 use crate::everyday_nouns;
 
-/// Names that a thing has at most.
 pub const MAX_NAMES: usize = 3;
 /// Most words that things are named by: lists of phrases for people are shorter.
 const MAX_WORDS: usize = 4096;
@@ -51,7 +50,6 @@ pub struct Spread {
 }
 
 impl Spread {
-    /// Takes some scores.
     pub fn add(&mut self, scores: &[f32]) {
         for score in scores.iter().copied().map(f64::from) {
             (self.sum, self.squares, self.n) = (self.sum + score, self.squares + score * score, self.n + 1.0);
@@ -60,7 +58,6 @@ impl Spread {
 }
 
 impl Confidence {
-    /// Takes the name of the encoder, and the scores of the scene.
     pub fn new(encoder: &str, scores: Spread) -> Self {
         let fit = if encoder.starts_with("slag-embedded") { EMBEDDED } else { OTHERS };
         let Spread { sum, squares, n } = scores;
@@ -88,7 +85,6 @@ pub struct Naming {
 }
 
 impl Naming {
-    /// Takes the score of the next word.
     pub fn add(&mut self, word: u32, score: f32, confidence: &Confidence) {
         self.sum += confidence.weight(score);
         let at = self.best[..self.n].iter().position(|best| best.0 < score).unwrap_or(self.n);

@@ -15,7 +15,6 @@ const N_NEAR: usize = 5;
 /// Longer texts are sentences, not misspelt phrases: they get no suggestions.
 const LONGEST_COMPARED: usize = 100;
 
-/// A text encoder of fixed phrases.
 #[derive(Debug)]
 pub struct PhraseEncoder {
     name: String,

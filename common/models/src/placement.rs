@@ -119,7 +119,6 @@ impl DeviceMemory {
         Ok(Self { device, host })
     }
 
-    /// Returns the processor's memory for both.
     pub(crate) fn of_processor() -> Self {
         Self { device: MemoryInfo::default(), host: MemoryInfo::default() }
     }

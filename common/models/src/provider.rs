@@ -12,11 +12,9 @@ use ort::{
 pub enum Provider {
     #[default]
     Cpu,
-    /// An NVIDIA GPU.
     Cuda,
     /// An NVIDIA GPU through TensorRT, which compiles the model before the first run.
     TensorRt,
-    /// Apple's Core ML.
     CoreMl,
     /// Any GPU under Windows.
     DirectMl,
@@ -36,7 +34,6 @@ impl Provider {
         }
     }
 
-    /// Returns ONNX Runtime's name for it.
     pub(crate) fn runtime_name(self) -> &'static str {
         match self {
             Self::Cpu => ep::CPU::NAME,

@@ -22,7 +22,6 @@ use crate::provider::{Provider, names};
 
 pub use crate::error::SessionError;
 
-/// Options of running models.
 #[derive(Clone, Debug)]
 pub struct SessionOptions {
     /// The library, from [`find_runtime`].
@@ -42,7 +41,6 @@ impl SessionOptions {
         Self { runtime, intra_op_threads: 1, providers: vec![Provider::Cpu], gpu: 0 }
     }
 
-    /// Returns whether models run on the CPU only.
     pub fn is_on_cpu(&self) -> bool {
         self.providers.first().is_none_or(|first| *first == Provider::Cpu)
     }
@@ -81,7 +79,6 @@ fn listed(outlets: &[Outlet]) -> String {
     listed.collect::<Vec<_>>().join(", ")
 }
 
-/// An opened model file.
 #[derive(Debug)]
 pub(crate) struct Model {
     path: PathBuf,
@@ -263,7 +260,6 @@ impl Model {
         self.expect("output", self.session.outputs(), name.into(), element, shape)
     }
 
-    /// Checks that the model has no inputs except `names`.
     pub(crate) fn expect_no_input_but(&self, names: &[&str]) -> Result<(), SessionError> {
         match self.session.inputs().iter().find(|input| !names.contains(&input.name())) {
             None => Ok(()),

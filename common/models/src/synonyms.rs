@@ -28,7 +28,6 @@ pub(crate) fn key(text: &str) -> String {
     words.join(" ")
 }
 
-/// The phrases that a model knows.
 #[derive(Debug)]
 pub struct KnownPhrases {
     phrases: HashSet<String>,

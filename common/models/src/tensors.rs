@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use half::f16;
 use safetensors::{Dtype, SafeTensors};
 
-/// Error of reading a tensor.
 #[derive(Debug, thiserror::Error)]
 pub enum TensorsError {
     #[error("{cause}; put the file there or correct the description")]

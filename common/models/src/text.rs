@@ -86,7 +86,6 @@ impl Tokens {
     }
 }
 
-/// A text encoder that runs an ONNX file.
 #[derive(Debug)]
 pub struct OnnxTextEncoder {
     name: String,

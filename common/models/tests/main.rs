@@ -8,7 +8,6 @@ mod conse;
 mod dense;
 mod encoders;
 mod full_size;
-mod hostile;
 mod hub;
 mod sam;
 mod sam2;

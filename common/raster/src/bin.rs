@@ -7,7 +7,6 @@ use crate::buckets::Buckets;
 use crate::constants::TILE_SIZE_PX;
 use crate::project::ScreenGaussian;
 
-/// Edge of a tile, pixels.
 const TILE: u32 = TILE_SIZE_PX as u32;
 /// Gaussians per task that assigns them to rows.
 const CHUNK: usize = 4096;
@@ -20,9 +19,7 @@ pub struct Tiles {
     /// Rows of tiles, top to bottom. Each has one bucket per tile, left to right, with indices into the visible
     /// Gaussians, from near to far.
     pub rows: Vec<Buckets<u32>>,
-    /// Image width, pixels.
     pub width_px: u32,
-    /// Image height, pixels.
     pub height_px: u32,
 }
 

@@ -32,9 +32,7 @@ pub type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
 /// Position of a tile, and its pixels inside the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TileRect {
-    /// Left edge, pixels.
     pub x_px: usize,
-    /// Top edge, pixels.
     pub y_px: usize,
     /// Columns inside the image.
     pub width_px: usize,

@@ -51,12 +51,10 @@ impl<T> Buckets<T> {
         &self.items[self.starts[bucket]..self.starts[bucket + 1]]
     }
 
-    /// Iterates over the items of each bucket.
     pub fn iter(&self) -> impl Iterator<Item = &[T]> {
         self.starts.windows(2).map(|ends| &self.items[ends[0]..ends[1]])
     }
 
-    /// Iterates over the items of each bucket, mutably.
     pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
         let mut rest = self.items.as_mut_slice();
         self.starts.windows(2).map(move |ends| {
@@ -70,7 +68,6 @@ impl<T> Buckets<T> {
         self.items.len()
     }
 
-    /// Converts each item.
     pub fn map<U>(self, f: impl FnMut(T) -> U) -> Buckets<U> {
         Buckets { starts: self.starts, items: self.items.into_iter().map(f).collect() }
     }

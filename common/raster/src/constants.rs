@@ -1,6 +1,5 @@
 //! Constants of the rasteriser, equal to those of gsplat 1.5.3; all backends take them from here.
 
-/// Edge of a screen tile, pixels.
 pub const TILE_SIZE_PX: usize = 16;
 /// Camera z below which a Gaussian is not drawn, world units.
 pub const NEAR_Z: f64 = 0.01;

@@ -29,9 +29,6 @@ pub struct Drawing {
 
 impl Drawing {
     /// Returns the colours as pixels, limited to 1.
-    ///
-    /// # Panics
-    /// If `rgb` has not three values per pixel.
     pub fn image(&self) -> RgbImage {
         let bytes = self.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
         RgbImage::from_raw(self.width_px, self.height_px, bytes).expect("three values per pixel")
@@ -136,7 +133,6 @@ impl WeightSink for PixelSink<'_> {
 pub struct ViewCounters {
     /// Gaussians with a pixel of the image in their footprint; they may be occluded.
     pub visible: usize,
-    /// Number of (Gaussian, tile) pairs.
     pub pairs: usize,
     /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once
     /// projected.

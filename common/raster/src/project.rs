@@ -87,7 +87,6 @@ pub struct PreparedScene<'s> {
     unusable: usize,
 }
 
-/// Extent of a Gaussian.
 #[derive(Clone, Copy, Zeroable)]
 struct Size {
     /// Largest standard deviation, world units.
@@ -100,7 +99,6 @@ impl<'s> PreparedScene<'s> {
     /// Bytes that it keeps for each Gaussian.
     pub const BYTES_PER_GAUSSIAN: usize = size_of::<Size>();
 
-    /// Prepares a scene with columns of matching lengths.
     pub fn new(scene: &'s Gaussians) -> Self {
         let mut sizes: Vec<Size> = bytemuck::zeroed_vec(scene.len());
         let unusable = sizes
@@ -156,7 +154,6 @@ impl<'s> PreparedScene<'s> {
 
 /// The frustum of a view, for a cheap and conservative visibility test.
 struct Bounds {
-    /// Focal lengths, pixels.
     focal_px: DVec2,
     /// Distance from the centre of the first pixel to the principal point, pixels.
     before_px: DVec2,

@@ -10,7 +10,6 @@ use crate::constants::MAX_IMAGE_PX;
 pub struct RasterView {
     /// Rigid transform from world to camera (OpenCV axes).
     pub camera_from_world: DAffine3,
-    /// Intrinsics of the camera, without distortion.
     pub intrinsics: Intrinsics,
 }
 
@@ -21,7 +20,6 @@ impl RasterView {
     }
 }
 
-/// What cannot be drawn.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum InputError {
     #[error("scene column {column} has {found} values, expected {expected}; read the scene again")]

@@ -37,7 +37,6 @@ pub struct AccessSettings {
     pub token_file: Option<PathBuf>,
 }
 
-/// The setting that is wrong.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
     #[error("the token file: {cause}; it needs a token of at least {MIN_TOKEN_CHARS} characters")]
@@ -124,7 +123,6 @@ impl Access {
         Self { reads, ..self }
     }
 
-    /// Returns whether anybody may write.
     pub fn takes_writes(&self) -> bool {
         !matches!(self.writes, Writes::None)
     }

@@ -51,12 +51,10 @@ async fn ask_for_health(mut stream: impl Stream) -> io::Result<Vec<u8>> {
     Ok(answer)
 }
 
-/// Where a service listens.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Listen {
     /// A TCP address; with port 0 the system chooses the port.
     Tcp(SocketAddr),
-    /// The path of a Unix domain socket.
     Unix(PathBuf),
 }
 
@@ -116,7 +114,6 @@ pub struct ListenError {
     pub cause: io::Error,
 }
 
-/// A socket that accepts connections.
 #[derive(Debug)]
 pub struct Listener {
     socket: Socket,
@@ -171,7 +168,6 @@ async fn bind_unix(_: &std::path::Path) -> io::Result<Socket> {
 }
 
 impl Listener {
-    /// Speaks TLS on the connections.
     #[must_use]
     pub fn with_tls(mut self, tls: Option<Tls>) -> Self {
         self.tls = tls;

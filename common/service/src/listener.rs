@@ -25,7 +25,6 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Longest time for the request of a connection beyond the limits, and for sending its answer.
 const RESERVED_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Bounds of a service's connections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConnectionLimits {
     /// Open connections. Further ones are answered once, and with 503 unless they ask for health, readiness or

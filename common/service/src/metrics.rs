@@ -12,7 +12,6 @@ use std::time::Duration;
 use axum::http::{HeaderValue, header};
 use axum::response::{IntoResponse, Response};
 
-/// Responses by route and status.
 #[derive(Debug, Default)]
 pub struct ResponseCounts(Mutex<BTreeMap<(String, u16), u64>>);
 
@@ -100,7 +99,6 @@ impl Exposition {
         self.sample(name, "_count", cumulated);
     }
 
-    /// Adds the responses by route and status.
     pub fn responses(&mut self, responses: &ResponseCounts) {
         let name = "http_requests_total";
         self.family(name, "counter", "Responses by route and status.");

@@ -16,7 +16,6 @@ use crate::problem::ProblemBody;
 use crate::replies::As;
 use crate::routes::{Parameter, Route, Routes};
 
-/// Column in which the help text's summaries begin.
 const SUMMARY_COLUMN: usize = 36;
 
 /// A service, as its description and help text name it.

@@ -102,7 +102,6 @@ impl<T: DeserializeOwned> Params<T> {
         }
     }
 
-    /// Reads a query string.
     pub fn parse(uri: &axum::http::Uri) -> Result<T, RequestError> {
         let pairs = Query::<Vec<(String, String)>>::try_from_uri(uri);
         let refused = |text: String| RequestError::new("query string", &text, "name=value pairs");

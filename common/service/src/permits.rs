@@ -13,7 +13,6 @@ pub(crate) const HEALTH_PATHS: [&str; 3] = ["/healthz", "/readyz", "/metrics"];
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Reserved;
 
-/// The connections of a service.
 pub(crate) struct Permits {
     n_connections: usize,
     n_per_peer: usize,

@@ -57,7 +57,6 @@ impl Selection {
         }
     }
 
-    /// Reads the value of a `Range` header.
     fn of_range(value: &str, len_bytes: u64) -> Self {
         let Some((unit, set)) = value.split_once('=') else { return Self::Whole };
         if !unit.eq_ignore_ascii_case("bytes") {

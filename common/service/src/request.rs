@@ -21,7 +21,6 @@ use crate::problem::Problem;
 /// The label of paths that are no route: a scanner must not fill the metrics.
 const OTHER: &str = "other";
 
-/// The header of a request's id.
 const REQUEST_ID: &str = "x-request-id";
 /// Longest id taken over from a client.
 const MAX_ID_CHARS: usize = 64;

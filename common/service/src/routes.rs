@@ -46,7 +46,6 @@ impl Parameter {
     }
 }
 
-/// What the body of a request is.
 #[derive(Clone, Debug)]
 pub(crate) struct BodyOf {
     pub(crate) media_types: &'static [&'static str],
@@ -74,7 +73,6 @@ pub struct Route {
     pub(crate) replies: fn(&mut SchemaGenerator) -> Vec<Reply>,
 }
 
-/// Routes under construction.
 pub struct Routes<S> {
     router: Router<S>,
     table: Vec<Route>,

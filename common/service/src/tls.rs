@@ -17,7 +17,6 @@ use rustls::{ConfigBuilder, ServerConfig, WantsVerifier};
 use slag_common::files;
 use tokio_rustls::TlsAcceptor;
 
-/// The certificate's files.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TlsFiles {
     /// Certificate and the chain that leads to its authority, PEM.
@@ -66,7 +65,6 @@ impl fmt::Debug for Tls {
 }
 
 impl Tls {
-    /// Reads a certificate and its key.
     pub fn open(files: TlsFiles) -> Result<Self, TlsError> {
         let provider = Arc::new(ring::default_provider());
         let stamps = stamps_of(&files);

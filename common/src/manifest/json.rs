@@ -4,7 +4,6 @@ use super::records::{MAX_BYTES, MAX_TEXT_FILES, Manifest, VERSION};
 use crate::frames::Aabb;
 use crate::shard::MAX_DIM;
 
-/// Why a manifest is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ManifestError {
     #[error(
@@ -18,10 +17,6 @@ pub enum ManifestError {
 }
 
 impl Manifest {
-    /// Returns the JSON text.
-    ///
-    /// # Panics
-    /// Never: a manifest has no map with other keys than strings.
     pub fn to_bytes(&self) -> Vec<u8> {
         serde_json::to_vec(self).expect("a manifest has no map with other keys than strings")
     }

@@ -11,7 +11,6 @@ use crate::shard::{Profile, ScoreErrors};
 
 /// Version of the manifest format that is written and read.
 pub const VERSION: u32 = 2;
-/// Path of the manifest among a store's targets.
 pub const TARGET: &str = "manifest";
 pub const MAX_TEXT_FILES: usize = 16;
 /// Largest manifest read: a cell takes about 600 bytes, so this allows 100,000 cells.

@@ -27,7 +27,6 @@ const MARGIN: f64 = 0.05;
 /// thousands are alike.
 const MAX_CANDIDATES: usize = 32;
 
-/// A cell of a generation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Place {
     pub bounds: Aabb,
@@ -42,7 +41,6 @@ pub fn is_unchanged(thing: &Thing, own: &[Place], other: &[Place]) -> bool {
     here.peek().is_some() && here.all(|place| other.iter().any(|known| known.splat == place.splat))
 }
 
-/// A thing that lies elsewhere.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Moved {
     pub from: Thing,
@@ -51,7 +49,6 @@ pub struct Moved {
     pub distance: f64,
 }
 
-/// The changes from one list of things to another.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Changes {
     /// Things of exactly the same Gaussians.
@@ -130,7 +127,6 @@ fn pairs(old: &[Thing], new: &[Thing], cost: impl Fn(&Thing, &Thing) -> Option<f
     candidates.into_iter().map(|(_, at_old, at_new)| (at_old, at_new)).collect()
 }
 
-/// Returns both lists without the things of pairs.
 fn without(old: Vec<Thing>, new: Vec<Thing>, pairs: &[(usize, usize)]) -> [Vec<Thing>; 2] {
     let rest = |things: Vec<Thing>, mut taken: Vec<usize>| -> Vec<Thing> {
         taken.sort_unstable();
@@ -171,7 +167,6 @@ fn have_one_size(a: &Thing, b: &Thing) -> bool {
     edges(a).iter().zip(edges(b)).all(|(a, b)| a.max(b) <= MOVED_SIZE_RATIO * a.min(b))
 }
 
-/// An object of a generation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Thing {
     /// Derived from the indices of its Gaussians in the splat: equal while these are the same.

@@ -11,12 +11,9 @@ use crate::quantise::quantise;
 
 /// Marks a run of Gaussians that belong to no object.
 pub const NO_OBJECT: u16 = u16::MAX;
-/// Largest number of vectors of an object.
 pub const MAX_VECTORS: u32 = 16;
-/// Longest photo name, bytes.
 pub const MAX_PHOTO_BYTES: usize = 1024;
 
-/// Section ids.
 pub mod section {
     /// [`super::ObjectsHeader`].
     pub const HEADER: u32 = 20;
@@ -34,7 +31,6 @@ pub mod section {
     pub const PHOTOS: u32 = 26;
 }
 
-/// The fixed-size header of the objects.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ObjectsHeader {
@@ -42,7 +38,6 @@ pub struct ObjectsHeader {
     pub n_objects: u32,
     pub n_vectors: u32,
     pub n_runs: u32,
-    /// Total length of the photo names, bytes.
     pub photos_bytes: u32,
     /// Mean score over a bank of texts and all objects of the scene.
     pub score_mean: f32,
@@ -70,9 +65,7 @@ pub struct ObjectRecord {
     pub n_gaussians_here: u32,
     /// Box of the object in the photo that shows it best: x0, y0, x1, y1 in pixels; x1 and y1 are exclusive.
     pub photo_box_px: [u32; 4],
-    /// Start of the photo's name.
     pub photo_start: u32,
-    /// Length of the photo's name.
     pub photo_bytes: u32,
 }
 
@@ -100,7 +93,6 @@ pub struct Objects<'a> {
     pub run_ends: &'a [u32],
     /// `[n_runs]`.
     pub run_objects: &'a [u16],
-    /// Names of photos, UTF-8.
     pub photos: &'a [u8],
 }
 
@@ -217,7 +209,6 @@ impl ObjectsLayout {
         Ok(Some(Self { header, columns }))
     }
 
-    /// Returns the columns of the bytes that were checked.
     pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Objects<'a> {
         let [records, vectors, steps, run_ends, run_objects, photos] =
             self.columns.each_ref().map(|range| &bytes[range.clone()]);

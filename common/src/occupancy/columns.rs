@@ -11,7 +11,6 @@ pub const BLOCK_EDGE: i32 = 4;
 /// Bits of a stored run that name its kind.
 pub(super) const KIND_BITS: u32 = 2;
 
-/// Section ids.
 pub mod section {
     /// [`super::OccupancyHeader`].
     pub const HEADER: u32 = 50;
@@ -21,7 +20,6 @@ pub mod section {
     pub const MASKS: u32 = 52;
 }
 
-/// The fixed-size header of the occupancy.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct OccupancyHeader {
@@ -29,7 +27,6 @@ pub struct OccupancyHeader {
     pub voxel: f64,
     /// Smallest block along each axis: block b begins at voxel 4 b.
     pub first_block: [i32; 3],
-    /// Blocks along each axis.
     pub n_blocks: [u32; 3],
     pub n_runs: u32,
     /// Blocks with masks of their own.
@@ -40,7 +37,6 @@ pub struct OccupancyHeader {
     pub min_views: u32,
 }
 
-/// What is known of a voxel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum VoxelState {
     /// Nothing: no view has looked there.
@@ -50,7 +46,6 @@ pub enum VoxelState {
     Occupied,
 }
 
-/// The state of the blocks of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunKind {
     Free = 1,
@@ -68,7 +63,6 @@ pub struct StoredRun {
 }
 
 impl StoredRun {
-    /// Returns the kind; `None` if there is no such kind.
     pub(super) fn kind(self) -> Option<RunKind> {
         match self.len_and_kind & ((1 << KIND_BITS) - 1) {
             1 => Some(RunKind::Free),
@@ -181,7 +175,6 @@ impl Occupancy<'_> {
 const MAX_BLOCKS: u64 = 1 << 27;
 /// Farthest block from the world's origin: voxels are numbered in 32 bits.
 const MAX_BLOCK: i64 = 1 << 28;
-/// Largest edge of a voxel.
 const MAX_VOXEL: f64 = 1e6;
 
 /// Where the columns of a shard's checked occupancy lie.
@@ -230,7 +223,6 @@ impl OccupancyLayout {
         Ok(Some(Self { header, columns: [runs, masks] }))
     }
 
-    /// Returns the columns of the bytes that were checked.
     pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Occupancy<'a> {
         let [runs, masks] = self.columns.each_ref().map(|range| &bytes[range.clone()]);
         Occupancy {
@@ -275,7 +267,6 @@ pub struct Block {
 /// Most blocks along an axis of a shard: the box of all blocks stays within the format's limit.
 const MAX_EDGE: i32 = 512;
 
-/// The occupancy of a shard, to be written.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BuiltOccupancy {
     header: OccupancyHeader,
@@ -331,12 +322,10 @@ impl BuiltOccupancy {
         Self { header, runs, masks }
     }
 
-    /// Returns the columns as readers see them.
     pub fn view(&self) -> Occupancy<'_> {
         Occupancy { header: self.header, runs: &self.runs, masks: &self.masks }
     }
 
-    /// Returns the bytes that the columns take.
     pub fn len_bytes(&self) -> u64 {
         self.view().sections().iter().map(|(_, bytes)| bytes.len() as u64).sum()
     }

@@ -179,7 +179,6 @@ impl Images {
     }
 }
 
-/// Returns the view of an image record.
 fn view(
     cameras: &Cameras,
     images_dir: &Path,

@@ -4,7 +4,6 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Why poses could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum PoseError {
     #[error("{0}; check that the file exists and is readable")]
@@ -45,7 +44,6 @@ impl fmt::Display for Place {
     }
 }
 
-/// The fault of a pose file.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PoseProblem {
     #[error("expected {expected}, found {found:?}; export the poses again")]

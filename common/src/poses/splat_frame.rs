@@ -53,7 +53,6 @@ struct Json {
 }
 
 impl SplatFrame {
-    /// Reads a `dataparser_transforms.json`.
     pub fn read(path: &Path) -> Result<Self, PoseError> {
         let mut bytes = Vec::new();
         files::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
@@ -107,10 +106,8 @@ impl SplatFrame {
     }
 }
 
-/// A transform from the world of the poses to the splat's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SplatFromPoses {
-    /// The transform.
     pub similarity: Similarity,
     pub begins_at: Origin,
 }

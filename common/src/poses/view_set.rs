@@ -11,7 +11,6 @@ use crate::camera::View;
 pub struct ViewSet {
     /// Sorted by name; names are unique.
     pub views: Vec<View>,
-    /// The format they were read from.
     pub source: PoseSource,
     /// Names of frames that are listed without a pose (ScanNet's `-inf`), sorted; they are not in `views`.
     pub without_pose: Vec<String>,
@@ -32,7 +31,6 @@ pub struct AppliedTransform {
     pub scale: f64,
 }
 
-/// A format of poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PoseSource {
     /// COLMAP `cameras.txt` and `images.txt`.

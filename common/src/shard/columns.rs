@@ -46,7 +46,6 @@ impl Positions<'_> {
     }
 }
 
-/// The basis of a cell's centroids.
 #[derive(Clone, Copy, Debug)]
 pub struct Basis<'a> {
     /// `[dim]`.
@@ -72,7 +71,6 @@ pub struct Residuals<'a> {
 }
 
 impl Residuals<'_> {
-    /// Returns the index of a Gaussian's codeword in a subspace.
     pub fn code(&self, index: usize, subspace: usize) -> usize {
         let n_bytes = (self.subspace_starts.len() - 1) / 2;
         let byte = self.codes[(index / BLOCK * n_bytes + subspace / 2) * BLOCK + index % BLOCK];
@@ -152,7 +150,6 @@ impl ShardView<'_> {
         self.exact.is_some() || self.packed_indices.is_some()
     }
 
-    /// Returns the index of a Gaussian in the input splat file, if the shard knows it.
     pub fn input_index(&self, index: usize) -> Option<u32> {
         let packed = || self.packed_indices.map(|indices| indices.get(index));
         self.exact.map(|exact| exact.input_indices[index]).or_else(packed)
@@ -169,12 +166,10 @@ impl ShardView<'_> {
         self.centroid_starts[centroid] as usize..self.centroid_starts[centroid + 1] as usize
     }
 
-    /// Returns the centroid of a Gaussian that has evidence.
     pub fn centroid_of(&self, index: usize) -> usize {
         self.centroid_starts.partition_point(|start| *start as usize <= index) - 1
     }
 
-    /// Returns the number of Gaussians that have an embedding.
     pub fn n_with_evidence(&self) -> usize {
         self.centroid_starts[self.header.n_centroids as usize] as usize
     }
@@ -184,7 +179,6 @@ impl ShardView<'_> {
         Aabb { min: self.header.box_min.into(), max: self.header.box_max.into() }
     }
 
-    /// Returns the id of the encoder that defines the space of the centroids.
     pub fn encoder_id(&self) -> Hash32 {
         Hash32(self.header.encoder_id)
     }

@@ -4,7 +4,6 @@ use bytemuck::{Pod, Zeroable};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// First bytes of a shard.
 pub const MAGIC: [u8; 8] = *b"SLAGSHRD";
 /// Version of the shard format that is written and read.
 pub const VERSION: u32 = 2;
@@ -17,7 +16,6 @@ pub const MAX_SUBSPACES: usize = 128;
 /// Largest `dim` accepted: more than any text-image model has.
 pub const MAX_DIM: usize = 8192;
 
-/// Ids of a shard's sections.
 pub mod section {
     /// [`super::ShardHeader`].
     pub const HEADER: u32 = 1;
@@ -88,7 +86,6 @@ pub struct ScoreErrors {
     pub spread: f32,
 }
 
-/// The fixed-size header of a shard.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ShardHeader {

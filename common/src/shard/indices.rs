@@ -6,11 +6,9 @@
 
 use bytemuck::{Pod, Zeroable};
 
-/// The fixed-size header of the column.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct IndicesHeader {
-    /// Smallest index.
     pub least: u32,
     /// Bits of an index, 0..=32.
     pub width_bits: u32,
@@ -63,7 +61,6 @@ pub(super) fn n_words(n: usize, width_bits: u32) -> Option<usize> {
     (width_bits <= 32).then(|| (n as u64 * u64::from(width_bits)).div_ceil(32) as usize)
 }
 
-/// A packed column, to be written.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct IndexColumn {
     header: IndicesHeader,

@@ -10,12 +10,13 @@ use super::format::{
     BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, PositionForm, ScoreErrors, ShardHeader, VERSION, section,
 };
 use super::indices::{self, IndicesHeader, PackedIndices};
+use super::write::Additions;
 use crate::appearance::Appearance;
 use crate::container::{ContainerError, Layout, damaged};
-use crate::landmarks::{Landmarks, LandmarksLayout};
-use crate::objects::{Objects, ObjectsLayout};
-use crate::occupancy::{Occupancy, OccupancyLayout};
-use crate::photo_poses::{PhotoPoses, PhotoPosesLayout};
+use crate::landmarks::LandmarksLayout;
+use crate::objects::ObjectsLayout;
+use crate::occupancy::OccupancyLayout;
+use crate::photo_poses::PhotoPosesLayout;
 
 /// Largest length accepted: embeddings have unit length, and components are scaled to about that.
 const MAX_LENGTH: f32 = 4096.0;
@@ -74,49 +75,23 @@ impl ShardLayout {
         })
     }
 
-    /// Returns the objects in the checked bytes, if the shard has any.
-    ///
-    /// # Panics
-    /// As [`ShardLayout::view`], with an 8-byte aligned address.
-    pub fn objects<'a>(&self, bytes: &'a [u8]) -> Option<Objects<'a>> {
-        self.objects.as_ref().map(|objects| objects.view(bytes))
-    }
-
-    /// Returns how the Gaussians look, if the checked shard tells.
-    ///
-    /// # Panics
-    /// If `bytes` are shorter than those checked.
-    pub fn appearance<'a>(&self, bytes: &'a [u8]) -> Option<Appearance<'a>> {
-        let [colours, sizes, rotations] = self.appearance.clone()?.map(|range| &bytes[range]);
-        Some(Appearance {
-            colours: bytemuck::cast_slice(colours),
-            sizes: bytemuck::cast_slice(sizes),
-            rotations: bytemuck::cast_slice(rotations),
-        })
-    }
-
-    /// Returns which places of the checked bytes' cell are free, if the shard says so.
-    ///
-    /// # Panics
-    /// As [`ShardLayout::objects`].
-    pub fn occupancy<'a>(&self, bytes: &'a [u8]) -> Option<Occupancy<'a>> {
-        self.occupancy.as_ref().map(|occupancy| occupancy.view(bytes))
-    }
-
-    /// Returns where the photos of the checked bytes' cell were taken, if the shard says so.
-    ///
-    /// # Panics
-    /// As [`ShardLayout::objects`].
-    pub fn photo_poses<'a>(&self, bytes: &'a [u8]) -> Option<PhotoPoses<'a>> {
-        self.photo_poses.as_ref().map(|photos| photos.view(bytes))
-    }
-
-    /// Returns what robots recognise the place of the checked bytes' cell by, if the shard has it.
-    ///
-    /// # Panics
-    /// As [`ShardLayout::objects`].
-    pub fn landmarks<'a>(&self, bytes: &'a [u8]) -> Option<Landmarks<'a>> {
-        self.landmarks.as_ref().map(|landmarks| landmarks.view(bytes))
+    /// Returns what the checked bytes carry beyond the columns of [`ShardLayout::view`], under its conditions.
+    pub fn additions<'a>(&self, bytes: &'a [u8]) -> Additions<'a> {
+        let appearance = self.appearance.as_ref().map(|columns| {
+            let [colours, sizes, rotations] = columns.clone().map(|range| &bytes[range]);
+            Appearance {
+                colours: bytemuck::cast_slice(colours),
+                sizes: bytemuck::cast_slice(sizes),
+                rotations: bytemuck::cast_slice(rotations),
+            }
+        });
+        Additions {
+            objects: self.objects.as_ref().map(|objects| objects.view(bytes)),
+            appearance,
+            occupancy: self.occupancy.as_ref().map(|occupancy| occupancy.view(bytes)),
+            photo_poses: self.photo_poses.as_ref().map(|photos| photos.view(bytes)),
+            landmarks: self.landmarks.as_ref().map(|landmarks| landmarks.view(bytes)),
+        }
     }
 
     /// Returns the columns in the checked bytes.
@@ -214,7 +189,6 @@ fn check_errors(errors: &ScoreErrors) -> Result<(), String> {
     Ok(())
 }
 
-/// Checks the columns of a shard whose header is checked.
 struct Checker<'a> {
     bytes: &'a [u8],
     layout: &'a Layout,

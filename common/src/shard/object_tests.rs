@@ -88,7 +88,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
 fn round_trip() {
     let bytes = AlignedBytes::copy_of(&written(|_| {}));
     let layout = ShardLayout::check(&bytes).expect("valid");
-    let objects = layout.objects(&bytes).expect("has objects");
+    let objects = layout.additions(&bytes).objects.expect("has objects");
     assert_eq!(objects.records, [record(0xdead_beef_0000_0001, 2, 0..5), record(7, 3, 5..10)]);
     assert_eq!(objects.records.iter().map(|r| objects.photo(r)).collect::<Vec<_>>(), ["a.jpg", "ü.pn"]);
     let runs: Vec<_> = objects.runs().collect();
@@ -102,12 +102,15 @@ fn round_trip() {
     // Writing both at once gives the same bytes; a shard without objects has none.
     let again = objects;
     let mut out = Vec::new();
-    layout.view(&bytes).write_with(&mut out, Some(&again)).expect("writes to memory");
+    layout
+        .view(&bytes)
+        .write_with(&mut out, Additions { objects: Some(again), ..Additions::default() })
+        .expect("writes to memory");
     assert_eq!(out, &bytes[..]);
     out.clear();
     layout.view(&bytes).write(&mut out).expect("writes to memory");
     let bytes = AlignedBytes::copy_of(&out);
-    assert!(ShardLayout::check(&bytes).expect("valid").objects(&bytes).is_none());
+    assert!(ShardLayout::check(&bytes).expect("valid").additions(&bytes).objects.is_none());
 }
 
 /// A hostile writer can compute correct checksums over invalid contents: each is refused.

@@ -12,7 +12,6 @@ use crate::container::AlignedBytes;
 use crate::frames::Aabb;
 use crate::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use crate::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
-use crate::occupancy::Occupancy;
 
 /// Returns the header of a shard without basis and codes, with 16-bit positions over a box.
 pub fn header(cell_id: u32, n_gaussians: usize, n_centroids: usize, dim: usize, bounds: Aabb) -> ShardHeader {
@@ -101,8 +100,8 @@ pub struct SampleObjects {
 impl SampleObjects {
     const N_VECTORS: usize = 3;
 
-    /// Writes a shard again with these objects.
-    pub fn add_to(&self, shard: &ShardView<'_>, occupancy: Option<&Occupancy<'_>>) -> Vec<u8> {
+    /// Writes a shard again with these objects, beside other additions.
+    pub fn add_to(&self, shard: &ShardView<'_>, others: Additions<'_>) -> Vec<u8> {
         let mut object_of = vec![NO_OBJECT; shard.header.n_gaussians as usize];
         let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
         for (number, object) in (0u16..).zip(&self.objects) {
@@ -143,9 +142,10 @@ impl SampleObjects {
             run_objects: &run_objects,
             photos: photos.as_bytes(),
         };
-        let additions = Additions { objects: Some(&objects), occupancy, ..Additions::default() };
         let mut bytes = Vec::new();
-        shard.write_with(&mut bytes, additions).expect("writes to memory");
+        shard
+            .write_with(&mut bytes, Additions { objects: Some(objects), ..others })
+            .expect("writes to memory");
         bytes
     }
 }

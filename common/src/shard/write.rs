@@ -14,21 +14,15 @@ use crate::photo_poses::PhotoPoses;
 /// What a shard may carry beyond what questions need.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Additions<'a> {
-    pub objects: Option<&'a Objects<'a>>,
+    pub objects: Option<Objects<'a>>,
     /// How its Gaussians look.
     pub appearance: Option<Appearance<'a>>,
     /// Which places of its cell are free.
-    pub occupancy: Option<&'a Occupancy<'a>>,
+    pub occupancy: Option<Occupancy<'a>>,
     /// Where the photos of its cell were taken.
     pub photo_poses: Option<PhotoPoses<'a>>,
     /// What robots recognise their place by.
     pub landmarks: Option<Landmarks<'a>>,
-}
-
-impl<'a> From<Option<&'a Objects<'a>>> for Additions<'a> {
-    fn from(objects: Option<&'a Objects<'a>>) -> Self {
-        Self { objects, ..Self::default() }
-    }
 }
 
 impl ShardView<'_> {
@@ -36,9 +30,8 @@ impl ShardView<'_> {
         self.write_with(out, Additions::default())
     }
 
-    /// Writes the shard and its additions.
-    pub fn write_with<'a>(&self, out: impl io::Write, additions: impl Into<Additions<'a>>) -> io::Result<()> {
-        let Additions { objects, appearance, occupancy, photo_poses, landmarks } = additions.into();
+    pub fn write_with(&self, out: impl io::Write, additions: Additions<'_>) -> io::Result<()> {
+        let Additions { objects, appearance, occupancy, photo_poses, landmarks } = additions;
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),

@@ -14,7 +14,6 @@ pub struct ReadOptions {
 }
 
 impl ReadOptions {
-    /// Returns the degree to keep from a file of degree `degree`.
     pub(super) fn kept_degree(self, degree: u8) -> u8 {
         if self.with_sh_rest { degree.min(MAX_SH_DEGREE) } else { 0 }
     }
@@ -46,7 +45,6 @@ pub(super) fn plausible_count(
     })
 }
 
-/// Returns empty columns with capacity for `count` Gaussians.
 pub(super) fn columns(count: usize, degree: u8) -> Gaussians {
     Gaussians {
         means_in_world: Vec::with_capacity(count),

@@ -2,6 +2,7 @@
 //! bundle. Version 2 maps bytes through codebooks; version 1 (without `version`) maps them to ranges.
 
 use std::io::{BufReader, Cursor, Read};
+use std::ops::RangeInclusive;
 use std::path::{Component, Path, PathBuf};
 
 use glam::DVec3;
@@ -97,7 +98,6 @@ impl Quantised {
     }
 }
 
-/// The source of a SOG's files.
 enum Parts {
     Folder(PathBuf),
     Bundle(Box<ZipArchive<BufReader<fs_err::File>>>),
@@ -126,7 +126,6 @@ impl Pixels {
     }
 }
 
-/// Reads a SOG folder, given its meta file.
 pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let folder = meta_path.parent().unwrap_or(Path::new("")).to_path_buf();
     let len_bytes = fs_err::metadata(meta_path)?.len();
@@ -188,7 +187,6 @@ impl Sog {
         }
     }
 
-    /// Returns the bytes of a part, at most `max_bytes`.
     fn bytes(&mut self, part: &str, max_bytes: u64) -> Result<Vec<u8>, SplatError> {
         let mut bytes = Vec::new();
         let failed = |path: &Path, source: std::io::Error| {
@@ -221,7 +219,7 @@ impl Sog {
         &mut self,
         files: &[String],
         index: usize,
-        n_pixels: std::ops::RangeInclusive<u64>,
+        n_pixels: RangeInclusive<u64>,
     ) -> Result<Pixels, SplatError> {
         let Some(part) = files.get(index) else {
             return Err(self.malformed("meta.json", format_args!("{} files", index + 1), files.len()));
@@ -297,35 +295,8 @@ impl Sog {
         let n_pixels = count..=count.saturating_mul(2) + SPARE_PIXELS;
         let mut out = columns(n, 0);
 
-        let low = self.pixels(&meta.means.files, 0, n_pixels.clone())?;
-        let high = self.pixels(&meta.means.files, 1, n_pixels.clone())?;
-        out.means_in_world.extend(low.iter(n).zip(high.iter(n)).map(|(low, high)| {
-            DVec3::from_array(std::array::from_fn(|axis| {
-                let unit = f64::from(u16::from_le_bytes([low[axis], high[axis]])) / 65535.0;
-                let (min, max) = (meta.means.mins[axis], meta.means.maxs[axis]);
-                // The stored value is sign(x) ln(|x| + 1).
-                let log = min + (max - min) * unit;
-                log.abs().exp_m1().copysign(log)
-            }))
-        }));
-        drop((low, high));
-
-        let quats = self.pixels(&meta.quats.files, 0, n_pixels.clone())?;
-        let behind = quats.rgba.as_chunks::<4>().0.get(n..).unwrap_or_default();
-        // What fills up the last rows is alike everywhere.
-        if behind.iter().any(|pixel| *pixel != behind[0] && pixel[3] >= ROTATION_TAG) {
-            let expected = "a number of Gaussians (`count`) that takes in all those of the images";
-            return Err(self.malformed("meta.json", expected, format_args!("{n}, and more behind them")));
-        }
-        out.rotations_wxyz.extend(quats.iter(n).map(|[a, b, c, tag]| match tag.checked_sub(ROTATION_TAG) {
-            Some(largest) => {
-                let others =
-                    [a, b, c].map(|q| (f64::from(q) / 127.5 - 1.0) * std::f64::consts::FRAC_1_SQRT_2);
-                unit_rotation(with_largest(largest.into(), others))
-            }
-            None => [0.0; 4],
-        }));
-        drop(quats);
+        self.decode_means(meta, n_pixels.clone(), &mut out, n)?;
+        self.decode_rotations(meta, n_pixels.clone(), &mut out, n)?;
 
         let tables: [_; 3] = self.tables("scales", &meta.scales)?;
         let scales = self.pixels(&meta.scales.files, 0, n_pixels.clone())?;
@@ -355,12 +326,58 @@ impl Sog {
         Ok(out)
     }
 
+    fn decode_means(
+        &mut self,
+        meta: &Meta,
+        n_pixels: RangeInclusive<u64>,
+        out: &mut Gaussians,
+        n: usize,
+    ) -> Result<(), SplatError> {
+        let low = self.pixels(&meta.means.files, 0, n_pixels.clone())?;
+        let high = self.pixels(&meta.means.files, 1, n_pixels)?;
+        out.means_in_world.extend(low.iter(n).zip(high.iter(n)).map(|(low, high)| {
+            DVec3::from_array(std::array::from_fn(|axis| {
+                let unit = f64::from(u16::from_le_bytes([low[axis], high[axis]])) / 65535.0;
+                let (min, max) = (meta.means.mins[axis], meta.means.maxs[axis]);
+                // The stored value is sign(x) ln(|x| + 1).
+                let log = min + (max - min) * unit;
+                log.abs().exp_m1().copysign(log)
+            }))
+        }));
+        Ok(())
+    }
+
+    fn decode_rotations(
+        &mut self,
+        meta: &Meta,
+        n_pixels: RangeInclusive<u64>,
+        out: &mut Gaussians,
+        n: usize,
+    ) -> Result<(), SplatError> {
+        let quats = self.pixels(&meta.quats.files, 0, n_pixels)?;
+        let behind = quats.rgba.as_chunks::<4>().0.get(n..).unwrap_or_default();
+        // What fills up the last rows is alike everywhere.
+        if behind.iter().any(|pixel| *pixel != behind[0] && pixel[3] >= ROTATION_TAG) {
+            let expected = "a number of Gaussians (`count`) that takes in all those of the images";
+            return Err(self.malformed("meta.json", expected, format_args!("{n}, and more behind them")));
+        }
+        out.rotations_wxyz.extend(quats.iter(n).map(|[a, b, c, tag]| match tag.checked_sub(ROTATION_TAG) {
+            Some(largest) => {
+                let others =
+                    [a, b, c].map(|q| (f64::from(q) / 127.5 - 1.0) * std::f64::consts::FRAC_1_SQRT_2);
+                unit_rotation(with_largest(largest.into(), others))
+            }
+            None => [0.0; 4],
+        }));
+        Ok(())
+    }
+
     /// Decodes the harmonics: each Gaussian has a label, and each label is a run of pixels in the codebook.
     fn decode_sh_rest(
         &mut self,
         sh_rest: &Quantised,
         count: usize,
-        n_pixels: std::ops::RangeInclusive<u64>,
+        n_pixels: RangeInclusive<u64>,
         out: &mut Gaussians,
     ) -> Result<(), SplatError> {
         let [table]: [_; 1] = self.tables("shN", sh_rest)?;

@@ -27,7 +27,6 @@ const EXTENSION_COORDINATE_SYSTEM: u32 = 0xADBE_0003;
 const RIGHT_UP_BACK: u32 = 4;
 /// Window size that every Zstandard decoder should accept (RFC 8878, 3.1.1.1.2).
 const MIN_WINDOW_BYTES: u64 = 8 << 20;
-/// Rows decoded at a time.
 const ROWS_AT_ONCE: usize = 4096;
 
 /// Signs of the coefficients above degree 0 when y and z change sign: -1 where the powers of y and z in the basis

@@ -3,7 +3,6 @@
 
 use serde_json::Value;
 
-/// A value without a canonical form.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the number {found} is not a whole number of 64 bits, the only kind that canonical JSON has")]
 pub struct NotCanonical {

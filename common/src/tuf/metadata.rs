@@ -25,7 +25,6 @@ pub trait Body: Serialize + DeserializeOwned {
 /// The keys of a role, and how many of them must sign.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RoleKeys {
-    /// Ids of the keys.
     pub keyids: Vec<String>,
     /// Signatures by different keys that are enough.
     pub threshold: u32,
@@ -75,7 +74,6 @@ impl Body for Root {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileMeta {
     pub version: u64,
-    /// Length, bytes.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub length: Option<u64>,
     /// Hashes by algorithm, hex.
@@ -141,7 +139,6 @@ impl Body for Snapshot {
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TargetFile {
-    /// Length, bytes.
     pub length: u64,
     /// Hashes by algorithm, hex.
     pub hashes: BTreeMap<String, String>,
@@ -178,7 +175,6 @@ impl TargetFile {
 /// Targets: the files. Delegations to other roles are not followed.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Targets {
-    /// Files by path.
     pub targets: BTreeMap<String, TargetFile>,
 }
 
@@ -186,7 +182,6 @@ impl Body for Targets {
     const TYPE: &'static str = "targets";
 }
 
-/// Returns the SHA-256 of bytes, hex.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
@@ -237,7 +232,6 @@ pub struct Key {
 }
 
 impl Key {
-    /// Returns the public half of a signing key.
     pub fn of(key: &SigningKey) -> Self {
         let public = hex::encode(key.verifying_key().to_bytes());
         let keyval = BTreeMap::from([("public".to_owned(), Value::String(public))]);

@@ -31,15 +31,10 @@ pub use time::{format_utc, parse_utc};
 pub use trusted::{Kept, Offered, Trusted};
 pub use update::{Source, refresh};
 
-/// Version of the specification that is written.
 pub const SPEC_VERSION: &str = "1.0.31";
-/// Longest root metadata read.
 pub const MAX_ROOT_BYTES: u64 = 256 << 10;
-/// Longest timestamp metadata read.
 pub const MAX_TIMESTAMP_BYTES: u64 = 16 << 10;
 /// Longest snapshot metadata read. A client keeps root, timestamp and snapshot; this bounds what it keeps.
 pub const MAX_SNAPSHOT_BYTES: u64 = 256 << 10;
-/// Longest targets metadata read.
 pub const MAX_TARGETS_BYTES: u64 = 5 << 20;
-/// Most new roots read in one update.
 pub const MAX_ROOTS: u32 = 256;

@@ -15,7 +15,6 @@ use super::time::{format_utc, parse_utc};
 /// What all metadata begins with.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Head {
-    /// Kind of metadata.
     #[serde(rename = "_type")]
     pub kind: String,
     pub spec_version: String,
@@ -51,7 +50,6 @@ pub struct SignedMetadata<T> {
     pub head: Head,
     /// Seconds since 1970 from which it is refused.
     pub expires_unix_secs: u64,
-    /// What the role says.
     pub body: T,
     signatures: Vec<MetadataSignature>,
     canonical: Vec<u8>,
@@ -113,7 +111,6 @@ impl<T: Body> SignedMetadata<T> {
         }
     }
 
-    /// Checks the expiry against a reference time, seconds since 1970.
     pub fn check_expiry(&self, role: &str, now_unix_secs: u64) -> Result<(), TufError> {
         match self.expires_unix_secs <= now_unix_secs {
             true => Err(TufError::Expired {

@@ -18,7 +18,6 @@ pub enum Offered {
     Same,
 }
 
-/// The metadata that is trusted at present.
 #[derive(Clone, Debug)]
 pub struct Trusted {
     root: SignedMetadata<Root>,
@@ -39,22 +38,18 @@ impl Trusted {
         &self.root
     }
 
-    /// Returns the timestamp, once there is one.
     pub fn timestamp(&self) -> Option<&SignedMetadata<Timestamp>> {
         self.timestamp.as_ref()
     }
 
-    /// Returns the snapshot, once there is one.
     pub fn snapshot(&self) -> Option<&SignedMetadata<Snapshot>> {
         self.snapshot.as_ref()
     }
 
-    /// Returns the targets metadata, once there is some.
     pub fn targets(&self) -> Option<&SignedMetadata<Targets>> {
         self.targets.as_ref()
     }
 
-    /// Returns a file that the targets metadata lists.
     pub fn target(&self, path: &str) -> Option<&TargetFile> {
         self.targets.as_ref()?.body.targets.get(path)
     }
@@ -153,7 +148,6 @@ impl Trusted {
         Ok(())
     }
 
-    /// Returns what the snapshot states of the targets metadata.
     pub(super) fn targets_meta(&self) -> Result<&FileMeta, TufError> {
         let order = || TufError::Order { role: Targets::TYPE.into() };
         Ok(&self.snapshot.as_ref().ok_or_else(order)?.body.meta["targets.json"])

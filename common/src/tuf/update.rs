@@ -6,7 +6,6 @@ use super::metadata::{Body, Root, Snapshot, Targets, Timestamp};
 use super::trusted::{Kept, Trusted, text};
 use super::{MAX_ROOT_BYTES, MAX_ROOTS, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES};
 
-/// Where metadata comes from.
 pub trait Source {
     /// Reads a metadata file, such as `2.root.json`: at most `max_bytes + 1` bytes, so that a longer one shows.
     /// `None` if there is no such file.

@@ -1,10 +1,13 @@
 //! All formats against `expected.json`, which was recorded with splat-transform 2.7.1 and confirmed by a second
 //! reader; trained scenes against a separate parser of their layout.
 
+use std::io::Read;
+
 use serde_json::Value;
 use slag_common::splat::{ReadOptions, SplatError, read};
 
-use super::{assert_columns_agree, assert_near, needs_shared, read_all, shared};
+use super::generated::gzip;
+use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
 
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().into_iter().flatten().map(|v| v.as_f64().expect("a number")).collect()
@@ -175,4 +178,33 @@ fn a_missing_file_is_named_once() {
     let chain = std::iter::successors(Some(&error as &dyn std::error::Error), |error| error.source());
     let text = chain.map(ToString::to_string).collect::<Vec<_>>().join(": ");
     assert_eq!(text.matches("absent.ply").count(), 1, "{text}");
+}
+
+/// More rows than the header counts, or two columns of a name, would be half read in silence.
+#[needs_shared]
+#[test]
+fn files_that_go_on_behind_their_last_row_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let fixture =
+        |name: &str| std::fs::read(shared("fixtures/formats").join(name)).expect("the fixture is there");
+    let spz = fixture("playbot_lod6_v3.spz");
+    let mut content = Vec::new();
+    flate2::read::GzDecoder::new(&spz[..]).read_to_end(&mut content).expect("unpacks");
+    let longer = |bytes: &[u8]| [bytes, &[7; 400]].concat();
+    let (ascii, plain) = (fixture("gsplatrs_minimal_ascii.ply"), fixture("playbot_lod6.ply"));
+    let rows = ascii.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
+    for (name, bytes) in [
+        ("plain.ply", longer(&plain)),
+        ("ascii.ply", [&ascii, &b"\n"[..], &ascii[rows..]].concat()),
+        ("packed.ply", longer(&fixture("playbot_lod6.compressed.ply"))),
+        ("whole.spz", gzip(&longer(&content))),
+    ] {
+        let error = read_bytes(folder.path(), name, &bytes).expect_err(name).to_string();
+        assert!(error.contains("expected the end of the"), "{error}");
+    }
+    read_bytes(folder.path(), "blank.ply", &[&plain[..], b"\n"].concat()).expect("reads");
+    let (from, to) = ("property float opacity\n", "property float opacity\nproperty float opacity\n");
+    let twice = String::from_utf8(ascii).expect("text").replacen(from, to, 1);
+    let error = read_bytes(folder.path(), "twice.ply", twice.as_bytes()).expect_err("is refused").to_string();
+    assert!(error.contains("a property that the element does not have yet"), "{error}");
 }

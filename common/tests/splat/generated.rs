@@ -196,7 +196,7 @@ fn write_webp(path: &Path, width: u32, pixels: &[[u8; 4]]) {
 }
 
 /// Writes a SOG of version 1 with six Gaussians and harmonics of degree 1.
-pub fn write_sog_v1(folder: &Path) {
+fn write_sog_v1(folder: &Path) {
     let pixel = |seed: u8| -> Vec<[u8; 4]> {
         (0..6)
             .map(|i: u8| [0, 1, 2, 3].map(|c: u8| seed.wrapping_mul(31).wrapping_add(i * 40 + c * 11)))

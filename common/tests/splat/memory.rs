@@ -5,7 +5,6 @@ use std::io::{BufWriter, Write};
 use slag_common::Gaussians;
 use slag_common::splat::{ReadOptions, read};
 
-/// Returns the peak memory of this process, bytes.
 fn peak_rss_bytes() -> usize {
     let status = std::fs::read_to_string("/proc/self/status").expect("Linux");
     let line = status.lines().find(|line| line.starts_with("VmHWM:")).expect("VmHWM");

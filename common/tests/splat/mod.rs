@@ -1,6 +1,5 @@
-//! Splat files: recorded values of other readers, oracles of our own, and damage.
+//! Splat files: recorded values of other readers, and oracles of our own.
 
-mod damage;
 mod formats;
 mod generated;
 mod memory;
@@ -16,7 +15,6 @@ fn read_all(path: &Path) -> Result<Gaussians, SplatError> {
     read(path, &ReadOptions { with_sh_rest: true })
 }
 
-/// Writes `bytes` to a file in `folder` and reads it.
 fn read_bytes(folder: &Path, name: &str, bytes: &[u8]) -> Result<Gaussians, SplatError> {
     let path = folder.join(name);
     std::fs::write(&path, bytes).expect("the temporary folder can be written");

@@ -17,7 +17,6 @@ pub fn key(n: u8) -> SigningKey {
     SigningKey::from_bytes(&[n; 32])
 }
 
-/// The signing keys of a repository.
 #[derive(Clone)]
 pub struct Owner {
     pub root: Vec<SigningKey>,
@@ -114,7 +113,6 @@ impl Repo {
         self.sign_timestamp();
     }
 
-    /// Signs the next timestamp for the present snapshot.
     pub fn sign_timestamp(&mut self) {
         let meta = FileMeta::of(self.version, &self.files[&format!("{}.snapshot.json", self.version)]);
         self.timestamp_version += 1;
@@ -159,7 +157,6 @@ pub fn update(kept: &mut Kept, repo: &mut Repo) -> Result<Trusted, TufError> {
     refresh(kept, repo, NOW)
 }
 
-/// A client that has updated from a repository.
 pub fn updated(repo: &mut Repo) -> Kept {
     let mut kept = client(repo);
     update(&mut kept, repo).expect("an honest repository");

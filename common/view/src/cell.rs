@@ -5,7 +5,6 @@ use glam::{DVec3, Vec3};
 use half::f16;
 use slag_common::appearance::{Appearance, larger_size_code, size_code};
 
-/// First bytes of the message.
 const MAGIC: [u8; 4] = *b"SLGG";
 const VERSION: u32 = 1;
 /// Bytes before the columns.

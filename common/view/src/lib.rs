@@ -48,7 +48,6 @@ pub fn is_built() -> bool {
     !FILES.is_empty()
 }
 
-/// Routes `/view` and `/view/*`.
 pub fn router<S: Clone + Send + Sync + 'static>() -> Router<S> {
     Router::new()
         .route("/view", get(async |headers: HeaderMap| reply("index.html", &headers)))

@@ -2,7 +2,6 @@
 
 use std::ops::Range;
 
-/// First bytes of the message.
 const MAGIC: [u8; 4] = *b"SLGS";
 const VERSION: u32 = 1;
 /// Bytes before the table of cells.

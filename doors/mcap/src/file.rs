@@ -9,7 +9,6 @@ use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 use serde_json::{Value, json};
 
-/// An MCAP file that is being written.
 pub struct File<W: Write + Seek> {
     writer: Writer<W>,
     time_ns: u64,
@@ -34,7 +33,6 @@ impl<W: Write + Seek> File<W> {
         Ok(self.writer.write_to_known_channel(&header, message.to_string().as_bytes())?)
     }
 
-    /// Writes the end of the file.
     pub fn finish(mut self) -> Result<()> {
         self.writer.finish()?;
         Ok(self.writer.into_inner().flush()?)

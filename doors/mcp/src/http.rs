@@ -11,7 +11,6 @@ use slag_service::listener::{self, ConnectionLimits};
 
 use crate::Tools;
 
-/// Where the protocol is spoken.
 pub const PATH: &str = "/mcp";
 /// Longest request: a photo of 3 MB in base64.
 const MAX_BODY_BYTES: usize = 4 << 20;

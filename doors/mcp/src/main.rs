@@ -54,7 +54,6 @@ fn run(args: Args) -> Result<()> {
     Ok(())
 }
 
-/// Speaks until stdin ends.
 async fn speak_on_stdio(tools: Tools) -> Result<()> {
     let service = tools.serve(rmcp::transport::stdio()).await.context("no MCP client on stdin")?;
     service.waiting().await?;

@@ -19,7 +19,6 @@ const INSTRUCTIONS: &str = "Answers where things are on the robot's map of its s
     is there; ask find for each thing, and where_to_stand before going to one. Names in a list are guesses with their \
     chances.";
 
-/// The tools over a robot.
 #[derive(Clone, Debug)]
 pub struct Tools {
     robot: Robot,

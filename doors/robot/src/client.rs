@@ -62,7 +62,6 @@ impl Robot {
         self.get("/v1/map")
     }
 
-    /// Returns things on board, by the parameters of `GET /v1/objects`.
     pub fn objects(&self, parameters: &[(&str, String)]) -> Result<ObjectPage, RobotError> {
         self.get_with("/v1/objects", parameters)
     }
@@ -76,22 +75,18 @@ impl Robot {
         Ok(self.objects(&parameters)?.n_objects)
     }
 
-    /// Returns places to stand, by the parameters of `GET /v1/goal`.
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<GoalReply, RobotError> {
         self.get_with("/v1/goal", parameters)
     }
 
-    /// Returns what changed between two generations, by the parameters of `GET /v1/changes`.
     pub fn changes(&self, parameters: &[(&str, String)]) -> Result<ChangesReply, RobotError> {
         self.get_with("/v1/changes", parameters)
     }
 
-    /// Returns the ground around the robot, by the parameters of `GET /v1/floor`.
     pub fn floor(&self, parameters: &[(&str, String)]) -> Result<Floor, RobotError> {
         self.get_with("/v1/floor", parameters)
     }
 
-    /// Returns where the camera of a JPEG or PNG is, by the parameters of `POST /v1/locate`.
     pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<locate::Answer, RobotError> {
         let media_type = if photo.starts_with(b"\x89PNG") { "image/png" } else { "image/jpeg" };
         self.send("/v1/locate", parameters, media_type, photo)

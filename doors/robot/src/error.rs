@@ -5,7 +5,6 @@ use serde_json::Value;
 /// Longest text that a robot takes.
 pub(crate) const MAX_TEXT_BYTES: usize = 512;
 
-/// Why the robot gave no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {
     #[error(

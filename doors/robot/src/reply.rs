@@ -26,15 +26,12 @@ pub struct Results<A = Answer> {
     /// What was asked in place of words that the robot's model does not know.
     #[serde(default)]
     pub asked_as: BTreeMap<String, String>,
-    /// Why there is no answer.
     pub none: Option<Nothing>,
-    /// Offset of the next page, if there is one.
     pub next_offset: Option<u64>,
     /// Best first.
     pub answers: Vec<A>,
 }
 
-/// Why nothing was found.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Nothing {
     /// `below-threshold`, `no-such-thing`, `no-such-pair` ...
@@ -43,7 +40,6 @@ pub struct Nothing {
     pub detail: String,
     /// The part of a phrase that failed.
     pub thing: Option<String>,
-    /// Best score of anything on board.
     pub best_score: Option<f32>,
 }
 
@@ -62,9 +58,7 @@ pub struct Answer {
     pub box_max_in_world: [f64; 3],
     /// Edges of that box.
     pub size: [f64; 3],
-    /// Its box along its own axes.
     pub oriented_box: OrientedBox,
-    /// How well it matches.
     pub score: f32,
     /// Distance from the asker, if the request had a position.
     pub distance: Option<f64>,
@@ -75,11 +69,9 @@ pub struct Answer {
     pub related_to: Vec<Witness>,
 }
 
-/// A Gaussian that matches.
 #[derive(Clone, Copy, Debug, Deserialize)]
 pub struct PointAnswer {
     pub position_in_world: [f64; 3],
-    /// How well it matches.
     pub score: f32,
 }
 

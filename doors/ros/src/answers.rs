@@ -55,7 +55,6 @@ pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3
     Detection3DArray { header: header.clone(), detections: answers.iter().map(detection).collect() }
 }
 
-/// Returns a place to stand.
 pub fn goal_pose(header: &Header, goal: &Goal) -> PoseStamped {
     let pose = Pose {
         position: goal.position_in_world.to_array().into(),

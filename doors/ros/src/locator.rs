@@ -9,7 +9,6 @@ use crate::geometry::Rigid;
 use crate::messages::CameraInfo;
 use crate::transforms::Transforms;
 
-/// Photos that are remembered.
 const N_KEPT: usize = 7;
 /// Photos that must agree on where the robot is, this one among them.
 const MIN_AGREEING: usize = 2;

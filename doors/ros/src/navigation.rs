@@ -20,7 +20,6 @@ pub enum Ended {
     Replaced,
 }
 
-/// Sends goals to Nav2.
 pub struct Navigator {
     client: ActionClient<NavigationGoal, NavigationResult, NavigationFeedback>,
 }

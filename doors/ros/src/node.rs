@@ -45,7 +45,6 @@ const PHOTO_PERIOD: Duration = Duration::from_secs(2);
 /// Pause after a failed read, so that a broken topic does not burn the CPU.
 const READ_PAUSE: Duration = Duration::from_millis(100);
 
-/// What all parts of the node share.
 struct Shared {
     args: Args,
     robot: Robot,
@@ -77,7 +76,6 @@ struct Locating {
 /// The action that drives, if goals are sent there.
 struct Navigation {
     navigator: Navigator,
-    /// How the newest goal stands.
     state: Publisher<Text>,
     /// Cancels the newest goal with a message, and ends with that goal. If it is dropped, another goal takes its
     /// place.
@@ -114,7 +112,6 @@ struct Found {
     reason: String,
 }
 
-/// Runs the node until `stop` completes.
 pub async fn run(args: Args, robot: Robot, stop: impl Future<Output = ()>) -> Result<()> {
     let mut node = join(&args)?;
     let shared = Arc::new(Shared::new(&mut node, args, robot)?);

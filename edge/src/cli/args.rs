@@ -122,7 +122,6 @@ pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     how.session_options(&model_commands::runtime_folders(&exe), n_cores.min(MAX_MODEL_THREADS))
 }
 
-/// Reads an environment variable.
 pub fn variable(name: &str) -> Option<OsString> {
     std::env::var_os(name)
 }

@@ -16,7 +16,6 @@ use toml::{Table, Value};
 
 /// The file that is read if it is there and no other is named.
 const DEFAULT_FILE: &str = "/etc/slag/edge.toml";
-/// What `--help` says of this.
 pub const HELP: &str = "Flags may also come from the environment (SLAG_EDGE_CACHE for --cache, SLAG_EDGE_FETCH_RADIUS for fetch --radius) \
     and from the configuration file (cache = \"DIR\", and radius = 20 under [fetch]); the command line comes first, then \
     the environment, then the file.";
@@ -57,7 +56,6 @@ pub fn parse(
     Ok(command.try_get_matches_from(line)?)
 }
 
-/// A file, or none.
 struct File {
     path: PathBuf,
     table: Table,

@@ -157,7 +157,7 @@ fn on_board(cache: &EdgeCache) -> Vec<Finding> {
     if status.geo_reference.is_none() {
         note("latitude", "none: the scene has no geo-reference, so positions are in its world");
     }
-    if snapshot.shards.iter().all(|shard| shard.occupancy().is_none()) {
+    if snapshot.shards.iter().all(|shard| shard.additions().occupancy.is_none()) {
         note("goal", "no places to stand: the scene was encoded without --occupancy");
     }
     findings

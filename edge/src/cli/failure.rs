@@ -29,7 +29,6 @@ impl From<Exit> for ExitCode {
 
 /// Reasons for ending a run early.
 pub enum Failure {
-    /// Invalid request.
     Usage(anyhow::Error),
     /// Failure; the string is the kind of error for programs.
     Failed(&'static str, anyhow::Error),
@@ -41,7 +40,6 @@ pub enum Failure {
 }
 
 impl Failure {
-    /// Returns a function that wraps an error with its kind.
     pub fn of(kind: &'static str) -> impl Fn(anyhow::Error) -> Self {
         move |error| Self::Failed(kind, error)
     }

@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use crate::goal::{self, GoalError, GoalRequest, GoalTarget};
+use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use crate::query::{object_id, parse_point};
 use crate::score::Budget;
 use clap::Args;
@@ -28,34 +28,10 @@ pub struct GoalArgs {
     /// Where the robot is, world frame [default: the middle of the area on board].
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     pub near: Option<DVec3>,
-    /// Radius of the robot, seen from above.
-    #[arg(long, value_name = "M", default_value_t = 0.3)]
-    pub radius_m: f64,
-    /// Largest horizontal distance from the robot's middle to the thing's surface.
-    #[arg(long, value_name = "M", default_value_t = 0.8)]
-    pub reach_m: f64,
-    /// Height of the sensor above the ground.
-    #[arg(long, value_name = "M", default_value_t = 0.4)]
-    pub sensor_height_m: f64,
-    /// Height of the robot [default: 0.1 above the sensor].
-    #[arg(long, value_name = "M")]
-    pub height_m: Option<f64>,
-    /// Highest step that it climbs, 1.5 of the scene's voxels or more [default: 0.1, or 0.15 with voxels of 0.1
-    /// m].
-    #[arg(long, value_name = "M")]
-    pub step_m: Option<f64>,
-    /// Steepest ground that it drives on: rise for each metre of way.
-    #[arg(long, value_name = "RATIO", default_value_t = 0.5)]
-    pub slope: f64,
-    /// How far around it ground is looked at.
-    #[arg(long, value_name = "M", default_value_t = 20.0)]
-    pub range_m: f64,
-    /// Least share of the thing that the sensor must see.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.02)]
-    pub min_visible: f64,
-    /// Most poses.
-    #[arg(long, default_value_t = 3)]
-    pub limit: usize,
+    #[command(flatten)]
+    pub robot: Robot,
+    #[command(flatten)]
+    pub stand: Stand,
     /// Write the ground around the robot as a picture: black what it must not touch, grey what is unknown, white
     /// where it can go.
     #[arg(long, value_name = "FILE.pgm")]
@@ -74,19 +50,7 @@ pub struct GoalArgs {
 pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let target =
         object_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
-    let request = GoalRequest {
-        near: args.near,
-        radius_m: args.radius_m,
-        reach_m: args.reach_m,
-        sensor_height_m: args.sensor_height_m,
-        height_m: args.height_m,
-        step_m: args.step_m,
-        slope: args.slope,
-        range_m: args.range_m,
-        min_visible: args.min_visible,
-        limit: args.limit,
-        ..GoalRequest::new(target)
-    };
+    let request = GoalRequest { target, near: args.near, robot: args.robot, stand: args.stand };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;

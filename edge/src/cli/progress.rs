@@ -57,7 +57,6 @@ pub fn print_line(report: &FetchReport) -> Result<(), Failure> {
     Ok(())
 }
 
-/// A progress line on the terminal.
 #[derive(Default)]
 pub struct Bar {
     shown: bool,
@@ -66,12 +65,10 @@ pub struct Bar {
 }
 
 impl Bar {
-    /// Makes a progress line, shown or not.
     pub fn new(shown: bool) -> Self {
         Self { shown, ..Self::default() }
     }
 
-    /// Ends the line.
     pub fn finish(&self) {
         if self.shown && self.planned_bytes.load(Ordering::Relaxed) > 0 {
             // Failing to show progress is no reason to stop.

@@ -101,7 +101,6 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
     if args.json { write_json(reply) } else { print_reply(&reply) }
 }
 
-/// Writes the Gaussians of a reply, piece by piece.
 fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
     let mut file = fs_err::File::create(path)?;
     for piece in reply.ply() {

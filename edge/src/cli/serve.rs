@@ -107,7 +107,6 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     served
 }
 
-/// Serves until a signal to stop.
 async fn serve(
     args: ServeArgs,
     tls: Option<Tls>,
@@ -214,7 +213,6 @@ fn scrub_in_background(app: &Arc<App>, secs: u64) -> Result<Option<Arc<AtomicBoo
     Ok(Some(cancel))
 }
 
-/// Returns who may ask.
 fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
     let settings = AccessSettings {
         hosts: std::mem::take(&mut args.host),
@@ -259,7 +257,6 @@ mod tests {
 /// Pulses in the time after which systemd takes a silent service for dead; it advises two.
 const PULSES_PER_TIMEOUT: u32 = 3;
 
-/// What systemd is told.
 #[derive(Clone, Copy, Debug)]
 enum News {
     Ready,

@@ -66,7 +66,6 @@ impl<'a> Client<'a> {
         Ok(Self { http, base: from.trim_end_matches('/').to_owned() })
     }
 
-    /// Returns the address of the store.
     pub fn base(&self) -> &str {
         &self.base
     }

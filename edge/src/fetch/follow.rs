@@ -37,7 +37,6 @@ pub struct FollowSettings {
     pub refresh: Option<Duration>,
     /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
     pub first_backoff: Duration,
-    /// Longest wait after a failure.
     pub longest_backoff: Duration,
 }
 
@@ -80,7 +79,6 @@ impl Follower {
         Self { settings, covered: None, attempted: None, n_failures: 0, retry_at: Duration::ZERO }
     }
 
-    /// Returns the radius to fetch, world units.
     pub fn fetch_radius(&self) -> f64 {
         self.settings.radius + self.settings.margin
     }
@@ -112,7 +110,6 @@ impl Follower {
         self.covered = None;
     }
 
-    /// Records a successful fetch and its start.
     pub fn fetched(&mut self, began: Duration, centre_in_world: DVec3) {
         (self.covered, self.attempted) = (Some((centre_in_world, began)), Some(began));
         (self.n_failures, self.retry_at) = (0, Duration::ZERO);
@@ -169,7 +166,6 @@ pub struct Following {
 }
 
 impl Following {
-    /// Posts the robot's position.
     pub fn post(&self, position: Position) {
         let mut inbox = self.lock();
         inbox.status.position = Some(position);
@@ -208,7 +204,6 @@ impl Following {
         inbox.n_failures_in_a_row
     }
 
-    /// Records that following begins again.
     pub(crate) fn note_restart(&self) {
         self.lock().status.n_restarts += 1;
     }
@@ -251,7 +246,6 @@ impl Following {
 
 pub struct FollowEnvironment<'a> {
     pub fetch: &'a mut dyn FnMut(&FetchRequest) -> Result<FetchReport, FetchError>,
-    /// Receives the outcome of each fetch.
     pub report: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a dyn Fn() -> f64,

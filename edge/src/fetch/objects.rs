@@ -19,7 +19,6 @@ use super::staging::part_path;
 use crate::store::files::is_bad_medium;
 use crate::store::{self, CellFault, CurrentCell, EdgeCache, StoreError};
 
-/// Most connections at a time.
 const MAX_PARALLEL: usize = 64;
 
 /// Checks of an object beyond its hash.

@@ -84,7 +84,6 @@ impl Offer {
 
 struct StoreMetadata<'a> {
     client: &'a Client<'a>,
-    /// Why the last download failed.
     failure: Option<FetchError>,
 }
 

@@ -11,7 +11,6 @@ use super::position::PlanError;
 use super::request::Tally;
 use crate::store::CurrentCell;
 
-/// A shard on board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Held {
     pub len_bytes: u64,
@@ -19,11 +18,9 @@ pub struct Held {
     pub last_used: u64,
 }
 
-/// The set of cells wanted on board.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wanted {
     pub profile: Profile,
-    /// Where the robot is.
     pub centre_in_world: DVec3,
     /// Cells within this distance are needed, world units.
     pub radius: f64,

@@ -21,7 +21,6 @@ const MAX_CONTENT_BYTES: u64 = MAX_COPY_BYTES - 256;
 const LOCK_TIMEOUT: Duration = Duration::from_secs(2);
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
-/// Reasons for which the records cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordsError {
     #[error("another fetch uses {path}; wait for it or end it", path = path.display())]
@@ -51,7 +50,6 @@ pub struct Accepted {
     pub root_version: u64,
     /// When the newest timestamp says it was signed, seconds since 1970.
     pub signed_unix_secs: Option<u64>,
-    /// When it expires, seconds since 1970.
     pub expires_unix_secs: Option<u64>,
 }
 
@@ -105,7 +103,6 @@ impl Records {
         Ok(Self { copies, version, record, damage, _lock: lock })
     }
 
-    /// Returns the error of damaged records, if both copies are damaged.
     pub fn damage(&self) -> Option<RecordsError> {
         let what = self.damage.clone()?;
         Some(RecordsError::Damaged { path: self.copies.dir().to_owned(), what })
@@ -124,7 +121,6 @@ impl Records {
         self.record.kept.as_ref()
     }
 
-    /// Returns the SHA-256 of the root that was trusted first, hex.
     pub(crate) fn first_root_sha256(&self) -> Option<&str> {
         self.record.first_root_sha256.as_deref()
     }
@@ -135,12 +131,10 @@ impl Records {
         self.write(cache, Record { first_root_sha256, kept: Some(kept), ..self.record.clone() })
     }
 
-    /// Durably records accepted metadata.
     pub fn keep(&mut self, cache: &EdgeCache, kept: &Kept) -> Result<(), RecordsError> {
         self.write(cache, Record { kept: Some(kept.clone()), ..self.record.clone() })
     }
 
-    /// Durably records an accepted scene and the request for it.
     pub fn accept(&mut self, cache: &EdgeCache, last: &LastFetch, scene: &str) -> Result<(), RecordsError> {
         let (scene, last) = (Some(scene.to_owned()), Some(last.clone()));
         self.write(cache, Record { scene, last, ..self.record.clone() })

@@ -26,7 +26,6 @@ pub struct FetchRequest {
     /// Cells within this distance are fetched, world units.
     pub radius: f64,
     pub profile: Profile,
-    /// At the first contact, trust the root that the store offers.
     pub trust_first: bool,
     /// The only scene accepted, from now on; absent: the one accepted before or, at the first contact, the
     /// server's.
@@ -63,7 +62,6 @@ pub trait Progress: Sync {
 
 impl Progress for () {}
 
-/// The surroundings of a fetch.
 pub struct Environment<'a> {
     pub now_unix_secs: u64,
     /// Set to end the fetch; the next one resumes what arrived.
@@ -77,7 +75,6 @@ pub struct Environment<'a> {
     pub limits: NetworkLimits,
 }
 
-/// Number and length of some shards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Tally {
     pub n_shards: usize,
@@ -93,12 +90,9 @@ impl Tally {
     }
 }
 
-/// The text model that a scene carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct TextModelTally {
-    /// Length of its files.
     pub bytes: u64,
-    /// Length of those that were downloaded.
     pub downloaded_bytes: u64,
 }
 
@@ -108,7 +102,6 @@ pub struct FetchReport {
     pub generation: u64,
     /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
-    /// Version of the root by which the manifest is trusted.
     pub root_version: u64,
     /// Whether that root was accepted because it was the first.
     pub is_first_contact: bool,
@@ -116,7 +109,6 @@ pub struct FetchReport {
     pub encoder_id: Hash32,
     pub encoder_name: String,
     pub profile: Profile,
-    /// Centre, world frame.
     pub centre_in_world: DVec3,
     /// Radius, world units.
     pub radius: f64,

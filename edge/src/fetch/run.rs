@@ -240,7 +240,6 @@ impl<'a> Planned<'a> {
     }
 }
 
-/// The new generation is on board.
 struct Switched<'a> {
     planned: Planned<'a>,
     current: Current,

@@ -43,7 +43,6 @@ pub fn clear_staging(cache: &EdgeCache, wanted: &[Object]) -> Result<(), FetchEr
     Ok(())
 }
 
-/// Removes the manifests that are not needed any more.
 pub fn clear_manifests(cache: &EdgeCache, needed: &BTreeSet<Hash32>) -> Result<(), FetchError> {
     let dir = cache.dir().join("manifests");
     for name in cache.files().list(&dir)? {
@@ -67,7 +66,6 @@ pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchErro
 /// A longer file is damaged; a shard takes about 80 bytes.
 const MAX_BYTES: u64 = 16 << 20;
 
-/// The records of use.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Usage {

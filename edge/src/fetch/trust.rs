@@ -9,27 +9,18 @@ use super::records::Records;
 use super::request::Environment;
 use crate::store::EdgeCache;
 
-/// Where the first root comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum FirstRoot {
     /// Its bytes, which came by hand.
     Bytes(Vec<u8>),
     /// The store at an address has it; its SHA-256 in hex came by hand.
-    Sha256 {
-        /// Address of the store.
-        from: String,
-        sha256: String,
-    },
+    Sha256 { from: String, sha256: String },
     /// The first root of the store at an address, whoever answers there.
-    Any {
-        /// Address of the store.
-        from: String,
-    },
+    Any { from: String },
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct AddedRoot {
-    /// SHA-256, hex.
     pub sha256: String,
     pub version: u64,
     /// Whether it was trusted just now; otherwise the robot began with it, and nothing changed.

@@ -32,7 +32,6 @@ const SHARE_OF_BEST: f64 = 0.5;
 /// Metres of way that a pose that sees nothing would be worse than one that sees all.
 const SIGHT_WEIGHT_M: f64 = 4.0;
 
-/// A place near the thing.
 #[derive(Clone, Copy)]
 struct Candidate {
     cell: usize,
@@ -43,7 +42,7 @@ struct Candidate {
 /// Returns the best poses near the thing with a surface at `points`, or why there is none.
 pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) -> Result<Vec<Goal>, NoGoal> {
     let window = &around.space.window;
-    let near = cells_near(window, points, request.reach_m + window.voxel * 0.5f64.sqrt());
+    let near = cells_near(window, points, request.stand.reach_m + window.voxel * 0.5f64.sqrt());
     around.paths.find(near.iter().copied());
     let around = &*around;
     let reached: Vec<Candidate> = near.iter().filter_map(|cell| candidate(around, request, *cell)).collect();
@@ -61,7 +60,7 @@ pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) 
     };
     let mut looks = looked_at(sifted(window, reached.clone()));
     // Over the edge of a table, the thing on it is often seen only from a strip that is narrower than a square.
-    if looks.iter().all(|look| look.visible_share < request.min_visible) {
+    if looks.iter().all(|look| look.visible_share < request.stand.min_visible) {
         let step = reached.len().div_ceil(MAX_MORE);
         looks = looked_at(reached.into_iter().step_by(step).collect());
     }
@@ -69,7 +68,7 @@ pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) 
         return Err(NoGoal::Unreachable);
     }
     let best_share = looks.iter().map(|look| look.visible_share).fold(0.0, f64::max);
-    let least = request.min_visible.max(SHARE_OF_BEST * best_share);
+    let least = request.stand.min_visible.max(SHARE_OF_BEST * best_share);
     let mut seeing: Vec<Look> = looks.into_iter().filter(|look| look.visible_share >= least).collect();
     if seeing.is_empty() {
         return Err(NoGoal::NotVisible);
@@ -78,7 +77,7 @@ pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) 
     let mut best: Vec<Look> = Vec::new();
     for look in seeing {
         let is_apart = |other: &Look| other.position_in_world.distance(look.position_in_world) >= APART_M;
-        if best.len() < request.limit && best.iter().all(is_apart) {
+        if best.len() < request.stand.limit && best.iter().all(is_apart) {
             best.push(look);
         }
     }
@@ -122,7 +121,7 @@ fn cells_near(window: &Window, points: &[DVec3], distance: f64) -> Vec<usize> {
 
 fn candidate(around: &Around<'_>, request: &GoalRequest, cell: usize) -> Option<Candidate> {
     let path_m = around.paths.to(cell)? * around.space.window.voxel;
-    let spare_m = (around.clearance(cell) - request.radius_m).clamp(0.0, COMFORT_M);
+    let spare_m = (around.clearance(cell) - request.robot.radius_m).clamp(0.0, COMFORT_M);
     Some(Candidate { cell, cost_m: path_m + CLEARANCE_WEIGHT_M * (1.0 - spare_m / COMFORT_M) })
 }
 
@@ -144,7 +143,6 @@ fn sifted(window: &Window, candidates: Vec<Candidate>) -> Vec<Candidate> {
     sorted
 }
 
-/// The thing to stand at.
 struct Target<'a> {
     points: &'a [DVec3],
     samples: Vec<DVec3>,
@@ -155,7 +153,7 @@ impl<'a> Target<'a> {
     fn new(around: &Around<'a>, request: &GoalRequest, points: &'a [DVec3]) -> Self {
         let step = points.len().div_ceil(SAMPLES).max(1);
         let samples = points.iter().copied().step_by(step).collect();
-        Self { points, samples, thing: sight::Thing::new(around.space, points, request.reach_m) }
+        Self { points, samples, thing: sight::Thing::new(around.space, points, request.stand.reach_m) }
     }
 
     /// Returns the horizontal distance to the nearest of some points.
@@ -192,11 +190,11 @@ fn look(
 ) -> Option<Look> {
     let [x, y] = around.space.window.centre_of(of.cell);
     let mut pieces = target.points.chunks(64);
-    if !pieces.any(|points| Target::distance(points, [x, y]) <= request.reach_m) {
+    if !pieces.any(|points| Target::distance(points, [x, y]) <= request.stand.reach_m) {
         return None;
     }
     let position_in_world = DVec3::new(x, y, around.floor_height(of.cell)?);
-    let sensor_in_world = position_in_world + DVec3::Z * request.sensor_height_m;
+    let sensor_in_world = position_in_world + DVec3::Z * request.robot.sensor_height_m;
     let voxel = around.space.window.voxel_of(sensor_in_world);
     let mut seen = 0u128;
     for ((bit, point), hint) in (0..).zip(&target.samples).zip(hints) {

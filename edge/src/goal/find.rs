@@ -5,15 +5,13 @@ use slag_api::goal::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use slag_common::objects::public_id;
 
 use super::choose::choose;
-use super::request::{GoalError, GoalRequest, GoalTarget};
+use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings};
 use crate::query::{Ask, Engine, Outcome, Point, object_id};
 use crate::score::Budget;
 use crate::store::Snapshot;
 
-/// Things that are tried, best first.
 const MAX_THINGS: usize = 5;
-/// Most points of a thing's surface.
 const MAX_POINTS: usize = 4096;
 
 /// Finds places to stand near a thing. Blocks for tens of milliseconds.
@@ -39,11 +37,11 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
     let seen = Surroundings::look(&snapshot, request, near, budget)?;
     let voxel = seen.space.window.voxel;
     let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, voxel, near);
-    let Some(start) = seen.start(near, request.radius_m) else {
+    let Some(start) = seen.start(near, request.robot.radius_m) else {
         let detail = format!(
             "within {START_M} m of [{:.2}, {:.2}, {:.2}], where the robot is taken to be, no known ground at that height is {} m \
              clear",
-            near.x, near.y, near.z, request.radius_m
+            near.x, near.y, near.z, request.robot.radius_m
         );
         reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });
         return Ok(reply);
@@ -73,7 +71,8 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
 
 fn detail(missed: &MissedThing, request: &GoalRequest) -> String {
     let MissedThing { thing: TargetThing { id, .. }, none } = missed;
-    let GoalRequest { radius_m, reach_m, range_m, min_visible, sensor_height_m, .. } = request;
+    let Robot { radius_m, range_m, sensor_height_m, .. } = request.robot;
+    let Stand { reach_m, min_visible, .. } = request.stand;
     match none {
         NoGoal::NoSuchThing => format!("{id} is not on board"),
         NoGoal::Unreachable => format!(

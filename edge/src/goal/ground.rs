@@ -23,11 +23,9 @@ pub enum Floor {
     At(u8),
 }
 
-/// The ground of a space, by cell.
 pub struct Ground {
     /// `[n_x][n_y]`.
     pub floors: Vec<Floor>,
-    /// Cells along y.
     pub n_y: usize,
     /// `[n_x][n_y]`: surfaces with headroom; bit z is the surface whose highest voxel is z.
     surfaces: Vec<u128>,
@@ -186,7 +184,6 @@ pub fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
     std::array::from_fn(|cell| [whole(occupied, cell), whole(free, cell) | all_free])
 }
 
-/// Returns a mask of the lowest `n` bits.
 fn low_bits(n: u32) -> u128 {
     1u128.checked_shl(n).map_or(!0, |bit| bit - 1)
 }

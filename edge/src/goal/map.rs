@@ -12,10 +12,8 @@ use super::surroundings::Surroundings;
 use crate::query::Engine;
 use crate::score::Budget;
 
-/// The ground around a robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FloorMap {
-    /// Edge of a cell, metres.
     pub cell_m: f64,
     /// Corner of the first cell: the least x and y.
     pub origin_in_world: DVec3,
@@ -31,7 +29,7 @@ pub fn floor_map(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Res
     let snapshot = engine.snapshot()?;
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
     let seen = Surroundings::look(&snapshot, request, near, budget)?;
-    let start = seen.start(near, request.radius_m);
+    let start = seen.start(near, request.robot.radius_m);
     let paths = start.map(|start| {
         let mut paths = Paths::from(start, &seen.is_safe, &seen.ground, seen.step);
         paths.find(0..seen.is_safe.len());

@@ -26,4 +26,4 @@ mod tests;
 
 pub use find::find;
 pub use map::{FloorMap, floor_map};
-pub use request::{GoalError, GoalRequest, GoalTarget};
+pub use request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};

@@ -66,7 +66,6 @@ impl Paths {
         (cell / self.n_y + 1) * (self.n_y + 2) + cell % self.n_y + 1
     }
 
-    /// Finds the ways to some cells.
     pub fn find(&mut self, cells: impl IntoIterator<Item = usize>) {
         for cell in cells {
             let cell = self.bordered(cell);

@@ -16,7 +16,6 @@ const MAX_BLOCK: f64 = (1u32 << 28) as f64;
 /// Most blocks that are looked at: 190 MB.
 const MAX_BLOCKS: usize = 8 << 20;
 
-/// A block in its column.
 #[derive(Clone, Copy, Debug, bytemuck::Zeroable)]
 pub struct Stacked {
     /// Height in blocks above the window's lower side, below [`COLUMN_BLOCKS`].
@@ -79,7 +78,6 @@ impl Window {
     }
 }
 
-/// The blocks of a window.
 pub struct Space {
     pub window: Window,
     /// `[columns + 1]`: where each column's blocks start.

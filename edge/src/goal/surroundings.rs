@@ -23,7 +23,6 @@ const MAX_HEIGHT_M: f64 = 1.5;
 /// Bytes for a cell, in all steps together.
 const CELL_BYTES: usize = 36;
 
-/// What is known of the places around a robot.
 pub struct Around<'a> {
     pub space: &'a Space,
     pub ground: &'a Ground,
@@ -38,12 +37,10 @@ impl Around<'_> {
         f64::from(self.clearance.squared(cell)).sqrt() * self.space.window.voxel
     }
 
-    /// Returns whether the budget lasts.
     pub fn goes_on(&self) -> bool {
         self.budget.goes_on()
     }
 
-    /// Returns the height of the ground of a cell, world frame.
     pub(crate) fn floor_height(&self, cell: usize) -> Option<f64> {
         match self.ground.floors[cell] {
             Floor::At(z) => {
@@ -73,7 +70,7 @@ pub(super) struct Surroundings<'a> {
 /// storey below.
 fn own_surface(window: &Window, ground: &Ground, request: &GoalRequest, near: DVec3) -> Option<(usize, u8)> {
     let height = |offset: f64| window.voxel_of(near + DVec3::Z * offset)[2];
-    let highest = height(request.step_m(window.voxel) + SURFACE_DEPTH * window.voxel) - 1;
+    let highest = height(request.robot.step_m(window.voxel) + SURFACE_DEPTH * window.voxel) - 1;
     let lowest = height(-MAX_HEIGHT_M) - 1;
     let surface = |cell: usize| match (request.near, ground.floors[cell]) {
         (Some(_), _) => ground.surface_below(cell, highest).filter(|z| i32::from(*z) >= lowest),
@@ -111,7 +108,7 @@ impl<'a> Surroundings<'a> {
         budget: &'a Budget,
     ) -> Result<Self, GoalError> {
         let occupancies: Vec<Occupancy<'_>> =
-            snapshot.shards.iter().filter_map(|shard| shard.occupancy()).collect();
+            snapshot.shards.iter().filter_map(|shard| shard.additions().occupancy).collect();
         Self::of(&occupancies, request, centre, budget)
     }
 
@@ -125,13 +122,13 @@ impl<'a> Surroundings<'a> {
         let voxel = occupancies.first().ok_or(GoalError::NoOccupancy)?.header.voxel;
         let near = request.near.unwrap_or(centre);
         let most_m = MAX_CELLS.sqrt() / 2.0 * voxel;
-        let too_far = |most: String| RequestError::new("range_m", &request.range_m.to_string(), most);
-        if request.range_m > most_m {
+        let too_far = |most: String| RequestError::new("range_m", &request.robot.range_m.to_string(), most);
+        if request.robot.range_m > most_m {
             return Err(
                 too_far(format!("at most {most_m:.1}, as the scene's voxels are {voxel} m wide")).into()
             );
         }
-        let (step_m, least_m) = (request.step_m(voxel), LEAST_STEP_VOXELS * voxel);
+        let (step_m, least_m) = (request.robot.step_m(voxel), LEAST_STEP_VOXELS * voxel);
         if step_m < least_m - 1e-9 {
             let expected = format!(
                 "at least {least_m:.3}, as the scene's voxels are {voxel} m high and smaller steps do not show in them"
@@ -139,7 +136,7 @@ impl<'a> Surroundings<'a> {
             return Err(RequestError::new("step_m", &step_m.to_string(), expected).into());
         }
         let step = (step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
-        let window = Window::around(near, request.range_m, voxel);
+        let window = Window::around(near, request.robot.range_m, voxel);
         budget.take(window.cells().iter().product::<usize>() * CELL_BYTES);
         budget.check().map_err(GoalError::spent)?;
         let gathered = Space::gather(window, occupancies, budget);
@@ -147,17 +144,17 @@ impl<'a> Surroundings<'a> {
         let space = gathered
             .ok_or_else(|| too_far("a smaller range: there are more than 8 million blocks".into()))?;
         // A column has 128 voxels, so no higher robot has headroom.
-        let headroom = (request.height() / voxel).ceil().clamp(1.0, 128.0) as u32;
+        let headroom = (request.robot.height() / voxel).ceil().clamp(1.0, 128.0) as u32;
         let mut ground = Ground::find(&space, headroom, u32::from(step));
         let is_continued = match own_surface(&space.window, &ground, request, near) {
             Some((cell, z)) => ground.continue_from(cell, z, step, headroom),
             None => vec![false; ground.floors.len()],
         };
-        ground.block_slopes(request.slope, step, voxel);
+        ground.block_slopes(request.robot.slope, step, voxel);
         budget.check().map_err(GoalError::spent)?;
         let obstacles = clearance::obstacles(&ground, step);
         let clearance = Clearance::new(&obstacles, ground.n_y);
-        let least = (request.radius_m / voxel).powi(2).ceil() as u32;
+        let least = (request.robot.radius_m / voxel).powi(2).ceil() as u32;
         let is_safe = clearance.at_least(least.max(1));
         budget.check().map_err(GoalError::spent)?;
         Ok(Self { space, ground, is_continued, clearance, is_safe, step, budget })

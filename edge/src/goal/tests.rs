@@ -58,7 +58,6 @@ fn hall(more: impl Fn(DVec3) -> Option<At>) -> impl Fn(DVec3) -> At {
     }
 }
 
-/// The surface of the box.
 fn points() -> Vec<DVec3> {
     let steps = [2.8, 2.9, 3.0, 3.1, 3.2];
     let all = steps
@@ -69,6 +68,12 @@ fn points() -> Vec<DVec3> {
 
 const START: DVec3 = DVec3::new(0.6, 3.0, 0.0);
 
+fn asked(change: impl FnOnce(&mut GoalRequest)) -> GoalRequest {
+    let mut request = GoalRequest::new(GoalTarget::Object(1));
+    change(&mut request);
+    request
+}
+
 /// Finds the best poses near the thing with a surface at `points`.
 fn stand(
     world: &BuiltOccupancy,
@@ -78,7 +83,7 @@ fn stand(
 ) -> Result<Vec<Goal>, NoGoal> {
     let (request, budget) = (&GoalRequest { near: Some(near), ..request.clone() }, Budget::default());
     let seen = Surroundings::of(&[world.view()], request, near, &budget).expect("places are known");
-    let start = seen.start(near, request.radius_m).ok_or(NoGoal::UnknownGround)?;
+    let start = seen.start(near, request.robot.radius_m).ok_or(NoGoal::UnknownGround)?;
     choose(&mut seen.around(start), request, points)
 }
 
@@ -87,7 +92,7 @@ fn goals_with(world: &BuiltOccupancy, request: &GoalRequest) -> Result<Vec<Goal>
 }
 
 fn goals(more: impl Fn(DVec3) -> Option<At>) -> Result<Vec<Goal>, NoGoal> {
-    goals_with(&packed(hall(more)), &GoalRequest { limit: 5, ..GoalRequest::new(GoalTarget::Object(1)) })
+    goals_with(&packed(hall(more)), &asked(|r| r.stand.limit = 5))
 }
 
 /// Distances, clearances and headings by the hall's geometry.
@@ -162,8 +167,7 @@ fn a_screen_hides_the_thing_from_low_sensors() {
         (p.z < 0.6 && d > 0.35 && d < 0.4).then_some(At::Solid)
     };
     let world = packed(hall(screen));
-    let request =
-        |sensor_height_m| GoalRequest { sensor_height_m, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = |sensor_height_m| asked(|r| r.robot.sensor_height_m = sensor_height_m);
     assert_eq!(goals_with(&world, &request(0.4)), Err(NoGoal::NotVisible));
     goals_with(&world, &request(1.3)).expect("over the screen it is seen");
 }
@@ -179,7 +183,7 @@ fn nothing_is_seen_through_what_a_thing_stands_on() {
     };
     let world = packed(no_box);
     let on_board: Vec<DVec3> = points().into_iter().map(|p| p + DVec3::Z * 0.6).collect();
-    let request = GoalRequest::new(GoalTarget::Object(1));
+    let request = asked(|_| {});
     let found = stand(&world, &request, START, &on_board);
     assert_eq!(found, Err(NoGoal::NotVisible));
     // A thing that hangs there is seen from below.
@@ -200,7 +204,7 @@ fn what_hangs_on_a_wall_is_seen_from_below() {
             (0..9).map(move |z| DVec3::new(4.98, 2.8 + 0.05 * f64::from(y), 1.0 + 0.05 * f64::from(z)))
         })
         .collect();
-    let request = GoalRequest { reach_m: 0.45, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = asked(|r| r.stand.reach_m = 0.45);
     let world = packed(hall(wall));
     let found = stand(&world, &request, START, &on_wall).expect("poses");
     // Lines to its lower part enter the wall below it.
@@ -235,7 +239,7 @@ fn a_narrow_strip_from_which_a_thing_is_seen_is_found() {
         })
     };
     let found = |slit| {
-        let request = GoalRequest::new(GoalTarget::Object(1));
+        let request = asked(|_| {});
         stand(&world(slit), &request, DVec3::new(0.6, 0.6, 0.0), &pole)
     };
     let seeing = found(true).expect("poses");
@@ -255,7 +259,7 @@ fn steps_and_slopes_count() {
     };
     // Up a ramp, to a drop of 0.3 m at 2.6 m: from its upper side the box is 0.5 m away, closer no way leads.
     let world = packed(hall(ramp(0.3)));
-    let within = |reach_m| GoalRequest { reach_m, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let within = |reach_m| asked(|r| r.stand.reach_m = reach_m);
     let found = goals_with(&world, &within(0.8)).expect("poses");
     assert!(found.iter().all(|goal| goal.position_in_world.x <= 2.31), "{found:?}");
     assert_eq!(goals_with(&world, &within(0.45)), Err(NoGoal::Unreachable));
@@ -265,7 +269,7 @@ fn steps_and_slopes_count() {
     goals(threshold(0.05)).expect("poses");
     assert_eq!(goals(threshold(0.15)), Err(NoGoal::Unreachable));
     let world = packed(hall(threshold(0.15)));
-    let request = GoalRequest { step_m: Some(0.2), ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = asked(|r| r.robot.step_m = Some(0.2));
     goals_with(&world, &request).expect("a robot that climbs 20 cm");
     // A slope that is reached by a ramp on both sides.
     let hill = |p: DVec3| (p.z < (0.5 - (p.x - 1.8).abs()).max(0.0) * 0.6).then_some(At::Solid);
@@ -277,8 +281,8 @@ fn tables_are_driven_under_or_around() {
     // A table of 0.7 m over the whole way: a low robot drives below, a high one cannot.
     let table = |p: DVec3| inside(p, [1.4, 0.0, 0.65], [2.0, 6.0, 0.7]).then_some(At::Solid);
     let world = packed(hall(table));
-    goals_with(&world, &GoalRequest::new(GoalTarget::Object(1))).expect("below the table");
-    let high = GoalRequest { height_m: Some(0.9), ..GoalRequest::new(GoalTarget::Object(1)) };
+    goals_with(&world, &asked(|_| {})).expect("below the table");
+    let high = asked(|r| r.robot.height_m = Some(0.9));
     assert_eq!(goals_with(&world, &high), Err(NoGoal::Unreachable));
 }
 
@@ -288,7 +292,7 @@ fn tables_are_driven_under_or_around() {
 fn the_robots_height_decides_where_it_stands() {
     let table = |p: DVec3| inside(p, [1.0, 2.4, 0.0], [1.9, 3.6, 0.35]).then_some(At::Solid);
     let world = packed(hall(table));
-    let request = GoalRequest::new(GoalTarget::Object(1));
+    let request = asked(|_| {});
     let poses = |z: f64| stand(&world, &request, DVec3::new(1.1, 3.0, z), &points());
     for goal in poses(0.0).expect("from the floor beside it") {
         assert!(goal.position_in_world.z.abs() < 0.1, "{goal:?}");
@@ -312,7 +316,7 @@ fn the_storey_below_is_not_the_ground() {
         () => At::Free,
     };
     let world = packed_in(VOXEL, -3.2, |p| if p.z < -0.1 { below(p) } else { upper(p) });
-    let request = GoalRequest { limit: 5, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = asked(|r| r.stand.limit = 5);
     let found = stand(&world, &request, START, &points()).expect("poses");
     assert_eq!(found, goals(|_| None).expect("poses"), "as without a storey below");
     // From below, the cupboard is in the way; the thing itself is upstairs.
@@ -329,7 +333,7 @@ fn steep_ramps_are_not_driven() {
     goals(ridge(0.3)).expect("over a gentle one");
     assert_eq!(goals(ridge(0.95)), Err(NoGoal::Unreachable), "43 degrees");
     let world = packed(hall(ridge(0.95)));
-    let able = GoalRequest { slope: 1.2, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let able = asked(|r| r.robot.slope = 1.2);
     goals_with(&world, &able).expect("a robot that climbs");
 }
 
@@ -338,7 +342,7 @@ fn steep_ramps_are_not_driven() {
 fn steps_below_the_voxels_are_refused() {
     let refused = |voxel: f64, step_m: Option<f64>| {
         let world = packed_in(voxel, -4.0 * voxel, hall(|_| None));
-        let request = GoalRequest { step_m, ..GoalRequest::new(GoalTarget::Object(1)) };
+        let request = asked(|r| r.robot.step_m = step_m);
         let budget = Budget::default();
         let seen = Surroundings::of(&[world.view()], &request, START, &budget);
         seen.err().map(|error| error.to_string())
@@ -355,15 +359,14 @@ fn steps_below_the_voxels_are_refused() {
     assert!(refused(0.2, None).is_some());
     // In voxels of 10 cm the same hall has poses.
     let world = packed_in(0.1, -0.4, hall(|_| None));
-    let request = GoalRequest { step_m: Some(0.15), ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = asked(|r| r.robot.step_m = Some(0.15));
     goals_with(&world, &request).expect("poses");
 }
 
-/// Memory and time are checked before and while places are looked at.
 #[test]
 fn places_are_looked_at_within_a_budget() {
     let world = packed(hall(|_| None));
-    let request = GoalRequest { near: Some(START), ..GoalRequest::new(GoalTarget::Object(1)) };
+    let request = GoalRequest { near: Some(START), ..asked(|_| {}) };
     let pool = Pool::new(u64::MAX);
     let look = |bytes: u64, time: Duration| {
         let budget = Budget::new(bytes, time, &pool);
@@ -377,19 +380,17 @@ fn places_are_looked_at_within_a_budget() {
 #[test]
 fn requests_out_of_range_name_the_parameter() {
     let refused = |change: &dyn Fn(&mut GoalRequest)| {
-        let mut request = GoalRequest::new(GoalTarget::Object(1));
-        request.check().expect("the default is valid");
-        change(&mut request);
-        request.check().expect_err("refused").parameter
+        asked(|_| {}).check().expect("the default is valid");
+        asked(change).check().expect_err("refused").parameter
     };
-    assert_eq!(refused(&|r| r.radius_m = 0.0), "radius_m");
-    assert_eq!(refused(&|r| r.reach_m = f64::NAN), "reach_m");
-    assert_eq!(refused(&|r| r.height_m = Some(0.2)), "height_m");
-    assert_eq!(refused(&|r| r.sensor_height_m = 2.4), "sensor_height_m");
-    assert_eq!(refused(&|r| r.step_m = Some(-0.1)), "step_m");
-    assert_eq!(refused(&|r| r.slope = 0.0), "slope");
-    assert_eq!(refused(&|r| r.range_m = 51.0), "range_m");
-    assert_eq!(refused(&|r| r.min_visible = 0.0), "min_visible");
-    assert_eq!(refused(&|r| r.limit = 0), "limit");
+    assert_eq!(refused(&|r| r.robot.radius_m = 0.0), "radius_m");
+    assert_eq!(refused(&|r| r.stand.reach_m = f64::NAN), "reach_m");
+    assert_eq!(refused(&|r| r.robot.height_m = Some(0.2)), "height_m");
+    assert_eq!(refused(&|r| r.robot.sensor_height_m = 2.4), "sensor_height_m");
+    assert_eq!(refused(&|r| r.robot.step_m = Some(-0.1)), "step_m");
+    assert_eq!(refused(&|r| r.robot.slope = 0.0), "slope");
+    assert_eq!(refused(&|r| r.robot.range_m = 51.0), "range_m");
+    assert_eq!(refused(&|r| r.stand.min_visible = 0.0), "min_visible");
+    assert_eq!(refused(&|r| r.stand.limit = 0), "limit");
     assert_eq!(refused(&|r| r.near = Some(DVec3::splat(f64::INFINITY))), "near");
 }

@@ -20,13 +20,10 @@ use crate::query::Engine;
 use crate::score::{Budget, OverBudget, Pool};
 use crate::store::Snapshot;
 
-/// The service's state.
 pub struct App {
     pub(super) engine: Engine,
     pub(super) settings: Settings,
-    /// A permit for each query in progress.
     pub(super) permits: Arc<Semaphore>,
-    /// Memory of the queries in progress.
     query_memory: Arc<Pool>,
     pub(super) metrics: Metrics,
     pub(super) following: Option<Arc<Following>>,
@@ -34,7 +31,6 @@ pub struct App {
     pub(super) listeners: Arc<Semaphore>,
     /// Whether the service stops: what never ends by itself ends then.
     pub(super) stopping: watch::Sender<bool>,
-    /// Held while a generation is loaded.
     loading: Mutex<()>,
     /// Unreadable shards for which a fetch was asked.
     asked: Mutex<BTreeSet<Hash32>>,
@@ -185,12 +181,9 @@ impl App {
 /// Time for a request and for sending its answer, besides that for the query.
 const STALL_BEYOND_QUERY: Duration = Duration::from_secs(50);
 
-/// Bounds of the service.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Bounds of the connections.
     pub connections: ConnectionLimits,
-    /// Who may ask.
     pub access: Access,
     /// Queries in progress; further ones get 503.
     pub max_queries: usize,
@@ -202,7 +195,6 @@ pub struct Settings {
     pub query_bytes: u64,
     /// Memory that all queries in progress may use; one that exceeds it gets 503.
     pub all_queries_bytes: u64,
-    /// Time for sending a long answer.
     pub stream_timeout: Duration,
 }
 
@@ -240,17 +232,13 @@ impl Default for Settings {
 const QUERY_BOUNDS_SECS: [f64; 11] =
     [0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.512, 2.048];
 
-/// The counters of this service.
 pub struct Metrics {
-    /// Responses by route and status.
     pub responses: Arc<ResponseCounts>,
     /// Times of queries, refused ones too.
     pub query_times: Histogram,
-    /// Questions without an answer.
     pub empty_answers: AtomicU64,
     /// Generations put in place.
     pub reloads: AtomicU64,
-    /// Generations that did not open.
     pub reload_failures: AtomicU64,
 }
 

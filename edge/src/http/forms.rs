@@ -13,7 +13,6 @@ use crate::score::MAX_CORNERS;
 
 /// A number as it stands between commas.
 const NUMBER: &str = r"-?[0-9]{1,9}(\.[0-9]{1,9})?";
-/// A latitude and a longitude.
 const LAT_LON: &str = r"-?[0-8]?[0-9](\.[0-9]{1,9})?,-?(1[0-7][0-9]|[0-9]{1,2})(\.[0-9]{1,9})?";
 
 /// Defines types of texts of a form: the value, the form as a regular expression, and the parser.

@@ -19,7 +19,6 @@ const RETRY_SECS: u32 = 1;
 /// Time after which a follower that failed may follow again.
 const FOLLOWER_RETRY_SECS: u32 = 5;
 
-/// Errors of whatever needs a scene.
 pub const SCENE: [(u16, &str); 2] = [
     (500, "The service failed."),
     (
@@ -65,17 +64,14 @@ struct EncoderName {
     id: Hash32,
 }
 
-/// The limit of queries in progress is reached.
 pub fn overloaded(limit: usize) -> Problem {
     Problem::overloaded(format!("{limit} queries are in progress, the limit; ask again"), RETRY_SECS)
 }
 
-/// The limit of clients that listen to events is reached.
 pub fn too_many_listeners(limit: usize) -> Problem {
     Problem::overloaded(format!("{limit} clients listen to events, the limit; ask again"), RETRY_SECS)
 }
 
-/// The answer took too long.
 pub fn timeout(limit: Duration) -> Problem {
     let detail = format!("no answer within {} s; ask for a smaller radius, or again", limit.as_secs_f64());
     Problem::timeout(detail, RETRY_SECS)
@@ -90,13 +86,11 @@ pub fn out_of_time(given: Duration) -> Problem {
     Problem::new(StatusCode::GATEWAY_TIMEOUT, "time-budget", "Time budget spent", detail)
 }
 
-/// The service does not follow a robot.
 pub fn not_following() -> Problem {
     let detail = "positions are not followed; start the service with --follow URL";
     Problem::new(StatusCode::CONFLICT, "not-following", "Not following", detail)
 }
 
-/// The follower panicked and has not fetched since.
 pub fn follower_failed(failure: &str) -> Problem {
     let detail = format!(
         "positions are kept but not followed just now: {failure}; following starts again by itself, the log has more"
@@ -105,7 +99,6 @@ pub fn follower_failed(failure: &str) -> Problem {
         .retry_after(FOLLOWER_RETRY_SECS)
 }
 
-/// Returns the problem of a query that has no answer.
 pub fn query_problem(error: QueryError) -> Problem {
     let (kind, detail) = (error.kind(), error.to_string());
     let unavailable = |title| {

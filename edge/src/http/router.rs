@@ -62,7 +62,6 @@ fn routes() -> Routes<Arc<App>> {
         .get("/metrics", "counters in Prometheus' text format", status::metrics)
 }
 
-/// Returns the routes with their descriptions, and their table.
 pub(super) fn described() -> (Router<Arc<App>>, Vec<Route>) {
     routes().described::<Members>(ABOUT)
 }

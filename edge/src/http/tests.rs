@@ -89,7 +89,6 @@ async fn post(app: &Arc<App>, uri: &str, kind: &str, body: impl Into<Body>) -> A
     soon(async { read(router.oneshot(request).await.expect("infallible")).await }).await
 }
 
-/// Checks that a request was refused for a parameter.
 fn assert_refused((status, _, body): &Answered, parameter: &str, asked: &str) {
     assert_eq!((status.as_u16(), &body["parameter"]), (400, &json!(parameter)), "{asked}: {body}");
 }

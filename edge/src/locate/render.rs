@@ -32,7 +32,8 @@ pub(super) struct OnBoard<'a> {
 impl<'a> OnBoard<'a> {
     /// Returns the cells with an appearance, if there are any. Drawings are charged to the budget.
     pub(super) fn of(snapshot: &'a Snapshot, budget: &'a Budget) -> Option<Self> {
-        let cells = snapshot.shards.iter().filter_map(|shard| Some((shard.view(), shard.appearance()?)));
+        let cells =
+            snapshot.shards.iter().filter_map(|shard| Some((shard.view(), shard.additions().appearance?)));
         let cells: Vec<_> = cells.collect();
         (!cells.is_empty()).then_some(Self { cells, budget })
     }

@@ -30,7 +30,6 @@ fn member(steps: [u16; 3]) -> Member {
     Member { steps, embedding: vec![1.0, 0.0] }
 }
 
-/// A cache of one shard, with additional sections.
 fn with(dir: &Path, plain: &BuiltShard, additions: Additions<'_>) -> Snapshot {
     let mut bytes = Vec::new();
     plain.view().write_with(&mut bytes, additions).expect("writes to memory");

@@ -255,7 +255,6 @@ impl Answering<'_> {
         Answers { searched, reason, answers: Found::Clusters(answers), ..empty }
     }
 
-    /// Returns an empty answer that describes its question and its scene.
     fn empty(&self, asked: (&str, AnswerKind), scale: Scale, threshold: (f32, ThresholdSource)) -> Answers {
         let (manifest, request) = (self.scene.manifest, self.request);
         let bad_cells = bad_cells(self.scene, &request.region);
@@ -294,7 +293,6 @@ fn n_with_evidence(scene: &Scene<'_>, region: &Region) -> u64 {
     shards.map(|shard| shard.n_with_evidence() as u64).sum()
 }
 
-/// Returns the cells of a region whose shards could not be fetched.
 fn bad_cells(scene: &Scene<'_>, region: &Region) -> Vec<BadCellAnswer> {
     let touches =
         |bad: &&BadCell| cell_of(scene.manifest, bad.cell_id).is_none_or(|cell| region.touches(&cell.bounds));
@@ -336,7 +334,6 @@ fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer
     }
 }
 
-/// Describes an object. `score`: as reported.
 pub(super) fn object_answer(
     scene: &Scene<'_>,
     ranked: Ranked<FoundObject<'_>>,

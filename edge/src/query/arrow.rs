@@ -37,7 +37,6 @@ pub struct Pieces {
 }
 
 impl Pieces {
-    /// Starts a stream of a reply's Gaussians.
     pub fn new(reply: Reply) -> Self {
         let schema = Arc::new(schema(&reply));
         Self { reply, schema, writer: None, question: 0, item: 0, is_closed: false }

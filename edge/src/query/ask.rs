@@ -68,7 +68,6 @@ pub struct Ask {
 slag_common::named_members!(Ask);
 
 impl Ask {
-    /// Returns the most time to compute.
     pub(crate) fn time_budget(&self) -> Result<Option<Duration>, RequestError> {
         match self.time_budget_ms {
             Some(0) => Err(RequestError::new("time_budget_ms", "0", "at least 1")),

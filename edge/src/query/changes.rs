@@ -27,7 +27,6 @@ pub struct ChangesRequest {
     pub texts: Vec<String>,
 }
 
-/// Why generations are not compared.
 #[derive(Debug, thiserror::Error)]
 pub enum ChangesError {
     #[error(transparent)]
@@ -114,7 +113,6 @@ fn known(cache: &EdgeCache, manifest: &Manifest) -> Vec<u64> {
     known
 }
 
-/// Returns what the robot knows of a generation.
 fn generation(
     cache: &EdgeCache,
     snapshot: &Snapshot,

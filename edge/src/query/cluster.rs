@@ -33,7 +33,6 @@ pub struct Grouping {
     pub min_count: u64,
     /// Score at or above which Gaussians match.
     pub threshold: f32,
-    /// Permitted orientations of boxes.
     pub alignment: Alignment,
     pub with_members: bool,
 }
@@ -45,7 +44,6 @@ pub struct Cluster {
     pub n_gaussians: u64,
     /// Mean of the members' scores.
     pub score: f32,
-    /// Best of the members' scores.
     pub best_score: f32,
     /// Where its members' means are.
     pub extent: Extent,
@@ -55,7 +53,6 @@ pub struct Cluster {
     pub members: Vec<Run>,
 }
 
-/// All clusters of a set of matches.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clusters {
     /// Clusters with enough members, by first member, ascending.

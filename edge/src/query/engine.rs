@@ -108,7 +108,6 @@ impl OnBoard {
         })
     }
 
-    /// Returns whether the text model runs.
     pub(crate) fn text_is_alive(&self) -> bool {
         self.text.is_alive()
     }
@@ -119,7 +118,6 @@ impl OnBoard {
         Ok(self.text.encode(thing.as_deref().unwrap_or(text))?)
     }
 
-    /// Returns the vectors of a request's negatives.
     pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {
         let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
         negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)
@@ -140,7 +138,6 @@ pub struct Engine {
     /// Options to open the text models with that scenes carry; absent if the text model is given.
     carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
-    /// Vectors of the words that things are named by.
     pub(super) words: Mutex<Option<Arc<Words>>>,
     /// Buffers of finished answers, one for each answer computed at a time.
     idle: Mutex<Vec<Scratch>>,
@@ -181,7 +178,6 @@ impl Engine {
         &self.cache
     }
 
-    /// Returns the text encoder in use.
     pub fn encoder(&self) -> EncoderInfo {
         self.text().info().clone()
     }
@@ -233,7 +229,6 @@ impl Engine {
         }
     }
 
-    /// Returns the loaded generation.
     pub fn snapshot(&self) -> Result<Arc<Snapshot>, QueryError> {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         loaded.snapshot.clone().ok_or(QueryError::NoScene)
@@ -255,7 +250,8 @@ impl Engine {
     ) -> T {
         let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
-        let objects: Vec<Option<Objects<'_>>> = snapshot.shards.iter().map(|shard| shard.objects()).collect();
+        let objects: Vec<Option<Objects<'_>>> =
+            snapshot.shards.iter().map(|shard| shard.additions().objects).collect();
         let (index, manifest) = (&snapshot.objects, &snapshot.manifest);
         let bad_cells = &snapshot.bad_cells;
         let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched, bad_cells };
@@ -334,7 +330,6 @@ mod tests {
     use super::*;
     use crate::testing::{Axes, Member, TestShard, write_cache};
 
-    /// A scene and the text model of its encoder.
     fn loaded(encoder: u8) -> Loaded {
         let (dir, id) = (tempfile::tempdir().expect("a folder"), Hash32([encoder; 32]));
         let shard = TestShard::new(vec![vec![Member { steps: [0; 3], embedding: vec![1.0, 0.0] }]]);

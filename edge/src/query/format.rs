@@ -59,7 +59,6 @@ impl Reply {
 
 /// A piece ends with the first answer past this size.
 const JSON_PIECE_BYTES: usize = 64 << 10;
-/// Capacity reserved for that last answer.
 const ANSWER_BYTES: usize = 1 << 10;
 
 struct JsonPieces {

@@ -25,7 +25,6 @@ use crate::store::Snapshot;
 // The description says how many names there are.
 const _: () = assert!(MAX_NAMES == slag_models::names::MAX_NAMES);
 
-/// The form of an object's id.
 pub const OBJECT_ID: &str = "^o[0-9a-f]{16}$";
 
 /// Order of the objects.
@@ -50,7 +49,6 @@ pub struct ObjectFilter {
     pub order: ObjectOrder,
 }
 
-/// Reads an object's id as answers name it.
 pub fn object_id(text: &str) -> Option<u64> {
     let digits = text.strip_prefix('o')?;
     let is_hex = digits.len() == 16 && digits.bytes().all(|b| b.is_ascii_hexdigit());
@@ -139,7 +137,6 @@ pub(super) fn largest_cluster(scene: &Scene<'_>, object: usize) -> Vec<DVec3> {
     all.filter(|point| largest.extent.box_in_world.contains(*point)).collect()
 }
 
-/// Returns the number of an object in the index.
 fn number_of(scene: &Scene<'_>, id: u64) -> Option<usize> {
     // Objects are in order of their ids.
     let (mut low, mut high) = (0, scene.index.len());

@@ -23,7 +23,6 @@ pub enum ListFormat {
 
 /// The header of a table. Names, best first, with their confidences; positions and lengths in the unit of the scene.
 const COLUMNS: &str = "id,name,confidence,name_2,confidence_2,name_3,confidence_3,x,y,z,latitude_deg,longitude_deg,height_m,size_x,size_y,size_z,n_gaussians,photo";
-/// Names in a line.
 const N_NAMES: usize = 3;
 
 impl ListFormat {

@@ -23,7 +23,6 @@ const BUSY_PAUSE: Duration = Duration::from_millis(100);
 /// Words that took less are not kept on disk.
 const WORTH_KEEPING: Duration = Duration::from_secs(2);
 
-/// The names of a generation's things.
 pub struct Names {
     words: Arc<[WordVector]>,
     /// By object, in the order of the index: words and their confidences, best first.
@@ -41,12 +40,10 @@ impl Names {
         self.of(object).map(|(name, of)| Name { name: name.to_owned(), confidence: digits(of) }).collect()
     }
 
-    /// Returns the number of objects.
     pub fn len(&self) -> usize {
         self.of_object.len()
     }
 
-    /// Scores all words over all objects.
     pub fn new(words: Arc<[WordVector]>, scene: &Scene<'_>, budget: &Budget) -> Result<Self, ScoreError> {
         let n_objects = scene.index.len();
         let scores_bytes = WORDS_TOGETHER * size_of::<f32>();
@@ -79,12 +76,12 @@ impl Names {
 /// The words that things are named by, while they are encoded and after.
 pub struct Words {
     encoder_id: Hash32,
-    state: Mutex<State>,
+    state: Mutex<Progress>,
     is_over: Condvar,
 }
 
 #[derive(Clone)]
-enum State {
+enum Progress {
     Encoding,
     Ready(Arc<[WordVector]>),
     /// The text model stopped.
@@ -94,7 +91,7 @@ enum State {
 impl Words {
     /// Begins to encode the words of a text model, on a thread of their own.
     pub fn begin(cache: &EdgeCache, text: &Arc<TextService>) -> Arc<Self> {
-        let (state, is_over) = (Mutex::new(State::Encoding), Condvar::new());
+        let (state, is_over) = (Mutex::new(Progress::Encoding), Condvar::new());
         let words = Arc::new(Self { encoder_id: text.info().id, state, is_over });
         let (cache, text, encoding) = (cache.clone(), Arc::clone(text), Arc::clone(&words));
         let encode = move || encoding.become_ready(encode(&cache, &text));
@@ -108,22 +105,22 @@ impl Words {
     /// Returns whether these are, or will be, the words of an encoder.
     pub fn are_of(&self, encoder_id: Hash32) -> bool {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        self.encoder_id == encoder_id && !matches!(*state, State::Failed)
+        self.encoder_id == encoder_id && !matches!(*state, Progress::Failed)
     }
 
     /// Waits for the words; `None` if they take longer.
     pub fn wait(&self, longest: Duration) -> Option<Arc<[WordVector]>> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        let waiting = |state: &mut State| matches!(state, State::Encoding);
+        let waiting = |state: &mut Progress| matches!(state, Progress::Encoding);
         let waited = self.is_over.wait_timeout_while(state, longest, waiting);
         match &*waited.unwrap_or_else(PoisonError::into_inner).0 {
-            State::Ready(words) => Some(Arc::clone(words)),
-            State::Encoding | State::Failed => None,
+            Progress::Ready(words) => Some(Arc::clone(words)),
+            Progress::Encoding | Progress::Failed => None,
         }
     }
 
     fn become_ready(&self, words: Option<Vec<WordVector>>) {
-        let state = words.map_or(State::Failed, |words| State::Ready(words.into()));
+        let state = words.map_or(Progress::Failed, |words| Progress::Ready(words.into()));
         *self.state.lock().unwrap_or_else(PoisonError::into_inner) = state;
         self.is_over.notify_all();
     }

@@ -34,7 +34,6 @@ impl Engine {
         Ok(Some(on_board.listed.names.get_or_init(|| made)))
     }
 
-    /// Begins to encode the words that things are named by.
     pub(crate) fn begin_names(&self) {
         if let Ok(on_board) = self.on_board()
             && on_board.check().is_ok()

@@ -15,7 +15,6 @@ use crate::store::objects::Part;
 
 #[derive(Clone, Copy)]
 pub struct FoundObject<'a> {
-    /// Its index in the object index.
     pub object: usize,
     pub record: &'a ObjectRecord,
     pub score: f32,
@@ -33,7 +32,6 @@ impl FoundObject<'_> {
         self.cut.unwrap_or_else(whole)
     }
 
-    /// Returns its id as answers name it.
     pub fn public_id(&self) -> String {
         public_id(self.record.id)
     }
@@ -44,7 +42,6 @@ pub fn in_region(scene: &Scene<'_>, object: usize, region: &Region, min_count: u
     count_in(scene, object, region) >= min_count.max(1)
 }
 
-/// Returns the number of an object's Gaussians in a region.
 pub fn count_in(scene: &Scene<'_>, object: usize, region: &Region) -> u64 {
     scene.index.parts(object).iter().map(|part| count(scene, *part, region)).sum()
 }
@@ -90,7 +87,6 @@ pub fn record<'a>(scene: &Scene<'a>, object: usize) -> &'a ObjectRecord {
     &of_part(scene, first).records[first.number as usize]
 }
 
-/// Returns the photo that shows an object best.
 pub fn photo<'a>(scene: &Scene<'a>, object: usize) -> &'a str {
     of_part(scene, scene.index.parts(object)[0]).photo(record(scene, object))
 }
@@ -137,14 +133,12 @@ fn count(scene: &Scene<'_>, part: Part, region: &Region) -> u64 {
     points(scene, part, region).count() as u64
 }
 
-/// Returns the positions of a part's Gaussians in a region.
 fn points<'a>(scene: &'a Scene<'_>, part: Part, region: &'a Region) -> impl Iterator<Item = DVec3> + 'a {
     let shard = &scene.shards[part.shard as usize];
     let members = scene.index.runs(part, of_part(scene, part)).flatten();
     members.map(|i| shard.position_in_world(i as usize)).filter(|point| region.contains(*point))
 }
 
-/// Returns the objects of a part's shard.
 fn of_part<'a>(scene: &Scene<'a>, part: Part) -> &'a Objects<'a> {
     match &scene.objects[part.shard as usize] {
         Some(objects) => objects,

@@ -82,7 +82,6 @@ fn longest_first(axes: DMat3, min: DVec3, max: DVec3, alignment: Alignment) -> (
 /// Share of points that a box leaves out at either end of each axis, so that a few floaters do not inflate it.
 pub const TRIMMED: f64 = 0.02;
 
-/// Box and centre of points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Extent {
     /// Mean of the points inside the box.

@@ -22,7 +22,6 @@ pub struct Pieces<R> {
     at: Place,
 }
 
-/// A place in the points of a reply.
 #[derive(Clone, Copy, Default)]
 struct Place {
     question: usize,
@@ -112,7 +111,6 @@ fn run(answers: &Answers, answer: usize, run: usize) -> Option<Run> {
     }
 }
 
-/// Returns the Gaussians of all answers to a question.
 fn n_points(answers: &Answers) -> u64 {
     match &answers.answers {
         Found::Clusters(clusters) => {

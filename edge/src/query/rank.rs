@@ -19,7 +19,6 @@ pub fn relevance(score: f32, base: f32, distance: Option<f64>, half: f64) -> f32
     (margin / (1.0 + distance.unwrap_or(0.0) / half)) as f32
 }
 
-/// The order of a request's answers.
 pub struct Order {
     base: f32,
     half: f64,

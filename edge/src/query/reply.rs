@@ -20,7 +20,6 @@ pub struct Reply {
 }
 
 impl Reply {
-    /// Returns the manifest of the generation that answered.
     pub fn manifest(&self) -> &Manifest {
         &self.snapshot.manifest
     }
@@ -45,7 +44,6 @@ impl Reply {
     }
 }
 
-/// The answers to one question.
 pub enum Outcome {
     /// To a text or a vector.
     Plain(Answers),
@@ -55,7 +53,6 @@ pub enum Outcome {
 pub struct RelatedAnswers {
     /// What was asked in place of words that the model does not know.
     pub asked_as: BTreeMap<String, String>,
-    /// What was found for each thing of the phrase.
     pub parts: Vec<relations::Found>,
     /// The part that failed, if nothing was found.
     pub miss: Option<Miss>,
@@ -79,7 +76,6 @@ impl Outcome {
         }
     }
 
-    /// Returns the number of answers.
     pub fn len(&self) -> usize {
         match self {
             Self::Plain(answers) => answers.answers.len(),
@@ -87,7 +83,6 @@ impl Outcome {
         }
     }
 
-    /// Returns whether there is no answer.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -59,14 +59,12 @@ impl FromStr for AnswerKind {
     }
 }
 
-/// Negative prompts.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(from = "Vec<String>")]
 pub enum Negatives {
     /// None: scores are cosines.
     #[default]
     None,
-    /// [`CANONICAL_NEGATIVES`].
     Canonical,
     Phrases(Vec<String>),
 }
@@ -130,12 +128,17 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
 
 #[derive(Clone, Debug, PartialEq)]
 pub enum Asked {
-    /// A text, for the text model.
     Text(String),
     /// A vector of the scene's embedding space, by its place in the request; its length does not count.
-    Vector { at: usize, vector: Vec<f32> },
+    Vector {
+        at: usize,
+        vector: Vec<f32>,
+    },
     /// Things by their relations, and the text that was understood so.
-    Phrase { text: Option<String>, phrase: Phrase },
+    Phrase {
+        text: Option<String>,
+        phrase: Phrase,
+    },
 }
 
 impl Asked {
@@ -193,7 +196,6 @@ pub fn unit_vector(vector: &[f32]) -> Option<Vec<f32>> {
 pub struct QueryRequest {
     /// What is looked for; each is answered separately.
     pub asked: Vec<Asked>,
-    /// Negative prompts.
     pub negatives: Negatives,
     /// Most answers to each question; [`DEFAULT_LIMIT`] if absent.
     pub limit: Option<usize>,
@@ -208,7 +210,6 @@ pub struct QueryRequest {
     pub near: Option<DVec3>,
     /// The asker's heading, from x towards y, radians.
     pub heading_rad: Option<f64>,
-    /// The part of space to search.
     pub region: Region,
     /// Kind of answers; if absent, objects, and clusters for a question that no object answers.
     pub kind: Option<AnswerKind>,
@@ -265,7 +266,6 @@ impl QueryRequest {
         Ok(())
     }
 
-    /// Returns the answers to each question of a page.
     pub fn page(&self) -> usize {
         self.limit.unwrap_or(DEFAULT_LIMIT)
     }
@@ -282,24 +282,7 @@ impl QueryRequest {
         let refuse = |parameter: &str, found: &dyn ToString, expected: String| {
             Err(RequestError::new(parameter, &found.to_string(), expected))
         };
-        if !(1..=MAX_TEXTS).contains(&self.asked.len()) {
-            return refuse(
-                "text",
-                &format!("{} of them", self.asked.len()),
-                format!("1 to {MAX_TEXTS} texts"),
-            );
-        }
-        let negatives = self.negatives.phrases();
-        if negatives.len() > MAX_NEGATIVES {
-            let found = format!("{} of them", negatives.len());
-            return refuse("negatives", &found, format!("at most {MAX_NEGATIVES} phrases"));
-        }
-        negatives.iter().try_for_each(|text| check_text("negatives", text))?;
-        // Everything is as near to a text as to itself.
-        let mut texts = self.asked.iter().filter(|of| !matches!(of, Asked::Vector { .. })).map(Asked::label);
-        if let Some(text) = texts.find(|text| negatives.iter().any(|of| of.trim() == text.trim())) {
-            return refuse("negatives", &text, "words other than those asked for".into());
-        }
+        self.check_texts()?;
         self.asked.iter().try_for_each(|asked| asked.check(self))?;
         self.check_page()?;
         let (thresholds, expected) = match self.negatives {
@@ -340,6 +323,26 @@ impl QueryRequest {
             return refuse("min_count", &0, "at least 1".into());
         }
         Ok(())
+    }
+
+    fn check_texts(&self) -> Result<(), RequestError> {
+        let n_of_them = |n: usize| format!("{n} of them");
+        let n = self.asked.len();
+        if !(1..=MAX_TEXTS).contains(&n) {
+            return Err(RequestError::new("text", &n_of_them(n), format!("1 to {MAX_TEXTS} texts")));
+        }
+        let negatives = self.negatives.phrases();
+        if negatives.len() > MAX_NEGATIVES {
+            let expected = format!("at most {MAX_NEGATIVES} phrases");
+            return Err(RequestError::new("negatives", &n_of_them(negatives.len()), expected));
+        }
+        negatives.iter().try_for_each(|text| check_text("negatives", text))?;
+        // Everything is as near to a text as to itself.
+        let mut texts = self.asked.iter().filter(|of| !matches!(of, Asked::Vector { .. })).map(Asked::label);
+        match texts.find(|text| negatives.iter().any(|of| of.trim() == text.trim())) {
+            Some(text) => Err(RequestError::new("negatives", text, "words other than those asked for")),
+            None => Ok(()),
+        }
     }
 
     fn check_page(&self) -> Result<(), RequestError> {

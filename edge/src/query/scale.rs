@@ -17,7 +17,6 @@ pub enum ScoreKind {
     Relevancy,
 }
 
-/// Scale of the reported scores.
 #[derive(Clone, Copy)]
 pub struct Scale(pub ScoreKind);
 

@@ -17,15 +17,12 @@ const METRIC_VOXEL_M: f64 = 0.25;
 /// Voxels per middle edge of the median cell, in a scene that is not metric.
 const VOXELS_PER_CELL: f64 = 64.0;
 
-/// The data that a query runs on.
 pub struct Scene<'a> {
     pub shards: &'a [ShardView<'a>],
     /// The objects of each shard; absent in shards without them.
     pub objects: &'a [Option<Objects<'a>>],
-    /// Index of the objects over all shards.
     pub index: &'a ObjectIndex,
     pub manifest: &'a Manifest,
-    /// Centre and radius of the last fetch.
     pub fetched: (DVec3, f64),
     /// Cells within it whose shards could not be fetched.
     pub bad_cells: &'a [BadCell],

@@ -51,7 +51,7 @@ fn on_scene<T>(built: &[BuiltShard], work: impl FnOnce(&Scene<'_>) -> T) -> T {
 
 fn on_scene_of<T>(built: &[BuiltShard], manifest: &Manifest, work: impl FnOnce(&Scene<'_>) -> T) -> T {
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
-    let objects: Vec<_> = built.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
+    let objects: Vec<_> = built.iter().map(|shard| shard.layout.additions(&shard.bytes).objects).collect();
     let (index, fetched) = (ObjectIndex::new(&objects), (DVec3::ZERO, 50.0));
     work(&Scene { shards: &shards, objects: &objects, index: &index, manifest, fetched, bad_cells: &[] })
 }

@@ -16,7 +16,6 @@ use crate::store::Snapshot;
 
 /// Below every cosine, and below every difference of two cosines.
 const BELOW_ALL: f32 = -4.0;
-/// The program's name in a description.
 const PROGRAM: &str = "slag-edge";
 
 impl Engine {
@@ -28,7 +27,7 @@ impl Engine {
     ) -> Result<Description, QueryError> {
         let on_board = self.on_board()?;
         let snapshot = &on_board.snapshot;
-        let photos = snapshot.shards.iter().filter_map(|shard| shard.photo_poses());
+        let photos = snapshot.shards.iter().filter_map(|shard| shard.additions().photo_poses);
         let n_photos: usize = photos.map(|photos| photos.iter().count()).sum();
         budget.take(n_photos * size_of::<Photo>() + snapshot.manifest.cells.len() * size_of::<Cell>());
         budget.check().map_err(ScoreError::from)?;
@@ -52,7 +51,7 @@ impl Engine {
         cells.sort_by_key(|cell| cell.cell);
         let photos = snapshot.shards.iter().flat_map(|shard| {
             let origin = DVec3::from(shard.view().header.origin_in_world);
-            shard.photo_poses().into_iter().flat_map(move |photos| Photo::of_shard(origin, photos))
+            shard.additions().photo_poses.into_iter().flat_map(move |photos| Photo::of_shard(origin, photos))
         });
         Ok(Description {
             program: PROGRAM,
@@ -88,7 +87,7 @@ impl Engine {
         budget.take(CELL_HEAD_BYTES + sent.len() * (GAUSSIAN_BYTES + size_of::<DVec3>()));
         budget.check().map_err(ScoreError::from)?;
         let positions: Vec<DVec3> = sent.map(|at| view.position_in_world(at)).collect();
-        Ok(Some(cell_message(&positions, shard.appearance(), step)))
+        Ok(Some(cell_message(&positions, shard.additions().appearance, step)))
     }
 
     /// Returns what the things on board are called, each name with the number of things whose best one it is; then

@@ -8,7 +8,6 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-/// Why a request was given up.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum OverBudget {
     #[error(
@@ -86,7 +85,6 @@ impl Budget {
         has_room && self.take(bytes)
     }
 
-    /// Returns the bytes taken so far.
     pub fn used_bytes(&self) -> u64 {
         self.0.as_ref().map_or(0, |account| account.used.load(Relaxed))
     }

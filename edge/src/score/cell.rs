@@ -172,7 +172,6 @@ impl Cell<'_> {
         2.0 * f32::EPSILON * (of_centroids + residuals.residual_scales[centroid] * self.table_reach)
     }
 
-    /// Returns lower and upper bounds on the scores of a centroid's members.
     pub fn bounds(&self, centroid: usize) -> (f32, f32) {
         let score = self.centroids[centroid];
         match &self.detail {
@@ -210,7 +209,6 @@ impl Cell<'_> {
         self.asked.steepness * distance + 2.0 * question.rounding_bound() + self.centroid_error(centroid)
     }
 
-    /// Bounds the rounding error of a centroid's score.
     pub(crate) fn centroid_error(&self, centroid: usize) -> f32 {
         let error = |projection: &Projection| {
             // Members have unit length, so neither the centroid nor their distance from it is longer than 1.

@@ -20,7 +20,6 @@ pub(super) struct CentroidScores {
     pub shards: Vec<ShardScores>,
 }
 
-/// One question of those scored, with the shards it asks about.
 pub(super) struct AskedQuestion<'a> {
     pub shards: &'a [ShardView<'a>],
     pub question: &'a Question,

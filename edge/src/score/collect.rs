@@ -37,7 +37,6 @@ pub(super) struct Gather {
 }
 
 impl Gather {
-    /// Returns the work done.
     pub(crate) fn effort(&self) -> Effort {
         let mut effort = Effort::default();
         self.shards.iter().for_each(|of_shard| effort += of_shard.found.effort);
@@ -53,7 +52,6 @@ pub(super) struct Cut {
     pub least: f32,
 }
 
-/// Matches of one shard, and buffers.
 #[derive(Default)]
 pub(super) struct ShardGather {
     pub found: Matches,

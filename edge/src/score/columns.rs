@@ -43,12 +43,10 @@ impl Part<'_> {
 }
 
 impl Columns {
-    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.index.len()
     }
 
-    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.index.is_empty()
     }

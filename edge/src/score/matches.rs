@@ -29,7 +29,6 @@ pub struct Matches {
     /// Disjoint runs, by shard and start, ascending.
     pub runs: Vec<Run>,
     pub n_gaussians: u64,
-    /// Centroids that had to be decided member by member.
     pub n_centroids_undecided: u64,
     pub effort: Effort,
     /// Shards without a centroid that can reach the threshold.
@@ -49,7 +48,6 @@ impl Matches {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {
     pub n_rescored: u64,
-    /// Blocks of residual codes read.
     pub n_blocks_read: u64,
     pub n_fine_read: u64,
     pub n_embeddings_read: u64,

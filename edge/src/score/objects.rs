@@ -22,12 +22,10 @@ const TOGETHER: usize = 64;
 /// Rounding of two cosines and their mean to f32: half a step each, at 2 or less.
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 
-/// Scores of one question over the objects of a generation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ObjectScores {
     /// By object, in the order of the index.
     pub scores: Vec<f32>,
-    /// Bound on the error of every score.
     pub error_bound: f32,
 }
 
@@ -187,7 +185,8 @@ mod tests {
             let ids = [(10..80).rev().collect::<Vec<u64>>(), vec![5], (70..90).collect()];
             let built: Vec<BuiltShard> = ids.iter().map(|ids| built(&mut random, shape, ids)).collect();
             let shards = views(&built);
-            let mut objects: Vec<_> = built.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
+            let mut objects: Vec<_> =
+                built.iter().map(|shard| shard.layout.additions(&shard.bytes).objects).collect();
             objects[1] = None;
             let index = ObjectIndex::new(&objects);
             let mut questions: Vec<Question> =

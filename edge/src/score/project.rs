@@ -170,7 +170,6 @@ impl Projection {
         self.fine.set(&self.fine_components);
     }
 
-    /// Builds the tables of a residual code.
     pub(crate) fn set_tables(&mut self, residuals: &Residuals<'_>) {
         let n_subspaces = residuals.subspace_starts.len() - 1;
         let tables = &mut self.tables;

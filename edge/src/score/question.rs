@@ -62,7 +62,6 @@ impl Question {
         (largest * (1.0 + f64::from(f32::EPSILON))) as f32
     }
 
-    /// Bounds the error of scoring in f32.
     pub(crate) fn rounding_bound(&self) -> f32 {
         let of_dot = rounding_bound(self.vector.len());
         // The difference of two products, each at most 1, is rounded once more.

@@ -8,11 +8,9 @@ use slag_common::frames::Aabb;
 
 use super::budget::MAX_COORDINATE;
 
-/// A ball in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ball {
     pub centre_in_world: DVec3,
-    /// Its radius, world units.
     pub radius: f64,
 }
 
@@ -34,7 +32,6 @@ pub struct Region {
 }
 
 impl Region {
-    /// Returns whether a point lies inside.
     pub fn contains(&self, point: DVec3) -> bool {
         self.ball.is_none_or(|ball| ball.contains(point))
             && self.bounds.is_none_or(|bounds| bounds.contains(point))

@@ -30,7 +30,6 @@ impl Scratch {
         self.budget = budget;
     }
 
-    /// Returns what the searches may use.
     pub fn budget(&self) -> &Budget {
         &self.budget
     }

@@ -8,14 +8,12 @@ use super::centroids::AskedQuestion;
 use super::collect::{BINS, Cut, Gather, bin_of, edge_of, runs_inside};
 use super::matches::{Effort, Hit, Run};
 
-/// Buffers that answers are gathered and ranked in, kept from one answer to the next.
 #[derive(Default)]
 pub(super) struct AnswerBuffers {
     pub gather: Gather,
     order: Order,
 }
 
-/// Buffers for ranking.
 #[derive(Default)]
 struct Order {
     parts: Vec<Part>,

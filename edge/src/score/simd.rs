@@ -19,7 +19,6 @@ pub const ROWS: usize = 4;
 /// One byte column of a block of Gaussians, or the codewords of a subspace for each half of a byte shuffle.
 pub type Column = [u8; BLOCK];
 
-/// The kernels of an instruction set.
 pub trait Kernels: Copy {
     /// Returns the products of rows with a vector. All have the same length, a multiple of [`PAD`].
     fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];
@@ -104,7 +103,6 @@ impl<K: Kernels, F: FnMut(usize, i32)> Work<K> for MatrixTimesVector<'_, F> {
 
 /// Sums the values of a block's codes, see [`Kernels::block_sums`].
 pub struct BlockSums<'a> {
-    /// Byte columns of the block.
     pub columns: &'a [Column],
     /// Values of the subspaces in the low halves.
     pub low: &'a [Column],
@@ -172,7 +170,6 @@ impl<K: Kernels> Work<K> for FindSums<'_> {
     }
 }
 
-/// Multiplies some rows of a matrix with a vector.
 pub struct SomeRowsTimesVector<'a> {
     /// `[n][n_components]`.
     pub rows: &'a [i8],

@@ -160,7 +160,6 @@ proptest! {
     }
 }
 
-/// Centroids of noisy unit embeddings around random directions.
 fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: usize) -> Vec<TestShard> {
     let mut shard = |cell_id: usize| {
         let mut centroids = Vec::new();

@@ -24,7 +24,6 @@ pub struct Current {
     /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
     pub profile: Profile,
-    /// Centre of the fetch, world frame.
     pub centre_in_world: DVec3,
     /// Radius of the fetch, world units.
     pub radius: f64,
@@ -81,7 +80,6 @@ impl EdgeCache {
         &*self.files
     }
 
-    /// Returns the path of the generation pointer.
     pub fn current_path(&self) -> PathBuf {
         self.dir.join("current")
     }
@@ -90,7 +88,6 @@ impl EdgeCache {
         self.dir.join("shards").join(hash.to_string())
     }
 
-    /// Returns the folder of the marks of damaged shards.
     pub(super) fn damaged_dir(&self) -> PathBuf {
         self.dir.join("damaged")
     }

@@ -42,7 +42,6 @@ pub fn bad_medium(path: &Path, source: io::Error) -> io::Error {
     io::Error::new(source.kind(), BadMedium { path: path.to_owned(), source })
 }
 
-/// File metadata.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stat {
     pub len_bytes: u64,
@@ -62,7 +61,6 @@ pub trait Files: Send + Sync {
     /// Writes at an offset, creating the file if necessary, and truncates it behind the new bytes. Bytes
     /// between the old end and the offset are zero.
     fn write_from(&self, path: &Path, offset_bytes: u64, bytes: &[u8]) -> io::Result<()>;
-    /// Makes a file's content durable.
     fn sync(&self, path: &Path) -> io::Result<()>;
     /// Renames within the cache, replacing the target.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
@@ -72,7 +70,6 @@ pub trait Files: Send + Sync {
     fn remove(&self, path: &Path) -> io::Result<()>;
     /// Returns the names of the files in a folder, sorted; skips names that are not UTF-8.
     fn list(&self, dir: &Path) -> io::Result<Vec<String>>;
-    /// Reads a file of at most `max_bytes`.
     fn read(&self, path: &Path, max_bytes: u64) -> io::Result<AlignedBytes>;
     /// Maps an immutable file. A page that cannot be read then ends the program: read the file before.
     fn map(&self, path: &Path) -> io::Result<FileBytes>;
@@ -83,7 +80,6 @@ pub trait Files: Send + Sync {
     fn free_bytes(&self, dir: &Path) -> io::Result<Option<u64>>;
 }
 
-/// The real file system.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct DiskFiles;
 

@@ -40,7 +40,6 @@ const STEPS: u32 = 3;
 pub struct Record {
     pub scene: String,
     pub generation: u64,
-    /// When it was made, Unix seconds.
     pub created_unix_secs: u64,
     /// The space of the vectors.
     pub encoder_id: Hash32,
@@ -51,7 +50,6 @@ pub struct Record {
     places: Vec<Place>,
     /// The objects, by id.
     pub things: Vec<Thing>,
-    /// Components of a vector.
     dim: u32,
 }
 
@@ -71,7 +69,7 @@ impl Record {
         shards: impl IntoIterator<Item = &'a OpenShard>,
     ) -> Option<Self> {
         let distance = |of: &Aabb| of.min.max(centre.min(of.max)).distance_squared(centre);
-        let with_objects = |shard: &&OpenShard| shard.objects().is_some();
+        let with_objects = |shard: &&OpenShard| shard.additions().objects.is_some();
         let mut shards: Vec<&OpenShard> = shards.into_iter().filter(with_objects).collect();
         shards.sort_by(|a, b| {
             let by_distance = distance(&a.cell.bounds).total_cmp(&distance(&b.cell.bounds));
@@ -79,7 +77,7 @@ impl Record {
         });
         let (mut things, mut known, mut places) = (BTreeMap::new(), Vec::new(), Vec::new());
         for shard in shards {
-            let Some(objects) = shard.objects() else { continue };
+            let Some(objects) = shard.additions().objects else { continue };
             if things.len() + objects.records.len() > MAX_THINGS {
                 break;
             }

@@ -60,12 +60,10 @@ impl ObjectIndex {
         self.starts.len().saturating_sub(1)
     }
 
-    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Returns the parts of an object, at least one.
     pub fn parts(&self, object: usize) -> &[Part] {
         &self.parts[self.starts[object] as usize..self.starts[object + 1] as usize]
     }

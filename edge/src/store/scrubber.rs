@@ -16,7 +16,6 @@ pub struct Scrubber {
     n_steps: u64,
 }
 
-/// A shard that was read.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scrubbed {
     pub cell_id: u32,

@@ -4,13 +4,8 @@ use std::io;
 use std::path::Path;
 
 use slag_common::Hash32;
-use slag_common::appearance::Appearance;
-use slag_common::landmarks::Landmarks;
 use slag_common::manifest::{CellRecord, Manifest};
-use slag_common::objects::Objects;
-use slag_common::occupancy::Occupancy;
-use slag_common::photo_poses::PhotoPoses;
-use slag_common::shard::{Profile, ShardLayout, ShardView};
+use slag_common::shard::{Additions, Profile, ShardLayout, ShardView};
 
 use super::bad_cell::cell_of;
 use super::cache::{CurrentCell, EdgeCache};
@@ -18,7 +13,6 @@ use super::error::StoreError;
 use super::files::Stat;
 use super::mmap::FileBytes;
 
-/// A mapped and checked shard.
 #[derive(Debug)]
 pub struct OpenShard {
     pub cell: CellRecord,
@@ -34,31 +28,10 @@ impl OpenShard {
         self.layout.view(&self.bytes)
     }
 
-    /// Returns how its Gaussians look, if the shard tells.
-    pub fn appearance(&self) -> Option<Appearance<'_>> {
-        self.layout.appearance(&self.bytes)
+    pub fn additions(&self) -> Additions<'_> {
+        self.layout.additions(&self.bytes)
     }
 
-    pub fn objects(&self) -> Option<Objects<'_>> {
-        self.layout.objects(&self.bytes)
-    }
-
-    /// Returns which places of its cell are free, if the shard says so.
-    pub fn occupancy(&self) -> Option<Occupancy<'_>> {
-        self.layout.occupancy(&self.bytes)
-    }
-
-    /// Returns where the photos of its cell were taken, if the shard says so.
-    pub fn photo_poses(&self) -> Option<PhotoPoses<'_>> {
-        self.layout.photo_poses(&self.bytes)
-    }
-
-    /// Returns what its cell is recognised by, if the shard has it.
-    pub fn landmarks(&self) -> Option<Landmarks<'_>> {
-        self.layout.landmarks(&self.bytes)
-    }
-
-    /// Returns the hash of its bytes, by the manifest.
     pub fn hash(&self, profile: Profile) -> Option<Hash32> {
         self.cell.shards.get(&profile).map(|shard| shard.hash)
     }

@@ -109,7 +109,7 @@ impl Snapshot {
         }
         bad_cells.sort_by_key(|bad| bad.cell_id);
         shards.sort_by_key(|shard| shard.cell.cell_id);
-        let objects = shards.iter().map(|shard| shard.objects()).collect::<Vec<_>>();
+        let objects = shards.iter().map(|shard| shard.additions().objects).collect::<Vec<_>>();
         let objects = ObjectIndex::new(&objects);
         Ok(Self { current, current_stat, manifest, shards, bad_cells, may_recover, objects })
     }
@@ -124,11 +124,9 @@ impl Snapshot {
     }
 }
 
-/// Opens the shards of a generation.
 struct Opener<'a> {
     cache: &'a EdgeCache,
     profile: Profile,
-    /// Shards that were found damaged.
     marked: BTreeSet<Hash32>,
     /// Shards that an earlier snapshot has open, by cell.
     held: &'a [Arc<OpenShard>],

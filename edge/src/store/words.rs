@@ -21,7 +21,6 @@ const ASKED: u32 = 1;
 const KNOWN: u32 = 2;
 const VECTORS: u32 = 3;
 
-/// A word and its vector.
 pub type WordVector = (String, Arc<[f32]>);
 
 fn path(cache: &EdgeCache, encoder_id: Hash32) -> PathBuf {

@@ -11,7 +11,6 @@ use slag_common::shard::{
 use super::{BuiltShard, normalised};
 use slag_math::random::Random;
 
-/// What a random shard is to have.
 #[derive(Clone, Debug)]
 pub struct CodedShard {
     pub cell_id: u32,
@@ -29,7 +28,6 @@ pub struct CodedShard {
 
 /// Stated mean error of an exact shard's codes.
 pub const CODE_ERROR: f32 = 0.0033;
-/// Stated mean error of its fine residuals.
 pub const FINE_ERROR: f32 = 0.001;
 
 /// The columns of a shard but the exact ones.

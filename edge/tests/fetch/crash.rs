@@ -9,7 +9,7 @@ use slag_edge::store::files::Files;
 use slag_edge::store::{Snapshot, StoreError};
 
 use super::scene::Published;
-use super::server::{Fault, Server};
+use super::server::Server;
 use super::sim::SimFiles;
 use super::{Robot, assert_holds, at};
 use slag_math::random::Random;
@@ -62,12 +62,12 @@ impl Trial {
     }
 
     /// Cuts the power at a step of a fetch; returns whether the new generation was visible afterwards.
-    fn cut(&self, step: u64, seed: u64, parallel: usize) -> bool {
+    fn cut(&self, step: u64, seed: u64) -> bool {
         let files = Arc::new(self.before.fork(Some(step), seed));
-        let (_, result) = self.fetch(&files, parallel);
+        let (_, result) = self.fetch(&files, 1);
         // The records of use come last, and fail no fetch.
         assert!(result.is_err() || files.n_steps() == step, "step {step} seed {seed}: the cut came too late");
-        self.recover(&files, seed, &format!("step {step} seed {seed} parallel {parallel}"))
+        self.recover(&files, seed, &format!("step {step} seed {seed}"))
     }
 
     /// Restores the power, checks that a whole generation is there and that the next fetch works.
@@ -102,7 +102,7 @@ fn a_power_cut_at_any_step_leaves_a_whole_generation() {
     let mut n_new = 0;
     for step in 1..=n_steps {
         for seed in 0..6 {
-            n_new += u64::from(trial.cut(step, step * 100 + seed, 1));
+            n_new += u64::from(trial.cut(step, step * 100 + seed));
         }
     }
     assert!(n_new > 0 && n_new < n_steps * 6, "{n_new} of {n_steps} steps: both outcomes are seen");
@@ -125,23 +125,6 @@ fn a_power_cut_after_a_killed_fetch() {
             assert!(outcome.is_err() || second.n_steps() <= cut_step, "seed {seed}");
             trial.recover(&second, seed, &format!("killed at {kill_step}, cut at {cut_step}, seed {seed}"));
         }
-    }
-}
-
-/// Likewise with a server that breaks connections, and with parallel downloads.
-#[test]
-fn random_power_cuts_under_faults() {
-    let trial = Trial::new();
-    for seed in 0..100 {
-        let mut random = Random::new(seed);
-        let mut faults = Random::new(seed);
-        trial.server.faults(move |_| match faults.below(6) {
-            0 => Fault::Cut(faults.below(1200) as usize),
-            1 => Fault::Status(503),
-            _ => Fault::None,
-        });
-        // Fewer than the steps of a fetch without faults, so the cut always happens.
-        trial.cut(1 + random.below(25), seed, 3);
     }
 }
 

@@ -126,7 +126,6 @@ impl Robot {
     }
 }
 
-/// Returns the ids of the cells that a snapshot holds.
 fn cells(snapshot: &Snapshot) -> Vec<u32> {
     snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect()
 }
@@ -135,7 +134,6 @@ fn at(x: f64) -> Position {
     Position::World(DVec3::new(x, 0.0, 105.0))
 }
 
-/// Checks that a snapshot holds exactly these cells of a scene.
 fn assert_holds(snapshot: &Snapshot, published: &Published, cell_ids: std::ops::Range<u32>) {
     assert_eq!(cells(snapshot), cell_ids.collect::<Vec<_>>());
     assert_eq!(snapshot.manifest, published.manifest);

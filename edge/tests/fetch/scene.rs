@@ -10,7 +10,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::{self, Manifest};
 use slag_common::shard::sample::{self, SampleObject, SampleObjects, SampleShard};
-use slag_common::shard::{Profile, ShardHeader, ShardLayout, quantise};
+use slag_common::shard::{Additions, Profile, ShardHeader, ShardLayout, quantise};
 use slag_common::tuf::{
     FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, format_utc, sign,
 };
@@ -38,7 +38,6 @@ pub struct Published {
     pub manifest: Manifest,
     /// The manifest's bytes.
     pub listed: Vec<u8>,
-    /// Metadata files by name.
     pub metadata: BTreeMap<String, Vec<u8>>,
     pub objects: BTreeMap<Hash32, Vec<u8>>,
 }
@@ -84,7 +83,6 @@ pub struct TestThing {
     pub axis: usize,
 }
 
-/// Writes a shard again, with things.
 fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
     let bytes = AlignedBytes::copy_of(bytes);
     let layout = ShardLayout::check(&bytes).expect("sound");
@@ -103,7 +101,7 @@ fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
     };
     let objects = (0..).zip(things).map(object).collect();
     let objects = SampleObjects { objects, score_mean: 0.0, score_spread: 0.1, score_error_bound: 0.01 };
-    objects.add_to(&layout.view(&bytes), None)
+    objects.add_to(&layout.view(&bytes), Additions::default())
 }
 
 impl Published {

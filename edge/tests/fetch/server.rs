@@ -12,7 +12,6 @@ use slag_common::{Hash32, manifest};
 
 use super::scene::Published;
 
-/// Fault injected into a request.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Fault {
     None,
@@ -42,7 +41,6 @@ pub enum Fault {
     Stall,
 }
 
-/// A request received.
 #[derive(Clone, Debug)]
 pub struct Seen {
     pub path: String,
@@ -98,7 +96,6 @@ impl Server {
         *self.shared.published.lock().expect("sound") = published;
     }
 
-    /// Sets the function that chooses the fault for each request.
     pub fn faults(&self, chooser: impl FnMut(&Seen) -> Fault + Send + 'static) {
         *self.shared.chooser.lock().expect("sound") = Box::new(chooser);
     }

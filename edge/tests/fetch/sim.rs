@@ -42,7 +42,7 @@ impl Change {
 }
 
 #[derive(Clone, Default)]
-struct State {
+struct Disk {
     inodes: Vec<Inode>,
     live: BTreeMap<PathBuf, usize>,
     durable: BTreeMap<PathBuf, usize>,
@@ -59,9 +59,8 @@ struct State {
     random: u64,
 }
 
-/// The simulated storage.
 #[derive(Default)]
-pub struct SimFiles(Mutex<State>);
+pub struct SimFiles(Mutex<Disk>);
 
 impl SimFiles {
     /// Returns a copy that loses power at a step (counted from 1), which may or may not still take effect. A
@@ -69,7 +68,7 @@ impl SimFiles {
     /// happened, synced or not.
     pub fn fork(&self, cut_at: Option<u64>, seed: u64) -> Self {
         let state = self.0.lock().expect("sound").clone();
-        Self(Mutex::new(State { n_steps: 0, cut_at, is_cut: false, random: seed, ..state }))
+        Self(Mutex::new(Disk { n_steps: 0, cut_at, is_cut: false, random: seed, ..state }))
     }
 
     /// Lets one step from now on fail once with an I/O error; it may or may not take effect.
@@ -108,7 +107,6 @@ impl SimFiles {
         self.0.lock().expect("sound").used_bytes()
     }
 
-    /// Returns the storage as it is after the power comes back.
     pub fn after_power_cut(&self, seed: u64) -> Self {
         let mut random = Random::new(seed);
         let mut state = self.0.lock().expect("sound").clone();
@@ -133,7 +131,7 @@ impl SimFiles {
             inode.live = inode.durable.clone();
         }
         state.live = state.durable.clone();
-        Self(Mutex::new(State { is_cut: false, cut_at: None, fail_at: None, n_steps: 0, ..state }))
+        Self(Mutex::new(Disk { is_cut: false, cut_at: None, fail_at: None, n_steps: 0, ..state }))
     }
 }
 
@@ -159,7 +157,7 @@ fn torn(inode: &Inode, random: &mut Random) -> Vec<u8> {
     out
 }
 
-impl State {
+impl Disk {
     fn used_bytes(&self) -> u64 {
         self.live.values().map(|inode| self.inodes[*inode].live.len() as u64).sum()
     }
@@ -189,7 +187,7 @@ impl State {
 
 impl SimFiles {
     /// Takes one step, unless the power is cut; at the cut it may or may not take effect.
-    fn step(&self, work: impl FnOnce(&mut State) -> io::Result<()>) -> io::Result<()> {
+    fn step(&self, work: impl FnOnce(&mut Disk) -> io::Result<()>) -> io::Result<()> {
         let mut state = self.0.lock().expect("sound");
         state.check_power()?;
         state.n_steps += 1;
@@ -209,7 +207,7 @@ impl SimFiles {
         work(&mut state)
     }
 
-    fn look<T>(&self, work: impl FnOnce(&State) -> io::Result<T>) -> io::Result<T> {
+    fn look<T>(&self, work: impl FnOnce(&Disk) -> io::Result<T>) -> io::Result<T> {
         let state = self.0.lock().expect("sound");
         state.check_power()?;
         work(&state)

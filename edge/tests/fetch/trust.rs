@@ -49,7 +49,6 @@ impl Rotated {
         self.robot.fetch().unwrap_or_else(|e| panic!("{context}: {}", slag_edge::error_line(&e)));
     }
 
-    /// Flips a bit in both copies.
     fn damage_both_copies(&self) {
         for name in ["0", "1"] {
             let path = self.robot.cache.dir().join("trust").join(name);

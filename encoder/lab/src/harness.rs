@@ -63,7 +63,6 @@ pub(crate) fn resident_bytes(pid: Option<u32>) -> Option<u64> {
     Some(field(&status, "VmRSS")?.strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
 }
 
-/// Times of the same work, milliseconds.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub(crate) struct Times {
     pub(crate) n: usize,

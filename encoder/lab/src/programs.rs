@@ -15,7 +15,6 @@ use slag_encoder::progress::Progress;
 use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 
-/// Longest wait for an answer.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Returns the path of a program beside this one.
@@ -25,7 +24,6 @@ pub(crate) fn sibling(name: &str) -> Result<PathBuf> {
     if path.is_file() { Ok(path) } else { bail!("{} does not exist; build it first", path.display()) }
 }
 
-/// Runs a command to its end.
 pub(crate) fn finish(command: &mut Command) -> Result<()> {
     let output = command.stdin(Stdio::null()).output().with_context(|| line(command))?;
     let message = String::from_utf8_lossy(&output.stderr).trim().to_owned();
@@ -53,7 +51,6 @@ fn line(command: &Command) -> String {
     words.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(" ")
 }
 
-/// Removes a folder where it exists.
 pub(crate) fn remove(dir: &Path) -> std::io::Result<()> {
     if dir.exists() { fs_err::remove_dir_all(dir) } else { Ok(()) }
 }

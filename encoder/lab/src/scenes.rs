@@ -6,7 +6,6 @@ use anyhow::{Context, Result, bail};
 
 #[derive(Clone, Debug)]
 pub(crate) struct SceneFiles {
-    /// The folder's name.
     pub(crate) name: String,
     pub(crate) dir: PathBuf,
     pub(crate) splat: PathBuf,

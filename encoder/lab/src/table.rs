@@ -4,7 +4,6 @@ use std::fmt;
 
 use serde::Serialize;
 
-/// Rows of text under named columns.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Table {
     pub(crate) columns: Vec<String>,

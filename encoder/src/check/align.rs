@@ -4,7 +4,6 @@ use glam::{DQuat, DVec3};
 use slag_common::{Similarity, View};
 use slag_math::eigen::eigen_symmetric;
 
-/// Fewest cameras for a similarity.
 const MIN_CAMERAS: usize = 3;
 /// Cameras whose second-largest spread is below this share of the largest stand on a line: the rotation about it
 /// is undetermined.

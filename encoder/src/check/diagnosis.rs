@@ -25,7 +25,6 @@ const SWEEP_STEP: f64 = 1.06;
 const SWEEP_LIMIT: f64 = 64.0;
 /// First step of the refinement: rotation in radians, scale in its logarithm, translation in scene diagonals.
 const FIRST_STEP: f64 = 0.02;
-/// Number of times that the step is halved.
 const HALVINGS: u32 = 6;
 /// Gain below which the refinement fits noise of the few small samples, dB: the frame stays as computed.
 const REFINED_GAIN_DB: f64 = 1.0;
@@ -45,7 +44,6 @@ pub struct Trial {
     pub psnr_db: f64,
 }
 
-/// Result of the search for a mistake.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Diagnosis {
     /// PSNR of the sampled views with the inputs as given, dB.
@@ -60,11 +58,9 @@ pub struct Diagnosis {
     pub(crate) scene_diagonal: f64,
     /// Largest distance of a camera from the cameras' mean position, world units.
     pub(crate) camera_spread: f64,
-    /// The findings as sentences.
     pub advice: Vec<String>,
 }
 
-/// Means over the views drawn.
 pub(super) struct Means {
     pub(super) psnr_db: f64,
     /// PSNR of photos against their mean colour.
@@ -89,7 +85,6 @@ pub(super) struct Samples {
 }
 
 impl Samples {
-    /// Chooses `n_samples` of `n_views` views, evenly spread.
     pub(super) fn new(n_views: usize, n_samples: usize, width_px: u32) -> Self {
         let n = n_samples.clamp(1, n_views);
         let indices = (0..n).map(|i| i * n_views / n).collect();
@@ -178,7 +173,6 @@ struct Search<'a> {
     given_psnr_db: f64,
     /// Pairs that may yet be drawn.
     pairs_left: Cell<usize>,
-    /// Mistakes that the data suggest.
     suspected: Vec<Mistake>,
 }
 

@@ -17,7 +17,7 @@ mod view;
 use slag_common::Gaussians;
 
 use crate::ingest::IngestError;
-use crate::raster::Rasterizer;
+use crate::raster::{LoadedScene, Rasterizer};
 use diagnosis::{FLAWLESS_DB, Means, Samples};
 use view::{at_width, mean, picture, picture_name};
 
@@ -28,7 +28,7 @@ pub use mistake::{FrameCandidate, FrameCause, Mistake, nerfstudio_defaults};
 pub use options::CheckOptions;
 pub use report::CheckReport;
 pub(crate) use report::ViewCheck;
-pub use suspicion::suspicions;
+pub use suspicion::{Suspicion, suspicions};
 pub use view::{CheckView, psnr_db};
 
 /// PSNR against its mean colour from which a photo shows nothing, dB.
@@ -52,16 +52,54 @@ where
     V: IntoIterator<Item = Result<CheckView, IngestError>, IntoIter: ExactSizeIterator>,
 {
     let views = views.into_iter();
-    let n_views = views.len();
-    if n_views == 0 {
+    if views.len() == 0 {
         return Err(CheckError::NoViews);
     }
     if let Some(dir) = &options.pictures_dir {
         fs_err::create_dir_all(dir)?;
     }
     let loaded = rasterizer.load(scene)?;
-    let mut checks = Vec::with_capacity(n_views);
-    let mut unreadable = Vec::new();
+    let Compared { checks, unreadable, unusable_gaussians, samples } = compare(views, &*loaded, options)?;
+    let means = means_of(&checks);
+    let mut suspicions: Vec<String> =
+        options.suspicions.iter().map(|suspicion| suspicion.text.clone()).collect();
+    suspicions.extend(odd_views(&checks).filter(|_| means.fit()));
+    let is_suspect = options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some());
+    let diagnosis = if means.psnr_db < FLAWLESS_DB || !means.fit() || is_suspect {
+        let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;
+        // Where the drawings match as they are, only a mistake that improves them counts.
+        Some(found).filter(|found| !means.fit() || found.mistake.is_some())
+    } else {
+        None
+    };
+    Ok(CheckReport {
+        mean_psnr_db: means.psnr_db,
+        mean_flat_psnr_db: means.flat_psnr_db,
+        mean_covered_share: means.covered_share,
+        views: checks,
+        unreadable: unreadable.iter().map(ToString::to_string).collect(),
+        unusable_gaussians,
+        suspicions,
+        notes: Vec::new(),
+        diagnosis,
+    })
+}
+
+/// The views that could be compared with their photos, and what is left of them for a diagnosis.
+struct Compared {
+    checks: Vec<ViewCheck>,
+    unreadable: Vec<IngestError>,
+    unusable_gaussians: usize,
+    samples: Samples,
+}
+
+fn compare(
+    views: impl ExactSizeIterator<Item = Result<CheckView, IngestError>>,
+    scene: &dyn LoadedScene,
+    options: &CheckOptions,
+) -> Result<Compared, CheckError> {
+    let n_views = views.len();
+    let (mut checks, mut unreadable) = (Vec::with_capacity(n_views), Vec::new());
     let mut unusable_gaussians = 0;
     let mut samples = Samples::new(n_views, options.diagnosis_views, options.diagnosis_width_px);
     for (index, view) in views.enumerate() {
@@ -73,7 +111,7 @@ where
             }
         };
         let small = at_width(&view, options.width_px)?;
-        let drawing = small.draw(&*loaded)?;
+        let drawing = small.draw(scene)?;
         unusable_gaussians = unusable_gaussians.max(drawing.counters.unusable);
         if let Some(dir) = &options.pictures_dir {
             fs_err::write(dir.join(picture_name(index, &view.name)), picture(&small, &drawing)?)?;
@@ -87,44 +125,35 @@ where
         });
         samples.add(index, &view)?;
     }
-    if checks.is_empty() {
-        return Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) });
+    match checks.is_empty() {
+        true => Err(CheckError::NoPhotos { n_views, first: unreadable.remove(0) }),
+        false => Ok(Compared { checks, unreadable, unusable_gaussians, samples }),
     }
+}
+
+fn means_of(checks: &[ViewCheck]) -> Means {
     // A photo of one colour, as under a lens cap, tells nothing of the others.
     let mut told: Vec<&ViewCheck> = checks.iter().filter(|c| c.flat_psnr_db < PLAIN_DB).collect();
     if told.is_empty() {
         told = checks.iter().collect();
     }
-    let mut report = CheckReport {
-        mean_psnr_db: mean(told.iter().map(|c| c.psnr_db)),
-        mean_flat_psnr_db: mean(told.iter().map(|c| c.flat_psnr_db)),
-        mean_covered_share: mean(checks.iter().map(|c| c.covered_share)),
-        views: checks,
-        unreadable: unreadable.iter().map(ToString::to_string).collect(),
-        unusable_gaussians,
-        suspicions: options.suspicions.iter().map(|suspicion| suspicion.text.clone()).collect(),
-        notes: Vec::new(),
-        diagnosis: None,
-    };
-    let means = Means {
-        psnr_db: report.mean_psnr_db,
-        flat_psnr_db: report.mean_flat_psnr_db,
-        covered_share: report.mean_covered_share,
-    };
-    let mut odd = report.views.iter().filter(|view| !view.fits());
-    if let (true, Some(first)) = (means.fit(), odd.next()) {
-        let (n, of) = (1 + odd.count(), report.views.len());
-        report.suspicions.push(format!(
+    Means {
+        psnr_db: mean(told.iter().map(|c| c.psnr_db)),
+        flat_psnr_db: mean(told.iter().map(|c| c.flat_psnr_db)),
+        covered_share: mean(checks.iter().map(|c| c.covered_share)),
+    }
+}
+
+/// Names the views that do not fit, if there are some.
+fn odd_views(checks: &[ViewCheck]) -> impl Iterator<Item = String> {
+    let mut odd = checks.iter().filter(|view| !view.fits());
+    let first = odd.next();
+    let (n, of) = (1 + odd.count(), checks.len());
+    first.into_iter().map(move |first| {
+        format!(
             "{n} of {of} views look less like their photos than a plain colour does, the first is {}: look at the \
              poses of these photos, or leave them out",
             first.name
-        ));
-    }
-    let is_suspect = options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some());
-    if means.psnr_db < FLAWLESS_DB || !means.fit() || is_suspect {
-        let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;
-        // Where the drawings match as they are, only a mistake that improves them counts.
-        report.diagnosis = Some(found).filter(|found| !means.fit() || found.mistake.is_some());
-    }
-    Ok(report)
+        )
+    })
 }

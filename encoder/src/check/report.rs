@@ -9,7 +9,6 @@ use super::diagnosis::Diagnosis;
 /// A drawing with this PSNR looks much like its photo.
 const ALIKE_DB: f64 = 25.0;
 
-/// Comparison of one view with its photo.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ViewCheck {
     pub name: String,
@@ -34,11 +33,8 @@ impl ViewCheck {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {
     pub views: Vec<ViewCheck>,
-    /// Mean of `psnr_db` over the views, dB.
     pub mean_psnr_db: f64,
-    /// Mean of `flat_psnr_db` over the views, dB.
     pub(crate) mean_flat_psnr_db: f64,
-    /// Mean of `covered_share` over the views.
     pub mean_covered_share: f64,
     /// Largest number of Gaussians that cannot be drawn in a view.
     pub unusable_gaussians: usize,

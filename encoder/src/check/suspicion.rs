@@ -21,10 +21,8 @@ const OFF_CENTRE: f64 = 0.15;
 /// The worlds of splat and cameras are apart if their middles are this many of their sizes from each other.
 const APART: f64 = 10.0;
 
-/// Something that looks wrong.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Suspicion {
-    /// A sentence for the user.
     pub text: String,
     /// The mistake that would explain it; drawings tell.
     pub mistake: Option<Mistake>,
@@ -33,76 +31,60 @@ pub struct Suspicion {
 /// Returns what looks wrong in a splat and the poses of its photos.
 pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
     let usable: Vec<usize> = (0..scene.len()).filter(|i| scene.is_usable(*i)).collect();
-    let mut found = Vec::new();
-    let mut say = |mistake: Option<Mistake>, text: String| found.push(Suspicion { text, mistake });
-    if usable.is_empty() {
-        say(None, "the splat has no Gaussians that can be drawn".into());
-    } else if share(&usable, |i| scene.scales[i] == [0.0; 3]) > 0.5 {
-        say(
-            None,
-            "most Gaussians are points without a size; export the splat again, or leave out --activated scales"
-                .into(),
-        );
-    } else if usable.iter().all(|i| scene.scales[*i][2] == 0.0) {
-        say(None, "the Gaussians are flat, as those of 2DGS: their third axis is taken as 0".into());
-    }
-    let n_lost = scene.len() - usable.len();
-    if n_lost > 0 {
-        let advice = if 2 * n_lost > scene.len() { "; export the splat again" } else { " and are left out" };
-        say(None, format!("{n_lost} of {} Gaussians cannot be drawn{advice}", scene.len()));
-    }
-    if !usable.is_empty() && share(&usable, |i| scene.opacities[i] < INVISIBLE) > MOST {
-        say(None, "all Gaussians are transparent; export the splat again".into());
-    }
-    if let Some(mistake @ Mistake::Activated { .. }) = activated(scene, &usable) {
-        say(Some(mistake), mistake.to_string());
-    }
-    // Percents and bytes as logits saturate; surfaces may be opaque on purpose, of a logit that somebody chose.
-    let is_saturated = share(&usable, |i| scene.opacities[i] >= 1.0) > 0.5;
-    if usable.len() >= MANY
-        && is_saturated
-        && share(&usable, |i| scene.opacities[i] > ACTIVATED_OPACITY) > MOST
-    {
-        say(
-            None,
-            "all Gaussians are nearly opaque: the file's opacities may be percents or bytes, not logits"
-                .into(),
-        );
-    }
-    if usable.len() >= MANY
-        && share(&usable, |i| scene.sh_dc[i].iter().all(|c| (0.0..=1.0).contains(c))) > MOST
-    {
-        say(None, "all Gaussians are pale: the file's f_dc may be colours of 0 to 1, not harmonics".into());
-    }
-    if let Some((rounding, size)) = rounded(scene, &usable) {
-        say(
-            None,
-            format!(
-                "the splat's coordinates are so large that 32 bits round them to {rounding:.1e}, more than its small \
-                 Gaussians measure ({size:.1e}): subtract an offset before training (UTM coordinates, perhaps)"
-            ),
-        );
-    }
-    let n_doubled = doubled(scene, &usable);
-    if usable.len() >= MANY && 10 * n_doubled > usable.len() {
-        say(
-            None,
-            format!(
-                "{n_doubled} of {} Gaussians stand where another one alike stands: the splat was joined with itself, \
-                 and is drawn too dense; export it again",
-                scene.len()
-            ),
-        );
-    }
-    if let Some(frame) = shifted(scene, views) {
+    let of_text = |text: String| Suspicion { text, mistake: None };
+    let of_mistake = |mistake: Mistake| Suspicion { text: mistake.to_string(), mistake: Some(mistake) };
+    let mut found: Vec<Suspicion> = undrawable(scene, &usable).into_iter().map(of_text).collect();
+    found.extend(activated(scene, &usable).map(of_mistake));
+    let texts = misread(scene, &usable).into_iter().chain(rounded(scene, &usable));
+    found.extend(texts.chain(doubled(scene, &usable)).map(of_text));
+    found.extend(shifted(scene, views).map(|frame| {
         let [x, y, z] = frame.splat_from_poses.translation.to_array();
         let text = format!(
             "splat and cameras are far apart, by about ({x:.0}, {y:.0}, {z:.0}): one has an offset that the other lacks"
         );
-        say(Some(Mistake::Frame(frame)), text);
+        Suspicion { text, mistake: Some(Mistake::Frame(frame)) }
+    }));
+    found.extend(intrinsics(views).map(of_mistake));
+    found
+}
+
+/// Says which Gaussians show nothing, or less than they should.
+fn undrawable(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
+    let mut found: Vec<String> = Vec::new();
+    if usable.is_empty() {
+        found.push("the splat has no Gaussians that can be drawn".into());
+    } else if share(usable, |i| scene.scales[i] == [0.0; 3]) > 0.5 {
+        let advice = "export the splat again, or leave out --activated scales";
+        found.push(format!("most Gaussians are points without a size; {advice}"));
+    } else if usable.iter().all(|i| scene.scales[*i][2] == 0.0) {
+        found.push("the Gaussians are flat, as those of 2DGS: their third axis is taken as 0".into());
     }
-    if let Some(mistake) = intrinsics(views) {
-        say(Some(mistake), mistake.to_string());
+    let n_lost = scene.len() - usable.len();
+    if n_lost > 0 {
+        let advice = if 2 * n_lost > scene.len() { "; export the splat again" } else { " and are left out" };
+        found.push(format!("{n_lost} of {} Gaussians cannot be drawn{advice}", scene.len()));
+    }
+    if !usable.is_empty() && share(usable, |i| scene.opacities[i] < INVISIBLE) > MOST {
+        found.push("all Gaussians are transparent; export the splat again".into());
+    }
+    found
+}
+
+/// Says which columns of the file may be something else than what they are read as.
+fn misread(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
+    let mut found: Vec<String> = Vec::new();
+    if usable.len() < MANY {
+        return found;
+    }
+    // Percents and bytes as logits saturate; surfaces may be opaque on purpose, of a logit that somebody chose.
+    let is_saturated = share(usable, |i| scene.opacities[i] >= 1.0) > 0.5;
+    if is_saturated && share(usable, |i| scene.opacities[i] > ACTIVATED_OPACITY) > MOST {
+        let what = "the file's opacities may be percents or bytes, not logits";
+        found.push(format!("all Gaussians are nearly opaque: {what}"));
+    }
+    if share(usable, |i| scene.sh_dc[i].iter().all(|c| (0.0..=1.0).contains(c))) > MOST {
+        let what = "the file's f_dc may be colours of 0 to 1, not harmonics";
+        found.push(format!("all Gaussians are pale: {what}"));
     }
     found
 }
@@ -123,8 +105,8 @@ fn activated(scene: &Gaussians, usable: &[usize]) -> Option<Mistake> {
     (usable.len() >= MANY && (scales || opacities)).then_some(Mistake::Activated { scales, opacities })
 }
 
-/// Returns how many Gaussians agree with another one in position, scales and opacity, beyond the first of a kind.
-fn doubled(scene: &Gaussians, usable: &[usize]) -> usize {
+/// Says that Gaussians agree with another one in position, scales and opacity, beyond the first of a kind.
+fn doubled(scene: &Gaussians, usable: &[usize]) -> Option<String> {
     let key = |i: &usize| {
         let mut hasher = DefaultHasher::new();
         scene.means_in_world[*i].to_array().map(f64::to_bits).hash(&mut hasher);
@@ -133,12 +115,18 @@ fn doubled(scene: &Gaussians, usable: &[usize]) -> usize {
     };
     let mut keys: Vec<u64> = usable.iter().map(key).collect();
     keys.sort_unstable();
-    keys.windows(2).filter(|pair| pair[0] == pair[1]).count()
+    let n_doubled = keys.windows(2).filter(|pair| pair[0] == pair[1]).count();
+    (usable.len() >= MANY && 10 * n_doubled > usable.len()).then(|| {
+        format!(
+            "{n_doubled} of {} Gaussians stand where another one alike stands: the splat was joined with itself, \
+             and is drawn too dense; export it again",
+            scene.len()
+        )
+    })
 }
 
-/// Returns the rounding of coordinates that were stored in 32 bits and the size of small Gaussians, where the
-/// first is larger.
-fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<(f64, f64)> {
+/// Says that coordinates that were stored in 32 bits are rounded by more than the size of small Gaussians.
+fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<String> {
     let means = || usable.iter().map(|i| scene.means_in_world[*i]);
     let is_f32 = |mean: DVec3| mean.to_array().iter().all(|x| f64::from(*x as f32) == *x);
     if !means().step_by(usable.len() / 1000 + 1).all(is_f32) {
@@ -151,7 +139,12 @@ fn rounded(scene: &Gaussians, usable: &[usize]) -> Option<(f64, f64)> {
     let (rounding, size) =
         (farthest * f64::from(f32::EPSILON), f64::from(quantile(&mut sizes, 100, Rank::After)?));
     // Without an offset, the Gaussians are small and not the coordinates large.
-    (rounding > size && size > 0.0 && farthest > scene_diagonal(scene)).then_some((rounding, size))
+    (rounding > size && size > 0.0 && farthest > scene_diagonal(scene)).then(|| {
+        format!(
+            "the splat's coordinates are so large that 32 bits round them to {rounding:.1e}, more than its small \
+             Gaussians measure ({size:.1e}): subtract an offset before training (UTM coordinates, perhaps)"
+        )
+    })
 }
 
 /// Returns the round offset between splat and cameras, where they are far apart.

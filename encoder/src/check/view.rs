@@ -8,11 +8,9 @@ use image::{GrayImage, ImageFormat, RgbImage};
 use super::error::CheckError;
 use crate::raster::{Drawing, LoadedScene, RasterView};
 
-/// A photo with its camera.
 #[derive(Clone, Debug)]
 pub struct CheckView {
     pub name: String,
-    /// The undistorted photo.
     pub image: RgbImage,
     /// Pixels that belong to the photo, row-major, as 255 and 0; `None` if all do.
     pub valid: Option<GrayImage>,

@@ -6,12 +6,14 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use image::GrayImage;
 use slag_common::poses::SplatFrame;
-use slag_common::{View, durable, files, poses, splat};
+use slag_common::{Gaussians, Similarity, View, durable, files, poses, splat};
 
 use super::common::{Exit, InputArgs, print};
 use super::memory::free_memory_bytes;
 use super::next;
-use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
+use crate::check::{
+    self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Suspicion,
+};
 use crate::ingest::{self, FoundFrame, IngestError, LoadedImage, RotatedPhotos};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
@@ -51,47 +53,75 @@ pub struct CheckArgs {
 }
 
 pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
-    let input = &args.input;
-    let mut scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
-    input.activated.undo(&mut scene);
-    let views = input
-        .views
-        .as_ref()
-        .context("check compares the splat with photos; give their poses with --views")?;
-    args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;
-    let mut set = poses::read(views, input.images.as_deref())?;
-    let mut notes = set.notes.clone();
-    let drawn_from = ingest::drawn_from(views);
-    if let Some(splat) = &drawn_from {
-        notes.push(format!(
-            "the images are no photos: they were drawn from {splat}, so that they fit says little"
-        ));
+    let inputs = Inputs::read(args)?;
+    let (report, is_partial) = checked(args, inputs)?;
+    let next = if report.diagnosis.is_none() { next::of_check(&args.input) } else { String::new() };
+    print(json, &report, format!("{report}{next}"))?;
+    Ok(match (&report.diagnosis, is_partial) {
+        (Some(_), _) => Exit::Mismatch,
+        (None, true) => Exit::Partly,
+        (None, false) => Exit::Done,
+    })
+}
+
+/// What is compared: the splat, and the photos' cameras in its world.
+struct Inputs {
+    scene: Gaussians,
+    /// Views whose photos are there.
+    views: Vec<View>,
+    /// The similarity that a file states, which the cameras were moved by.
+    stated: Option<Similarity>,
+    frames: Vec<FrameCandidate>,
+    suspicions: Vec<Suspicion>,
+    notes: Vec<String>,
+    /// Whether frames or photos are left out.
+    is_partial: bool,
+}
+
+impl Inputs {
+    fn read(args: &CheckArgs) -> Result<Self> {
+        let input = &args.input;
+        let mut scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
+        input.activated.undo(&mut scene);
+        let views = input.views.as_ref();
+        let views = views.context("check compares the splat with photos; give their poses with --views")?;
+        args.write_frame.iter().try_for_each(|path| files::check_writable(path))?;
+        let mut set = poses::read(views, input.images.as_deref())?;
+        let mut notes = set.notes.clone();
+        let drawn_from = ingest::drawn_from(views);
+        notes.extend(drawn_from.as_ref().map(|splat| {
+            format!("the images are no photos: they were drawn from {splat}, so that they fit says little")
+        }));
+        let frame = match drawn_from {
+            Some(_) => None,
+            None => ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?,
+        };
+        let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;
+        if let Some(n) = input.every {
+            set = set.every(n);
+        }
+        notes.extend(set.left_out());
+        let n_left_out = set.damaged.len();
+        let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
+        let mut all = set.views;
+        if let Some(stated) = stated {
+            all.iter_mut()
+                .for_each(|view| view.camera_from_world = stated.camera_from_target(view.camera_from_world));
+        }
+        let (n_views, suspicions) = (all.len(), check::suspicions(&scene, &all));
+        let views = with_photos(all, input.strict, &mut notes)?;
+        let is_partial = n_left_out > 0 || views.len() < n_views;
+        Ok(Self { scene, views, stated, frames, suspicions, notes, is_partial })
     }
-    let frame = match drawn_from {
-        Some(_) => None,
-        None => ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?,
-    };
-    let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;
-    if let Some(n) = input.every {
-        set = set.every(n);
-    }
-    notes.extend(set.left_out());
-    let n_left_out = set.damaged.len();
-    let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
-    let in_splat = |view: View| View {
-        camera_from_world: stated
-            .map_or(view.camera_from_world, |stated| stated.camera_from_target(view.camera_from_world)),
-        ..view
-    };
-    let all: Vec<View> = set.views.into_iter().map(in_splat).collect();
-    let suspicions = check::suspicions(&scene, &all);
-    let n_views = all.len();
-    let there = with_photos(all, input.strict, &mut notes)?;
-    let n_missing = n_views - there.len();
-    let n = (args.samples as usize).min(there.len());
+}
+
+/// Checks the inputs; returns the report, and whether something was left out or does not fit.
+fn checked(args: &CheckArgs, inputs: Inputs) -> Result<(CheckReport, bool)> {
+    let Inputs { scene, views, stated, frames, suspicions, mut notes, is_partial } = inputs;
+    let n = (args.samples as usize).min(views.len());
     // One at a time: a photo is loaded when the check reaches it.
     let rotated = RotatedPhotos::default();
-    let views = (0..n).map(|i| load(&there[i * there.len() / n], &rotated));
+    let photos = (0..n).map(|i| load(&views[i * views.len() / n], &rotated));
     let options = CheckOptions {
         width_px: args.raster_width,
         pictures_dir: args.out.clone(),
@@ -100,9 +130,9 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         ..CheckOptions::default()
     };
     let devices = Devices::open(&args.device, GpuOptions::default())?;
-    let mut report = check::check(&scene, views, &devices, &options)?;
+    let mut report = check::check(&scene, photos, &devices, &options)?;
     rotated.warn();
-    if let (true, Some(first)) = (input.strict, report.unreadable.first()) {
+    if let (true, Some(first)) = (args.input.strict, report.unreadable.first()) {
         return Err(anyhow!("{first}"));
     }
     // Cameras were in the stated frame already; what is reported and written begins at the poses.
@@ -113,20 +143,11 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         notes.push(write_frame(path, &report)?);
     }
     report.notes = notes;
-    let next = if report.diagnosis.is_none() { next::of_check(input) } else { String::new() };
-    print(json, &report, format!("{report}{next}"))?;
-    let is_partial = n_missing > 0
-        || !report.unreadable.is_empty()
-        || n_left_out > 0
-        || report.views.iter().any(|view| !view.fits());
-    Ok(match (&report.diagnosis, is_partial) {
-        (Some(_), _) => Exit::Mismatch,
-        (None, true) => Exit::Partly,
-        (None, false) => Exit::Done,
-    })
+    let is_partial =
+        is_partial || !report.unreadable.is_empty() || report.views.iter().any(|view| !view.fits());
+    Ok((report, is_partial))
 }
 
-/// Returns the views whose photos are there, and notes how many are not.
 fn with_photos(views: Vec<View>, is_strict: bool, notes: &mut Vec<String>) -> Result<Vec<View>> {
     let (missing, there): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| !v.image_path.is_file());
     if let Some(first) = missing.first() {

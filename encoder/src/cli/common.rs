@@ -84,7 +84,6 @@ impl OutputArgs {
             .init();
     }
 
-    /// Returns whether progress may be shown.
     pub fn shows_progress(self) -> bool {
         !self.quiet && !self.json
     }
@@ -254,7 +253,6 @@ pub fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn
     Ok(models.text_encoder(&session)?)
 }
 
-/// Returns the number of cores.
 pub(crate) fn available_threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
@@ -267,7 +265,6 @@ pub async fn stopped() {
     }
 }
 
-/// Starts the threads of the services.
 pub fn runtime() -> Result<tokio::runtime::Runtime> {
     tokio::runtime::Builder::new_multi_thread()
         .enable_all()

@@ -23,7 +23,6 @@ pub struct DiffArgs {
     new: Option<At>,
 }
 
-/// A generation of a store.
 #[derive(Clone, Debug, PartialEq)]
 struct At {
     store: PathBuf,

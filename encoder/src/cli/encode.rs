@@ -324,7 +324,6 @@ impl TargetArgs {
     }
 }
 
-/// Parses the flags of a front's setting.
 fn parse_choices(flags: &str) -> Result<ChoiceArgs> {
     let command = ChoiceArgs::augment_args(clap::Command::new("encode").no_binary_name(true));
     command

@@ -5,7 +5,6 @@ use std::fs;
 use slag_common::ByteSize;
 use slag_common::byte_size::ByteSizeError;
 
-/// Least working memory, bytes.
 const MIN_MEMORY_BYTES: u64 = 64 << 20;
 /// Working memory on machines that do not report free memory.
 const UNKNOWN_MEMORY_BYTES: u64 = 2 << 30;

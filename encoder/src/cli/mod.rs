@@ -53,7 +53,6 @@ pub struct Cli {
 }
 
 impl Cli {
-    /// Returns whether the command looks for GPUs.
     pub fn uses_gpu(&self) -> bool {
         cfg!(feature = "gpu")
             && match &self.command {
@@ -123,7 +122,6 @@ pub enum Command {
     },
 }
 
-/// Runs the program and says how it ended.
 pub fn run(cli: Cli) -> Exit {
     let json = cli.output.json;
     let progress = progress::shown(cli.output.shows_progress());

@@ -16,7 +16,6 @@ use crate::store::metadata::MetadataReader;
 
 /// Share of the Gaussians that the extent leaves out on each side of each axis: strays lie far away.
 const STRAY_SHARE: f64 = 0.02;
-/// Port at which `serve` listens by default.
 const PORT: u16 = 7733;
 
 /// Returns the lines of a published store: extent, `query` and `serve` here, `trust` and `fetch` on the robot.
@@ -54,7 +53,6 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
     Ok(lines)
 }
 
-/// Returns the lines of inputs that fit.
 pub(super) fn of_check(input: &InputArgs) -> String {
     let views = input.views.as_ref().map_or(String::new(), |path| format!(" --views {}", shell_word(path)));
     let images = input.images.as_ref().map_or(String::new(), |dir| format!(" --images {}", shell_word(dir)));

@@ -9,7 +9,6 @@ use slag_common::note;
 
 use crate::progress::{Progress, Silent};
 
-/// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Returns a receiver that shows progress on stderr, or one that discards it.

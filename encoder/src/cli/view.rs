@@ -60,7 +60,6 @@ pub struct ViewArgs {
     pub(crate) no_open: bool,
 }
 
-/// Parses an axis of the world.
 fn parse_axis(text: &str) -> Result<Vec3, String> {
     let (sign, axis) = text.strip_prefix('-').map_or((1.0, text), |axis| (-1.0, axis));
     match axis {
@@ -71,7 +70,6 @@ fn parse_axis(text: &str) -> Result<Vec3, String> {
     }
 }
 
-/// Returns what opens the text encoder of a store.
 pub(super) fn open_text(models: ModelArgs) -> OpenText {
     Box::new(move |reader| text_encoder_of(reader, &models).map_err(|error| format!("{error:#}")))
 }
@@ -95,7 +93,6 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
     Ok(Exit::Done)
 }
 
-/// Refuses where the page is missing.
 fn check_page() -> Result<()> {
     match slag_view::is_built() {
         true => Ok(()),
@@ -124,7 +121,6 @@ fn shown(args: &ViewArgs) -> Result<Viewed> {
     Ok(Viewed { store: args.store.clone(), splat, views, up, open_text })
 }
 
-/// Returns the link that opens the page with a question.
 fn link(url: &str, question: Option<&str>) -> String {
     let encode = |byte: u8| match byte {
         b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'_' | b'.' => char::from(byte).to_string(),

@@ -62,7 +62,6 @@ impl TextBank {
         self.vectors.len().checked_div(self.dim).unwrap_or(0)
     }
 
-    /// Returns whether there is none.
     pub fn is_empty(&self) -> bool {
         self.vectors.is_empty()
     }
@@ -103,7 +102,6 @@ impl ScoreMetric {
         Self { dim, factor }
     }
 
-    /// Returns the components of an embedding.
     pub fn dim(&self) -> usize {
         self.dim
     }

@@ -8,7 +8,6 @@ use slag_math::matrix::{Panels, Rows};
 use super::measure;
 use super::members::Members;
 
-/// Embeddings decoded at a time.
 const CHUNK: usize = 1024;
 
 /// Decodes components to vectors, as readers do.
@@ -36,7 +35,6 @@ impl Decoder<'_> {
         Panels::new(self.m, self.dim, |c, i| f32::from(self.basis[c * self.dim + i]) * self.steps[c])
     }
 
-    /// Returns the length of each basis vector.
     pub(super) fn lengths(&self) -> Vec<f32> {
         let length = |(vector, step): (&[i8], &f32)| {
             vector.iter().map(|v| f32::from(*v).powi(2)).sum::<f32>().sqrt() * step

@@ -11,7 +11,6 @@ const LIKELY_TEXTS: usize = 950;
 /// Of each of these texts, scores in 1,000 that are bounded.
 const LIKELY_SCORES: usize = 990;
 
-/// Most sampled Gaussians of a cell.
 const SAMPLE: usize = 1024;
 
 /// The true scores of some Gaussians.

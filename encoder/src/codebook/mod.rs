@@ -51,9 +51,7 @@ pub(crate) fn working_bytes_per_embedding(dim: usize) -> usize {
 /// standard deviation over the scene).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CodebookSettings {
-    /// Largest accepted error of the compact profile.
     pub(crate) compact_error: f32,
-    /// Largest accepted error of the balanced profile.
     pub(crate) balanced_error: f32,
     /// Most components of a centroid: the dimension of compact and balanced shards. Fewer are taken where the
     /// errors allow it; even, 2 to [`MAX_COMPONENTS`].
@@ -87,7 +85,6 @@ impl Default for CodebookSettings {
 /// The metric and the texts that errors of scores are measured by.
 pub struct ScoreMetricContext {
     pub metric: ScoreMetric,
-    /// Texts whose scores are compared.
     pub bank: TextBank,
     /// Spread of a text's scores over the scene, as estimated beforehand.
     pub spread: f32,
@@ -99,7 +96,6 @@ pub struct Codebook {
     pub order: Vec<u32>,
     /// `[K + 1]`.
     pub centroid_starts: Vec<u32>,
-    /// Components of a centroid, m.
     pub n_components: usize,
     /// `[dim]`.
     pub mean: Vec<f16>,
@@ -112,9 +108,7 @@ pub struct Codebook {
     pub centroid_step: f32,
     /// `[K]`: largest distance of a member from its centroid.
     pub radii: Vec<f32>,
-    /// Errors of the centroids' scores.
     pub errors: ScoreErrors,
-    /// Moments of all texts' scores.
     pub moments: ScoreMoments,
     /// The residual code; `None` if the centroids are good enough.
     pub residuals: Option<CodebookResiduals>,
@@ -142,9 +136,7 @@ pub struct CodebookResiduals {
     pub codes: Vec<u8>,
     /// `[K]`: largest distance of a member from its decoded form.
     pub radii: Vec<f32>,
-    /// Errors of the decoded scores.
     pub errors: ScoreErrors,
-    /// Residuals in 8 bits, if requested.
     pub fine: Option<FineResiduals>,
 }
 
@@ -294,7 +286,6 @@ impl<'a> StoredCentroids<'a> {
         Self { mean: &fitted.mean, ranges, basis, basis_steps, centroids }
     }
 
-    /// Returns the decoder of the first `m` components.
     fn decoder(&self, m: usize) -> Decoder<'_> {
         let dim = self.mean.len();
         Decoder { dim, m, mean: self.mean, basis: &self.basis[..m * dim], steps: &self.basis_steps[..m] }

@@ -15,7 +15,6 @@ use slag_math::matrix::Rows;
 const TRAINING_SAMPLE: usize = 6144;
 /// Most components of a subspace: 16 codewords say little about each of more.
 const MAX_SUBSPACE_COMPONENTS: usize = 8;
-/// Numbers of subspaces are multiples of this.
 const SUBSPACES_STEP: usize = 4;
 
 pub struct ResidualCode {
@@ -120,7 +119,6 @@ impl ResidualCode {
         self.subspace_starts.len() - 1
     }
 
-    /// Returns the components that codewords cover.
     pub fn n_components(&self) -> usize {
         self.subspace_starts[self.n_subspaces()] as usize
     }

@@ -30,7 +30,6 @@ pub(crate) struct Diff {
     pub(crate) went: Vec<Thing>,
     /// Things that lie elsewhere, by the ids that they had.
     pub(crate) moved: Vec<Moved>,
-    /// Cells of the later generation.
     pub(crate) n_cells: usize,
     /// Those that have a shard which the earlier generation does not have.
     pub(crate) n_cells_changed: usize,
@@ -38,7 +37,6 @@ pub(crate) struct Diff {
     pub(crate) fetch_bytes: BTreeMap<String, u64>,
 }
 
-/// Compares two generations.
 pub(crate) fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, DiffError> {
     let (old_manifest, manifest) = (&old.published.manifest, &new.published.manifest);
     if old_manifest.encoder.id != manifest.encoder.id {
@@ -82,7 +80,6 @@ pub(crate) struct Generation<'a> {
     pub(crate) published: &'a Published,
 }
 
-/// Two generations cannot be compared.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum DiffError {
     #[error(transparent)]

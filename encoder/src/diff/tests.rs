@@ -3,7 +3,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{Manifest, ShardRecord};
 use slag_common::shard::sample::{self, SampleObject, SampleObjects, SampleShard};
-use slag_common::shard::{Profile, ShardHeader, ShardLayout};
+use slag_common::shard::{Additions, Profile, ShardHeader, ShardLayout};
 
 use super::*;
 use crate::store::tests::manifest;
@@ -37,7 +37,7 @@ fn shard(seed: u16, ids: &[u64]) -> Vec<u8> {
     };
     let objects = (0..).zip(ids).map(object).collect();
     let objects = SampleObjects { objects, score_mean: 0.0, score_spread: 0.1, score_error_bound: 0.0 };
-    objects.add_to(&shard.view(), None)
+    objects.add_to(&shard.view(), Additions::default())
 }
 
 /// A generation of a store with a cell for each list of shards, by profile.

@@ -43,7 +43,6 @@ impl EmbedError {
 pub(crate) enum PatchUse {
     /// Each of these patches is a region with a vector of its own; numbers row by row.
     Regions(Vec<usize>),
-    /// Masks take a share.
     Masks(Surroundings),
 }
 

@@ -96,7 +96,6 @@ impl SharedEncoders {
         gpus.len() * LANES_PER_GPU * VIEWS_PER_LANE
     }
 
-    /// Reserves the squares that wait, each of `square_bytes`.
     pub(crate) fn reserve(memory: &mut MemoryPlan, gpus: &[u32], square_bytes: u64) {
         let n = gpus.len() as u64 * LANES_PER_GPU as u64 * CROPS_PER_LANE;
         memory.reserve(Phase::Views, "crops that wait for GPUs", n * square_bytes);
@@ -162,7 +161,7 @@ impl Shared {
 
     /// Runs batches until there will be no more.
     fn work(&self) {
-        let lost = Lost(self);
+        let guard = AbandonOnPanic(self);
         let mut queue = self.queue();
         while !queue.is_closed {
             if queue.waiting.is_empty() {
@@ -175,7 +174,7 @@ impl Shared {
             queue.keep(done);
         }
         drop(queue);
-        std::mem::forget(lost);
+        std::mem::forget(guard);
     }
 
     fn opened<'l>(
@@ -236,9 +235,9 @@ impl Shared {
 }
 
 /// Tells the views that wait if it is dropped, which only a panic does.
-struct Lost<'l>(&'l Shared);
+struct AbandonOnPanic<'l>(&'l Shared);
 
-impl Drop for Lost<'_> {
+impl Drop for AbandonOnPanic<'_> {
     fn drop(&mut self) {
         let mut queue = self.0.queue();
         queue.is_abandoned = true;

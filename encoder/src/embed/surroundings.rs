@@ -10,7 +10,6 @@ const SHARE_OF_WINDOWS: f32 = 0.35;
 
 /// What the masks of a photo take of its vectors.
 pub(crate) struct Surroundings {
-    /// Share of a mask's vector.
     share: f32,
     /// `[masks]`: numbers of vectors of the photo, each with its share of the mean.
     of_mask: Vec<Vec<(usize, f32)>>,

@@ -23,7 +23,6 @@ use crate::occupancy::SceneOccupancy;
 use crate::shard::{BuiltShard, CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
 use crate::store::Store;
 
-/// Makes cells of what all views together say about them.
 pub(super) struct CellMaker<'a> {
     pub(super) scene: &'a Gaussians,
     pub(super) split: &'a CellSplit,
@@ -37,7 +36,6 @@ pub(super) struct CellMaker<'a> {
     pub(super) score_context: ScoreMetricContext,
     /// Where the photos of each cell were taken, if its shards say so.
     pub(super) photo_poses: Option<Vec<BuiltPhotoPoses>>,
-    /// The landmarks of each cell, if its shards have them.
     pub(super) landmarks: Option<Vec<BuiltLandmarks>>,
     pub(super) store: &'a Store,
     pub(super) context: &'a RunContext<'a>,
@@ -54,7 +52,6 @@ pub(super) struct CellsBudget {
 /// A cell whose parts are being lifted.
 struct CellInWork {
     embeddings: CellEmbeddings,
-    /// Fields in the store, by name.
     fields: Vec<(String, Hash32)>,
 }
 

@@ -29,14 +29,12 @@ use crate::store::Extras;
 
 /// The cells of a scene, all objects of them in the store.
 pub(super) struct BuiltCells {
-    /// Manifest records, by cell.
     pub(super) records: Vec<CellRecord>,
     /// Subspaces of each cell's residual code.
     pub(super) n_subspaces: Vec<u32>,
     pub(super) n_entries: Vec<u64>,
     pub(super) extras: Extras,
     pub(super) n_without_evidence: u64,
-    /// The search for objects, if there was one.
     pub(super) objects: Option<ObjectsReport>,
     pub(super) occupancy: Option<OccupancyReport>,
     pub(super) counts: Counts,
@@ -218,7 +216,6 @@ impl Counts {
     }
 }
 
-/// Returns the cost of the used views.
 fn views_report(views: &DoneViews<'_>, index: &ContributionIndex) -> ViewsReport {
     let record = |view: &&View| -> ViewRecord { views.records.get(&view.name).copied().unwrap_or_default() };
     let used = &views.used;
@@ -237,7 +234,6 @@ struct Opened {
     index: ContributionIndex,
     table: RegionTable,
     score_context: ScoreMetricContext,
-    /// Each view's masks in its photo.
     photos: Vec<Photo>,
     /// Bytes for the contributions that a pass of the refinement or of objects holds.
     pass_bytes: u64,

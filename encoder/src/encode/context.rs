@@ -16,7 +16,6 @@ use crate::progress::Progress;
 #[derive(Default)]
 struct StageTimes(Mutex<BTreeMap<&'static str, f64>>);
 
-/// The beginning of a phase.
 struct Began {
     phase: Phase,
     at: Instant,
@@ -24,7 +23,6 @@ struct Began {
     peak_before: Option<u64>,
 }
 
-/// The state that the steps of one run share.
 pub(crate) struct RunContext<'a> {
     start: Instant,
     progress: &'a dyn Progress,
@@ -35,7 +33,6 @@ pub(crate) struct RunContext<'a> {
 }
 
 impl<'a> RunContext<'a> {
-    /// Starts `n_threads` worker threads.
     pub(crate) fn new(
         n_threads: usize,
         progress: &'a dyn Progress,
@@ -48,7 +45,6 @@ impl<'a> RunContext<'a> {
         Ok(Self { start, progress, cancel, times: StageTimes::default(), phases, workers })
     }
 
-    /// Ends the present phase and begins the next.
     pub(super) fn begin_phase(&self, phase: Phase) {
         // Before anything of the phase is there, so that phases do not come on top of each other.
         memory::give_back();
@@ -69,7 +65,6 @@ impl<'a> RunContext<'a> {
         phases.iter().zip(ends).map(report).collect()
     }
 
-    /// Returns when the run began.
     pub(super) fn start(&self) -> Instant {
         self.start
     }
@@ -83,7 +78,6 @@ impl<'a> RunContext<'a> {
         self.cancel
     }
 
-    /// Returns whether the user has asked the run to stop.
     pub(crate) fn is_cancelled(&self) -> bool {
         self.cancel.load(Ordering::Relaxed)
     }
@@ -93,7 +87,6 @@ impl<'a> RunContext<'a> {
         self.workers.shared()
     }
 
-    /// Returns the run's threads.
     pub(crate) fn workers(&self) -> &Workers {
         &self.workers
     }
@@ -121,7 +114,6 @@ impl<'a> RunContext<'a> {
 /// Stack of a thread: while it waits for others' part of its work, it may take up another piece.
 const STACK_BYTES: usize = 8 << 20;
 
-/// The threads of a run.
 pub(crate) struct Workers {
     shared: ThreadPool,
     /// Pools of one thread that have no work; made as they are needed.
@@ -137,7 +129,6 @@ impl Workers {
         Ok(Self { shared: start(n_threads)?, alone: Mutex::default() })
     }
 
-    /// Returns the threads that share work.
     pub(crate) fn shared(&self) -> &ThreadPool {
         &self.shared
     }

@@ -33,25 +33,20 @@ pub struct FrontSetting {
     pub seconds_per_view: f64,
     pub seconds_per_million_gaussians: f64,
     pub bytes_per_gaussian: f64,
-    /// Multi-class mIoU.
     pub miou: f64,
 }
 
 /// What a user accepts; at least one of the two.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Target {
-    /// Seconds of the encode at most.
     pub seconds: Option<f64>,
-    /// Bytes of the profile's shards at most.
     pub bytes: Option<u64>,
 }
 
-/// A chosen setting.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Expectation {
     pub setting: FrontSetting,
     pub seconds: f64,
-    /// Expected bytes of the profile's shards.
     pub bytes: f64,
 }
 

@@ -100,7 +100,6 @@ fn check_cells(n: usize) -> Result<(), EncodeError> {
     Err(EncodeError::Setting { setting: "cells", problem })
 }
 
-/// Reserves the scene's columns.
 pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
     memory.reserve(Phase::Always, "the scene", scene.len_bytes());
 }
@@ -165,7 +164,6 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, Enco
     Ok(n_drawn)
 }
 
-/// Leaves out the views of these names.
 fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError> {
     for name in names {
         let Some(at) = views.iter().position(|view| view.name == *name) else {

@@ -17,9 +17,7 @@ const IDENTITY_KEY: &[u8] = b"identity";
 /// Present while every finished view of the job is published.
 const PUBLISHED_KEY: &[u8] = b"published";
 const STEP_KEY: &[u8] = b"step";
-/// Followed by the view's identity.
 const VIEW_PREFIX: &str = "view/";
-/// Folder of the views' files in the job's.
 const VIEWS_FOLDER: &str = "views";
 
 /// What a store knows of the encode that it keeps views of.
@@ -112,7 +110,6 @@ impl Job {
         self.views_folder().join(format!("{}.contributions", self.id_of_view[view]))
     }
 
-    /// Returns the file of the outlines of a view's masks.
     pub(crate) fn outlines_path(&self, view: &str) -> PathBuf {
         self.contributions_path(view).with_extension("outlines")
     }
@@ -163,7 +160,6 @@ impl Job {
         Ok(found.as_deref() == Some(&of_scene.0) && tree.scan_prefix(VIEW_PREFIX).next().is_some())
     }
 
-    /// Forgets the job: it was published.
     pub(super) fn finish(self) -> Result<(), EncodeError> {
         self.clear()
     }

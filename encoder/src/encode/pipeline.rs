@@ -36,7 +36,7 @@ pub(super) fn most_under_way(stages: &[Stage], of: RangeInclusive<usize>, n_core
     (first..last).map(n_places).sum::<usize>() + stages[last].n_slots
 }
 
-struct State<T, E> {
+struct Schedule<T, E> {
     /// Waiting before each stage but the first.
     waiting: Vec<VecDeque<T>>,
     n_running: Vec<usize>,
@@ -56,7 +56,6 @@ enum Failure<E> {
     Panic(Box<dyn Any + Send>),
 }
 
-/// What a thread does next.
 enum Task<T> {
     /// Asks the source for an item, and takes it through the first stage.
     Begin,
@@ -79,7 +78,7 @@ pub(super) fn run<T: Send, E: Send>(
 ) -> Result<Vec<StageReport>, E> {
     let start = Instant::now();
     let pipeline = Pipeline { stages, n_cores, source: Mutex::new(source), step, changed: Condvar::new() };
-    let state = Mutex::new(State {
+    let schedule = Mutex::new(Schedule {
         waiting: stages.iter().map(|_| VecDeque::new()).collect(),
         n_running: vec![0; stages.len()],
         is_asking: false,
@@ -92,10 +91,10 @@ pub(super) fn run<T: Send, E: Send>(
     let n_elsewhere: usize = stages.iter().filter(|stage| !stage.on_cpu).map(|stage| stage.n_slots).sum();
     std::thread::scope(|scope| {
         for _ in 0..n_cores + n_elsewhere {
-            scope.spawn(|| pipeline.work(&state));
+            scope.spawn(|| pipeline.work(&schedule));
         }
     });
-    let State { busy_secs, failure, .. } = state.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let Schedule { busy_secs, failure, .. } = schedule.into_inner().unwrap_or_else(PoisonError::into_inner);
     match failure {
         Some(Failure::Error(error)) => return Err(error),
         Some(Failure::Panic(panic)) => panic::resume_unwind(panic),
@@ -121,23 +120,23 @@ struct Pipeline<'a, S, F> {
 }
 
 impl<S, F> Pipeline<'_, S, F> {
-    fn work<T, E>(&self, state: &Mutex<State<T, E>>)
+    fn work<T, E>(&self, schedule: &Mutex<Schedule<T, E>>)
     where
         S: Iterator<Item = T>,
         F: Fn(usize, T) -> Result<Option<T>, E>,
     {
-        let lock = || state.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut state = lock();
-        while state.failure.is_none() {
-            let Some((at, task)) = state.take(self.stages, self.n_cores) else {
+        let lock = || schedule.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut schedule = lock();
+        while schedule.failure.is_none() {
+            let Some((at, task)) = schedule.take(self.stages, self.n_cores) else {
                 // Where nothing is under way and nothing can be begun, nothing waits.
-                if state.n_running.iter().all(|n| *n == 0) {
+                if schedule.n_running.iter().all(|n| *n == 0) {
                     break;
                 }
-                state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+                schedule = self.changed.wait(schedule).unwrap_or_else(PoisonError::into_inner);
                 continue;
             };
-            drop(state);
+            drop(schedule);
             // A panic must not leave the others waiting.
             let done = panic::catch_unwind(AssertUnwindSafe(|| match task {
                 Task::Step(stage, item) => Some(self.timed_step(stage, item)),
@@ -148,8 +147,8 @@ impl<S, F> Pipeline<'_, S, F> {
                     item.map(|item| self.timed_step(0, item))
                 }
             }));
-            state = lock();
-            state.end_step(at, done);
+            schedule = lock();
+            schedule.end_step(at, done);
             self.changed.notify_all();
         }
     }
@@ -167,7 +166,7 @@ impl<S, F> Pipeline<'_, S, F> {
 /// Seconds and result of a step, if the source had an item for it.
 type StepOutcome<T, E> = Option<(f64, Result<Option<T>, E>)>;
 
-impl<T, E> State<T, E> {
+impl<T, E> Schedule<T, E> {
     /// Takes the item that is furthest of those that can go on, and says into which stage.
     fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, Task<T>)> {
         let on_cpu = stages.iter().zip(&self.n_running).filter(|(stage, _)| stage.on_cpu);

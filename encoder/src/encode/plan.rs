@@ -38,7 +38,6 @@ pub(crate) struct Plan<'a> {
     pub(super) memory: MemoryPlan,
     pub(crate) segmenter: Box<dyn Segmenter>,
     pub(crate) job: Job,
-    /// Kept views that are done anew.
     pub(super) lost_views: Option<LostViews>,
     /// The encoder of the generation that this encode replaces, if it is another.
     pub(super) encoder_before: Option<String>,

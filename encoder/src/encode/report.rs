@@ -10,7 +10,6 @@ use crate::lanes::GpuLoad;
 use crate::objects::ObjectsReport;
 use crate::occupancy::OccupancyReport;
 
-/// A view that was left out.
 #[derive(Clone, Debug, Serialize)]
 pub struct SkippedView {
     pub view: String,
@@ -47,7 +46,6 @@ pub struct LostViews {
     pub reason: String,
 }
 
-/// The size of one cell and of its shards.
 #[derive(Clone, Debug, Serialize)]
 pub struct CellReport {
     pub cell_id: u32,
@@ -57,7 +55,6 @@ pub struct CellReport {
     pub n_centroids: u32,
     /// Subspaces of the residual code, half a byte a Gaussian each; 0 where centroids suffice for every profile.
     pub n_subspaces: u32,
-    /// Bytes of its shards, by profile.
     pub shard_bytes: BTreeMap<String, u64>,
     /// Mean error of their scores, relative to the spread of scores, by profile.
     pub score_error: BTreeMap<String, f32>,
@@ -77,7 +74,6 @@ pub struct ViewsReport {
     pub secs: Vec<f64>,
 }
 
-/// The load of one stage of the views' pipeline.
 #[derive(Clone, Debug, Serialize)]
 pub struct StageReport {
     pub stage: String,
@@ -92,7 +88,6 @@ pub struct StageReport {
     pub gpus: Vec<GpuReport>,
 }
 
-/// The load of a GPU by the models of one stage.
 #[derive(Clone, Debug, Serialize)]
 pub struct GpuReport {
     /// The GPU, as CUDA numbers it.
@@ -136,7 +131,6 @@ pub(crate) enum Phase {
     Superpoints,
     Objects,
     Refine,
-    /// Cells become codebooks and shards.
     Cells,
     Publish,
 }
@@ -154,12 +148,10 @@ pub(crate) struct PhaseReport {
 pub struct EncodeSummary {
     pub generation: u64,
     pub n_gaussians: u64,
-    /// Gaussians without an embedding.
     pub n_without_evidence: u64,
     /// Unusable Gaussians, which are in no cell.
     pub n_rejected: u64,
     pub n_views: usize,
-    /// Views whose photo exists.
     pub n_views_with_photo: usize,
     /// Views whose image is a drawing of the splat, no photo.
     pub n_views_drawn: usize,
@@ -176,7 +168,6 @@ pub struct EncodeSummary {
     pub(crate) encoder_before: Option<String>,
     /// Views without any mask: no mask file, or no mask that is large enough.
     pub n_views_without_masks: usize,
-    /// Views that were left out.
     pub skipped_views: Vec<SkippedView>,
     pub n_masks: usize,
     pub n_regions: usize,
@@ -184,11 +175,9 @@ pub struct EncodeSummary {
     pub n_entries: u64,
     pub n_cells: usize,
     pub n_centroids: u64,
-    /// The search for objects, if there was one.
     pub objects: Option<ObjectsReport>,
     /// Free and occupied places, if they were asked for.
     pub occupancy: Option<OccupancyReport>,
-    /// Bytes of all shards, by profile.
     pub shard_bytes: BTreeMap<String, u64>,
     pub cells: Vec<CellReport>,
     pub views: ViewsReport,
@@ -200,10 +189,8 @@ pub struct EncodeSummary {
     pub(crate) phases: Vec<PhaseReport>,
     /// Seconds from the first view to the last.
     pub views_secs: f64,
-    /// Seconds from start to end.
     pub wall_secs: f64,
     /// The device that ran the image model; absent where no view was left to do, or the model needs no runtime.
     pub(crate) images_on: Option<String>,
-    /// The encoder's name.
     pub encoder: String,
 }

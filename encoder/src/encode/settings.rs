@@ -28,7 +28,6 @@ pub const DEFAULT_MASK_LEVELS: usize = 3;
 pub(crate) const MAX_RASTER_WIDTH_PX: u32 = 1024;
 /// Gaussians of a cell at most: shards number them with 16 bits.
 pub(crate) const MAX_CELL_GAUSSIANS: usize = 65_536;
-/// Largest width of a cell of a metric scene.
 pub(crate) const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 
 #[derive(Clone, Debug)]
@@ -38,15 +37,12 @@ pub struct EncodeSettings {
     pub view: ViewSettings,
     /// How contributions become embeddings. Finished views stay valid when it changes.
     pub aggregation: Aggregation,
-    /// How embeddings become shards.
     pub cells: CellSettings,
-    /// What is published, and where.
     pub output: OutputSettings,
     /// How the run goes: none of it changes what is made of a given set of views.
     pub run: RunSettings,
 }
 
-/// The files that an encode reads.
 #[derive(Clone, Debug)]
 pub struct InputSettings {
     pub scene: PathBuf,
@@ -58,7 +54,6 @@ pub struct InputSettings {
     pub images: Option<PathBuf>,
     /// Poses of further photos in the same world, which lie where these files say.
     pub added: Vec<PathBuf>,
-    /// Names of views to leave out.
     pub dropped: Vec<String>,
     /// Every how many frames one is taken, by their numbers; all where absent.
     pub every: Option<NonZeroU32>,
@@ -68,14 +63,12 @@ pub struct InputSettings {
     pub activated: Activated,
     /// Whether a world unit is a metre; a geo-reference implies it.
     pub metric: bool,
-    /// A geo-reference file.
     pub geo: Option<PathBuf>,
 }
 
 /// How a view becomes contributions: all of it is part of the encode's identity.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewSettings {
-    /// Where masks come from.
     pub masks: Masks,
     /// Masks with fewer pixels are left out, but for those of what stands on the ground.
     pub min_mask_px: u32,
@@ -113,7 +106,6 @@ impl Regions {
     }
 }
 
-/// Where masks come from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Masks {
@@ -137,7 +129,6 @@ pub enum Masks {
         /// The model directory. The identity has the files' hashes instead.
         #[serde(skip)]
         dir: PathBuf,
-        /// How many masks it finds.
         settings: SamSettings,
         /// Threads within a run of the model; another number may change logits in the last bits.
         n_model_threads: usize,
@@ -164,7 +155,6 @@ impl RasterWidth {
 /// How embeddings become shards.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellSettings {
-    /// How large a cell may become.
     pub limits: CellLimits,
     /// Which shards are made, and how fine they are.
     pub shards: ShardSettings,
@@ -178,7 +168,6 @@ pub struct CellSettings {
     pub landmarks: bool,
 }
 
-/// What is published, and where.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OutputSettings {
     pub store: PathBuf,
@@ -187,7 +176,6 @@ pub struct OutputSettings {
     pub created_unix_secs: u64,
     /// Name or folder of the models, as later queries on this machine open them; `None` for the embedded ones.
     pub models: Option<PathBuf>,
-    /// Whether the store carries the text side of the models.
     pub text_model: bool,
 }
 

@@ -31,7 +31,6 @@ use crate::memory::MemoryPlan;
 use crate::raster::{GpuSlots, LoadedScene, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
 
-/// Width of pictures of masks for people.
 const PICTURE_WIDTH_PX: u32 = 480;
 
 /// What every view needs on its way.
@@ -49,7 +48,6 @@ pub(crate) struct ViewTools<'a> {
     pub(crate) sink: &'a dyn ViewSink,
 }
 
-/// The stages of a view, with what every view needs.
 pub(crate) struct ViewStages<'a> {
     tools: ViewTools<'a>,
     context: &'a RunContext<'a>,
@@ -181,7 +179,6 @@ impl ViewTools<'_> {
         models.preprocess().is_none() || wants_patches
     }
 
-    /// Reserves the photos in memory, in all stages and between them.
     pub(crate) fn reserve_photos(&self, memory: &mut MemoryPlan, views: &[View]) {
         let stages = self.stages();
         let at = |name| stages.iter().position(|stage| stage.name == name).unwrap_or(0);
@@ -236,7 +233,6 @@ impl<'a> ViewStages<'a> {
         self.images_on.get().cloned().flatten()
     }
 
-    /// Warns of what views left out.
     pub(super) fn warn(&self) {
         self.rotated.warn();
         let n = self.n_unrepresentable.load(Ordering::Relaxed);
@@ -279,7 +275,6 @@ impl<'a> ViewStages<'a> {
         Ok(Photo { loaded, depth: None })
     }
 
-    /// Draws the depth of the scene.
     fn add_depth(&self, view: &View, photo: Photo) -> Result<Photo, EncodeError> {
         let loaded = photo.loaded;
         let width = self.tools.settings.raster_width;
@@ -308,7 +303,6 @@ impl<'a> ViewStages<'a> {
         Ok(Segmented { loaded, masks })
     }
 
-    /// Makes the regions of a view and the crops of its masks.
     fn crop(&self, view: &View, segmented: Segmented) -> Result<Cropped, EncodeError> {
         let Segmented { loaded, mut masks } = segmented;
         let (patches, regions) = self.patches(&loaded.image, &masks);
@@ -355,7 +349,6 @@ impl<'a> ViewStages<'a> {
         wanted.then(|| Windows::new(models.windows(), photo.width(), photo.height()))
     }
 
-    /// Makes the regions of a view's masks.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
         let width = self.tools.settings.raster_width;
         let raster_view = raster_view(loaded, width.px(loaded.view.intrinsics.width_px));
@@ -401,7 +394,6 @@ impl<'a> ViewStages<'a> {
         Ok(Embedded { vectors, partition })
     }
 
-    /// Calls `work` with an encoder of its own.
     fn with_encoder<T>(&self, work: impl FnOnce(&mut dyn ImageEncoder) -> T) -> Result<T, ModelError> {
         let idle = match &self.encoders {
             Encoders::Shared(encoders) => return encoders.with_encoder(work),

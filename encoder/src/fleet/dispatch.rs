@@ -30,7 +30,6 @@ pub(super) trait Dispatcher: Sync {
     }
 }
 
-/// The share of worker `index` of `of`.
 pub(super) struct Share {
     index: usize,
     of: usize,

@@ -84,7 +84,6 @@ pub(super) fn view_key(id: Hash32) -> String {
     format!("views/{id}")
 }
 
-/// Reads a document.
 pub(super) fn parse<T: DeserializeOwned>(bucket: &Bucket, key: &str, bytes: &[u8]) -> Result<T, FleetError> {
     serde_json::from_slice(bytes).map_err(|e| FleetError::damaged(bucket, key, e))
 }

@@ -105,7 +105,6 @@ impl Prepared {
     }
 }
 
-/// Returns the error of a view as the fleet's.
 pub(super) fn of_encode(error: EncodeError) -> FleetError {
     match error {
         EncodeError::Fleet(inner) => match inner.downcast::<FleetError>() {

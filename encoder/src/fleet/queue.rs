@@ -185,7 +185,6 @@ impl Enqueuer {
     }
 }
 
-/// The queue of a run, as a worker has it.
 pub(super) struct Queue {
     held: Arc<Held>,
     max_deliver: i64,

@@ -26,7 +26,6 @@ impl Run {
         self.key("failed")
     }
 
-    /// Returns the key of the record of a view that failed, by its number in the plan.
     pub(super) fn failed_key(self, view: usize) -> String {
         format!("{}/{view:06}.json", self.failed_folder())
     }
@@ -47,7 +46,6 @@ impl Run {
         names.contains(&format!("{:08}/{name}", self.0))
     }
 
-    /// Begins the next run; one that has not ended is superseded.
     pub(super) fn begin(bucket: &Bucket, plan: &RunPlan) -> Result<Self, FleetError> {
         let newest = Self::newest(bucket)?;
         if let Some((run, names)) = &newest
@@ -81,7 +79,6 @@ impl Run {
         Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
     }
 
-    /// Returns whether the bucket has had no run.
     pub(super) fn is_first(bucket: &Bucket) -> Result<bool, FleetError> {
         Ok(Self::newest(bucket)?.is_none())
     }

@@ -7,7 +7,6 @@ use slag_math::stats::{median, trimmed_range};
 
 /// Side of a tile, in resolutions of the splat: 2.5 m in a survey from 40 m.
 const TILE: f64 = 36.0;
-/// Most tiles along a side.
 const MAX_TILES: f64 = 512.0;
 /// Height of a level, in which surfaces are added up, resolutions.
 const LEVEL: f64 = 1.5;
@@ -24,7 +23,6 @@ const ROUNDS: usize = 2;
 /// Share of the Gaussians beyond the tiles at each end.
 const TRIMMED: f64 = 0.005;
 
-/// The height of the ground at each place.
 #[derive(Debug)]
 pub(super) struct Ground {
     tile: f64,
@@ -90,7 +88,6 @@ impl Ground {
     }
 }
 
-/// Returns the level of a tile's ground.
 fn ground_level(areas: &BTreeMap<i64, f64>) -> Option<f64> {
     let at = |level: i64| areas.get(&level).copied().unwrap_or(0.0);
     let around = |level: &i64| (*level, at(level - 1) + at(*level) + at(level + 1));

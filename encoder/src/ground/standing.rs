@@ -21,7 +21,6 @@ const MAX_SCALE: f64 = 30.0;
 const VOXEL: f64 = 4.0;
 /// Height from which a place is above the ground, resolutions.
 const MIN_HEIGHT: f64 = 2.0;
-/// Fewest Gaussians of a thing.
 const MIN_GAUSSIANS: u32 = 10;
 /// A thing is narrower than this share of the ground: of walls and what touches them a room consists.
 const MAX_WIDTH: f64 = 0.25;
@@ -82,7 +81,6 @@ impl Footprint {
     }
 }
 
-/// Reserves the voxels of a scene's things.
 pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     let bytes_per_voxel = size_of::<u64>() + size_of::<u32>();
     memory.reserve(Phase::Always, "what stands on the ground", (n_gaussians * bytes_per_voxel) as u64);
@@ -94,7 +92,6 @@ impl Standing {
         Self(Things::find(scene, up_by(scene, views)))
     }
 
-    /// Returns whether nothing does.
     pub(crate) fn is_empty(&self) -> bool {
         self.0.as_ref().is_none_or(|things| things.voxels.is_empty())
     }

@@ -8,7 +8,6 @@ use slag_math::stats::{median, trimmed_range};
 
 /// Directions that are tried, on a half of the sphere: the nearest is within 3 degrees.
 const N_DIRECTIONS: usize = 1000;
-/// Most Gaussians whose normals are counted.
 const MAX_NORMALS: usize = 1 << 20;
 /// Cosine of the angle within which normals agree, 8 degrees.
 const AGREE: f64 = 0.990;

@@ -35,7 +35,6 @@ struct Origin {
     alt: f64,
 }
 
-/// Most bytes of a file.
 const MAX_BYTES: u64 = 1 << 20;
 
 /// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; other fields are ignored.

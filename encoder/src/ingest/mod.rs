@@ -27,7 +27,6 @@ const MAX_DOWNSCALE: u32 = 64;
 /// without distortion, once the first are gone, and its place before.
 const LOADED_BYTES_PER_PX: u64 = 11;
 
-/// An undistorted photo.
 #[derive(Clone, Debug)]
 pub struct LoadedImage {
     /// The view, with the size of the image and pinhole intrinsics.
@@ -47,7 +46,6 @@ pub struct LoadedImage {
 pub struct RotatedPhotos(Mutex<(usize, String)>);
 
 impl RotatedPhotos {
-    /// Counts a photo, if it has an orientation.
     pub fn add(&self, photo: &LoadedImage) {
         let mut rotated = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if photo.is_rotated {
@@ -126,7 +124,6 @@ pub fn drawn_from(poses: &Path) -> Option<String> {
     serde_json::from_slice::<Drawn>(&text).ok().map(|drawn| drawn.drawn_from)
 }
 
-/// Returns the BLAKE3 hash of a file's content.
 pub(crate) fn hash_file(path: &Path) -> io::Result<Hash32> {
     Ok(Hash32::of_reader(fs_err::File::open(path)?)?.0)
 }
@@ -152,7 +149,6 @@ fn photo_size_px(view: &View) -> [u32; 2] {
     [width_px, height_px]
 }
 
-/// Checks that a view's photo can be loaded within the free memory.
 pub fn check_memory(view: &View, free_bytes: u64) -> Result<(), IngestError> {
     let needed_bytes = photo_area_px(view).saturating_mul(LOADED_BYTES_PER_PX);
     if needed_bytes <= free_bytes {

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use slag_common::poses::{AppliedTransform, FRAME_FILE, PoseError, PoseSource, SplatFrame, SplatFromPoses};
 use slag_common::{Gaussians, Similarity};
 
-/// Where the splat's frame is stated.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum FrameChoice {
     /// By `dataparser_transforms.json` beside the splat, if there is one.
@@ -64,7 +63,6 @@ pub(crate) fn find_frame(
 }
 
 impl FoundFrame {
-    /// Returns the transform from the world of the poses to the splat's.
     pub fn splat_from_poses(&self) -> Similarity {
         self.stated.similarity
     }

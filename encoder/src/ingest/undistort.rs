@@ -33,9 +33,6 @@ impl Undistorter {
 
     /// Returns the ideal image, sampled bilinearly, and whether each of its pixels (row-major) is inside the
     /// photo. Pixels outside are black.
-    ///
-    /// # Panics
-    /// If the image does not have the size of the camera.
     pub fn image(&self, photo: &RgbImage) -> (RgbImage, Vec<bool>) {
         let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
         assert_eq!(photo.dimensions(), (width_px, height_px), "the undistorter is of another size");
@@ -53,9 +50,6 @@ impl Undistorter {
 
     /// Maps labels (row-major) to the ideal image by nearest neighbour. Pixels outside the photo get the label
     /// `outside`.
-    ///
-    /// # Panics
-    /// If the number of labels is not the number of pixels of the camera.
     pub fn labels(&self, labels: &[u32], outside: u32) -> Vec<u32> {
         let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
         assert_eq!(

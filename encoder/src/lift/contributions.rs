@@ -89,16 +89,13 @@ impl PackedEntry {
         (self.key >> REGION_BITS) as usize
     }
 
-    /// Returns the view's region.
     pub(super) fn region(self) -> u32 {
         self.key & (MAX_REGIONS as u32 - 1)
     }
 }
 
-/// One view's part of the lift.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewContributions {
-    /// Components of a mask vector.
     pub dim: usize,
     /// `[n_masks][dim]`, unit.
     pub mask_vectors: Vec<f32>,
@@ -218,16 +215,13 @@ pub struct ContributionFile {
     path: PathBuf,
     n_regions: usize,
     n_entries: u64,
-    /// Offset of the first entry.
     entries_at_bytes: u64,
     /// By (cell, slice), ascending.
     runs: Vec<Run>,
 }
 
-/// The regions of a view, and their masks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewRegions {
-    /// Components of a mask vector.
     pub dim: usize,
     /// `[n_masks][dim]`, unit.
     pub mask_vectors: Vec<f32>,
@@ -282,7 +276,6 @@ impl ContributionFile {
         &self.path
     }
 
-    /// Returns the runs, ascending by (cell, slice).
     pub fn runs(&self) -> &[Run] {
         &self.runs
     }
@@ -299,7 +292,6 @@ impl ContributionFile {
         self.runs[run].start..self.runs.get(run + 1).map_or(self.n_entries, |next| next.start)
     }
 
-    /// Reads and checks the entries of some runs.
     pub(super) fn read(&self, runs: Range<usize>) -> Result<Vec<PackedEntry>, ContributionError> {
         let bytes = self.bytes_of_runs(runs.clone());
         let mut entries =

@@ -19,9 +19,7 @@ pub struct CellField {
     pub input_indices: Vec<u32>,
     /// `[N + 1]`: where each Gaussian's entries start.
     pub starts: Vec<u64>,
-    /// Region of each entry.
     pub regions: Vec<u32>,
-    /// Weight of each entry.
     pub weights: Vec<f32>,
     /// `[N]`: `Σ_r a(k, r) n_r`, the evidence for the embedding.
     pub total_weights: Vec<f32>,
@@ -54,12 +52,10 @@ impl CellField {
         self.mean_lengths.extend(next.mean_lengths);
     }
 
-    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.input_indices.len()
     }
 
-    /// Returns whether the cell holds none.
     pub fn is_empty(&self) -> bool {
         self.input_indices.is_empty()
     }
@@ -70,7 +66,6 @@ impl CellField {
         self.regions[range.clone()].iter().map(|r| *r as usize).zip(self.weights[range].iter().copied())
     }
 
-    /// Returns whether a Gaussian has an embedding.
     pub fn has_evidence(&self, k: usize) -> bool {
         self.mean_lengths[k] > 0.0
     }

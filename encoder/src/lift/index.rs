@@ -151,14 +151,12 @@ impl ContributionIndex {
         self.views.iter().map(|view| view.file.n_entries())
     }
 
-    /// Returns the bytes that the index takes in memory.
     pub fn len_bytes(&self) -> u64 {
         let per_run = size_of::<Run>() + size_of::<u32>();
         let n_runs: usize = self.views.iter().map(|view| view.slices.len()).sum();
         (n_runs * per_run + self.parts.len() * size_of::<Part>() + size_of_val(&*self.locals_of_slice)) as u64
     }
 
-    /// Reserves the index's bytes.
     pub(crate) fn reserve(&self, memory: &mut MemoryPlan) {
         memory.reserve(Phase::Always, "the index of contributions", self.len_bytes());
     }
@@ -168,7 +166,6 @@ impl ContributionIndex {
         self.parts.iter().map(part_bytes).max().unwrap_or(0)
     }
 
-    /// Returns the bytes of all parts, transposed.
     pub(super) fn kept_bytes(&self) -> u64 {
         let of_part = |part: &Part| {
             part.n_entries * BYTES_PER_TRANSPOSED_ENTRY + part.locals.len() as u64 * BYTES_PER_GAUSSIAN
@@ -196,7 +193,6 @@ impl ContributionIndex {
         groups
     }
 
-    /// Reads and checks the entries of some parts.
     pub fn read(&self, parts: Range<usize>) -> Result<RawGroup, ContributionError> {
         let slices = self.slices_of(&parts);
         let runs_of = |view: &IndexedView| {

@@ -8,7 +8,6 @@ use crate::cells::CellSplit;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Part {
     pub cell_id: u32,
-    /// Number of the part within the cell.
     pub number: u32,
     /// Its Gaussians, by their index within the cell.
     pub(crate) locals: Range<usize>,
@@ -50,7 +49,6 @@ impl PartContributions {
         }
     }
 
-    /// Returns the range of a Gaussian's entries.
     #[inline(always)]
     pub(crate) fn entries_of(&self, k: usize) -> Range<usize> {
         self.starts[k] as usize..self.starts[k + 1] as usize

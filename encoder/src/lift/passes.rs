@@ -15,7 +15,6 @@ use super::table::RegionTable;
 use crate::cells::CellSplit;
 use crate::ground::Standing;
 
-/// The contributions of all views to a scene, and how passes go over them.
 #[derive(Clone, Copy)]
 pub(crate) struct SceneContributions<'a> {
     pub index: &'a ContributionIndex,

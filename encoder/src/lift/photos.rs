@@ -63,7 +63,6 @@ pub(crate) fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<()
     Ok(slag_common::durable::write(path, &outlines_to_bytes(outlines)?)?)
 }
 
-/// Returns the bytes of the file of the outlines of a view's masks.
 pub(crate) fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let n = outlines.len() as u64;

@@ -6,13 +6,11 @@ use super::field::CellField;
 use super::table::RegionTable;
 use crate::store::{StoreError, StoreReader};
 
-/// Name of the region table among a generation's extras.
 pub(crate) const EXTRA_REGIONS: &str = "regions";
 
 /// Name of the record ([`super::Aggregation`], JSON) of the refinements; absent for the plain average.
 pub(crate) const EXTRA_AGGREGATION: &str = "aggregation";
 
-/// Returns the name of a part of a cell's field among a generation's extras.
 pub(crate) fn extra_field(cell_id: u32, part: u32) -> String {
     format!("field/{cell_id}/{part}")
 }

@@ -26,7 +26,6 @@ fn first_number(n: usize, n_more: usize, what: &'static str) -> Result<u32, Cont
     if fits { Ok(n as u32) } else { Err(ContributionError::TooManyInAll { what }) }
 }
 
-/// The masks of every region of the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionTable {
     dim: usize,
@@ -55,7 +54,6 @@ impl RegionTable {
         }
     }
 
-    /// Returns the components of a vector.
     pub fn dim(&self) -> usize {
         self.dim
     }
@@ -72,13 +70,11 @@ impl RegionTable {
         self.mask_vectors.len() / self.dim
     }
 
-    /// Returns the bytes that the table takes in memory.
     pub fn len_bytes(&self) -> u64 {
         let numbers = size_of_val(&*self.starts) + size_of_val(&*self.masks) + size_of_val(&*self.shares);
         (size_of_val(&*self.mask_vectors) + numbers + self.levels.len()) as u64
     }
 
-    /// Reserves the table's bytes.
     pub(crate) fn reserve(&self, memory: &mut MemoryPlan) {
         memory.reserve(Phase::Always, "masks and regions of all views", self.len_bytes());
     }
@@ -114,7 +110,6 @@ impl RegionTable {
         self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
     }
 
-    /// Sets the level of each mask, `[n_masks]`.
     pub(crate) fn set_levels(&mut self, levels: Vec<u8>) {
         self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
     }
@@ -132,7 +127,6 @@ impl RegionTable {
         Ok(number)
     }
 
-    /// Returns the vectors of the masks, one per row.
     pub fn mask_vectors(&self) -> Rows<'_> {
         Rows::all(&self.mask_vectors, self.dim)
     }

@@ -52,7 +52,6 @@ pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
     open(&(0..n_views).map(view).collect::<Vec<_>>(), dim, &[n_gaussians as usize], u64::MAX)
 }
 
-/// Reads and transposes a scene within a budget.
 fn transpose(scene: &Scene, budget_bytes: u64) -> Vec<PartContributions> {
     scene.index.transposed_parts(&scene.table, budget_bytes).collect::<Result<_, _>>().expect("transposes")
 }
@@ -300,6 +299,14 @@ fn foreign_files_are_refused() {
     for message in [refused(6, &[5000]), refused(5, &[4096]), refused(5, &[]), refused(5, &[4990])] {
         assert!(message.contains(".contributions") && message.contains("delete it"), "{message}");
     }
+    // The entries have checksums of their own.
+    let mut bytes = fs_err::read(&scene.paths[0]).expect("reads");
+    *bytes.last_mut().expect("entries") ^= 1;
+    let path = scene.paths[0].with_file_name("flipped.contributions");
+    fs_err::write(&path, bytes).expect("writes");
+    let opened = ContributionIndex::open(&[path], 5, &[5000]);
+    let read = opened.and_then(|(index, _)| index.read(0..index.parts().len()).map(drop));
+    assert!(read.expect_err("refused").to_string().contains("flipped.contributions"));
     let mut view = ViewContributions {
         dim: 1,
         mask_vectors: vec![1.0],

@@ -29,11 +29,9 @@ impl BoxPx {
 /// A set of pixels of an image; masks may overlap.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mask {
-    /// The tight bounding box.
     pub box_px: BoxPx,
     /// Membership, row-major within the box.
     pub inside: Vec<bool>,
-    /// Number of pixels.
     pub area_px: u32,
     /// Coarseness, if the segmenter has several levels: 0 is the coarsest (whole objects); or [`Mask::FILLER`].
     pub level: u8,
@@ -62,7 +60,6 @@ impl Mask {
         Self { box_px, inside, area_px, level: 0 }
     }
 
-    /// Returns whether the mask contains a pixel of the image.
     pub fn contains(&self, x: u32, y: u32) -> bool {
         let BoxPx { x0, y0, x1, y1 } = self.box_px;
         (x0..x1).contains(&x)

@@ -11,7 +11,6 @@ use super::mask::{BoxPx, Mask};
 /// Most digits of a number with 32 bits and a sign, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;
 
-/// A run-length encoded mask.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Rle {
     width_px: u32,
@@ -82,43 +81,6 @@ impl Rle {
             counts.push(u32::try_from(base + value).map_err(|_| RleError::Run { index })?);
         }
         Self::from_counts(width_px, height_px, counts)
-    }
-
-    /// Encodes as COCO's compact text.
-    pub fn to_text(&self) -> String {
-        let mut text = String::new();
-        for (index, count) in self.counts.iter().enumerate() {
-            let base = if index > 2 { i64::from(self.counts[index - 2]) } else { 0 };
-            let mut value = i64::from(*count) - base;
-            loop {
-                let digit = (value & 0x1F) as u8;
-                value >>= 5;
-                let sign = if digit & 0x10 == 0 { 0 } else { -1 };
-                if value == sign {
-                    text.push(char::from(48 + digit));
-                    break;
-                }
-                text.push(char::from(48 + (digit | 0x20)));
-            }
-        }
-        text
-    }
-
-    /// Encodes a mask of an image of the given size; the part of its box outside the image is ignored.
-    pub fn from_mask(mask: &Mask, width_px: u32, height_px: u32) -> Self {
-        let mut counts = Vec::new();
-        let (mut run, mut inside) = (0_u32, false);
-        for x in 0..width_px {
-            for y in 0..height_px {
-                if mask.contains(x, y) != inside {
-                    counts.push(std::mem::take(&mut run));
-                    inside = !inside;
-                }
-                run += 1;
-            }
-        }
-        counts.push(run);
-        Self { width_px, height_px, counts }
     }
 
     /// Returns the image's width and height, pixels.

@@ -32,7 +32,6 @@ pub enum Phase {
 
 const PHASES: [Phase; 5] = [Phase::Views, Phase::Superpoints, Phase::Objects, Phase::Refine, Phase::Cells];
 
-/// Memory set aside for one purpose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reservation {
     pub purpose: &'static str,
@@ -40,7 +39,6 @@ pub struct Reservation {
     phase: Phase,
 }
 
-/// The budget is too small.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MemoryError {
     pub available_bytes: u64,
@@ -94,7 +92,6 @@ impl MemoryPlan {
         self.reservations.push(Reservation { purpose, len_bytes, phase });
     }
 
-    /// Marks the views as done: later reservations depend on their results.
     pub(crate) fn views_are_done(&mut self) {
         self.is_before_views = false;
     }
@@ -105,7 +102,6 @@ impl MemoryPlan {
         self.available_bytes.saturating_sub(self.reserved_bytes(phase))
     }
 
-    /// Returns the bytes that are set aside during a phase.
     fn reserved_bytes(&self, phase: Phase) -> u64 {
         self.of_phase(phase).fold(0u64, |sum, r| sum.saturating_add(r.len_bytes))
     }

@@ -39,7 +39,6 @@ const FULL_PX: f64 = 4096.0;
 /// A view counts the square of the share of its mask's outline that is not cut off, and no less than that of this.
 const LEAST_UNCUT: f32 = 0.05;
 
-/// What a view shows of a node.
 #[derive(Clone, Debug, Default, PartialEq)]
 struct NodeView {
     /// Gaussians that the view sees.
@@ -54,7 +53,6 @@ struct NodeView {
     uncut: f32,
 }
 
-/// What all views show of a node.
 type NodeViews = BTreeMap<u32, NodeView>;
 
 /// What is known of masks and superpoints.
@@ -71,7 +69,6 @@ pub(super) struct Sizes<'a> {
     /// `[n]`: what each superpoint covers of the ground; empty without any.
     pub(super) footprints: &'a [Footprint],
     pub(super) standing: &'a Standing,
-    /// Fewest Gaussians of an object.
     pub(super) min_gaussians: u32,
 }
 

@@ -14,7 +14,6 @@ const GAUSSIANS_PER_SAMPLE: usize = 8;
 /// Samples that are near a sample: with those of its own superpoint, those of a dozen.
 const N_NEIGHBOURS: usize = 48;
 
-/// Reserves the search.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     let per_sample = size_of::<(u32, u32)>()
         + size_of::<[f64; 3]>()

@@ -58,11 +58,9 @@ pub struct SceneObjects {
     pub object_of: Vec<Vec<u32>>,
     /// Mean and spread of the text bank's scores over the objects.
     pub calibration: Calibration,
-    /// Counts for the summary.
     pub report: ObjectsReport,
 }
 
-/// Counts of objects and masks, for the summary.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ObjectsReport {
     pub n_objects: usize,

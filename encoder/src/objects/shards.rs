@@ -22,7 +22,6 @@ pub struct CentroidBasis<'a> {
 }
 
 impl<'a> CentroidBasis<'a> {
-    /// Prepares the basis of a shard's centroids.
     pub fn new(dim: usize, basis: Option<Basis<'a>>) -> Self {
         let basis = basis.map(|basis| {
             let of_vector = |(v, step): (&[i8], &f32)| {
@@ -49,7 +48,6 @@ impl<'a> CentroidBasis<'a> {
         prepared
     }
 
-    /// Returns the number of components.
     pub fn m(&self) -> usize {
         self.basis.as_ref().map_or(self.dim, |(_, vectors)| vectors.len() / self.dim)
     }
@@ -102,7 +100,6 @@ impl<'a> CentroidBasis<'a> {
     }
 }
 
-/// The columns of a cell's objects.
 pub struct CellObjects {
     header: ObjectsHeader,
     records: Vec<ObjectRecord>,
@@ -155,7 +152,6 @@ impl CellObjects {
         cell
     }
 
-    /// Adds an object with `n_gaussians_here` Gaussians in the cell.
     fn add(&mut self, object: &Object, n_gaussians_here: u32, basis: &CentroidBasis<'_>) {
         let name = plain(&object.photo);
         // Many objects share the photo that shows them best.

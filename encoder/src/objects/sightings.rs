@@ -56,7 +56,6 @@ struct Entry {
     weight: f64,
 }
 
-/// Reserves what views show of superpoints, among `n_entries` contributions.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_entries: u64) {
     let bytes_per_region = (size_of::<Entry>() + size_of::<MaskSighting>()) as u64;
     memory.reserve(Phase::Objects, "masks of superpoints", n_entries / ENTRIES_PER_REGION * bytes_per_region);

@@ -101,7 +101,6 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    /// Returns the affinity, 0..=1.
     pub(super) fn affinity(&self) -> f64 {
         (self.together as f64 / SHARE as f64 + PRIOR * PRIOR_WEIGHT) / (self.n as f64 + PRIOR_WEIGHT)
     }

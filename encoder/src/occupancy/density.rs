@@ -26,7 +26,6 @@ pub(crate) const VOXEL_VARIANCE: f64 = 0.15;
 
 /// Blocks along an edge of a tile: its sums, 1 MiB, stay in a core's cache.
 const TILE_BLOCKS: i32 = 16;
-/// Voxels along an edge of a tile.
 const TILE_EDGE: usize = (TILE_BLOCKS * BLOCK_EDGE) as usize;
 /// Tiles along an axis that a Gaussian may reach into: larger ones are sky and other background that no robot
 /// drives into.
@@ -35,7 +34,6 @@ const MAX_TILES: i32 = 8;
 /// background: the Gaussians of a surface are thin.
 const MAX_THICKNESS: f32 = 0.2;
 
-/// The occupied voxels of a scene.
 pub(super) struct Occupied {
     /// By place: voxels of each block with at least one.
     pub(super) blocks: Vec<(BlockAt, u64)>,

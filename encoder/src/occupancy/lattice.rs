@@ -9,7 +9,6 @@ const MAX_BLOCK: f64 = (1u64 << 26) as f64;
 /// A block's place on the lattice. Ordered by x, then y, then z.
 pub(super) type BlockAt = [i32; 3];
 
-/// The voxels of a scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Lattice {
     /// Edge of a voxel, world units.

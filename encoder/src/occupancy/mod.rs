@@ -28,7 +28,6 @@ pub(crate) use seen::MIN_VIEWS;
 /// How places are told apart.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OccupancySettings {
-    /// Edge of a voxel, metres.
     pub(crate) voxel_m: f64,
 }
 
@@ -37,10 +36,8 @@ pub struct SceneOccupancy {
     pub report: OccupancyReport,
 }
 
-/// What was found of a scene's places.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct OccupancyReport {
-    /// Edge of a voxel, metres.
     pub(crate) voxel_m: f64,
     /// Voxels with a surface.
     pub(crate) n_occupied: u64,

@@ -2,7 +2,6 @@
 
 use serde::Serialize;
 
-/// Precision of the projection on a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
@@ -32,7 +31,6 @@ impl AdapterReport {
     }
 }
 
-/// Options for the use of a device.
 #[derive(Clone, Copy, Debug)]
 pub struct GpuOptions {
     /// Upper limit for a buffer, bytes; the limit of the device applies as well.

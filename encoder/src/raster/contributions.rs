@@ -19,7 +19,6 @@ const _: () = {
     assert!(TILE_SIZE_PX * TILE_SIZE_PX <= 1 << 8);
 };
 
-/// Contribution of a Gaussian to a region within one tile.
 #[derive(Clone, Copy, Zeroable)]
 pub(crate) struct TileContribution {
     /// Index into the visible Gaussians.

@@ -139,7 +139,6 @@ impl Devices {
         Ok(Self { gpus, views_in_flight })
     }
 
-    /// Creates a backend from opened GPUs.
     pub fn of(gpus: Vec<GpuRasterizer>, views_in_flight: usize) -> Self {
         Self { gpus, views_in_flight: views_in_flight.max(1) }
     }

@@ -34,12 +34,10 @@ impl Adapter {
 }
 
 impl GpuRasterizer {
-    /// Uses an opened device.
     pub fn new(device: Device, _: GpuOptions) -> Self {
         match device.none {}
     }
 
-    /// Returns the description of the device.
     pub fn report(&self) -> &AdapterReport {
         match self.none {}
     }

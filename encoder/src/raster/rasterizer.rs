@@ -20,7 +20,6 @@ impl GpuSlots {
     }
 }
 
-/// A backend that rasterises scenes.
 pub trait Rasterizer: Send + Sync {
     /// Returns a text that differs where contributions differ in their last bits.
     fn identity(&self) -> String;
@@ -108,7 +107,6 @@ pub enum WeightKind {
 /// Contribution of a Gaussian to a region: its weight summed over the pixels.
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Zeroable)]
 pub struct RegionWeight {
-    /// Index of the Gaussian in the scene.
     pub gaussian: u32,
     pub region: u32,
     /// Weight, pixels; above 0.

@@ -97,7 +97,6 @@ fn left_out(page: &mut Page, summary: &EncodeSummary, skipped: &Value) {
     ));
 }
 
-/// Adds the pictures of masks.
 fn masks(page: &mut Page, recorded: &Recorded) {
     let mut drawn: Vec<_> = recorded.views.iter().filter(|view| view.picture.is_some()).collect();
     drawn.sort_by(|a, b| a.name.cmp(&b.name));

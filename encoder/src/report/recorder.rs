@@ -32,7 +32,6 @@ pub(super) struct Recorded {
     pub(super) views: Vec<RecordedView>,
     /// Places in `views`, by name.
     place_of_view: BTreeMap<String, usize>,
-    /// Boxes around the means of the cells.
     pub(super) cells: Vec<Aabb>,
     pub(super) objects: Vec<FoundObject>,
 }

@@ -42,7 +42,6 @@ const COMPACT_SUPPORT: f32 = 0.3;
 /// The neighbours to which a pixel has an edge; the other four have an edge to the pixel.
 const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (-1, 1), (0, 1), (1, 1)];
 
-/// The parameters of [`GraphSegmenter`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct GraphSettings {
     /// Longest side of the working image, pixels; masks are scaled up from it.
@@ -53,7 +52,6 @@ pub struct GraphSettings {
     pub scales: Vec<f32>,
     /// Smallest component kept, as a share of the image.
     pub min_area_share: f32,
-    /// Weight of a colour difference.
     pub colour_weight: f32,
     /// Weight of a certain object boundary, in units of colour distance; 0 disables the model.
     pub boundary_weight: f32,
@@ -279,7 +277,6 @@ const _: () = assert!(NOT_NUMBERED == NO_REGION);
 /// An edge of the grid: its pixel times 4, plus the index of the neighbour.
 type Edge = u32;
 
-/// The working image.
 struct Raster {
     width_px: u32,
     height_px: u32,

@@ -16,7 +16,6 @@ use crate::masks::rle::RleError;
 /// Limit on the masks of one view: the total area of their boxes, one byte per pixel.
 pub(super) const MAX_MASK_BYTES: u64 = 1 << 30;
 
-/// Finds the masks of a photo.
 pub trait Segmenter: Sync {
     /// Returns the identity of the segmenter: its method, every parameter, and the hashes of its weights. Two
     /// segmenters of equal identity find the same masks in a photo for which [`Self::identity_of_view`] is equal
@@ -58,7 +57,6 @@ pub trait Segmenter: Sync {
 pub struct SegmentInput<'a> {
     /// The view, with the intrinsics of `image` (an ideal pinhole).
     pub view: &'a View,
-    /// The undistorted photo.
     pub image: &'a RgbImage,
     /// Pixels inside the lens image, row-major; `None` if all are.
     pub valid: Option<&'a [bool]>,

@@ -26,24 +26,17 @@ use crate::objects::shards::{CellObjects, CentroidBasis};
 pub struct BuiltShard {
     pub profile: Profile,
     pub bytes: Vec<u8>,
-    /// Hard bound of a score's error.
     pub score_error_bound: f32,
-    /// Measured errors of scores.
     pub score_errors: ScoreErrors,
 }
 
-/// A cell's shards.
 pub struct BuiltCell {
     /// One per profile.
     pub shards: Vec<BuiltShard>,
     pub n_centroids: u32,
-    /// Subspaces of the residual code.
     pub n_subspaces: u32,
-    /// Largest error of a position, world units.
     pub position_error: f64,
-    /// Moments of the scores of all texts.
     pub moments: ScoreMoments,
-    /// Gaussians without an embedding.
     pub n_without_evidence: usize,
 }
 
@@ -59,13 +52,10 @@ pub struct ShardSettings {
     pub compact_appearance: bool,
 }
 
-/// The embeddings of a cell's Gaussians.
 pub struct CellEmbeddings {
-    /// Components of an embedding.
     pub dim: usize,
     /// `[N][dim]`: unit, or zeros where there is no evidence.
     pub vectors: Vec<f32>,
-    /// `[N]`: whether there is evidence.
     pub has_evidence: Vec<bool>,
 }
 
@@ -82,7 +72,6 @@ pub(crate) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
     largest.map_or(0, |n_gaussians| working_bytes(n_gaussians, dim))
 }
 
-/// Reserves the bytes of the largest cell.
 pub(crate) fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
@@ -166,9 +155,9 @@ impl ShardBuilder<'_> {
         let objects = objects.as_ref().map(CellObjects::view);
         let appearance = AppearanceColumns::of(self.scene, &order.in_input());
         let additions = Additions {
-            objects: objects.as_ref(),
+            objects,
             appearance: Some(appearance.view()),
-            occupancy: extras.occupancy.as_ref(),
+            occupancy: extras.occupancy,
             photo_poses: extras.photo_poses,
             landmarks: extras.landmarks,
         };
@@ -291,7 +280,6 @@ pub fn landmarks(split: &CellSplit, code_version: u32, all: &[Landmark]) -> Vec<
     of_cells.iter().map(|landmarks| BuiltLandmarks::pack(code_version, landmarks)).collect()
 }
 
-/// A cell's positions, on the cell's grid.
 struct QuantisedPositions {
     /// Largest distance of a stored position from the mean, per axis: half a step, unless the doubles of readers
     /// are coarser.
@@ -337,7 +325,6 @@ impl QuantisedPositions {
         Self { error, columns }
     }
 
-    /// Returns the columns to write.
     fn view(&self) -> Positions<'_> {
         match &self.columns {
             Columns::Packed(words) => Positions::Packed(words),

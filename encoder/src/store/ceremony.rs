@@ -33,7 +33,6 @@ pub(crate) struct Changed {
     pub(crate) draft: Option<PathBuf>,
 }
 
-/// A key that the newest root names.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct KeyStatus {
     pub(crate) role: String,
@@ -46,13 +45,10 @@ pub(crate) struct KeyStatus {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct KeysStatus {
     pub(crate) root_version: u64,
-    /// Its SHA-256, hex.
     pub root_sha256: String,
-    /// When it expires, seconds since 1970.
     pub(crate) root_expires_unix_secs: u64,
     /// Root's keys that must sign a change.
     pub(crate) threshold: u32,
-    /// All keys, by role.
     pub(crate) keys: Vec<KeyStatus>,
     /// When the timestamp expires, seconds since 1970; absent before the first publication.
     pub(crate) timestamp_expires_unix_secs: Option<u64>,

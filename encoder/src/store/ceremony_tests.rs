@@ -3,28 +3,17 @@
 use std::path::Path;
 
 use slag_common::manifest::{self, Manifest};
-use slag_common::tuf::{Kept, Source, TufError, refresh};
+use slag_common::tuf::{Kept, TufError, refresh};
 
 use super::ceremony::{Change, default_root_folder, sign_draft};
-use super::metadata::{Metadata, clock_unix_secs, read_published};
+use super::metadata::{Metadata, clock_unix_secs};
+use super::metadata_tests::{Folder, client};
 use super::tests::manifest as manifest_of;
 use super::{Extras, Store, StoreError};
-
-struct Folder<'a>(&'a Path);
-
-impl Source for Folder<'_> {
-    fn metadata(&mut self, name: &str, _: u64) -> Result<Option<Vec<u8>>, String> {
-        read_published(self.0, name).map_err(|e| e.to_string())
-    }
-}
 
 fn publish(dir: &Path, generation: u64) {
     let scene = Manifest { created_unix_secs: 1, ..manifest_of(generation, &[]) };
     Store::create_or_open(dir).expect("opens").publish(&scene, &Extras::new()).expect("publishes");
-}
-
-fn client(dir: &Path) -> Kept {
-    Kept::from_root(&read_published(dir, "1.root.json").expect("readable").expect("there")).expect("a root")
 }
 
 /// A robot sees the manifest that is published.

@@ -84,7 +84,6 @@ pub(super) fn read_manifest_bytes(path: &Path) -> Result<Option<Vec<u8>>, StoreE
 
 const FILE: &str = "models.json";
 
-/// The models of the last encode into a store.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct ModelsRecord {
     /// The encoder's id, as the manifest has it.

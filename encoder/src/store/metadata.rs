@@ -50,7 +50,6 @@ pub(super) struct RootFile {
     pub(crate) bytes: Vec<u8>,
 }
 
-/// The metadata of a store, to read.
 pub(crate) struct MetadataReader {
     pub(super) store: PathBuf,
 }

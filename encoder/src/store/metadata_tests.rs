@@ -16,7 +16,7 @@ const DAY: u64 = 86_400;
 /// Later than the clock, in the year 2079.
 const NOW: u64 = 40_000 * DAY;
 
-struct Folder<'a>(&'a Path);
+pub(super) struct Folder<'a>(pub(super) &'a Path);
 
 impl Source for Folder<'_> {
     fn metadata(&mut self, name: &str, _: u64) -> Result<Option<Vec<u8>>, String> {
@@ -24,12 +24,20 @@ impl Source for Folder<'_> {
     }
 }
 
+/// Returns a store with generation 1, and its folder.
+fn published(now: u64) -> (tempfile::TempDir, Store) {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    publish(&store, 1, now);
+    (dir, store)
+}
+
 fn publish(store: &Store, generation: u64, now: u64) {
     let scene = Manifest { created_unix_secs: now, ..manifest_of(generation, &[]) };
     store.publish(&scene, &Extras::new()).expect("publishes");
 }
 
-fn client(dir: &Path) -> Kept {
+pub(super) fn client(dir: &Path) -> Kept {
     Kept::from_root(&read_published(dir, "1.root.json").expect("readable").expect("there")).expect("a root")
 }
 
@@ -41,9 +49,7 @@ fn update(kept: &mut Kept, dir: &Path, now: u64) -> Result<(Trusted, TargetFile)
 
 #[test]
 fn each_generation_is_a_target() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
-    publish(&store, 1, NOW);
+    let (dir, store) = published(NOW);
     let mut kept = client(dir.path());
     for generation in 2..5 {
         publish(&store, generation, NOW + generation);
@@ -62,9 +68,7 @@ fn each_generation_is_a_target() {
 /// A crash after the manifest was replaced leaves clients with the generation before; opening makes it good.
 #[test]
 fn metadata_behind_the_manifest_is_made_good() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
-    publish(&store, 1, NOW);
+    let (dir, store) = published(NOW);
     let timestamp = dir.path().join("metadata/timestamp.json");
     let old = fs_err::read(&timestamp).expect("there");
     publish(&store, 2, NOW);
@@ -143,9 +147,7 @@ fn an_expired_root_is_warned_of_and_renewed() {
 /// signed as of it, until a new key of the timestamp makes them forget it; warnings say so.
 #[test]
 fn a_clock_that_went_back_locks_no_robot_out() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
-    publish(&store, 1, NOW);
+    let (dir, _store) = published(NOW);
     let mut kept = client(dir.path());
     update(&mut kept, dir.path(), NOW).expect("fresh");
     let now = NOW - 3650 * DAY;
@@ -171,9 +173,7 @@ fn nothing_is_signed_as_of_1970() {
 /// A key that the root does not name would lock every client out.
 #[test]
 fn a_key_that_the_root_does_not_name_signs_nothing() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let store = Store::create_or_open(dir.path()).expect("opens");
-    publish(&store, 1, NOW);
+    let (dir, _store) = published(NOW);
     fs_err::write(dir.path().join("keys/timestamp.key"), "07".repeat(32)).expect("written");
     let refused = Metadata::open(dir.path()).expect("opens").refresh(NOW, 1);
     assert!(
@@ -186,8 +186,7 @@ fn a_key_that_the_root_does_not_name_signs_nothing() {
 #[test]
 fn role_keys_are_private() {
     use std::os::unix::fs::PermissionsExt;
-    let dir = tempfile::tempdir().expect("temporary folder");
-    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, NOW);
+    let (dir, _store) = published(NOW);
     for name in ["root/1", "targets", "snapshot", "timestamp"] {
         let path = dir.path().join("keys").join(format!("{name}.key"));
         let mode = fs_err::metadata(path).expect("there").permissions().mode();
@@ -197,8 +196,7 @@ fn role_keys_are_private() {
 
 #[test]
 fn only_names_of_metadata_are_read() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, NOW);
+    let (dir, _store) = published(NOW);
     fs_err::copy(dir.path().join("metadata/1.root.json"), dir.path().join("metadata/01.root.json"))
         .expect("copied");
     for name in ["01.root.json", "+1.root.json", "root.json", "lock", "../manifest", "1.timestamp.json", ""] {
@@ -209,7 +207,6 @@ fn only_names_of_metadata_are_read() {
 /// A reproducible encode dates its manifest back; its timestamp must count nevertheless.
 #[test]
 fn a_manifest_that_is_dated_back_is_signed_today() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, 1);
+    let (dir, _store) = published(1);
     update(&mut client(dir.path()), dir.path(), clock_unix_secs()).expect("fresh");
 }

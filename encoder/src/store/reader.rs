@@ -170,7 +170,6 @@ impl StoreReader {
     }
 }
 
-/// A shard as it was read.
 pub struct StoredShard {
     pub bytes: AlignedBytes,
     pub layout: ShardLayout,
@@ -182,7 +181,7 @@ impl StoredShard {
     }
 
     pub fn objects(&self) -> Option<Objects<'_>> {
-        self.layout.objects(&self.bytes)
+        self.layout.additions(&self.bytes).objects
     }
 }
 

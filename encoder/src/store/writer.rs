@@ -129,7 +129,6 @@ impl Store {
         Ok(())
     }
 
-    /// Returns the generation that the next published manifest should have.
     pub fn next_generation(&self) -> Result<u64, StoreError> {
         Ok(self.catalogue.last_generation()?.map_or(1, |current| current.saturating_add(1)))
     }
@@ -271,7 +270,6 @@ fn named_in(path: &Path, names: &BTreeSet<Hash32>) -> bool {
     name.is_some_and(|hash: Hash32| names.contains(&hash))
 }
 
-/// Returns the files of a folder with their lengths, by name.
 fn files_in(folder: &Path) -> io::Result<BTreeMap<PathBuf, u64>> {
     fs_err::read_dir(folder)?
         .map(|entry| {

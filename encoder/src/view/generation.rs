@@ -30,7 +30,6 @@ enum Scored {
 }
 
 impl Generation {
-    /// Opens a generation: its objects, and its fields if there is a splat.
     pub(super) fn open(reader: StoreReader, splat: Option<&Splat>) -> Result<Self, ViewError> {
         let (mut things, mut photos) = (Things::default(), Vec::new());
         for cell in &reader.manifest().cells {
@@ -101,7 +100,7 @@ impl Generation {
                 let view = shard.view();
                 let n_gaussians = view.header.n_gaussians as usize;
                 let positions = step.indices(n_gaussians).map(|at| view.position_in_world(at));
-                let appearance = shard.layout.appearance(&shard.bytes);
+                let appearance = shard.layout.additions(&shard.bytes).appearance;
                 Ok(cell_message(&positions.collect::<Vec<DVec3>>(), appearance, step))
             }
         }

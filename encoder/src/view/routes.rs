@@ -18,10 +18,8 @@ use crate::diff::Diff;
 
 /// Answers in a page of `/v1/query` unless the request says otherwise.
 const DEFAULT_LIMIT: usize = 10;
-/// Most answers in a page.
 const MAX_LIMIT: usize = 1000;
 const MAX_NEGATIVES: usize = 32;
-/// Longest photo that is sent.
 const MAX_PHOTO_BYTES: u64 = 64 << 20;
 const BINARY: [(header::HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];
 

@@ -9,7 +9,7 @@ use crate::store::{StoreError, StoreReader, StoredShard};
 
 pub(super) fn photos_of(shard: &StoredShard) -> Vec<Photo> {
     let origin = DVec3::from(shard.layout.header.origin_in_world);
-    let photos = shard.layout.photo_poses(&shard.bytes);
+    let photos = shard.layout.additions(&shard.bytes).photo_poses;
     photos.into_iter().flat_map(|photos| Photo::of_shard(origin, photos)).collect()
 }
 
@@ -52,7 +52,7 @@ pub(super) fn smallest_with_appearance(
 ) -> Result<Option<StoredShard>, StoreError> {
     let mut shards = cell.shards.values().map(|record| reader.read_shard(record));
     let smallest = shards.next().transpose()?;
-    let tells = |shard: &StoredShard| shard.layout.appearance(&shard.bytes).is_some();
+    let tells = |shard: &StoredShard| shard.layout.additions(&shard.bytes).appearance.is_some();
     if smallest.as_ref().is_none_or(tells) {
         return Ok(smallest);
     }

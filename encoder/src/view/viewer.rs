@@ -197,7 +197,6 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Describes photos, in the order of the views.
 fn described(views: &[View]) -> Vec<Photo> {
     views.iter().map(photo).collect()
 }

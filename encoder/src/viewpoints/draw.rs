@@ -16,7 +16,6 @@ use super::plan::{Viewpoint, ViewpointPlan};
 use crate::progress::Progress;
 use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer};
 
-/// Name of the poses file.
 pub const POSES_FILE: &str = "transforms.json";
 /// Size of drawings, pixels: that of the photos that the segmenter learnt on, enlarged little.
 const SIZE_PX: [u32; 2] = [800, 600];

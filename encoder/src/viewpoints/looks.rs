@@ -8,7 +8,6 @@ use super::space::{Space, WIDTH};
 use crate::masks::RegionMap;
 use crate::raster::{self, LoadedScene, RasterError, RasterView, RegionWeight, WeightKind};
 
-/// Size of the drawings, pixels.
 const SIZE_PX: [u32; 2] = [40, 30];
 /// Tangent of half the horizontal field of view, 60 degrees: that of a phone's main camera.
 const HALF_WIDTH: f64 = 0.577_350_269;
@@ -27,7 +26,6 @@ const N_SIDES: usize = 8;
 /// Bytes of what a candidate shows: eight a Gaussian, of which a pixel shows few.
 pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
 
-/// What a candidate shows.
 pub(super) struct Look {
     /// Camera from the planner's axes.
     pub(super) camera: DAffine3,

@@ -35,7 +35,6 @@ pub enum SceneKind {
     Object,
 }
 
-/// A camera of a plan.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Viewpoint {
     pub camera_from_world: DAffine3,

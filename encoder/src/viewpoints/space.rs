@@ -10,7 +10,6 @@ use crate::ground::up::{self, TRIMMED};
 /// Widest side of the scene without strays: far more than the rasteriser's near plane.
 pub(super) const WIDTH: f64 = 10.0;
 pub(super) const VOXEL: f64 = WIDTH / 160.0;
-/// Voxels around the scene.
 const MARGIN: f64 = 4.0;
 /// Larger ones are sky or fog, which occupy nothing.
 const MAX_SCALE: f32 = 0.1 * WIDTH as f32;
@@ -97,7 +96,6 @@ impl Space {
         self.plan_from_world.transpose().z_axis
     }
 
-    /// Returns a camera of the planner's axes in the world.
     pub(super) fn camera_from_world(&self, camera_from_plan: DAffine3) -> DAffine3 {
         let rotation = camera_from_plan.matrix3 * self.plan_from_world;
         let eye_in_plan = -(camera_from_plan.matrix3.transpose() * camera_from_plan.translation);

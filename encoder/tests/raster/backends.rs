@@ -8,7 +8,6 @@ use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 /// A rasteriser and the tolerances of its arithmetic.
 pub struct Backend {
     pub name: &'static str,
-    /// The rasteriser.
     pub rasterizer: Box<dyn Rasterizer>,
     /// Factor on the bounds that the rows claim.
     pub bound_factor: f64,

@@ -13,16 +13,17 @@ use super::table::{Case, Row};
 use slag_math::random::Random;
 use slag_test_support::{is_nightly, trials};
 
-/// Many views of few Gaussians each: none hides the others.
+/// Many views of few Gaussians each: none hides the others. Focal lengths lie between two.
 fn cases(
     n: u64,
     size_px: [u32; 2],
-    focal_px: impl Fn(&mut Random) -> f64,
+    [shortest_px, longest_px]: [f64; 2],
     fill: impl Fn(&mut Gaussians, &RasterView, &mut Random),
 ) -> Vec<Case> {
     let case = |seed| {
         let random = &mut Random::new(seed);
-        let focal_px = focal_px(random);
+        let is_fixed = shortest_px == longest_px;
+        let focal_px = if is_fixed { shortest_px } else { random.log_between(shortest_px, longest_px) };
         let view = posed(random, size_px, focal_px);
         let mut scene = Gaussians::default();
         fill(&mut scene, &view, random);
@@ -34,25 +35,20 @@ fn cases(
 
 #[test]
 fn scales() {
-    let cases = cases(
-        60,
-        [40, 30],
-        |_| 50.0,
-        |scene, view, random| {
-            for _ in 0..12 {
-                let mean = random.in_view(view, [0.3, 8.0]);
-                let scales = std::array::from_fn(|_| random.log_between(1e-6, 1e3));
-                let opacity = random.between(0.05, 1.0);
-                push(scene, view, random, mean, scales, opacity);
-            }
-        },
-    );
+    let cases = cases(60, [40, 30], [50.0; 2], |scene, view, random| {
+        for _ in 0..12 {
+            let mean = random.in_view(view, [0.3, 8.0]);
+            let scales = std::array::from_fn(|_| random.log_between(1e-6, 1e3));
+            let opacity = random.between(0.05, 1.0);
+            push(scene, view, random, mean, scales, opacity);
+        }
+    });
     let range = "1e-6 to 1e3 world units, each axis its own";
     Row { name: "scales", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
 /// Returns views with needles and discs whose longest axis is up to `max_ratio` times the shortest.
-fn needles(max_ratio: f64, focal_px: impl Fn(&mut Random) -> f64) -> Vec<Case> {
+fn needles(max_ratio: f64, focal_px: [f64; 2]) -> Vec<Case> {
     cases(60, [40, 30], focal_px, |scene, view, random| {
         for _ in 0..12 {
             let mean = random.in_view(view, [0.3, 8.0]);
@@ -68,33 +64,28 @@ fn needles(max_ratio: f64, focal_px: impl Fn(&mut Random) -> f64) -> Vec<Case> {
 #[test]
 fn anisotropy() {
     let range = "longest to shortest axis 1 to 1e4, to 1e5 px long";
-    Row { name: "anisotropy", range, claimed: 1e-5, unit_px: 1.0 }.check(&needles(1e4, |_| 50.0));
+    Row { name: "anisotropy", range, claimed: 1e-5, unit_px: 1.0 }.check(&needles(1e4, [50.0; 2]));
 }
 
 /// The determinant of such a covariance, taken as a difference, has no correct digit in float64.
 #[test]
 fn anisotropy_through_long_lenses() {
     let range = "ratio to 1e9, focal lengths 2,000 to 20,000 px, to 6e7 px long";
-    let cases = needles(1e9, |random| random.log_between(2_000.0, 20_000.0));
+    let cases = needles(1e9, [2_000.0, 20_000.0]);
     Row { name: "long needles", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
 #[test]
 fn opacities() {
-    let cases = cases(
-        40,
-        [24, 20],
-        |_| 30.0,
-        |scene, view, random| {
-            for i in 0..24 {
-                let mean = random.in_view(view, [0.5, 8.0]);
-                let scales = std::array::from_fn(|_| random.log_between(0.02, 1.0));
-                // Spread towards both ends.
-                let share = random.log_between(1e-4, 1.0);
-                push(scene, view, random, mean, scales, if i % 2 == 0 { share } else { 1.0 - share });
-            }
-        },
-    );
+    let cases = cases(40, [24, 20], [30.0; 2], |scene, view, random| {
+        for i in 0..24 {
+            let mean = random.in_view(view, [0.5, 8.0]);
+            let scales = std::array::from_fn(|_| random.log_between(0.02, 1.0));
+            // Spread towards both ends.
+            let share = random.log_between(1e-4, 1.0);
+            push(scene, view, random, mean, scales, if i % 2 == 0 { share } else { 1.0 - share });
+        }
+    });
     Row { name: "opacities", range: "1e-4 to 0.9999", claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
@@ -117,45 +108,26 @@ pub fn read_ply(rows: &[[f64; 14]]) -> Gaussians {
 /// Oracle of the reader: the logistic function by hyperbolic tangent.
 #[test]
 fn logits() {
-    let read = cases(
-        40,
-        [24, 20],
-        |_| 30.0,
-        |scene, view, random| {
-            let rows: Vec<[f64; 14]> = (0..24)
-                .map(|i| {
-                    let [x, y, z] = {
-                        let mean = random.in_view(view, [0.5, 8.0]);
-                        view.camera_from_world.inverse().transform_point3(mean).to_array()
-                    };
-                    let [a, b, c] = std::array::from_fn(|_| random.between(-4.0, 0.0));
-                    let logit = [-50.0, 50.0, f64::INFINITY, f64::NEG_INFINITY];
-                    let logit = logit.get(i).copied().unwrap_or_else(|| random.between(-50.0, 50.0));
-                    [
-                        x,
-                        y,
-                        z,
-                        random.between(0.5, 1.0),
-                        random.between(-1.0, 1.0),
-                        0.1,
-                        0.2,
-                        a,
-                        b,
-                        c,
-                        logit,
-                        0.0,
-                        0.0,
-                        0.0,
-                    ]
-                })
-                .collect();
-            *scene = read_ply(&rows);
-            for (row, opacity) in rows.iter().zip(&scene.opacities) {
-                let expected = 0.5 + 0.5 * (row[10] / 2.0).tanh();
-                assert!((f64::from(*opacity) - expected).abs() <= 1e-7, "logit {}: {opacity}", row[10]);
-            }
-        },
-    );
+    let read = cases(40, [24, 20], [30.0; 2], |scene, view, random| {
+        let rows: Vec<[f64; 14]> = (0..24)
+            .map(|i| {
+                let [x, y, z] = {
+                    let mean = random.in_view(view, [0.5, 8.0]);
+                    view.camera_from_world.inverse().transform_point3(mean).to_array()
+                };
+                let [a, b, c] = std::array::from_fn(|_| random.between(-4.0, 0.0));
+                let logit = [-50.0, 50.0, f64::INFINITY, f64::NEG_INFINITY];
+                let logit = logit.get(i).copied().unwrap_or_else(|| random.between(-50.0, 50.0));
+                let [w, i] = [random.between(0.5, 1.0), random.between(-1.0, 1.0)];
+                [x, y, z, w, i, 0.1, 0.2, a, b, c, logit, 0.0, 0.0, 0.0]
+            })
+            .collect();
+        *scene = read_ply(&rows);
+        for (row, opacity) in rows.iter().zip(&scene.opacities) {
+            let expected = 0.5 + 0.5 * (row[10] / 2.0).tanh();
+            assert!((f64::from(*opacity) - expected).abs() <= 1e-7, "logit {}: {opacity}", row[10]);
+        }
+    });
     let range = "-50 to 50 and infinite, through the PLY reader";
     Row { name: "logits", range, claimed: 1e-5, unit_px: 1.0 }.check(&read);
 }
@@ -165,33 +137,28 @@ fn logits() {
 #[test]
 fn on_the_cuts() {
     let steps = |value: f32, n: i32| f64::from(f32::from_bits(value.to_bits().wrapping_add_signed(n)));
-    let cases = cases(
-        8,
-        [48, 32],
-        |_| 50.0,
-        |scene, view, random| {
-            for i in 0..20 {
-                let (x, y) = (f64::from(4 * (i % 5)) + 2.5, f64::from(4 * (i / 5)) + 2.5);
-                let (dx, dy) = (random.between(0.0, 0.05), random.between(0.0, 0.05));
-                // Without an extent of its own a Gaussian has the variance of the blur.
-                let falloff = (-0.5 * (dx * dx + dy * dy) / 0.3).exp();
-                let mut layer = |depth: f64, alpha: f64| {
-                    let mean = unproject(view, x + dx, y + dy, depth);
-                    push(scene, view, random, mean, [1e-6; 3], alpha / falloff);
-                };
-                let n = i % 7 - 3;
-                if i % 2 == 0 {
-                    layer(1.0, steps(1.0 / 255.0, n));
-                } else {
-                    // 0.01 of the light goes through each; what is behind sees all or nothing of the rest.
-                    layer(1.0, f64::from(0.99_f32));
-                    layer(2.0, steps(0.99, n));
-                    layer(3.0, 0.5);
-                }
+    let cases = cases(8, [48, 32], [50.0; 2], |scene, view, random| {
+        for i in 0..20 {
+            let (x, y) = (f64::from(4 * (i % 5)) + 2.5, f64::from(4 * (i / 5)) + 2.5);
+            let (dx, dy) = (random.between(0.0, 0.05), random.between(0.0, 0.05));
+            // Without an extent of its own a Gaussian has the variance of the blur.
+            let falloff = (-0.5 * (dx * dx + dy * dy) / 0.3).exp();
+            let mut layer = |depth: f64, alpha: f64| {
+                let mean = unproject(view, x + dx, y + dy, depth);
+                push(scene, view, random, mean, [1e-6; 3], alpha / falloff);
+            };
+            let n = i % 7 - 3;
+            if i % 2 == 0 {
+                layer(1.0, steps(1.0 / 255.0, n));
+            } else {
+                // 0.01 of the light goes through each; what is behind sees all or nothing of the rest.
+                layer(1.0, f64::from(0.99_f32));
+                layer(2.0, steps(0.99, n));
+                layer(3.0, 0.5);
             }
-            push(scene, view, random, unproject(view, 36.0, 20.0, 1.0), [0.2; 3], 0.9);
-        },
-    );
+        }
+        push(scene, view, random, unproject(view, 36.0, 20.0, 1.0), [0.2; 3], 0.9);
+    });
     let range = "alpha within 3 steps of f32 of 1/255, transmittance of 1e-4";
     Row { name: "on the cuts", range, claimed: 1e-5, unit_px: 1e-2 }.check(&cases);
 }
@@ -226,21 +193,16 @@ fn pile() {
 
 #[test]
 fn near_plane() {
-    let cases = cases(
-        60,
-        [40, 30],
-        |_| 50.0,
-        |scene, view, random| {
-            for i in 0..40 {
-                // A quarter each: about the plane, in front of it, behind the camera, at the scene's depth.
-                let depth = [0.01, 0.05, -1.0, 3.0][i % 4] * random.log_between(0.5, 2.0);
-                let mean = unproject(view, random.between(-20.0, 60.0), random.between(-15.0, 45.0), depth);
-                let scales = std::array::from_fn(|_| random.log_between(1e-4, 1.0));
-                let opacity = random.between(0.05, 0.5);
-                push(scene, view, random, mean, scales, opacity);
-            }
-        },
-    );
+    let cases = cases(60, [40, 30], [50.0; 2], |scene, view, random| {
+        for i in 0..40 {
+            // A quarter each: about the plane, in front of it, behind the camera, at the scene's depth.
+            let depth = [0.01, 0.05, -1.0, 3.0][i % 4] * random.log_between(0.5, 2.0);
+            let mean = unproject(view, random.between(-20.0, 60.0), random.between(-15.0, 45.0), depth);
+            let scales = std::array::from_fn(|_| random.log_between(1e-4, 1.0));
+            let opacity = random.between(0.05, 0.5);
+            push(scene, view, random, mean, scales, opacity);
+        }
+    });
     let range = "depths 0.005 to 0.02 about the plane at 0.01, and behind";
     Row { name: "near plane", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
@@ -268,20 +230,15 @@ fn far_from_the_origin() {
 
 #[test]
 fn focal_lengths() {
-    let cases = cases(
-        60,
-        [40, 30],
-        |random| random.log_between(50.0, 20_000.0),
-        |scene, view, random| {
-            for _ in 0..16 {
-                let mean = random.in_view(view, [0.05, 500.0]);
-                let unit_of_px = mean.z / view.intrinsics.focal_x_px;
-                let scales = std::array::from_fn(|_| random.log_between(0.01, 100.0) * unit_of_px);
-                let opacity = random.between(0.05, 1.0);
-                push(scene, view, random, mean, scales, opacity);
-            }
-        },
-    );
+    let cases = cases(60, [40, 30], [50.0, 20_000.0], |scene, view, random| {
+        for _ in 0..16 {
+            let mean = random.in_view(view, [0.05, 500.0]);
+            let unit_of_px = mean.z / view.intrinsics.focal_x_px;
+            let scales = std::array::from_fn(|_| random.log_between(0.01, 100.0) * unit_of_px);
+            let opacity = random.between(0.05, 1.0);
+            push(scene, view, random, mean, scales, opacity);
+        }
+    });
     Row { name: "focal lengths", range: "50 to 20,000 px", claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
@@ -289,19 +246,14 @@ fn focal_lengths() {
 fn image_sizes() {
     let sizes_px = [[1, 1], [8192, 1], [8192, 5], [1, 8192], [3, 8192]];
     let of_size = |size_px| {
-        cases(
-            3,
-            size_px,
-            |_| 4000.0,
-            |scene, view, random| {
-                for _ in 0..20 {
-                    let mean = random.in_view(view, [0.5, 8.0]);
-                    let scales = std::array::from_fn(|_| random.log_between(1e-5, 1.0));
-                    let opacity = random.between(0.05, 0.7);
-                    push(scene, view, random, mean, scales, opacity);
-                }
-            },
-        )
+        cases(3, size_px, [4000.0; 2], |scene, view, random| {
+            for _ in 0..20 {
+                let mean = random.in_view(view, [0.5, 8.0]);
+                let scales = std::array::from_fn(|_| random.log_between(1e-5, 1.0));
+                let opacity = random.between(0.05, 0.7);
+                push(scene, view, random, mean, scales, opacity);
+            }
+        })
     };
     let cases: Vec<Case> = sizes_px.into_iter().flat_map(of_size).collect();
     Row { name: "image sizes", range: "1x1, 8192x1, 8192x5, 1x8192, 3x8192 px", claimed: 1e-5, unit_px: 1.0 }

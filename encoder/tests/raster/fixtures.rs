@@ -7,7 +7,6 @@ use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
 pub use slag_test_support::{needs_shared, shared};
 
-/// An open archive of arrays.
 pub struct Npz(npy::Npz);
 
 impl Npz {

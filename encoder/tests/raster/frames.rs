@@ -36,7 +36,6 @@ impl House {
         Self { splat, views, photos }
     }
 
-    /// Checks the house with its splat moved.
     fn check(&self, moved: &Similarity, frames: Vec<FrameCandidate>) -> CheckReport {
         let mut splat = self.splat.clone();
         moved.transform_gaussians(&mut splat);

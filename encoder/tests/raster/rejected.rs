@@ -11,7 +11,6 @@ use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, rand
 use super::table::{Case, KINDS, Row};
 use slag_math::random::Random;
 
-/// Changes the Gaussian of an index.
 type Edit = Box<dyn Fn(&mut Gaussians, usize)>;
 
 /// Every field with every invalid value.

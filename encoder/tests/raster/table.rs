@@ -14,14 +14,12 @@ pub const KINDS: [WeightKind; 2] = [WeightKind::Blend, WeightKind::Falloff];
 /// Rows with Gaussians at equal depths or on a cut, where the last bit of f32 decides.
 const ROWS_OF_TIES: [&str; 3] = ["pile", "on the cuts", "rotations"];
 
-/// A view of a scene.
 pub struct Case {
     pub scene: Gaussians,
     pub view: RasterView,
     pub regions: RegionMap,
     /// The same view in a frame where float64 is exact, for the oracle.
     pub exact: Option<(Gaussians, RasterView)>,
-    /// Gaussians that must be counted as unusable.
     pub n_unusable: usize,
 }
 

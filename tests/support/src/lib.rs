@@ -1,18 +1,15 @@
-//! What tests of several crates share: the test data beside the project, damaged files, and an allocator that
-//! counts.
+//! What tests of several crates share: the test data beside the project, and an allocator that counts.
 //!
 //! Some tests use scenes and models that are too large for the repository. They lie in `../shared`, or in the
 //! folder that `SLAG_SHARED` names. Mark such a test with [`needs_shared`]: where the data is absent, `cargo test`
 //! lists the test as ignored; in CI it runs and fails. Tests that take minutes and guard against rare faults are
 //! marked with [`nightly`].
 
-mod damage;
 mod loop_disk;
 mod memory;
 
 use std::path::{Path, PathBuf};
 
-pub use damage::damaged;
 pub use loop_disk::{BLOCK_BYTES, LoopDisk};
 pub use memory::{CountingAllocator, Taken, memory_of};
 pub use slag_test_needs::{needs_loop_disk, needs_shared, nightly};
@@ -49,9 +46,6 @@ pub fn shared(path: &str) -> PathBuf {
 }
 
 /// Returns the path of the ONNX Runtime library that `scripts/setup.sh` installs.
-///
-/// # Panics
-/// If it does not exist.
 pub fn onnx_runtime() -> PathBuf {
     let library = format!("target/onnxruntime/{}/libonnxruntime.so", std::env::consts::ARCH);
     let library = workspace_root().join(library);

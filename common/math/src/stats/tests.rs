@@ -1,7 +1,6 @@
 use super::*;
 use crate::random::Random;
 
-/// Ten values in any order: 0, 10, .., 90.
 fn tens() -> [f64; 10] {
     [70.0, 0.0, 30.0, 90.0, 10.0, 60.0, 20.0, 80.0, 50.0, 40.0]
 }

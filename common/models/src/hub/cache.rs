@@ -41,17 +41,14 @@ impl Hub {
         Self { table, options }
     }
 
-    /// Returns the table of known models.
     pub fn table(&self) -> &Table {
         &self.table
     }
 
-    /// Returns the folder of a model of the table.
     pub fn folder(&self, entry: &Entry) -> PathBuf {
         self.options.root.join(&entry.name)
     }
 
-    /// Returns a model of the table.
     pub fn entry(&self, name: &str) -> Result<&Entry, HubError> {
         let known = || self.table.models.iter().map(|entry| entry.name.clone()).collect();
         self.table.find(name).ok_or_else(|| HubError::Unknown { name: name.to_owned(), known: known() })

@@ -19,7 +19,6 @@ const MAX_REDIRECTS: usize = 5;
 /// Limit on consecutive attempts without progress.
 const MAX_ATTEMPTS: u32 = 5;
 
-/// Options of reaching the hub and keeping its models.
 #[derive(Clone, Debug)]
 pub struct HubOptions {
     /// Folder of the models, see [`models_folder`](super::models_folder).
@@ -28,7 +27,6 @@ pub struct HubOptions {
     pub hub: Option<String>,
     /// Proxy, in the format of `HTTPS_PROXY`.
     pub proxy: Option<String>,
-    /// Timeout of connections and reads.
     pub timeout: Duration,
     /// Wait before the second attempt; doubled before each further one.
     pub first_backoff: Duration,
@@ -49,7 +47,6 @@ impl Watch for Log {
     }
 }
 
-/// The hub's metadata of a file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Advertised {
     pub revision: Option<String>,
@@ -73,7 +70,6 @@ pub(super) fn client(options: &HubOptions) -> Result<Client<'static>, DownloadFa
     Ok(Client::new(limits, TlsConfig::default(), proxy, concat!("slag/", env!("CARGO_PKG_VERSION")), &Log))
 }
 
-/// Requests a file's metadata.
 pub(super) fn ask(client: &Client<'_>, url: &str) -> Result<Advertised, DownloadError> {
     let host = |url: &str| url.parse::<ureq::http::Uri>().ok().and_then(|uri| uri.authority().cloned());
     let own = host(url);
@@ -94,7 +90,6 @@ pub(super) fn ask(client: &Client<'_>, url: &str) -> Result<Advertised, Download
 }
 
 impl Advertised {
-    /// Adds the metadata of a response of the hub.
     fn take(&mut self, response: &Response<ureq::Body>) {
         let text = |name| header_text(response, HeaderName::from_static(name));
         let revision = text("x-repo-commit");

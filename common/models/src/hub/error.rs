@@ -63,7 +63,6 @@ pub enum HubError {
     Io(#[from] io::Error),
 }
 
-/// A missing file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Wanted {
     pub(super) url: String,
@@ -79,7 +78,6 @@ impl std::fmt::Display for Wanted {
     }
 }
 
-/// The source of an expected hash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Source {

@@ -9,7 +9,6 @@ use serde::{Deserialize, Serialize};
 use super::error::{HubError, Source};
 use crate::description::Sha256;
 
-/// The entries of all models.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Lock {
@@ -28,7 +27,6 @@ pub struct Accepted {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LockedFile {
-    /// Its SHA-256.
     pub sha256: Sha256,
     pub hash_source: Source,
 }
@@ -62,7 +60,6 @@ impl Lock {
         Ok(slag_common::durable::write(&path_in(root), &text)?)
     }
 
-    /// Returns the entry of a model.
     pub fn get(&self, name: &str) -> Option<&Accepted> {
         self.models.get(name)
     }

@@ -25,18 +25,14 @@ pub enum Side {
 pub struct PulledFile {
     /// Its path below the model's folder.
     pub path: String,
-    /// Its SHA-256.
     pub sha256: Sha256,
     pub hash_source: Source,
-    /// Whether it was already present.
     pub was_here: bool,
 }
 
-/// A pull under way.
 pub(super) struct Pull<'a> {
     pub(super) table: &'a Table,
     pub(super) options: &'a HubOptions,
-    /// The model's folder.
     pub(super) folder: PathBuf,
     pub(super) entry: &'a Entry,
     pub(super) side: Side,

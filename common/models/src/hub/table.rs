@@ -65,12 +65,10 @@ pub struct Entry {
 const ROLES: [&str; 5] = ["image_encoder", "mask_decoder", "image", "text", "tokenizer"];
 const FIRST_OF_TEXT: usize = 3;
 
-/// The known length and hash of a file.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {
     pub len_bytes: u64,
-    /// Its SHA-256.
     pub sha256: Sha256,
 }
 
@@ -89,7 +87,6 @@ impl Entry {
         [self.files.get("image"), self.data.get("image")].into_iter().flatten().map(String::as_str).collect()
     }
 
-    /// Returns whether it finds masks.
     pub fn is_segmenter(&self) -> bool {
         self.files.contains_key("mask_decoder")
     }

@@ -6,11 +6,9 @@ use serde::Deserialize;
 
 use crate::description::{DescriptionError, FileRef, check_common, read_toml, require};
 
-/// The description of a segmenter's directory.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SamDescription {
-    /// The model's name.
     pub name: String,
     /// Its strengths and limits, for people.
     #[serde(default)]
@@ -23,7 +21,6 @@ pub struct SamDescription {
     pub segment: SegmentDescription,
 }
 
-/// The kinds of segmenters.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum SegmentDescription {
@@ -40,13 +37,11 @@ impl SegmentDescription {
         }
     }
 
-    /// Returns whether the photo is stretched over the square.
     pub fn is_stretched(&self) -> bool {
         matches!(self, Self::Sam2(_))
     }
 }
 
-/// The files of SAM and its image preprocessing.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SamFiles {

@@ -60,7 +60,6 @@ pub struct Sam {
     prompts_per_call: Option<usize>,
 }
 
-/// The encoder's output for an image.
 #[derive(Debug)]
 pub struct Embedding {
     /// Tensors by the name of the decoder's input.
@@ -87,7 +86,6 @@ impl Embedding {
     }
 }
 
-/// The decoder's output for prompts.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decoded {
     /// The model's estimate of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
@@ -349,7 +347,6 @@ impl Decoded {
 pub struct Letterbox {
     /// Edge length of the square, in pixels.
     pub size_px: u32,
-    /// Width and height of the image, in pixels.
     pub image_px: [u32; 2],
     /// Width and height of the resized image, in pixels.
     pub resized_px: [u32; 2],

@@ -7,7 +7,6 @@ use crate::session::{Declared, Model, SessionError, shapes_fit};
 /// Masks that SAM proposes for a prompt: subpart, part and whole, in that order.
 pub const MASKS_PER_PROMPT: usize = 3;
 
-/// The names of inputs and outputs.
 #[derive(Debug)]
 pub(super) struct Names {
     pub(super) pixels: String,
@@ -34,7 +33,6 @@ pub(super) struct Link {
     pub(super) input: String,
 }
 
-/// The decoder's inputs by their use.
 #[derive(Default)]
 struct Inputs {
     points: Vec<String>,

@@ -4,11 +4,9 @@ use std::path::Path;
 
 use super::onnx::{Element, Graph, constant, model, node, value};
 
-/// Components of a vector.
 pub const DIM: usize = 4;
 /// Tokens that the text model knows; the tokenizer has [`VOCABULARY`].
 pub const N_TOKENS: usize = 8;
-/// Edge of the images, pixels.
 pub const SIZE_PX: u32 = 8;
 /// The tokenizer's vocabulary, by id; 1 ends a text, as in SigLIP's.
 pub const VOCABULARY: [&str; 8] = ["<pad>", "</s>", "<unk>", "▁a", "▁red", "▁chair", "▁", "s"];
@@ -22,7 +20,6 @@ pub fn row(id: u32) -> [f32; DIM] {
 /// The image model's weights, `[3][DIM]`.
 pub const WEIGHTS: [f32; 3 * DIM] = [1.0, 0.5, -0.25, 0.0, 0.0, 1.0, 0.5, -0.5, 0.25, 0.0, 1.0, 1.0];
 
-/// Variations of the text model.
 #[derive(Clone, Copy)]
 pub struct TextKind {
     pub ids: Element,

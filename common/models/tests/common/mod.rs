@@ -10,7 +10,6 @@ use slag_common::npy::Npz;
 use slag_models::SessionOptions;
 pub use slag_test_support::{needs_shared, shared, workspace_root};
 
-/// A model directory of the project's tests.
 pub fn model_dir(name: &str) -> PathBuf {
     workspace_root().join("tests/models").join(name)
 }
@@ -35,13 +34,11 @@ pub fn image(npz: &Path, name: &str) -> image::RgbImage {
     image::RgbImage::from_raw(shape[1] as u32, shape[0] as u32, levels).expect("it is RGB")
 }
 
-/// The vector scaled to unit length, in f64.
 pub fn unit(vector: &[f32]) -> Vec<f64> {
     let norm = vector.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
     vector.iter().map(|&x| f64::from(x) / norm).collect()
 }
 
-/// The largest absolute difference.
 pub fn max_difference(a: &[f32], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
     a.iter().zip(b).map(|(&a, b)| (f64::from(a) - b).abs()).fold(0.0, f64::max)

@@ -15,7 +15,6 @@ impl Element {
     }
 }
 
-/// A message of protocol buffers.
 #[derive(Default)]
 struct Message(Vec<u8>);
 
@@ -54,7 +53,6 @@ pub fn value(name: &str, element: Element, shape: &[i64]) -> Vec<u8> {
     Message::default().bytes(1, name).bytes(2, Message::default().bytes(1, tensor.0).0).0
 }
 
-/// A constant f32 or f16 tensor.
 pub fn constant(name: &str, element: Element, shape: &[i64], values: &[f32]) -> Vec<u8> {
     let raw: Vec<u8> = match element {
         Element::F16 => values.iter().flat_map(|&x| half::f16::from_f32(x).to_le_bytes()).collect(),
@@ -77,7 +75,6 @@ pub fn node(op: &str, inputs: &[&str], output: &str, attributes: &[(&str, &[i64]
     message.bytes(2, output).bytes(4, op).each(5, attributes).0
 }
 
-/// The parts of a model.
 #[derive(Clone, Default)]
 pub struct Graph {
     pub nodes: Vec<Vec<u8>>,

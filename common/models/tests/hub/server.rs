@@ -31,7 +31,6 @@ repository = "owner/made"
 files = { image = "onnx/vision.onnx", text = "onnx/text.onnx", tokenizer = "tokenizer.json" }
 "#;
 
-/// The table of that model alone.
 pub fn table() -> String {
     let (_, layout) = DESCRIPTION.split_once("licence = \"none\"\n").expect("a head");
     let layout = [("vision.onnx", "IMAGE"), ("text.onnx", "TEXT"), ("tokenizer.json", "TOKENIZER")]
@@ -72,7 +71,6 @@ pub struct Server {
     pub files: Arc<Mutex<Files>>,
 }
 
-/// The hub's files and faults.
 pub struct Files {
     pub bytes: BTreeMap<String, Vec<u8>>,
     pub commit: &'static str,

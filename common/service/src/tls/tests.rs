@@ -27,7 +27,6 @@ impl Authority {
         Self { issuer: Issuer::new(params, key), certificate }
     }
 
-    /// Writes a certificate for a name, and its key.
     fn issue(&self, name: &str, files: &TlsFiles) {
         let key = KeyPair::generate().expect("a key");
         let params = CertificateParams::new([name.to_owned()]).expect("a name");

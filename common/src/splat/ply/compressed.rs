@@ -61,25 +61,28 @@ fn unpack_rotation(word: u32) -> [f64; 4] {
     with_largest((word >> 30) as usize, others)
 }
 
-/// Reads the rows of a file with its header already read.
-pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
+fn read_chunks(ply: &mut Ply) -> Result<Vec<Chunk>, SplatError> {
     let chunk = ply.require_element("chunk", EXPORT_AGAIN)?;
-    let mut chunk_properties = ply.properties(chunk, &RANGES, EXPORT_AGAIN)?;
+    let mut properties = ply.properties(chunk, &RANGES, EXPORT_AGAIN)?;
     // Files of the first version have no colour ranges; colours span 0..=1.
     if ply.elements[chunk].property(COLOUR_RANGES[0]).is_some() {
-        chunk_properties.extend(ply.properties(chunk, &COLOUR_RANGES, EXPORT_AGAIN)?);
+        properties.extend(ply.properties(chunk, &COLOUR_RANGES, EXPORT_AGAIN)?);
     }
-    let packed = ply.properties(vertex, &PACKED, EXPORT_AGAIN)?;
-
     ply.seek_element(chunk)?;
     let mut chunks = Vec::with_capacity(ply.checked_count(chunk)?);
-    ply.rows(&chunk_properties, |row| {
-        let mut ranges =
-            [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0];
+    ply.rows(&properties, |row| {
+        let mut ranges = [0.0; 18];
+        ranges[15..].fill(1.0);
         ranges.iter_mut().zip(row).for_each(|(range, value)| *range = *value as f32);
         chunks.push(Chunk(ranges));
     })?;
+    Ok(chunks)
+}
 
+/// Reads the rows of a file with its header already read.
+pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
+    let packed = ply.properties(vertex, &PACKED, EXPORT_AGAIN)?;
+    let chunks = read_chunks(&mut ply)?;
     ply.seek_element(vertex)?;
     let count = ply.checked_count(vertex)?;
     if count.div_ceil(GAUSSIANS_PER_CHUNK) != chunks.len() {

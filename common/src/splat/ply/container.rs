@@ -89,7 +89,6 @@ struct Property {
     kind: Kind,
 }
 
-/// A table of a PLY file.
 #[derive(Debug)]
 pub(super) struct Element {
     pub name: String,
@@ -122,14 +121,11 @@ pub(super) struct Ply {
     pub input: Input,
     encoding: Encoding,
     pub elements: Vec<Element>,
-    /// Index of the next element.
     next: usize,
-    /// Lines read so far.
     line: u64,
 }
 
 impl Ply {
-    /// Reads the header.
     pub fn open(mut input: Input) -> Result<Self, SplatError> {
         let mut header = Header { encoding: None, elements: Vec::new() };
         let mut bytes = Vec::new();
@@ -171,7 +167,6 @@ impl Ply {
         self.elements.iter().position(|e| e.name == name)
     }
 
-    /// Returns the index of an element, or an error if it is missing.
     pub fn require_element(&self, name: &str, advice: &'static str) -> Result<usize, SplatError> {
         let missing = || self.missing(format!("a header with an element {name:?}"), advice);
         self.element(name).ok_or_else(missing)

@@ -29,7 +29,6 @@ use sh_rest::sh_rest_properties;
 /// Advice for a PLY without the properties of a splat.
 const NOT_A_SPLAT: &str =
     "this is not a trained splat but perhaps a point cloud or mesh: give the PLY of the splat";
-/// The name of the Gaussians' element.
 const VERTEX: &str = "vertex";
 const GEOMETRY: [&str; 10] =
     ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0", "scale_1"];

@@ -23,16 +23,13 @@ pub struct PointProperties {
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Index of the text.
     pub question: u32,
     /// Rank of its answer, from 1.
     pub answer: u32,
-    /// Mean, world frame.
     pub position_in_world: DVec3,
     pub score: f32,
     /// Cell, and index in its shard.
     pub shard_index: (u32, u32),
-    /// Index in the input splat file.
     pub input_index: u32,
 }
 
@@ -64,7 +61,6 @@ impl PointProperties {
             + 24
     }
 
-    /// Appends a point to the rows of a file.
     pub fn put(self, point: &Point, rows: &mut Vec<u8>) {
         if self.question {
             rows.extend_from_slice(&point.question.to_le_bytes());

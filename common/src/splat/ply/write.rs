@@ -20,7 +20,6 @@ pub fn write_to(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Resul
     write_rows(writer, gaussians)
 }
 
-/// Writes the header of a file of `n` Gaussians.
 pub fn write_header(mut writer: impl Write, n: u64, sh_degree: u8) -> std::io::Result<()> {
     let per_channel = Gaussians::sh_rest_per_channel(sh_degree);
     let rest_names = (0..3 * per_channel).map(|i| format!("f_rest_{i}"));
@@ -33,7 +32,6 @@ pub fn write_header(mut writer: impl Write, n: u64, sh_degree: u8) -> std::io::R
     writeln!(writer, "end_header")
 }
 
-/// Writes Gaussians of the header's degree.
 pub fn write_rows(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Result<()> {
     let per_channel = Gaussians::sh_rest_per_channel(gaussians.sh_degree);
     let mut row: Vec<u8> = Vec::new();

@@ -9,7 +9,6 @@ use crate::dump::Dump;
 /// Sums that are formed side by side, so that the compiler uses vector instructions.
 const LANES: usize = 16;
 
-/// All vectors in memory.
 pub struct Dense {
     dim: usize,
     vectors: Vec<f32>,

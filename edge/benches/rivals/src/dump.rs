@@ -7,7 +7,6 @@ use anyhow::{Context, Result, ensure};
 use memmap2::Mmap;
 use serde::{Deserialize, Serialize};
 
-/// Numbers of vectors, components and queries.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Meta {
     pub n: usize,

@@ -63,7 +63,6 @@ impl Engine {
         self.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned())
     }
 
-    /// Returns the name and version of the library.
     fn library(self) -> String {
         match self {
             Self::Dense => "plain f32 loop".into(),
@@ -72,7 +71,6 @@ impl Engine {
     }
 }
 
-/// An index that answers queries.
 trait Index {
     /// Returns the ids of the best `limit`, best first.
     fn search(&self, query: &[f32], limit: usize) -> Result<Vec<u32>>;

@@ -11,7 +11,6 @@ use crate::dump::{Dump, Meta};
 use crate::qdrant::Qdrant;
 use crate::{Args, Engine, Index};
 
-/// Figures of an engine.
 #[derive(Debug, Serialize)]
 pub struct Report {
     engine: Engine,

@@ -21,7 +21,6 @@ fn many() -> [BuiltShard; 2] {
     [shard(5, 40_000, [1.0, 0.0, 0.0]), shard(9, 20_000, [0.8, 0.6, 0.0])]
 }
 
-/// Collects a body's pieces.
 async fn pieces(response: Response) -> Result<Vec<Vec<u8>>, axum::Error> {
     let mut body = response.into_body();
     let mut pieces = Vec::new();

@@ -3,8 +3,8 @@
 use slag_common::container::AlignedBytes;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::Manifest;
-use slag_common::shard::ShardLayout;
 use slag_common::shard::sample::{SampleObject, SampleObjects};
+use slag_common::shard::{Additions, ShardLayout};
 
 use super::v1::room_with;
 use super::*;
@@ -37,7 +37,7 @@ fn things() -> [BuiltShard; 1] {
         thing(3, 0, [1.6, 0.9, 0.7], [128, 500]),
     ];
     let objects = SampleObjects { objects, score_mean: 0.0, score_spread: 0.1, score_error_bound: 0.005 };
-    let bytes = AlignedBytes::copy_of(&objects.add_to(&room.view(), None));
+    let bytes = AlignedBytes::copy_of(&objects.add_to(&room.view(), Additions::default()));
     let layout = ShardLayout::check(&bytes).expect("a valid shard");
     [BuiltShard { bytes, layout, embeddings: room.embeddings.clone() }]
 }

@@ -26,7 +26,6 @@ const MEDIA_TYPE: &str = "text/event-stream";
 const TICK: Duration = Duration::from_millis(500);
 /// Time without an event after which a comment is sent: a client that is gone is noticed.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
-/// Events made ahead of the client.
 const EVENTS_AHEAD: usize = 4;
 
 pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> {

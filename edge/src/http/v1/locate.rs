@@ -19,7 +19,6 @@ use crate::locate::{Answer, Camera, LocateError, PhotoFile, answer, map_working_
 use crate::query::{Point, QueryError, RequestError};
 use crate::score::{MAX_COORDINATE, ScoreError};
 
-/// Media types of the photo.
 pub const PHOTOS: &[&str] = &["image/jpeg", "image/png"];
 
 /// The photo's camera, without lens distortion.

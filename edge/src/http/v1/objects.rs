@@ -19,9 +19,7 @@ use crate::http::problem::query_problem;
 use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError, object_id};
 use crate::score::MAX_COORDINATE;
 
-/// Objects in a page unless the request says otherwise.
 const DEFAULT_PAGE: usize = 100;
-/// Most objects in a page.
 const MAX_PAGE: usize = 1000;
 
 /// Which objects are listed.
@@ -78,7 +76,6 @@ impl ListParams {
         forms::area(ball, self.bounds.take(), self.polygon.take(), self.polygon_lat_lon.take())
     }
 
-    /// Returns which objects of a generation are asked for.
     fn filter(mut self, manifest: &Manifest) -> Result<ObjectFilter, RequestError> {
         let refuse =
             |parameter, found: String, expected: String| Err(RequestError::new(parameter, &found, expected));
@@ -113,7 +110,6 @@ pub async fn list(
     Ok(As::new(([(header::CONTENT_TYPE, format.media_type())], listing.await?)))
 }
 
-/// A list of objects in any format.
 pub struct ListFormats;
 
 impl Described for ListFormats {

@@ -10,7 +10,6 @@ use crate::text::MAX_TEXT_BYTES;
 
 /// Most things that a phrase may name.
 pub const MAX_THINGS: usize = 8;
-/// Most `n` of a pick.
 pub const MAX_NTH: usize = 100;
 /// Names that stand for the asker, wherever it is.
 pub const ASKER: [&str; 4] = ["me", "myself", "us", "here"];
@@ -154,14 +153,12 @@ pub enum By {
 }
 
 impl By {
-    /// Returns whether distances are compared.
     pub(crate) fn is_distance(self) -> bool {
         matches!(self, Self::Nearest | Self::Farthest)
     }
 }
 
 impl Phrase {
-    /// Names a thing alone.
     pub fn thing(thing: impl Into<String>) -> Self {
         Self { thing: thing.into(), pick: None, relation: None }
     }

@@ -13,7 +13,6 @@ use crate::query::answers::ReasonKind;
 /// win over a sure one.
 const SURE: f64 = 0.5;
 
-/// A thing that a phrase means.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
     /// Its index among the candidates of the phrase's thing.
@@ -41,7 +40,6 @@ pub struct Witness {
     pub score: Option<f32>,
 }
 
-/// Why nothing was found.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Miss {
     /// The part that failed.
@@ -73,7 +71,6 @@ struct Anchor {
     object: Option<usize>,
 }
 
-/// What relations are measured by.
 struct Measure<'a, 'b> {
     things: &'a Things<'b>,
     viewer: Option<&'a Viewer>,

@@ -8,7 +8,7 @@ use crate::score::{Budget, OverBudget, Pool, ScoreError};
 fn a_budget_is_enough_or_is_named() {
     let yard = yard();
     let shards: Vec<_> = yard.iter().map(BuiltShard::view).collect();
-    let objects: Vec<_> = yard.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
+    let objects: Vec<_> = yard.iter().map(|shard| shard.layout.additions(&shard.bytes).objects).collect();
     let (index, manifest) = (ObjectIndex::new(&objects), manifest_of(&yard, 7));
     let scene = Scene {
         shards: &shards,

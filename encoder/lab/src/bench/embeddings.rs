@@ -43,7 +43,6 @@ impl Noise {
         (mix64(self.0) >> 40) as f32 / (1u64 << 24) as f32
     }
 
-    /// Adds a random vector of about this length in the first dimensions.
     fn add_noise(&mut self, length: f32, out: &mut [f32]) {
         let n = out.len().min(FILLED);
         // A sum of four uniform numbers has variance 1/3.

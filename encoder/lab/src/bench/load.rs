@@ -15,7 +15,6 @@ use crate::programs::agent;
 /// Time to measure the capacity, and concurrent queries meanwhile.
 const WARM_UP: Duration = Duration::from_secs(2);
 const WARM_UP_CLIENTS: u32 = 4;
-/// Longest answer that is read.
 const MAX_BODY_BYTES: u64 = 256 << 20;
 
 /// `bench load`.
@@ -50,7 +49,6 @@ pub(crate) struct LoadReport {
     capacity_per_sec: f64,
     offered_per_sec: f64,
     n_clients: u32,
-    /// Response times without overload.
     unloaded: Times,
     accepted: Times,
     /// Refusals (503).

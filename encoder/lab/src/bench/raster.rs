@@ -20,7 +20,6 @@ use slag_encoder::raster::{RasterError, RasterView, Rasterizer, ViewWeights, Wei
 use crate::harness::{Machine, Times, timed_ms};
 use crate::table::Table;
 
-/// Most views that are drawn in turn.
 const N_VIEWS: usize = 4;
 /// Columns and rows of regions: about as many as a photo's masks make.
 const GRID: [u32; 2] = [8, 6];
@@ -85,7 +84,6 @@ struct RasterCase {
     relative_l1: f64,
 }
 
-/// Opens the devices, measures all of them, and reports.
 pub(crate) fn run(args: &RasterArgs, progress: &dyn Progress) -> Result<RasterReport> {
     let threads = args.threads.map_or(0, |n| n as usize);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("cannot start threads")?;
@@ -119,7 +117,6 @@ impl BenchScene {
     }
 }
 
-/// Returns a map of equal rectangles.
 fn grid_regions(width_px: u32, height_px: u32) -> RegionMap {
     let [columns, rows] = GRID;
     let region = |x: u32, y: u32| y * rows / height_px * columns + x * columns / width_px;

@@ -114,7 +114,6 @@ impl Engine {
     }
 }
 
-/// Figures of an engine at one size.
 #[derive(Debug, Serialize, Deserialize)]
 struct Figures {
     engine: String,

@@ -39,15 +39,11 @@ const TOLERANCE_M: f64 = 0.25;
 const MARKER: &str = "demo.json";
 
 pub struct DemoOptions {
-    /// Folder to work in.
     pub out: PathBuf,
-    /// Seed of room and yard.
     pub seed: u64,
-    /// How models run.
     pub session: SessionOptions,
     /// The robot's program.
     pub edge: PathBuf,
-    /// Creation time to sign.
     pub created_unix_secs: u64,
 }
 
@@ -63,9 +59,7 @@ pub struct DemoReport {
     pub pictures: [PathBuf; 2],
     pub encode: EncodeSummary,
     pub downloaded_bytes: u64,
-    /// The model's description of itself.
     pub about_model: String,
-    /// The questions, in order.
     pub questions: Vec<Question>,
 }
 
@@ -73,13 +67,11 @@ pub struct DemoReport {
 pub struct Question {
     pub text: String,
     pub answer: Option<EdgeAnswer>,
-    /// Why there is no answer.
     pub reason: Option<serde_json::Value>,
     /// The things that it asks for: name, and centre of the box.
     pub truth: Vec<(String, DVec3)>,
     /// Milliseconds from the start of `slag-edge query` to its end.
     pub process_ms: f64,
-    /// Whether the answer is correct.
     pub right: bool,
 }
 
@@ -101,7 +93,6 @@ struct Tally {
 }
 
 impl DemoReport {
-    /// Returns whether every answer is correct.
     pub fn all_right(&self) -> bool {
         self.questions.iter().all(|q| q.right)
     }

@@ -10,9 +10,7 @@ use slag_common::gaussians::SH_C0;
 use slag_encoder::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 
 const PANEL_WIDTH_PX: u32 = 320;
-/// Views tried for a panel.
 const N_CANDIDATES: usize = 8;
-/// Panels in a row.
 const COLUMNS: usize = 4;
 
 const BACKGROUND: [f32; 3] = [0.9; 3];
@@ -44,7 +42,6 @@ fn luma([r, g, b]: [f32; 3]) -> f32 {
     0.299 * r + 0.587 * g + 0.114 * b
 }
 
-/// One question's part of the picture.
 pub(super) struct Panel<'a> {
     /// The question, written across the top.
     pub(super) question: &'a str,
@@ -115,7 +112,6 @@ fn best_view(scene: &Gaussians, views: &[RasterView], panel: &Panel<'_>) -> Resu
 const MAP_PX_PER_M: f64 = 48.0;
 /// The map leaves out Gaussians above this height, such as ceilings and lamps.
 const MAP_HEIGHT_M: f64 = 2.2;
-/// Margin around the cells.
 const MARGIN_M: f64 = 0.5;
 
 /// Draws the scene from above: cells that the robot fetched in colour with their borders, other cells in grey, a
@@ -205,7 +201,6 @@ const GLYPH: u32 = 8;
 const SCALE: u32 = 2;
 /// Space around the text and between its lines, pixels of the picture.
 const MARGIN_PX: u32 = 6;
-/// Colour of the text.
 const INK: Rgb<u8> = Rgb([20; 3]);
 
 /// Writes a text on a light band across the top of a picture, in as many lines as it needs.
@@ -254,7 +249,6 @@ fn lines(text: &str, n_columns: usize) -> Vec<String> {
     lines
 }
 
-/// A cluster of matching Gaussians.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct EdgeAnswer {
     pub position_in_world: DVec3,

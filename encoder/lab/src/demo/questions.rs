@@ -9,7 +9,6 @@ const MIN_PIXELS: u64 = 12_000;
 /// A thing that no scene has.
 const ABSENT: &str = "an elephant";
 
-/// A question and its correct answers.
 pub(super) struct Asked<'a> {
     pub(super) text: String,
     /// The things that it describes; empty if the correct answer is that nothing was found.

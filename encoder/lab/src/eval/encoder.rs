@@ -23,9 +23,7 @@ use slag_math::dot;
 
 /// A crop shows a whole thing if its mask is the true one and more than this share of the thing is visible.
 const WHOLE: f64 = 0.6;
-/// Scenes with crops in memory at a time.
 const SCENES_AT_A_TIME: u64 = 16;
-/// Timed crops and texts.
 const N_TIMED: usize = 64;
 
 /// `eval encoder`.
@@ -65,7 +63,6 @@ struct NounReport {
 pub(crate) struct EncoderReport {
     encoder: String,
     n_scenes: u64,
-    /// Seed of the first scene; the others follow.
     first_seed: u64,
     /// Tallies of several sets of crops, with their names.
     tallies: Vec<(String, Tally)>,
@@ -84,7 +81,6 @@ pub(crate) struct EncoderReport {
     ms_per_text: f64,
 }
 
-/// Embeddings of the texts that crops are compared with.
 struct Texts {
     nouns: Vec<Vec<f32>>,
     colours: Vec<Vec<f32>>,
@@ -108,7 +104,6 @@ impl Texts {
     }
 }
 
-/// Evaluates an encoder on the crops of scenes.
 pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<EncoderReport> {
     let (models, session) = open_models(&args.models)?;
     let (nouns, seeds) = (&NOUNS[..], args.seed..args.seed + args.n_scenes);

@@ -147,7 +147,6 @@ pub(crate) struct EvalReport {
     n_unlabelled: usize,
 }
 
-/// Judges a store by labels.
 pub(crate) fn judge(
     reader: &StoreReader,
     truth: &Truth,
@@ -207,7 +206,6 @@ struct Class {
     of_objects: Vec<f32>,
 }
 
-/// Scores words.
 struct Asker<'a> {
     reader: &'a StoreReader,
     objects: Option<&'a PublishedObjects>,
@@ -286,7 +284,6 @@ impl Asker<'_> {
     }
 }
 
-/// Lowest scores of a match.
 struct Thresholds {
     of_gaussians: f32,
     of_objects: f32,

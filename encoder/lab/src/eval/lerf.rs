@@ -86,7 +86,6 @@ pub(super) struct LabelledFrame {
     pub(super) name: String,
     /// The camera, at the label's size.
     pub(super) view: RasterView,
-    /// The things, one per category.
     pub(super) things: Vec<LabelledThing>,
 }
 
@@ -124,7 +123,6 @@ enum Polygons {
 }
 
 impl LerfLabels {
-    /// Reads the labels of a scene with these views.
     pub(super) fn read(dir: &Path, views: &[View]) -> Result<Self> {
         let mut paths = Vec::new();
         for entry in fs_err::read_dir(dir)? {
@@ -231,7 +229,6 @@ fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
     }
 }
 
-/// Figures of a thing on a frame.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ThingReport {
     pub(super) frame: String,
@@ -247,7 +244,6 @@ pub(crate) struct LerfReport {
     pub(super) things: Vec<ThingReport>,
     /// Categories that the encoder cannot encode, and why; their things count as not found.
     pub(super) unknown_words: BTreeMap<String, String>,
-    /// Labelled frames without a pose; left out of the means.
     pub(super) frames_without_view: Vec<String>,
 }
 

@@ -30,9 +30,7 @@ use crate::table::{Table, figure};
 const HELD_OUT: usize = 4;
 /// Foreign photos that are tried in a scene at most, evenly among all.
 const MAX_FOREIGN: usize = 48;
-/// Error of the focal length of [`Change::Focal`].
 const FOCAL_FACTOR: f64 = 1.03;
-/// Light of [`Change::Dark`].
 const DARK_FACTOR: f32 = 0.4;
 /// Steps of a robot's positions where the scene is metric, metres.
 const POSITION_STEP_M: f64 = 0.02;

@@ -54,7 +54,6 @@ pub(super) struct Confusion {
 }
 
 impl Confusion {
-    /// Returns an empty matrix.
     pub(super) fn new(n_classes: usize) -> Self {
         Self { n_classes, counts: vec![0; n_classes * (n_classes + 1)] }
     }
@@ -84,7 +83,6 @@ impl Confusion {
     }
 }
 
-/// Returns the mean of the values that are present; `None` without any.
 pub(super) fn mean(values: impl IntoIterator<Item = Option<f64>>) -> Option<f64> {
     let (sum, n) = values.into_iter().flatten().fold((0.0, 0), |(sum, n), v| (sum + v, n + 1));
     (n > 0).then(|| sum / f64::from(n))

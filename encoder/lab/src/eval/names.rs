@@ -56,7 +56,6 @@ pub(crate) struct NamesArgs {
     models: ModelArgs,
 }
 
-/// The names of an object.
 #[derive(Clone, Copy, Debug)]
 struct Named {
     /// The best name's score.
@@ -80,7 +79,6 @@ struct Row {
     log_loss: f64,
 }
 
-/// The figures of each scene, then of all.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct NamesReport {
     rows: Vec<Row>,

@@ -33,7 +33,6 @@ pub(crate) struct ScenesArgs {
     pub(crate) out: PathBuf,
 }
 
-/// Where masks come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum MaskSource {

@@ -27,7 +27,6 @@ use super::metrics::{Confusion, mean};
 use super::truth::check_scene;
 use crate::table::{Table, figure};
 
-/// The protocol's scenes.
 const SCENES: [&str; 10] = [
     "scene0000_00",
     "scene0062_00",
@@ -111,7 +110,6 @@ pub(super) struct ScannetSettings {
     pub(super) segments: bool,
 }
 
-/// Figures of a scene.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct ScanReport {
     scene: String,
@@ -377,10 +375,8 @@ impl fmt::Display for ScannetReport {
     }
 }
 
-/// Largest NYU40 id.
 const MAX_ID: u16 = 40;
 
-/// A labelled mesh.
 #[derive(Clone, Debug)]
 pub(super) struct Scan {
     pub(super) name: String,

@@ -38,7 +38,6 @@ pub(crate) struct SplatOnlyReport {
     mean: Row,
 }
 
-/// Figures of one encode.
 struct Figures {
     n_views: usize,
     ap: Option<f64>,

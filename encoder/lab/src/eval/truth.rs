@@ -23,7 +23,6 @@ pub(super) struct Thing {
     pub(super) train_pixels: u64,
 }
 
-/// The labels of a scene.
 #[derive(Clone, Debug)]
 pub(crate) struct Truth {
     /// The things, without floors and walls.

@@ -15,9 +15,7 @@ use slag_encoder::raster::{self, RasterView};
 pub(super) const PHOTO_PX: [u32; 2] = [640, 480];
 /// Horizontal field of view, 75 degrees: a phone's wide camera.
 pub(super) const FIELD_OF_VIEW_RAD: f64 = 75.0 * std::f64::consts::PI / 180.0;
-/// Height of a walking camera over the ground.
 const CAMERA_HEIGHT_M: f64 = 1.5;
-/// Height of a robot's camera over the ground.
 const ROBOT_HEIGHT_M: f64 = 0.6;
 /// Gap between things on the ground, so that cameras can walk around them.
 const GAP_M: f64 = 0.3;
@@ -25,17 +23,14 @@ const GAP_M: f64 = 0.3;
 const CAMERA_CLEARANCE_M: f64 = 0.35;
 /// Poses tried for a thing before it is left out.
 const N_TRIES: usize = 30;
-/// Thickness of walls and ground.
 const SHELL_M: f64 = 0.04;
 
-/// A thing in its scene.
 #[derive(Clone, Debug)]
 pub struct Placed {
     pub noun: usize,
     /// Its parts, colours and paint.
     pub object: Object,
     pub world_from_object: DAffine3,
-    /// The box around it.
     pub bounds: Aabb,
     /// Whether it belongs to the scene's shell, such as floor and walls.
     pub shell: bool,
@@ -356,7 +351,6 @@ impl Area {
     }
 }
 
-/// Returns the box around parts.
 fn bounds(parts: &[Part], world_from_object: DAffine3) -> Aabb {
     let mut bounds = Aabb::EMPTY;
     for part in parts {
@@ -393,7 +387,6 @@ fn around_z(yaw_rad: f64, at: DVec3) -> DAffine3 {
     DAffine3::from_mat3_translation(DMat3::from_rotation_z(yaw_rad), at)
 }
 
-/// Returns the intrinsics of a scene's photos.
 pub fn photo_intrinsics() -> Intrinsics {
     pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD)
 }

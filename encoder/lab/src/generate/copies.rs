@@ -21,7 +21,6 @@ const SPACING: f64 = 1.1;
 pub struct WrittenCopies {
     pub scene: PathBuf,
     pub views: PathBuf,
-    /// The masks, if the scene has any.
     pub masks: Option<PathBuf>,
     pub n_gaussians: u64,
     /// Distance between neighbouring copies, world units.
@@ -83,7 +82,6 @@ impl Grid {
     }
 }
 
-/// A labelled scene.
 struct Source {
     folder: PathBuf,
     gaussians: Gaussians,

@@ -22,7 +22,6 @@ use slag_encoder::raster::RasterView;
 use slag_encoder::segment::{GraphSegmenter, SegmentInput, Segmenter};
 use slag_math::random::Xorshift;
 
-/// Edge of the photos to take crops from.
 const PHOTO_PX: u32 = 208;
 const N_PHOTOS: usize = 14;
 /// Masks with fewer pixels are ignored, as in `encode`.
@@ -50,11 +49,9 @@ pub struct Label {
     pub noun: usize,
     pub colour: Colour,
     pub material: Material,
-    /// Whether the pair of noun and colour is held out from training.
     pub held_out: bool,
     /// Height divided by the larger horizontal edge.
     pub slenderness: f64,
-    /// Pixels of the mask.
     pub area_px: u32,
     /// Visible share of the thing.
     pub shown: f64,
@@ -160,7 +157,6 @@ pub(crate) fn crops(split: Split, seed: u64) -> Vec<(Crop, Label)> {
     out
 }
 
-/// Returns a view of a random thing from a random direction.
 fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Xorshift) -> Option<RasterView> {
     let things: Vec<usize> = (0..layout.placed.len()).filter(|i| !layout.placed[*i].shell).collect();
     if things.is_empty() {
@@ -189,7 +185,6 @@ fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Xorshift) ->
     None
 }
 
-/// Returns the visible things of a photo with their masks.
 fn masks_of(photo: &Photo) -> Vec<(u32, Mask)> {
     let label = |thing: &u16| if *thing == NOTHING { NO_REGION } else { u32::from(*thing) };
     let labels: Vec<u32> = photo.thing_of_pixel.iter().map(label).collect();

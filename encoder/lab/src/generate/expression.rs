@@ -10,25 +10,18 @@ pub enum Expression {
     /// A new random number in -1..1 at each evaluation.
     Random,
     Minus(Box<Expression>),
-    /// An operator with two operands.
     Binary(Operator, Box<[Expression; 2]>),
 }
 
-/// An operator with two operands.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Operator {
-    /// `+`
     Add,
-    /// `-`
     Subtract,
-    /// `*`
     Multiply,
-    /// `/`
     Divide,
 }
 
 impl Expression {
-    /// Parses an expression with the variables `names`.
     pub fn parse(text: &str, names: &[String]) -> Result<Self, String> {
         let mut parser = Parser { rest: text.trim(), names, depth: 0 };
         let expression = parser.sum()?;
@@ -58,7 +51,6 @@ impl Expression {
     }
 }
 
-/// Deepest nesting of parentheses and signs.
 const MAX_DEPTH: usize = 64;
 
 struct Parser<'a> {

@@ -90,7 +90,6 @@ pub struct Top {
 pub struct Noun {
     pub name: String,
     pub words: Vec<String>,
-    /// Kinds of thing that it belongs to.
     pub kinds: Vec<String>,
     pub found: Vec<(SceneKind, Place)>,
     paints: Vec<PaintRule>,

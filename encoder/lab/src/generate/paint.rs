@@ -80,7 +80,6 @@ named! {
     Tile "tile",
 }
 
-/// Colour and material of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Paint {
     /// Colour under white light, 0 to 1.

@@ -12,7 +12,6 @@ const TILE_PX: u32 = 16;
 /// Distance from the surface at which shadow rays start.
 const OFF_SURFACE_M: f64 = 1e-4;
 
-/// Light source of a scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Light {
     /// From a direction; unit length.
@@ -55,9 +54,7 @@ struct Piece {
 pub struct Solids {
     things: Vec<Thing>,
     light: Light,
-    /// Share of ambient light.
     ambient: f64,
-    /// Colour of the light.
     tint: [f64; 3],
 }
 
@@ -83,7 +80,6 @@ struct Hit {
 }
 
 impl Thing {
-    /// Places parts of the object's frame in the world.
     pub fn new(parts: &[Part], world_from_object: DAffine3) -> Self {
         let pieces: Vec<Piece> = parts
             .iter()

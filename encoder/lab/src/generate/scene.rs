@@ -19,13 +19,10 @@ use super::render::NOTHING;
 const SPACING_OF_RADIUS: f64 = 0.03;
 /// Bounds of that distance.
 const SPACING_M: [f64; 2] = [0.012, 0.11];
-/// Opacity of a surface Gaussian.
 const OPACITY: f32 = 0.97;
 /// Standard deviation of a surface Gaussian in spacings: neighbours overlap into a closed surface.
 const SPREAD: f64 = 0.62;
-/// Thickness of a surface Gaussian.
 const THICKNESS_M: f32 = 0.002;
-/// Held-out test views.
 const N_TEST_VIEWS: u32 = 6;
 /// First id of things in the labels. Ids of floor, walls and other background begin at 1.
 const FIRST_ID: u16 = 10;
@@ -36,7 +33,6 @@ pub struct Scene {
     pub id_of_gaussian: Vec<u16>,
     /// The objects, including floor and walls.
     pub objects: Vec<TrueObject>,
-    /// The cameras of the photos.
     pub views: Vec<RasterView>,
     test_views: Vec<RasterView>,
     layout: Layout,
@@ -44,18 +40,15 @@ pub struct Scene {
 
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TrueObject {
-    /// Its id in masks and labels.
     pub id: u16,
     pub category: String,
     pub words: Vec<String>,
-    /// Kinds of thing that it belongs to.
     pub kinds: Vec<String>,
     /// Its colours, the main one first.
     pub colours: Vec<&'static str>,
     pub material: &'static str,
     /// Whether it is background, such as floor and walls.
     pub background: bool,
-    /// Centre of its box, metres.
     pub centre: DVec3,
     /// Smallest corner of the box around it.
     pub aabb_min: DVec3,
@@ -123,7 +116,6 @@ impl Scene {
         Self { gaussians, id_of_gaussian, objects, views, test_views, layout }
     }
 
-    /// Takes other photos.
     pub fn photograph(&mut self, walk: Walk, n_views: u32) {
         self.views = self.layout.photos(walk, n_views);
     }

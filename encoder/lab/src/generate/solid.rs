@@ -32,7 +32,6 @@ pub struct Part {
 #[derive(Clone, Copy, Debug)]
 pub struct Surfel {
     pub position: DVec3,
-    /// Outward normal, unit length.
     pub normal: DVec3,
 }
 
@@ -133,7 +132,6 @@ impl Shape {
         }
     }
 
-    /// Returns points on the surface, about `spacing_m` apart.
     fn surfels(self, spacing_m: f64) -> Vec<Surfel> {
         let mut out = Vec::new();
         match self {

@@ -42,7 +42,6 @@ impl Aggregation {
         fill: true,
     };
 
-    /// Returns whether the finer superpoints are found.
     pub(crate) fn has_fine_superpoints(&self) -> bool {
         self.superpoint > 0.0 || self.fill
     }

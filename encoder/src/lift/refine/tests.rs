@@ -16,7 +16,6 @@ use slag_math::dot;
 
 const DIM: usize = 12;
 const N: usize = 90;
-/// Gaussians that no view sees.
 const UNSEEN: [usize; 2] = [7, 50];
 
 fn random(seed: u64) -> f64 {

@@ -220,7 +220,6 @@ impl Collection<'_> {
         self.count(Filter::must_not([Condition::matches("scene", self.manifest.scene.clone())])).await
     }
 
-    /// Counts the points that pass a filter.
     pub(super) async fn count(&self, filter: Filter) -> Result<u64, PushError> {
         let count = || {
             let request = CountPointsBuilder::new(&self.name).exact(true).filter(filter.clone());
@@ -230,7 +229,6 @@ impl Collection<'_> {
         Ok(counted.result.map_or(0, |result| result.count))
     }
 
-    /// Asks for a snapshot and waits for it.
     pub(super) async fn create_snapshot(&self) -> Result<Snapshot, PushError> {
         let create = || self.database.patient_client.create_snapshot(self.name.as_str());
         let created = self.database.attempt("create a snapshot", create).await?;

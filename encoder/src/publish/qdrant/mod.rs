@@ -109,7 +109,6 @@ pub(crate) struct PushReport {
     pub(crate) n_created_collections: usize,
     /// Collections of cells that this generation no longer has, deleted.
     pub(crate) deleted_collections: Vec<String>,
-    /// Snapshots of the collections, where asked for.
     pub(crate) snapshots: Vec<Snapshot>,
 }
 

@@ -44,7 +44,6 @@ pub(crate) enum Quantisation {
 }
 
 impl IndexSettings {
-    /// Returns the request that creates a collection for vectors of `dim` components.
     pub(super) fn create(&self, name: &str, dim: u64) -> CreateCollection {
         let mut vectors = VectorParamsBuilder::new(dim, Distance::Cosine).build();
         vectors.on_disk = self.on_disk.then_some(true);

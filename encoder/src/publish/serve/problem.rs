@@ -13,7 +13,6 @@ pub(super) fn bad_parameter(detail: impl Into<String>) -> Problem {
     Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", detail)
 }
 
-/// The store does not publish this.
 pub(super) fn not_published(what: &str) -> Problem {
     let detail = format!("{what} is not published here; fetch the manifest again, it lists the objects");
     Problem::new(StatusCode::NOT_FOUND, "not-found", "Not found", detail)
@@ -25,7 +24,6 @@ pub(super) fn not_geo_referenced(error: GeographicError) -> Problem {
     Problem::new(StatusCode::CONFLICT, "not-geo-referenced", "Scene is not geo-referenced", detail)
 }
 
-/// No byte of the range lies in the object.
 pub(super) fn range_not_satisfiable(len_bytes: u64) -> Problem {
     let detail = format!("no byte of the range is there; the object has {len_bytes} bytes");
     let (status, kind) = (StatusCode::RANGE_NOT_SATISFIABLE, "range-not-satisfiable");

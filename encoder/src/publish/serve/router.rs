@@ -37,7 +37,6 @@ const ABOUT: About = About {
     summary: "slag-encoder serves a scene's shards to robots.",
     errors: &[(503, "Too much is asked at once, or the answer took too long.")],
 };
-/// Errors of whatever reads the store.
 const STORE: [(u16, &str); 1] = [(500, "The service failed.")];
 /// No request here needs a body; a few bytes of a careless client do no harm.
 const REQUEST_BODY_BYTES: usize = 1024;
@@ -68,7 +67,6 @@ pub fn bounded(routes: Router, limits: Limits, access: Access) -> Router {
     counted(routes, limits, Arc::default(), access)
 }
 
-/// Returns the routes with their descriptions, and their table.
 pub(super) fn described() -> (Router<Arc<Service>>, Vec<Route>) {
     routes().described::<ParameterMembers>(ABOUT)
 }

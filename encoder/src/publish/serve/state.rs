@@ -77,7 +77,6 @@ impl Snapshot {
     }
 }
 
-/// A manifest that did not open.
 struct Failed {
     /// `None`: the file was missing.
     version: Option<Stamp>,

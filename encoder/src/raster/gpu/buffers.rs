@@ -9,13 +9,11 @@ use super::jobs::{
 use super::layout::{Capacities, screen_layout};
 use super::shader::{Counter, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZE};
 
-/// Size of the counters, bytes.
 pub(crate) const COUNTERS_BYTES: u64 = 64;
 
 /// Size of the parameters of a band, with room to spare, bytes.
 pub(crate) const VIEW_BYTES: u64 = 256;
 
-/// Size of a pixel's region, bytes.
 pub(crate) const REGION_BYTES: u64 = REGION_BITS as u64 / 8;
 
 /// Returns the size of the regions of so many pixels, in whole words, bytes.
@@ -26,7 +24,6 @@ pub(crate) fn regions_bytes(n_px: usize) -> u64 {
 /// Sizes for which buffers are created.
 #[derive(Clone, Copy)]
 pub struct Size {
-    /// Capacities for the output of the shaders.
     pub(crate) capacities: Capacities,
     pub(crate) n_tiles: u32,
     /// Pixels of a band.

@@ -27,7 +27,6 @@ fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
     }
 }
 
-/// An adapter that can be opened.
 pub struct Adapter {
     pub report: AdapterReport,
     adapter: wgpu::Adapter,

@@ -8,11 +8,8 @@ use super::shader::{Counter, NONE, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZ
 
 /// Distance between records, bytes; bindings must be aligned.
 pub(crate) const JOB_STRIDE_BYTES: u64 = 256;
-/// Size of a record of dispatch sizes, bytes.
 pub(crate) const DISPATCH_BYTES: u64 = 16;
-/// Size of a pair, words.
 pub(crate) const PAIR_WORDS: u32 = 2;
-/// Size of an entry, words.
 pub(crate) const ENTRY_WORDS: u32 = 4;
 
 #[derive(Clone, Copy)]
@@ -33,7 +30,6 @@ pub(crate) enum SortKey {
     MemberRegion,
 }
 
-/// Bits per sort pass.
 pub(crate) const DIGIT_BITS: u32 = RADIX.ilog2();
 pub(crate) const MAX_PASSES: u32 = (u32::BITS + REGION_BITS).div_ceil(DIGIT_BITS);
 
@@ -69,7 +65,6 @@ impl Scan {
     }
 }
 
-/// Returns the index of the record of a sort pass.
 pub(crate) fn sort_job(key: SortKey, pass: u32) -> u64 {
     SCAN_JOBS + key as u64 * u64::from(MAX_PASSES) + u64::from(pass)
 }
@@ -80,7 +75,6 @@ pub(crate) fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
     (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
 }
 
-/// Returns the number of bits of the numbers below `n`.
 pub(crate) fn bits_of(n: u32) -> u32 {
     u32::BITS - n.saturating_sub(1).leading_zeros()
 }

@@ -25,7 +25,6 @@ pub(crate) struct SceneGaussian {
     pub(crate) rotation_wxyz: [f32; 4],
     /// Standard deviations, world units.
     pub scales: [f32; 3],
-    /// Unused.
     pub padding: u32,
 }
 
@@ -116,7 +115,6 @@ impl RegionSum {
         u64::from(self.high) << 32 | u64::from(self.low)
     }
 
-    /// Converts a sum for this Gaussian and region to its weight.
     pub fn weight(&self, fixed: u64) -> RegionWeight {
         let weight = (fixed as f64 / (1u64 << SUM_FRACTION_BITS) as f64) as f32;
         RegionWeight { gaussian: self.gaussian, region: self.region, weight }
@@ -127,15 +125,12 @@ impl RegionSum {
 #[repr(C)]
 pub(crate) struct Background {
     pub rgb: [f32; 3],
-    /// Unused.
     pub padding: u32,
 }
 
-/// Capacities of the buffers of a workspace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Capacities {
     pub visible: u32,
-    /// (Tile, Gaussian) pairs.
     pub pairs: u32,
     /// Contributions per tile, Gaussian and region.
     pub entries: u32,
@@ -166,7 +161,6 @@ impl Capacities {
     }
 }
 
-/// Parameters of the shaders for a band of a view.
 pub(crate) struct ViewBlock {
     /// `rotation` (9), `position_high` (3), `position_low` (3), focal lengths, centre.
     pub(crate) reals: [f64; 19],

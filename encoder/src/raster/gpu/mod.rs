@@ -44,12 +44,10 @@ pub struct GpuRasterizer {
 }
 
 impl GpuRasterizer {
-    /// Creates a backend from an opened device.
     pub fn new(device: Device, options: GpuOptions) -> Self {
         Self { device: Arc::new(device), options }
     }
 
-    /// Returns the description of the device.
     pub fn report(&self) -> &AdapterReport {
         &self.device.report
     }
@@ -85,7 +83,6 @@ struct GpuScene<'s> {
     returned: Condvar,
 }
 
-/// Workspaces that are not in use.
 struct Pool {
     idle: Vec<Workspace>,
     n_made: usize,
@@ -331,7 +328,6 @@ impl<'s> GpuScene<'s> {
         Err(self.device.capacity_error(what))
     }
 
-    /// Uploads the colours of all Gaussians seen from a view.
     fn colours(&self, view: &RasterView) -> Result<wgpu::Buffer, RasterError> {
         let position_in_world = view.camera_from_world.inverse().translation;
         let colours: Vec<[f32; 3]> = (0..self.scene.len())
@@ -387,7 +383,6 @@ impl Drop for LentWorkspace<'_, '_> {
 struct Rows {
     /// Row-major range within the image.
     px: Range<usize>,
-    /// Whether the band is the whole image.
     is_whole: bool,
 }
 

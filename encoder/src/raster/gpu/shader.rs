@@ -26,14 +26,12 @@ pub const SUM_FRACTION_BITS: u32 = 35;
 pub(crate) const REGION_BITS: u32 = 16;
 /// Most items of a buffer: counts above it do not fit, and stay far below 2^32.
 pub(crate) const MAX_CAPACITY: u32 = 1 << 31;
-/// Stands for "no counter".
 pub const NONE: u32 = u32::MAX;
 
 /// Counters that shaders increment; the host reads them after each band.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(crate) enum Counter {
-    /// Gaussians visible in the band.
     Visible,
     /// Visible Gaussians that were not visible in an earlier band.
     FirstVisible,
@@ -165,7 +163,6 @@ pub(crate) struct Kernels {
 }
 
 impl Kernels {
-    /// Compiles all stages.
     pub fn new(device: &wgpu::Device, precision: Precision) -> Self {
         let with_constants = |stage: &str, entry: &str, constants: &[(&str, f64)]| {
             let descriptor = wgpu::ShaderModuleDescriptor {

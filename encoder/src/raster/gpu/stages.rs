@@ -11,10 +11,8 @@ use super::layout::{Chunk, ScanJob, SceneGaussian};
 use super::shader::{Counter, NONE, WORKGROUP_SIZE};
 use crate::raster::rasterizer::WeightKind;
 
-/// Records the stages of one view in flight.
 pub(crate) struct Stages {
     pub buffers: Buffers,
-    /// Bind groups by kernel and variant.
     groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
 }
 
@@ -60,7 +58,6 @@ impl Stages {
         dispatch(pass, &kernels.write_visible, &group, [n_blocks, 1]);
     }
 
-    /// Records a prefix sum.
     pub fn scan(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, scan: Scan) {
         let values = match scan {
             Scan::Digits(_) => &self.buffers.histogram,
@@ -290,7 +287,6 @@ pub(crate) fn dispatch_indirect(
     pass.dispatch_workgroups_indirect(sizes, offset);
 }
 
-/// Size of a Gaussian in device memory, bytes.
 pub(crate) const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
 
 pub(crate) struct SceneChunk {

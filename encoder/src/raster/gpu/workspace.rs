@@ -265,7 +265,6 @@ pub(crate) struct Band<'a> {
     pub chunks: &'a [SceneChunk],
     /// Uploads the Gaussians of a chunk that is not on the device.
     pub(crate) upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
-    /// The view and the rows of tiles of the band.
     pub view: &'a ViewBlock,
 }
 

@@ -17,7 +17,6 @@ pub(super) struct Candidate {
 }
 
 impl Candidate {
-    /// Returns LangSplat's score.
     pub(super) fn score(&self) -> f64 {
         f64::from(self.predicted_iou) * self.stability
     }

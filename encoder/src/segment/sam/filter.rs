@@ -12,11 +12,9 @@ use crate::masks::BoxPx;
 /// Distance within which a box touches an edge, as in the reference implementation.
 const EDGE_TOLERANCE_PX: u32 = 20;
 
-/// The filters for the masks of one image.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Filters<'a> {
     pub(super) settings: &'a SamSettings,
-    /// Width and height of the image.
     pub(super) image_px: [u32; 2],
 }
 

@@ -39,7 +39,6 @@ const MODELS_PER_GPU: usize = 2;
 /// Photos at a time in an opened model: one is embedded while the points of others are decoded and filtered.
 const PHOTOS_PER_MODEL: usize = 3;
 
-/// Finds masks with SAM.
 #[derive(Debug)]
 pub struct SamSegmenter {
     lanes: Lanes<Arc<Sam>>,

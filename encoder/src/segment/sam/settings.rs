@@ -44,14 +44,12 @@ pub struct ScoreFilter {
 }
 
 impl ScoreFilter {
-    /// LangSplat's own thresholds.
     pub const LANGSPLAT: Self = Self { min_score: 0.7, max_iou: 0.8, max_contained: 0.5 };
 }
 
 /// Settings for the prompts and the filters of masks. The defaults are those of the reference implementation.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct SamSettings {
-    /// Points along each side of the grid.
     pub points_per_side: u32,
     /// Points that the decoder processes at once. Memory: 0.8 MB per point, twice.
     pub points_per_batch: u32,

@@ -127,7 +127,6 @@ fn enlarged(logits: &[f32], letterbox: &Letterbox, logits_px: [u32; 2]) -> Vec<f
     bilinear(&cut, [width, height], letterbox.image_px.map(|edge| edge as usize))
 }
 
-/// A mask of the recomputation.
 #[derive(Clone)]
 struct Dense {
     inside: Vec<bool>,

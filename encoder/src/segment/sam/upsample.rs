@@ -53,13 +53,11 @@ impl Axis {
         axis
     }
 
-    /// Returns the pixels whose first logit is `first`.
     fn pixels(&self, first: usize) -> Range<usize> {
         self.first.partition_point(|&tap| tap < first)..self.first.partition_point(|&tap| tap <= first)
     }
 }
 
-/// Upsampling from logits to the pixels of one image.
 pub(super) struct Upsampler {
     n_columns: usize,
     x: Axis,

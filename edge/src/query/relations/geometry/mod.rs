@@ -102,7 +102,6 @@ const LEVEL: [f64; 2] = [0.5, 0.1];
 /// A thing between two others is off the line from one to the other by at most this share of its length.
 const OFF_LINE: [f64; 2] = [0.2, 0.5];
 
-/// Returns the degree to which two things are near each other.
 fn near(thing: &Solid, other: &Solid, metre: f64) -> f64 {
     let more = OF_SIZE * thing.half.max_element().min(other.half.max_element());
     falling(thing.gap(other), NEAR_M * metre + more, FAR_M * metre + more)
@@ -117,7 +116,6 @@ fn beside(thing: &Solid, other: &Solid, metre: f64) -> f64 {
     level * apart * falling(thing.horizontal_gap(other), BESIDE_M[0] * metre, BESIDE_M[1] * metre)
 }
 
-/// Returns the degree to which a thing is between two others.
 pub fn between(thing: &Solid, one: &Solid, other: &Solid) -> f64 {
     let (from, to) = (one.centre.truncate(), other.centre.truncate());
     let length = from.distance(to);
@@ -138,7 +136,6 @@ const INSIDE: [f64; 2] = [0.8, 0.4];
 /// A thing is smaller than this share of what it is in.
 const SMALLER: f64 = 0.5;
 
-/// Returns the degree to which a thing is inside another.
 fn inside(thing: &Solid, container: &Solid, metre: f64) -> f64 {
     if thing.volume() >= SMALLER * container.volume() {
         return 0.0;

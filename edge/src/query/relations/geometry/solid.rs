@@ -39,12 +39,10 @@ impl Solid {
         Self { centre: at, half: DVec3::ZERO, along: DVec2::X }
     }
 
-    /// Returns its lowest height.
     pub fn bottom(&self) -> f64 {
         self.centre.z - self.half.z
     }
 
-    /// Returns its greatest height.
     pub fn top(&self) -> f64 {
         self.centre.z + self.half.z
     }
@@ -57,7 +55,6 @@ impl Solid {
         8.0 * self.half.x * self.half.y * self.half.z
     }
 
-    /// Returns the area of its outline on the ground.
     pub fn area(&self) -> f64 {
         4.0 * self.half.x * self.half.y
     }
@@ -93,12 +90,10 @@ impl Solid {
         self.top().min(other.top()) - self.bottom().max(other.bottom())
     }
 
-    /// Returns the area that two outlines share.
     pub(crate) fn shared_area(&self, other: &Self) -> f64 {
         shared_area(&self.corners(), &other.corners())
     }
 
-    /// Returns the horizontal distance between two outlines.
     pub(crate) fn horizontal_gap(&self, other: &Self) -> f64 {
         outline_gap(&self.corners(), &other.corners())
     }

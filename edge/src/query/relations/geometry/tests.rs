@@ -5,7 +5,6 @@ use slag_common::frames::Aabb;
 use super::*;
 use glam::DVec3;
 
-/// World units in a metre.
 const METRES: f64 = 1.0;
 
 fn solid(centre: [f64; 3], size: [f64; 3]) -> Solid {

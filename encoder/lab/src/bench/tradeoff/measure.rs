@@ -14,12 +14,10 @@ use crate::harness::Machine;
 use crate::programs::{json_of, remove};
 use crate::scenes::SceneFiles;
 
-/// Paths of the programs and their common flags.
 #[derive(Clone, Debug)]
 pub(super) struct Programs {
     pub(super) encoder: PathBuf,
     pub(super) lab: PathBuf,
-    /// Flags that select the models and their runtime.
     pub(super) models: Vec<String>,
     pub(super) segmenter: Option<PathBuf>,
     /// Version, models and device in words.

@@ -12,7 +12,6 @@ use crate::bench::plot::{self, PlotPoint};
 use crate::harness::Machine;
 use crate::table::{Table, figure};
 
-/// Cost and accuracy of a point.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Figures {
     pub(super) scene: String,
@@ -43,7 +42,6 @@ pub(super) struct Figures {
 pub(crate) struct TradeoffReport {
     pub(super) machine: Machine,
     pub(super) figures: Vec<Figures>,
-    /// Points left out because a scene lacks their data.
     pub(crate) left_out: Vec<String>,
 }
 

@@ -64,7 +64,6 @@ pub(crate) struct GoalArgs {
     list: bool,
 }
 
-/// Judges every scene.
 pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport> {
     let mut report = GoalReport::default();
     // The objects' outlines are the true ones where places are judged, not segmentation.
@@ -146,7 +145,6 @@ struct Label {
     object: Option<String>,
 }
 
-/// Returns the things of a scene and its store, in the order of the layout.
 fn labels(scene: &Path, store: &Path) -> Result<Vec<Label>> {
     let reader = StoreReader::open(store)?;
     let objects = PublishedObjects::read(&reader)?;
@@ -287,7 +285,6 @@ impl fmt::Display for GoalReport {
 /// Distance of the surface points that are looked at.
 const SPACING_M: f64 = 0.012;
 
-/// Free voxels, and those that are not.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 struct Voxels {
     n_free: u64,
@@ -311,7 +308,7 @@ fn compare_voxels(layout: &Layout, store: &Path) -> Result<Voxels> {
     for cell in &reader.manifest().cells {
         let Some(record) = cell.shards.values().next() else { continue };
         let shard = reader.read_shard(record)?;
-        let Some(occupancy) = shard.layout.occupancy(&shard.bytes) else { continue };
+        let Some(occupancy) = shard.layout.additions(&shard.bytes).occupancy else { continue };
         let voxel = occupancy.header.voxel;
         let surfaces = surfaces.get_or_insert_with(|| surface_voxels(layout, voxel));
         found.len_bytes += occupancy.sections().iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
@@ -332,7 +329,6 @@ fn compare_voxels(layout: &Layout, store: &Path) -> Result<Voxels> {
     Ok(found)
 }
 
-/// Returns the voxels with a point of a true surface.
 fn surface_voxels(layout: &Layout, voxel: f64) -> HashSet<[i32; 3]> {
     let mut voxels = HashSet::new();
     for placed in &layout.placed {

@@ -19,7 +19,6 @@ pub(super) const STEP_M: f64 = 0.1;
 pub(super) const MIN_VISIBLE: f64 = 0.02;
 /// Least share of the thing's outline that must truly be shown.
 pub(super) const MIN_SHOWN: f64 = 0.1;
-/// Edge of a cell of the true map.
 const CELL_M: f64 = 0.02;
 /// Distance of the surface points that are looked at.
 const SPACING_M: f64 = 0.01;
@@ -30,7 +29,6 @@ const FIELD_OF_VIEW_RAD: f64 = 110.0 * PI / 180.0;
 /// Least pixels that a thing must have.
 const MIN_SHOWN_PX: u32 = 12;
 
-/// The truth about a layout, for a robot.
 pub(super) struct Truth<'a> {
     layout: &'a Layout,
     solids: Solids,
@@ -150,7 +148,6 @@ impl<'a> Truth<'a> {
     }
 }
 
-/// Returns points on a thing's surface, world frame.
 fn surface(layout: &Layout, thing: usize, spacing_m: f64) -> impl Iterator<Item = DVec3> + '_ {
     let placed = &layout.placed[thing];
     let surfels = placed.object.parts.iter().flat_map(move |part| part.surfels(spacing_m));

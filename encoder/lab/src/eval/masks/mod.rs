@@ -39,7 +39,6 @@ use segments::{Ious, MIN_PX, Segments};
 
 /// Opacity from which a pixel has splat behind it.
 const MIN_COVERAGE: f32 = 0.5;
-/// Photos of a generated scene.
 const N_GENERATED_VIEWS: u32 = 24;
 
 /// `eval masks`.
@@ -123,7 +122,6 @@ pub(crate) fn run(args: &MasksArgs, progress: &dyn Progress) -> Result<MasksRepo
     Ok(MasksReport { rows })
 }
 
-/// Generates a scene, unless it is there.
 fn generated(kind: SceneKind, seed: u64, out: &Path) -> Result<PathBuf> {
     let dir = out.join(format!("{}-{seed}", flag_value(&kind)?));
     if !dir.join("transforms.json").is_file() {

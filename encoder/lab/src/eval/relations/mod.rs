@@ -29,7 +29,6 @@ const MIN_IOU: f64 = 0.1;
 const TOLERANCE_M: f64 = 0.25;
 /// Most questions about a relation in a scene, with and without an answer each.
 const MAX_QUESTIONS: usize = 12;
-/// Most answers to a question.
 const LIMIT: usize = 10;
 
 /// `eval relations`.
@@ -62,7 +61,6 @@ struct Instances {
     instances: Vec<TrueThing>,
 }
 
-/// Asks about every scene.
 pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<RelationsReport> {
     let mut report = RelationsReport::default();
     let scenes = Prepared {
@@ -203,7 +201,6 @@ fn iou(a: &Aabb, b: &Aabb) -> f64 {
     if both > 0.0 { shared / both } else { 0.0 }
 }
 
-/// How a question is asked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 enum Way {
@@ -228,7 +225,6 @@ struct Counts {
     /// Those whose best answer is right; without a thing that is meant: those without an answer.
     n_right: usize,
     n_answers: usize,
-    /// Answers that are a thing that is meant.
     n_answers_right: usize,
     n_meant: usize,
     /// Those among the answers.
@@ -257,7 +253,6 @@ struct Row {
     counts: Counts,
 }
 
-/// The figures by relation, and over all.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RelationsReport {
     scenes: Vec<String>,

@@ -21,7 +21,6 @@ const RAISED_M: f64 = 0.1;
 #[derive(Clone, Debug, Deserialize)]
 pub(super) struct TrueThing {
     pub(super) category: String,
-    /// Kinds of thing that it belongs to.
     #[serde(default)]
     pub(super) kinds: Vec<String>,
     /// Smallest corner of its box, metres.
@@ -32,7 +31,6 @@ pub(super) struct TrueThing {
     pub(super) train_pixels: u64,
 }
 
-/// A relation that is asked about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Asked {
@@ -62,7 +60,6 @@ impl Asked {
         Self::Largest,
     ];
 
-    /// Returns the question about two words.
     pub(super) fn text(self, thing: &str, of: &str) -> String {
         match self {
             Self::On => format!("{thing} on the {of}"),

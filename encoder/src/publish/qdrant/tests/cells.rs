@@ -13,7 +13,6 @@ fn vectors() -> qdrant_client::qdrant::VectorParams {
     VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build()
 }
 
-/// A collection that holds a point of a scene.
 fn held_of(scene: &str) -> Held {
     let mut held = Held::new(vectors());
     held.points

@@ -20,7 +20,6 @@ pub(super) struct Stored {
     pub(super) payload: HashMap<String, Value>,
 }
 
-/// A collection as stored.
 #[derive(Clone, Default)]
 pub(super) struct Held {
     /// As created and updated.

@@ -17,7 +17,6 @@ fn photo() -> image::RgbImage {
     image::RgbImage::from_raw(shape[1] as u32, shape[0] as u32, levels).expect("RGB")
 }
 
-/// Keeps every proposal.
 fn all(points_per_side: u32) -> SamSettings {
     SamSettings {
         points_per_side,
