@@ -21,7 +21,7 @@ use slag_encoder::objects::NONE;
 use slag_encoder::progress::Progress;
 use slag_encoder::query::PublishedObjects;
 use slag_encoder::store::StoreReader;
-use truth::{HEIGHT_M, MIN_SHOWN, MIN_VISIBLE, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
+use truth::{MIN_SHOWN, SENSOR_HEIGHT_M, Truth, goal_request};
 
 use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
@@ -104,11 +104,7 @@ fn judge(args: &GoalArgs, dir: &Path, layout: &Layout, report: &mut GoalReport) 
             None => Verdict::NoObject,
             Some(id) => {
                 let asked = Instant::now();
-                let path = format!(
-                    "/v1/goal?id={id}&near={},{},0&radius_m={}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
-                    start.x, start.y, args.radius_m
-                );
-                let reply = service.get(&path)?;
+                let reply = service.get(&goal_request(&format!("id={id}"), start, args.radius_m))?;
                 report.millis.push(asked.elapsed().as_secs_f64() * 1e3);
                 verdict(&truth, index, &reply)?
             }

@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde_json::Value;
 use slag_common::{View, poses};
 
-use super::truth::{HEIGHT_M, MIN_SHOWN, MIN_VISIBLE, REACH_M, SENSOR_HEIGHT_M, STEP_M, Truth};
+use super::truth::{MIN_SHOWN, SENSOR_HEIGHT_M, Truth, goal_request};
 use crate::generate::compose::Layout;
 use crate::generate::grammar::NOUNS;
 use crate::programs::Service;
@@ -55,11 +55,8 @@ impl Road {
             let odom_from_scene_as_found = odom_from_camera * found.inverse();
             for word in &reachable {
                 self.n_runs += 1;
-                let at = found.translation;
-                let reply = service.get(&format!(
-                    "/v1/goal?text={}&near={},{},0&radius_m={radius_m}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
-                    word.replace(' ', "%20"), at.x, at.y
-                ))?;
+                let what = format!("text={}", word.replace(' ', "%20"));
+                let reply = service.get(&goal_request(&what, found.translation, radius_m))?;
                 let Some(goal) = reply["goals"].get(0) else { continue };
                 let goal_in_scene: DVec3 = serde_json::from_value(goal["position_in_world"].clone())?;
                 let goal_in_odom = odom_from_scene_as_found.transform_point3(goal_in_scene);

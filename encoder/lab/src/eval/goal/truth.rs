@@ -11,12 +11,12 @@ use crate::generate::compose::{Layout, looking, pinhole};
 use crate::generate::render::Solids;
 
 /// Largest horizontal distance to the thing.
-pub(super) const REACH_M: f64 = 0.8;
+const REACH_M: f64 = 0.8;
 pub(super) const SENSOR_HEIGHT_M: f64 = 0.4;
-pub(super) const HEIGHT_M: f64 = 0.5;
-pub(super) const STEP_M: f64 = 0.1;
+const HEIGHT_M: f64 = 0.5;
+const STEP_M: f64 = 0.1;
 /// Least share of the thing's Gaussians that must be seen. From one side hardly half of them are.
-pub(super) const MIN_VISIBLE: f64 = 0.02;
+const MIN_VISIBLE: f64 = 0.02;
 /// Least share of the thing's outline that must truly be shown.
 pub(super) const MIN_SHOWN: f64 = 0.1;
 const CELL_M: f64 = 0.02;
@@ -28,6 +28,14 @@ const PICTURE_PX: [u32; 2] = [240, 240];
 const FIELD_OF_VIEW_RAD: f64 = 110.0 * PI / 180.0;
 /// Least pixels that a thing must have.
 const MIN_SHOWN_PX: u32 = 12;
+
+/// Returns the request of places to stand near what a parameter names, of a robot that is somewhere on the floor.
+pub(super) fn goal_request(what: &str, at: DVec3, radius_m: f64) -> String {
+    format!(
+        "/v1/goal?{what}&near={},{},0&radius_m={radius_m}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
+        at.x, at.y
+    )
+}
 
 pub(super) struct Truth<'a> {
     layout: &'a Layout,
