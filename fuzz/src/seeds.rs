@@ -210,7 +210,7 @@ fn with_additions(view: &ShardView<'_>) -> Vec<u8> {
         photo: "a.jpg".into(),
         photo_box_px: [10, 20, 110, 70],
     };
-    let objects = vec![object(1, &[3..5]), object(7, &[0..2, 5..6])];
+    let objects = vec![object(1, std::slice::from_ref(&(3..5))), object(7, &[0..2, 5..6])];
     let objects = SampleObjects { objects, score_mean: 0.02, score_spread: 0.1, score_error_bound: 0.02 };
     let block = |z, occupied, free| Block { at: [0, 0, z], occupied, free };
     let places = BuiltOccupancy::pack(0.05, 0.1, 2, &[block(0, 1, 2), block(1, 0, !0), block(5, !0, 0)]);

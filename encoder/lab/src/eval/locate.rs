@@ -141,18 +141,19 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
     let files = SceneFiles::find_all(&args.scenes)?;
     progress.begin("locate", "scene", files.len() as u64, 0);
     let scenes = files.iter().map(|files| prepare(files, args)).collect::<Result<Vec<_>>>()?;
+    let load = |scene: &Located| scene.drawn.as_ref().map(|drawn| CpuRasterizer.load(drawn)).transpose();
+    let drawn = scenes.iter().map(load).collect::<Result<Vec<_>, _>>()?;
     let (mut of_scenes, mut all_tries, mut all_foreign) = (Vec::new(), Vec::new(), Vec::new());
     for (at, scene) in scenes.iter().enumerate() {
         let loaded = CpuRasterizer.load(&scene.gaussians)?;
         let renderer = SceneRenderer(loaded.as_ref());
         let renderer = (!args.unverified).then_some(&renderer as &(dyn Renderer + Sync));
-        let drawn = scene.drawn.as_ref().map(|drawn| CpuRasterizer.load(drawn)).transpose()?;
-        let attempt = |view: &View| -> Result<Try> {
-            Ok(attempt(scene, &query(view, args.change, drawn.as_deref())?, renderer))
+        let attempt = |of: usize, view: &View| -> Result<Try> {
+            Ok(attempt(scene, &query(view, args.change, drawn[of].as_deref())?, renderer))
         };
         let mut tries = Vec::new();
         for view in &scene.queries {
-            let one = attempt(view)?;
+            let one = attempt(at, view)?;
             if args.list && !one.is_within(0.25, 5.0) {
                 let told = match &one.found {
                     Err(reason) => reason.clone(),
@@ -162,11 +163,12 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
             }
             tries.push(one);
         }
-        let others = scenes.iter().enumerate().filter(|(other, _)| *other != at);
-        let others: Vec<&View> = others.flat_map(|(_, other)| &other.queries).collect();
-        let others: Vec<&View> =
-            others.iter().step_by(others.len().div_ceil(MAX_FOREIGN).max(1)).copied().collect();
-        let foreign = others.par_iter().map(|view| attempt(view)).collect::<Result<Vec<_>>>()?;
+        let others = (0..scenes.len()).filter(|other| *other != at);
+        let others: Vec<(usize, &View)> =
+            others.flat_map(|other| scenes[other].queries.iter().map(move |view| (other, view))).collect();
+        let others: Vec<_> = others.iter().step_by(others.len().div_ceil(MAX_FOREIGN).max(1)).collect();
+        let foreign =
+            others.par_iter().map(|(other, view)| attempt(*other, view)).collect::<Result<Vec<_>>>()?;
         of_scenes.push(Figures::of(&scene.name, &[scene], &tries, &foreign));
         all_tries.extend(tries);
         all_foreign.extend(foreign);
