@@ -141,8 +141,9 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
     let files = SceneFiles::find_all(&args.scenes)?;
     progress.begin("locate", "scene", files.len() as u64, 0);
     let scenes = files.iter().map(|files| prepare(files, args)).collect::<Result<Vec<_>>>()?;
-    let load = |scene: &Located| scene.drawn.as_ref().map(|drawn| CpuRasterizer.load(drawn)).transpose();
-    let drawn = scenes.iter().map(load).collect::<Result<Vec<_>, _>>()?;
+    let drawn =
+        scenes.iter().map(|scene| scene.drawn.as_ref().map(|drawn| CpuRasterizer.load(drawn)).transpose());
+    let drawn = drawn.collect::<Result<Vec<_>, _>>()?;
     let (mut of_scenes, mut all_tries, mut all_foreign) = (Vec::new(), Vec::new(), Vec::new());
     for (at, scene) in scenes.iter().enumerate() {
         let loaded = CpuRasterizer.load(&scene.gaussians)?;
