@@ -65,7 +65,7 @@ pub(crate) struct GoalArgs {
 }
 
 pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport> {
-    let mut report = GoalReport::default();
+    let (mut places, mut road) = (Places::default(), Road::default());
     // The objects' outlines are the true ones where places are judged, not segmentation.
     let encode_flags: &[&str] = match args.from_photos {
         true => &["--occupancy", "--locate", "--appearance"],
@@ -79,22 +79,31 @@ pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport
         walk: args.walk,
         encode_flags,
     };
-    report.scenes = scenes.judge(progress, |kind, seed, dir| {
-        judge(args, dir, &Layout::new(&[kind], seed, &|_, _| true), &mut report)
+    let scenes = scenes.judge(progress, |kind, seed, dir| {
+        let layout = Layout::new(&[kind], seed, &|_, _| true);
+        let views = layout.photos(args.walk, args.n_views);
+        let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
+        let truth = Truth::new(&layout, args.radius_m, cameras)?;
+        let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
+        match args.from_photos {
+            true => road.add(&dir.join("scene"), &layout, &truth, &service, args.radius_m),
+            false => judge(args, dir, &layout, &truth, &service, &mut places),
+        }
     })?;
-    Ok(report)
+    let (places, road) = if args.from_photos { (None, Some(road)) } else { (Some(places), None) };
+    Ok(GoalReport { scenes, places, road })
 }
 
-fn judge(args: &GoalArgs, dir: &Path, layout: &Layout, report: &mut GoalReport) -> Result<()> {
+/// Judges the places of a scene.
+fn judge(
+    args: &GoalArgs,
+    dir: &Path,
+    layout: &Layout,
+    truth: &Truth<'_>,
+    service: &Service,
+    report: &mut Places,
+) -> Result<()> {
     report.voxels.add(compare_voxels(layout, &dir.join("store"))?);
-    let views = layout.photos(args.walk, args.n_views);
-    let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
-    let truth = Truth::new(layout, args.radius_m, cameras)?;
-    let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
-    if args.from_photos {
-        let road = report.road.get_or_insert_default();
-        return road.add(&dir.join("scene"), layout, &truth, &service, args.radius_m);
-    }
     let labels = labels(&dir.join("scene"), &dir.join("store"))?;
     let start = truth.start();
     for (index, placed) in layout.placed.iter().enumerate().filter(|(_, placed)| !placed.shell) {
@@ -106,7 +115,7 @@ fn judge(args: &GoalArgs, dir: &Path, layout: &Layout, report: &mut GoalReport) 
                 let asked = Instant::now();
                 let reply = service.get(&goal_request(&format!("id={id}"), start, args.radius_m))?;
                 report.millis.push(asked.elapsed().as_secs_f64() * 1e3);
-                verdict(&truth, index, &reply)?
+                verdict(truth, index, &reply)?
             }
         };
         let noun = &NOUNS[placed.noun].name;
@@ -192,12 +201,18 @@ impl Verdict {
     }
 }
 
-#[derive(Clone, Debug, Default, Serialize)]
+/// Figures of all scenes: of places, or of the whole road.
+#[derive(Clone, Debug, Serialize)]
 pub(crate) struct GoalReport {
     scenes: Vec<String>,
-    /// In place of the other figures, where they were not asked for.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(flatten)]
+    places: Option<Places>,
+    #[serde(flatten)]
     road: Option<Road>,
+}
+
+#[derive(Clone, Debug, Default, Serialize)]
+struct Places {
     voxels: Voxels,
     /// Things that the robot truly reaches: places within reach from which they are shown.
     n_reachable: usize,
@@ -221,7 +236,7 @@ pub(crate) struct GoalReport {
     millis: Vec<f64>,
 }
 
-impl GoalReport {
+impl Places {
     fn count(&mut self, radius_m: f64, is_reachable: bool, verdict: &Verdict) {
         if let Verdict::Pose { clearance_m, is_reached, height_error_m, .. } = verdict {
             self.n_poses += 1;
@@ -246,17 +261,25 @@ impl GoalReport {
 
 impl fmt::Display for GoalReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Voxels { n_free, n_false, len_bytes } = self.voxels;
         writeln!(f, "{} scenes: {}\n", self.scenes.len(), self.scenes.join(", "))?;
         let mut table = Table::new(["figure", "n", "of them"]);
         let mut row = |name: &str, n: String, of: String| table.row([name.to_owned(), n, of]);
+        if let Some(places) = &self.places {
+            places.tell(&mut row);
+        }
         if let Some(Road { n_photos, n_located, n_runs, n_shown, n_hidden }) = self.road {
             row("photos", n_photos.to_string(), format!("{n_located} located"));
             let shown = percent(n_shown as u64, n_runs as u64);
             let ends = format!("{n_shown} end where it is shown: {shown}; {n_hidden} where it is not");
             row("runs, a photo and a word each", n_runs.to_string(), ends);
-            return write!(f, "{table}");
         }
+        write!(f, "{table}")
+    }
+}
+
+impl Places {
+    fn tell(&self, row: &mut impl FnMut(&str, String, String)) {
+        let Voxels { n_free, n_false, len_bytes } = self.voxels;
         row("free voxels", n_free.to_string(), format!("{n_false} false: {}", percent(n_false, n_free)));
         row("bytes of occupancy in each profile", len_bytes.to_string(), String::new());
         let share = percent(self.n_shown as u64, self.n_reachable as u64);
@@ -274,7 +297,6 @@ impl fmt::Display for GoalReport {
         let times = Times::of(self.millis.clone());
         let millis = format!("{:.1} ms median, {:.1} ms at most", times.median_ms, times.max_ms);
         row("requests", times.n.to_string(), millis);
-        write!(f, "{table}")
     }
 }
 
