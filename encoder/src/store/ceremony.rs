@@ -178,9 +178,6 @@ impl MetadataReader {
 }
 
 /// Signs a draft with all keys of a folder, and returns how many these are.
-///
-/// # Errors
-/// [`StoreError::RootDraft`] if it is no root; [`StoreError`] otherwise.
 pub(crate) fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, StoreError> {
     let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
     let bytes = fs_err::read(draft)?;

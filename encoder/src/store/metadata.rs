@@ -215,9 +215,6 @@ impl Metadata {
     }
 
     /// Makes keys and the first root. `root_folder`: where root's keys lie, `n_root_keys` of them.
-    ///
-    /// # Errors
-    /// [`StoreError::HasRoot`]; [`StoreError`] otherwise.
     pub(crate) fn make_root(
         &self,
         root_folder: &Path,
@@ -300,9 +297,6 @@ pub(super) fn signing_time(clock_unix_secs: u64) -> u64 {
 }
 
 /// Reads a metadata file of a store by the name that clients ask for; `None` if there is no such file.
-///
-/// # Errors
-/// [`StoreError::Io`]; [`StoreError::Metadata`] for one that is too long.
 pub(crate) fn read_published(store: &Path, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
     let max_bytes = match name.split_once('.') {
         Some(("timestamp", "json")) => MAX_TIMESTAMP_BYTES,

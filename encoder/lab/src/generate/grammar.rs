@@ -162,9 +162,6 @@ fn exactly<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; 
 
 impl Noun {
     /// Parses an object file's text.
-    ///
-    /// # Errors
-    /// The number of the wrong line, and what is wrong.
     fn parse(name: String, text: &str) -> Result<Self, String> {
         let mut noun = Self {
             name,
