@@ -113,7 +113,6 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
     Ok(response)
 }
 
-/// Answers in any format of this build.
 pub struct Formats;
 
 impl Described for Formats {

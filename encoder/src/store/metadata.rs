@@ -41,7 +41,6 @@ pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 pub(crate) struct Refreshed {
     pub(crate) timestamp_version: u64,
     pub(crate) snapshot_version: u64,
-    /// When clients refuse it, seconds since 1970.
     pub(crate) expires_unix_secs: u64,
 }
 
@@ -281,7 +280,6 @@ impl Metadata {
     }
 }
 
-/// Returns the system's time, seconds since 1970.
 pub(crate) fn clock_unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }

@@ -74,7 +74,6 @@ enum Change {
     Covered,
 }
 
-/// A scene, its map and its queries.
 struct Located {
     name: String,
     /// The scene as a robot has it.
@@ -207,7 +206,6 @@ fn on_board(scene: &Gaussians) -> Gaussians {
     on_board
 }
 
-/// Locates a photo in a scene's map.
 fn attempt(
     scene: &Located,
     view: &View,

@@ -53,7 +53,6 @@ impl Workspace {
         device.buffer("staging", bytes, Usage::MAP_READ | Usage::COPY_DST)
     }
 
-    /// Returns whether a band of this size fits.
     pub fn holds(&self, n_tiles: u32, n_px: u32) -> bool {
         n_tiles <= self.n_tiles && n_px <= self.n_px
     }
