@@ -57,26 +57,30 @@ fn logits(blob: &Blob) -> Vec<f32> {
 /// Returns synthetic answers to `n` prompts. Many objects repeat; some are soft, have a low predicted IoU, are
 /// cut, or have holes or islands.
 fn blobs(n: usize, seed: u64, extent: [f64; 2]) -> Vec<Blob> {
-    let mut random = Random::new(seed);
+    let mut state = seed;
+    let mut random = move || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / (1_u64 << 31) as f64
+    };
     let mut blobs: Vec<Blob> = Vec::new();
     for k in 0..3 * n {
-        let again = k > 6 && random.unit() < 0.4;
+        let again = k > 6 && random() < 0.4;
         let mut blob = match again {
-            true => blobs[(random.unit() * blobs.len() as f64) as usize],
+            true => blobs[(random() * blobs.len() as f64) as usize],
             false => Blob {
-                centre: [random.unit() * extent[0], random.unit() * extent[1]],
-                radius: 12.0 + 40.0 * random.unit(),
-                slope: 0.2 + 1.5 * random.unit() * random.unit(),
+                centre: [random() * extent[0], random() * extent[1]],
+                radius: 12.0 + 40.0 * random(),
+                slope: 0.2 + 1.5 * random() * random(),
                 spot: None,
                 predicted_iou: 0.0,
             },
         };
-        blob.radius += 6.0 * random.unit();
-        blob.predicted_iou = (0.8 + 0.2 * random.unit()) as f32;
+        blob.radius += 6.0 * random();
+        blob.predicted_iou = (0.8 + 0.2 * random()) as f32;
         let to_side = |part: f64| [blob.centre[0] + part * blob.radius, blob.centre[1]];
-        blob.spot = match (random.unit() * 5.0) as u32 {
-            0 => Some((to_side(0.3), 3.0 + 5.0 * random.unit(), -3.0)),
-            1 => Some((to_side(1.6), 4.0 + 5.0 * random.unit(), 3.0)),
+        blob.spot = match (random() * 5.0) as u32 {
+            0 => Some((to_side(0.3), 3.0 + 5.0 * random(), -3.0)),
+            1 => Some((to_side(1.6), 4.0 + 5.0 * random(), 3.0)),
             _ => None,
         };
         blobs.push(blob);
@@ -429,7 +433,7 @@ fn healing_of_noise_equals_a_plain_recomputation() {
         let [width, height] = [1 + round % 19, 1 + round % 13];
         let density = 0.2 + 0.6 * random.unit();
         let inside: Vec<bool> = (0..width * height).map(|_| random.unit() < density).collect();
-        let min_region_px = (random.between(0.0, 12.0)) as u32;
+        let min_region_px = (random.unit() * 12.0) as u32;
         let mut runs = Vec::new();
         for (y, row) in inside.chunks_exact(width).enumerate() {
             // Runs must be disjoint: each begins after a pixel outside.
