@@ -15,11 +15,9 @@ use slag_test_support::{memory_of, shared_folder};
 
 /// Memory a decoder may take in addition to [`MAX_EXPANSION`] times its input: buffers and small images.
 const FREE_BYTES: usize = 64 << 20;
-/// Largest ratio of a decoder's memory to its input.
 const MAX_EXPANSION: usize = 256;
 /// Mutations of each target; targets that write files and decode images take the longest.
 const N_MUTATIONS: u64 = 3000;
-/// Values at the boundaries of integer types.
 const INTERESTING: [u64; 12] =
     [0, 1, 2, 0x7f, 0x80, 0xff, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, u64::MAX >> 1, u64::MAX];
 

@@ -121,7 +121,6 @@ pub(crate) fn damaged(offset: usize, what: impl Into<String>) -> ContainerError 
     ContainerError::Damaged { offset_bytes: offset as u64, what: what.into() }
 }
 
-/// The places of a checked container's sections.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Layout {
     sections: Vec<(u32, Range<usize>)>,
@@ -176,7 +175,6 @@ impl Layout {
         Ok(Self { sections })
     }
 
-    /// Returns the place of a section, if it exists.
     pub fn find(&self, id: u32) -> Option<Range<usize>> {
         self.sections.iter().find(|(other, _)| *other == id).map(|(_, range)| range.clone())
     }

@@ -117,7 +117,6 @@ impl BuiltLandmarks {
     }
 }
 
-/// Where the columns of a shard's checked landmarks lie.
 #[derive(Clone, Debug)]
 pub(crate) struct LandmarksLayout {
     header: Range<usize>,

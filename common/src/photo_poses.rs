@@ -89,7 +89,6 @@ impl BuiltPhotoPoses {
     }
 }
 
-/// Where the columns of a shard's checked photos lie.
 #[derive(Clone, Debug)]
 pub(crate) struct PhotoPosesLayout {
     poses: Range<usize>,

@@ -21,7 +21,6 @@ pub const MAX_PHOTO_BYTES: usize = 32 << 20;
 const MAX_SIDE_PX: u32 = 16_384;
 const MAX_PX: u64 = 50_000_000;
 
-/// Why a photo cannot be located at all.
 #[derive(Debug, thiserror::Error)]
 pub enum LocateError {
     #[error("no photo: {0}; give a JPEG, PNG or WebP")]

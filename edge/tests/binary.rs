@@ -75,7 +75,6 @@ fn fetched((listed, shard): (Vec<u8>, Vec<u8>)) -> tempfile::TempDir {
     dir
 }
 
-/// Starts a service; returns its process and its address.
 fn serve(cache: &Path, args: &[&str]) -> (Child, String) {
     let mut serving = slag_edge(cache, &[&["serve", "--listen", "127.0.0.1:0"], args].concat());
     let mut serving = serving.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
@@ -85,7 +84,6 @@ fn serve(cache: &Path, args: &[&str]) -> (Child, String) {
     (serving, url)
 }
 
-/// Ends a service and returns its log.
 fn stop(mut serving: Child) -> String {
     let killed = Command::new("kill").args(["-TERM", &serving.id().to_string()]).status().expect("runs");
     assert!(killed.success());

@@ -95,7 +95,6 @@ impl Bucket {
         self.is_local
     }
 
-    /// Returns the threads that wait for the network.
     pub(crate) fn runtime(&self) -> &Arc<Runtime> {
         &self.runtime
     }

@@ -200,7 +200,6 @@ pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
     CellSplit { cells, cell_of_gaussian, local_of_gaussian, n_rejected, n_for_precision }
 }
 
-/// What becomes of a part of the scene.
 enum Next {
     /// Cut before this many Gaussians of the part, which is in order; `for_precision`: only exact positions ask
     /// for it.

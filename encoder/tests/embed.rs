@@ -14,7 +14,6 @@ struct Labelled {
     photo: RgbImage,
     /// Instance of each pixel.
     labels: Vec<u8>,
-    /// A mask per instance of 200 pixels or more.
     masks: Vec<(u8, Mask)>,
 }
 

@@ -91,7 +91,6 @@ fn workers_leave_nothing_and_do_not_mix() {
     assert!(refused.contains("7.0.0") && refused.contains("install the same program"), "{refused}");
 }
 
-/// Returns what a worker that must fail prints.
 fn worker_output(command: &mut Command) -> String {
     let output = command.output().expect("starts");
     assert_eq!(output.status.code(), Some(1), "{command:?}");

@@ -13,7 +13,6 @@ pub struct Authority {
 }
 
 impl Authority {
-    /// Makes an authority, and writes its certificate.
     pub fn new(file: PathBuf) -> Self {
         let mut params = CertificateParams::default();
         params.distinguished_name.push(DnType::CommonName, text(&file));
@@ -23,7 +22,6 @@ impl Authority {
         Self { issuer: Issuer::new(params, key), file }
     }
 
-    /// Writes a certificate for this machine, and its key.
     pub fn issue(&self, cert: &Path, key: &Path) {
         let own = KeyPair::generate().expect("a key");
         let params = CertificateParams::new(["127.0.0.1".to_owned()]).expect("an address");

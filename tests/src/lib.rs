@@ -55,7 +55,6 @@ pub fn lab(args: &[&str]) -> Command {
     command("slag-lab", args)
 }
 
-/// Returns a command of the robot's program.
 pub fn edge(args: &[&str]) -> Command {
     let mut command = command("slag-edge", args);
     // Not this machine's own configuration.

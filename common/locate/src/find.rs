@@ -11,7 +11,6 @@ use crate::pose::{Match, Pinhole, covariance};
 use crate::ransac::{Agreed, INLIER_PX, locally_refined, ransac};
 use crate::render::{Compared, Renderer};
 
-/// Fewest features with which a place can be recognised.
 const MIN_FEATURES: usize = 20;
 /// Fewest inliers of a pose that no rendering verifies; of photos of other scenes 15 agree at most.
 const MIN_INLIERS: usize = 20;

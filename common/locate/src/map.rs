@@ -64,7 +64,6 @@ pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Returns the median of points, along each axis.
 pub(crate) fn middle(points: Vec<DVec3>) -> DVec3 {
     DVec3::from([0, 1, 2].map(|axis| median(points.iter().map(|point| point[axis]).collect())))
 }

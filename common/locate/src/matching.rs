@@ -119,7 +119,6 @@ impl Query {
     }
 }
 
-/// Returns views by their votes, those with most first.
 fn ranked(votes: BTreeMap<u16, usize>) -> Vec<u16> {
     let mut views: Vec<(u16, usize)> = votes.into_iter().collect();
     views.sort_by_key(|(view, n)| (std::cmp::Reverse(*n), *view));

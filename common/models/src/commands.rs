@@ -87,7 +87,6 @@ impl RunArgs {
 /// The calling program's side of the commands.
 pub struct Context<'a> {
     pub variable: &'a dyn Fn(&str) -> Option<std::ffi::OsString>,
-    /// Which files of a model are pulled.
     pub side: Side,
     pub ask: &'a dyn Fn(&str) -> bool,
 }

@@ -5,7 +5,6 @@ use std::path::Path;
 use crate::description::{Description, DescriptionError, FILE_NAME, FileRef, read_toml};
 use crate::sam::SamDescription;
 
-/// The description of a model directory of either kind.
 pub(crate) enum Described {
     Encoders(Box<Description>),
     Segmenter(Box<SamDescription>),

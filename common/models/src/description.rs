@@ -129,7 +129,6 @@ pub struct ImageDescription {
     pub output: Option<String>,
     /// Edge length of the model's input square, in pixels.
     pub size_px: u16,
-    /// How crops are resized to that square.
     pub resize: Resize,
     #[serde(default)]
     pub filter: Filter,
@@ -166,7 +165,6 @@ impl ImageDescription {
         self.patches.as_ref().map(|patches| u32::from(self.size_px / patches.patch_px.max(1)))
     }
 
-    /// Returns the steps from a crop to pixel values.
     pub fn preprocess(&self) -> Preprocess {
         Preprocess::new(u32::from(self.size_px), self.resize, self.filter, self.mean, self.std)
     }

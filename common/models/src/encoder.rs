@@ -8,7 +8,6 @@ use crate::error::InferenceError;
 use crate::placement::Placement;
 use crate::synonyms::KnownPhrases;
 
-/// Turns crops of photographs into unit vectors.
 pub trait ImageEncoder: Send {
     fn dim(&self) -> usize;
 

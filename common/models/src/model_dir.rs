@@ -135,7 +135,6 @@ impl ModelDir {
         Self { id, source: Source::Colours }
     }
 
-    /// Returns the identity of the embedding space.
     pub fn encoder_id(&self) -> &EncoderId {
         &self.id
     }

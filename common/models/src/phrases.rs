@@ -9,7 +9,6 @@ use crate::error::{InferenceError, ModelError, PhrasesError};
 use crate::synonyms::{KnownPhrases, key, singulars, without_hyphens};
 use crate::{tensors, text::centred};
 
-/// Number of suggestions for an unknown phrase.
 const N_NEAR: usize = 5;
 
 /// Longer texts are sentences, not misspelt phrases: they get no suggestions.

@@ -13,7 +13,6 @@ use ort::value::{DynTensor, TensorElementType};
 use crate::floats::bytes_mut;
 use crate::provider::Provider;
 
-/// The providers that a model's nodes run on.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Placement {
     provider: Provider,

@@ -65,7 +65,6 @@ pub(crate) fn values_of_levels(mean: [f64; 3], std: [f64; 3]) -> [[f32; 256]; 3]
     std::array::from_fn(|c| std::array::from_fn(|level| value(c, level)))
 }
 
-/// The steps from a crop to pixel values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Preprocess {
     size_px: u32,
@@ -86,7 +85,6 @@ impl Preprocess {
         Self { resize: Resize::Stretch, ..self.clone() }
     }
 
-    /// Returns the edge length of the square, in pixels.
     pub fn size_px(&self) -> u32 {
         self.size_px
     }

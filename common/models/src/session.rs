@@ -88,7 +88,6 @@ pub(crate) struct Model {
     memory: Option<DeviceMemory>,
 }
 
-/// An input or output of a model.
 pub(crate) struct Slot {
     pub name: String,
     pub element: TensorElementType,

@@ -17,7 +17,6 @@ use crate::{
     synonyms::KnownPhrases,
 };
 
-/// Turns text into the token ids of one model.
 #[derive(Debug)]
 pub struct Tokens {
     path: PathBuf,

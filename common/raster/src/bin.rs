@@ -13,7 +13,6 @@ const CHUNK: usize = 4096;
 /// Gaussians of a tile above which all threads sort it together.
 const MANY: usize = 1 << 16;
 
-/// The Gaussians of every tile of an image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tiles {
     /// Rows of tiles, top to bottom. Each has one bucket per tile, left to right, with indices into the visible

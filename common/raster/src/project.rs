@@ -72,7 +72,6 @@ pub struct Projection {
     /// Gaussians with at least one pixel centre of the image in the bounding box of their footprint, in scene
     /// order.
     pub visible: Vec<ScreenGaussian>,
-    /// Number of Gaussians that cannot be drawn.
     pub unusable: usize,
 }
 

@@ -230,7 +230,6 @@ impl Access {
         origin.to_str().is_ok_and(|origin| self.is_given(origin)).then(|| origin.clone())
     }
 
-    /// Lets the pages of an origin read an answer.
     pub(crate) fn allow(response: &mut Response, origin: HeaderValue) {
         let headers = response.headers_mut();
         headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, origin);

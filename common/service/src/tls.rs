@@ -25,7 +25,6 @@ pub struct TlsFiles {
     pub key: PathBuf,
 }
 
-/// The file that is of no use.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
     #[error("{}: {cause}, expected {expected} in PEM", path.display())]
@@ -54,7 +53,6 @@ struct Certificate {
     state: Mutex<ReadPair>,
 }
 
-/// Makes TLS connections out of accepted ones.
 #[derive(Clone)]
 pub struct Tls(TlsAcceptor);
 

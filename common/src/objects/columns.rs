@@ -148,7 +148,6 @@ const MAX_STEP: f32 = 4096.0;
 /// Largest error of a score: the longest difference of two vectors of about unit length.
 const MAX_ERROR: f32 = 4.0;
 
-/// Where the columns of a shard's checked objects lie.
 #[derive(Clone, Debug)]
 pub(crate) struct ObjectsLayout {
     header: ObjectsHeader,

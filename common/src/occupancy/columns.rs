@@ -177,7 +177,6 @@ const MAX_BLOCKS: u64 = 1 << 27;
 const MAX_BLOCK: i64 = 1 << 28;
 const MAX_VOXEL: f64 = 1e6;
 
-/// Where the columns of a shard's checked occupancy lie.
 #[derive(Clone, Debug)]
 pub(crate) struct OccupancyLayout {
     header: OccupancyHeader,

@@ -17,7 +17,6 @@ fn checked(bytes: &AlignedBytes) -> Result<Option<OccupancyLayout>, ContainerErr
     OccupancyLayout::check(bytes, &Layout::check(bytes, MAGIC, 1).expect("a container"))
 }
 
-/// Blocks of every kind around the origin, with gaps.
 fn blocks(random: &mut Random, n: i32) -> Vec<Block> {
     let mut all = Vec::new();
     for at in (-n..n).flat_map(|x| (-n..n).flat_map(move |y| (-n..n).map(move |z| [x, y, z]))) {

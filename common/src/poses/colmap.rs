@@ -91,7 +91,6 @@ pub(super) fn largest_model(folder: &Path) -> Option<PathBuf> {
     largest(models(folder).into_iter()).map(|(_, model)| model)
 }
 
-/// Returns the first of the models with most images.
 fn largest(models: impl Iterator<Item = (u64, PathBuf)>) -> Option<(u64, PathBuf)> {
     models.reduce(|best, model| if model.0 > best.0 { model } else { best })
 }
@@ -259,7 +258,6 @@ impl Lines {
     }
 }
 
-/// Splits off the next word and parses it.
 fn take<T: std::str::FromStr>(rest: &mut &str, expected: &'static str) -> Result<T, PoseProblem> {
     let trimmed = rest.trim_start();
     let (word, after) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));

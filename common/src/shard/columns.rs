@@ -91,7 +91,6 @@ pub struct ExactColumns<'a> {
 /// Residuals with 8 bits a component: a Gaussian's take an eighth of the bytes of its embedding.
 #[derive(Clone, Copy, Debug)]
 pub struct Fine<'a> {
-    /// Measured errors of scores from fine residuals.
     pub errors: ScoreErrors,
     /// `[m]`.
     pub steps: &'a [f32],
@@ -174,7 +173,6 @@ impl ShardView<'_> {
         self.centroid_starts[self.header.n_centroids as usize] as usize
     }
 
-    /// Returns the box around the Gaussians' extents.
     pub fn bounds(&self) -> Aabb {
         Aabb { min: self.header.box_min.into(), max: self.header.box_max.into() }
     }

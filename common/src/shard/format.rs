@@ -11,7 +11,6 @@ pub const VERSION: u32 = 2;
 pub const BLOCK: usize = 32;
 /// Codewords of a subspace: a code takes half a byte.
 pub const CODEWORDS: usize = 16;
-/// Largest number of subspaces of a residual code.
 pub const MAX_SUBSPACES: usize = 128;
 /// Largest `dim` accepted: more than any text-image model has.
 pub const MAX_DIM: usize = 8192;

@@ -86,7 +86,6 @@ impl IndexColumn {
         Self { header: IndicesHeader { least, width_bits }, words }
     }
 
-    /// Returns the column as readers see it.
     pub fn view(&self) -> PackedIndices<'_> {
         PackedIndices { header: self.header, words: &self.words }
     }

@@ -1,4 +1,5 @@
 use glam::DVec3;
+use slag_math::random::Random;
 
 use super::sample::{self, SampleShard};
 use super::*;
@@ -160,21 +161,12 @@ fn consecutive_gaussians_of_an_object_are_a_run() {
 #[test]
 fn rounded_vectors_keep_scores() {
     let dim = 64;
-    let mut state = 5u64;
-    let mut random = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-        (state >> 40) as f32 / (1 << 23) as f32 - 1.0
-    };
-    let mut unit = || {
-        let v: Vec<f32> = (0..dim).map(|_| random()).collect();
-        let length = v.iter().map(|c| c * c).sum::<f32>().sqrt();
-        v.into_iter().map(|c| c / length).collect::<Vec<f32>>()
-    };
-    let vectors: Vec<f32> = (0..3).flat_map(|_| unit()).collect();
+    let mut random = Random::new(5);
+    let vectors: Vec<f32> = (0..3).flat_map(|_| random.unit_vector(dim)).collect();
     let (rounded, steps) = quantise_vectors(&vectors, dim, 5);
     assert_eq!((rounded.len(), steps.len()), (5 * dim, 5));
     for _ in 0..50 {
-        let query = unit();
+        let query = random.unit_vector(dim);
         let product =
             |v: &mut dyn Iterator<Item = f64>| -> f64 { v.zip(&query).map(|(v, q)| v * f64::from(*q)).sum() };
         let exact: Vec<f32> =

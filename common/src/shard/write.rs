@@ -17,7 +17,6 @@ pub struct Additions<'a> {
     pub objects: Option<Objects<'a>>,
     /// How its Gaussians look.
     pub appearance: Option<Appearance<'a>>,
-    /// Which places of its cell are free.
     pub occupancy: Option<Occupancy<'a>>,
     /// Where the photos of its cell were taken.
     pub photo_poses: Option<PhotoPoses<'a>>,

@@ -5,7 +5,6 @@ use std::fmt::{self, Display};
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Why a splat file could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum SplatError {
     #[error("{cause}; check the path and its permissions")]

@@ -9,7 +9,6 @@ use crate::files;
 /// Large enough to make system calls negligible, small compared with the columns.
 const BUFFER_BYTES: usize = 1 << 18;
 
-/// A file open for reading, with its current offset.
 pub(super) struct Input {
     reader: BufReader<fs_err::File>,
     path: PathBuf,
@@ -75,7 +74,6 @@ impl Input {
         Ok(())
     }
 
-    /// Checks that at least `n` bytes remain.
     pub fn require(&self, n: u64, what: &str) -> Result<(), SplatError> {
         if n <= self.remaining_bytes() {
             return Ok(());

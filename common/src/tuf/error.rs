@@ -1,6 +1,5 @@
 //! Reasons to refuse metadata, by the attack that they stop.
 
-/// Why metadata or a file is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TufError {
     #[error("{role} metadata: {what}; check that the address is that of a slag-encoder store")]

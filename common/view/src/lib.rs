@@ -43,7 +43,6 @@ const POLICY: &str = include_str!("csp.txt");
 const NOT_BUILT: &str =
     "this program was built without its page; run scripts/build-page.sh and build the program again";
 
-/// Whether the page was built into this program.
 pub fn is_built() -> bool {
     !FILES.is_empty()
 }

@@ -20,9 +20,6 @@ const MAX_BODY_BYTES: usize = 4 << 20;
 /// A request names one of `hosts`, this machine or the address listened on: a page that made its own name point
 /// here (DNS rebinding) names itself. Requests of web pages (`Origin`) are refused. There are no sessions, so
 /// nothing is kept between requests.
-///
-/// # Errors
-/// Requests that were cut off at the end.
 pub async fn serve(
     tools: Tools,
     listener: Listener,

@@ -16,7 +16,6 @@ use crate::reply::{PointAnswer, Reply};
 
 /// Longest reply that is read: ten thousand answers are 10 MB.
 const MAX_REPLY_BYTES: u64 = 64 << 20;
-/// Time for a request and its reply.
 const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A robot's `slag-edge serve`. Calls block.

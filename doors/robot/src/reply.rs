@@ -15,7 +15,6 @@ pub struct Reply<A = Answer> {
     pub frame: String,
     /// `m`, or `world` for scenes whose scale is unknown.
     pub unit: String,
-    /// One for each question, in their order.
     pub results: Vec<Results<A>>,
 }
 
@@ -64,7 +63,6 @@ pub struct Answer {
     pub distance: Option<f64>,
     /// How well the relation holds, 0 to 1.
     pub degree: Option<f64>,
-    /// The things that the relation holds with.
     #[serde(default)]
     pub related_to: Vec<Witness>,
 }

@@ -98,7 +98,6 @@ impl Rigid {
         (self.rotation * DVec3::from_array(point) + self.translation).to_array()
     }
 
-    /// Returns the angle that this motion turns by, radians.
     pub fn angle(self) -> f64 {
         self.rotation.angle_between(DQuat::IDENTITY)
     }
@@ -116,7 +115,6 @@ impl Rigid {
         Pose { position: self.origin().into(), orientation: self.quaternion() }
     }
 
-    /// Returns the place of the child's origin.
     pub fn origin(self) -> [f64; 3] {
         self.translation.to_array()
     }

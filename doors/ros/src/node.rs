@@ -34,7 +34,6 @@ use crate::transforms::Transforms;
 const KEPT: usize = 4;
 /// Longest pause for subscribers that do not keep up.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
-/// Longest wait until a goal is cancelled.
 const STOP_TIMEOUT: Duration = Duration::from_secs(3);
 /// Time for what was written last to leave the process.
 const SEND_TIME: Duration = Duration::from_millis(500);

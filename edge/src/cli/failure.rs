@@ -44,7 +44,6 @@ impl Failure {
         move |error| Self::Failed(kind, error)
     }
 
-    /// Returns what went wrong, in one line.
     pub fn text(&self) -> String {
         match self {
             Self::BrokenPipe => String::new(),

@@ -31,7 +31,6 @@ pub struct FollowSettings {
     pub radius: f64,
     /// Distance fetched beyond the radius, world units.
     pub margin: f64,
-    /// Shortest time between the starts of two fetches.
     pub min_interval: Duration,
     /// Interval at which a resting robot looks for a new generation; absent: never.
     pub refresh: Option<Duration>,
@@ -66,7 +65,6 @@ pub enum Decision {
 #[derive(Clone, Debug)]
 pub struct Follower {
     settings: FollowSettings,
-    /// Centre and time of the last successful fetch.
     covered: Option<(DVec3, Duration)>,
     attempted: Option<Duration>,
     n_failures: u32,

@@ -163,7 +163,6 @@ fn scene_height(manifest: &Manifest, point: DVec3) -> f64 {
     nearest.map_or(point.z, |bounds| bounds.centre().z)
 }
 
-/// Reasons for which a fetch cannot be planned.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PlanError {
     #[error("{name} is {value}, expected {expected}")]

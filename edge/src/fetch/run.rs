@@ -49,7 +49,6 @@ struct Locked<'a> {
     records: Records,
     usage: Usage,
     last: LastFetch,
-    /// The generation on board, and its manifest.
     current: Option<Current>,
     on_board: Option<Offer>,
 }

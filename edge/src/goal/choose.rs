@@ -169,7 +169,6 @@ impl<'a> Target<'a> {
     }
 }
 
-/// What a sensor at a candidate sees.
 struct Look {
     of: Candidate,
     position_in_world: DVec3,

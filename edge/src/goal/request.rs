@@ -109,7 +109,6 @@ impl Default for Stand {
     }
 }
 
-/// A request for places to stand near a thing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GoalRequest {
     pub target: GoalTarget,

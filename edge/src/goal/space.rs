@@ -45,7 +45,6 @@ impl Window {
         Self { voxel, first, n }
     }
 
-    /// Returns the voxels along x and y.
     pub fn cells(&self) -> [usize; 2] {
         self.n.map(|n| n * BLOCK_EDGE as usize)
     }

@@ -27,7 +27,6 @@ pub struct App {
     query_memory: Arc<Pool>,
     pub(super) metrics: Metrics,
     pub(super) following: Option<Arc<Following>>,
-    /// A permit for each client of `GET /v1/events`.
     pub(super) listeners: Arc<Semaphore>,
     /// Whether the service stops: what never ends by itself ends then.
     pub(super) stopping: watch::Sender<bool>,

@@ -4,7 +4,7 @@ use axum::http::HeaderMap;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::forms::{self, BoxText, LatLonPolygonText, LatLonText, NegativesText, PolygonText, XyzText};
+use super::forms::{self, AreaParams, LatLonText, NegativesText, XyzText};
 use crate::query::{
     AnswerKind, Ask, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Format, MAX_GAUSSIANS, MAX_NEGATIVES, MAX_TEXTS,
     Negatives, RequestError, Words,
@@ -51,16 +51,6 @@ pub struct AskParams {
     /// Only within this distance of the asker, world units.
     #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
     radius: Option<f64>,
-    /// Only between two opposite corners.
-    #[serde(rename = "box")]
-    #[schemars(example = &"0,0,0,4,3,2")]
-    bounds: Option<BoxText>,
-    /// Only inside this outline of 3 to 256 corners, seen from above.
-    #[schemars(example = &"0,0,4,0,4,3")]
-    polygon: Option<PolygonText>,
-    /// The same on the earth.
-    #[schemars(example = &"46.8,-92.1,46.8,-92,46.9,-92")]
-    polygon_lat_lon: Option<LatLonPolygonText>,
     /// Least Gaussians of an answer; smaller clusters are counted.
     #[schemars(range(min = 1), extend("default" = DEFAULT_MIN_COUNT), example = 10)]
     min_count: Option<u64>,
@@ -104,7 +94,7 @@ pub struct ShortParams {
 
 impl AskParams {
     /// Returns the questions as the body of a POST asks them.
-    pub fn ask(self) -> Result<Ask, RequestError> {
+    pub fn ask(self, area: AreaParams) -> Result<Ask, RequestError> {
         let near = forms::point(self.near, self.near_lat_lon)?;
         let ball = match (self.radius, near) {
             (None, _) => None,
@@ -114,7 +104,7 @@ impl AskParams {
                 return Err(RequestError::new("near", "nothing", expected));
             }
         };
-        let region = forms::area(ball, self.bounds, self.polygon, self.polygon_lat_lon)?;
+        let region = area.area(ball)?;
         Ok(Ask {
             texts: self.text,
             relations: Some(self.relations == Switch::On),
@@ -137,8 +127,8 @@ impl AskParams {
 
 impl ShortParams {
     /// Returns the questions of `/query`: what `/v1/query` takes, with answers that come at once.
-    pub fn ask(self, params: AskParams, headers: &HeaderMap) -> Result<Ask, RequestError> {
-        let mut ask = params.ask()?;
+    pub fn ask(self, params: AskParams, area: AreaParams, headers: &HeaderMap) -> Result<Ask, RequestError> {
+        let mut ask = params.ask(area)?;
         let twice = |parameter: &str, other: &str| {
             Err(RequestError::new(parameter, &format!("{other} as well"), "one of the two"))
         };

@@ -2,14 +2,15 @@
 
 use glam::DVec3;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::de::{Deserialize, Deserializer, Error};
+use serde::Deserialize;
+use serde::de::{Deserializer, Error};
 use slag_common::frames::Aabb;
 
 use crate::query::{
     Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, object_id, parse_box,
     parse_point,
 };
-use crate::score::MAX_CORNERS;
+use crate::score::{MAX_COORDINATE, MAX_CORNERS};
 
 /// A number as it stands between commas.
 const NUMBER: &str = r"-?[0-9]{1,9}(\.[0-9]{1,9})?";
@@ -95,9 +96,6 @@ fn id(text: &str) -> Result<u64, &'static str> {
 }
 
 /// Returns the point that is given in one of two ways.
-///
-/// # Errors
-/// It is given in both.
 pub fn point(near: Option<XyzText>, near_lat_lon: Option<LatLonText>) -> Result<Option<Point>, RequestError> {
     let world = near.map(|XyzText(point)| Point::World(point.to_array()));
     match (world, near_lat_lon.map(|LatLonText(point)| Point::Geographic(point))) {
@@ -106,40 +104,65 @@ pub fn point(near: Option<XyzText>, near_lat_lon: Option<LatLonText>) -> Result<
     }
 }
 
-/// Returns the area of a ball, a box and a polygon, each of which may be absent.
-///
-/// # Errors
-/// The polygon is given in two ways.
-pub fn area(
-    ball: Option<(Point, f64)>,
+/// Where what is asked for lies, besides a ball.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+pub struct AreaParams {
+    /// Only between two opposite corners.
+    #[serde(rename = "box")]
+    #[schemars(example = &"0,0,0,4,3,2")]
     bounds: Option<BoxText>,
+    /// Only inside this outline of 3 to 256 corners, seen from above.
+    #[schemars(example = &"0,0,4,0,4,3")]
     polygon: Option<PolygonText>,
+    /// The same on the earth.
+    #[schemars(example = &"46.8,-92.1,46.8,-92,46.9,-92")]
     polygon_lat_lon: Option<LatLonPolygonText>,
-) -> Result<Area, RequestError> {
-    let corner = |corner: DVec3| Point::World(corner.to_array());
-    let polygon = match (polygon, polygon_lat_lon) {
-        (Some(_), Some(_)) => {
-            return Err(RequestError::new("polygon_lat_lon", "polygon as well", "one of the two"));
-        }
-        (world, geographic) => world.map(|of| of.0).or(geographic.map(|of| of.0)).unwrap_or_default(),
-    };
-    Ok(Area {
-        ball: ball.map(|(centre, radius)| AreaBall { centre, radius }),
-        bounds: bounds.map(|BoxText(of)| AreaBox { from: corner(of.min), to: corner(of.max) }),
-        polygon,
-    })
 }
 
-/// Returns the ball of a point and a radius, both of which may be absent.
-///
-/// # Errors
-/// One is there without the other, or the radius is not positive.
-pub fn ball<P>(near: Option<P>, radius: Option<f64>) -> Result<Option<(P, f64)>, RequestError> {
-    match (near, radius) {
-        (None, None) => Ok(None),
-        (Some(near), Some(radius)) if radius > 0.0 && radius.is_finite() => Ok(Some((near, radius))),
-        (Some(_), Some(radius)) => Err(RequestError::new("radius", &radius.to_string(), "more than 0")),
-        (None, Some(_)) => Err(RequestError::new("near", "nothing", "x,y,z, because there is a radius")),
-        (Some(_), None) => Err(RequestError::new("radius", "nothing", "a number, because there is near")),
+impl AreaParams {
+    /// Returns the area of a ball, if there is one, and of these.
+    pub fn area(self, ball: Option<(Point, f64)>) -> Result<Area, RequestError> {
+        let corner = |corner: DVec3| Point::World(corner.to_array());
+        let polygon = match (self.polygon, self.polygon_lat_lon) {
+            (Some(_), Some(_)) => {
+                return Err(RequestError::new("polygon_lat_lon", "polygon as well", "one of the two"));
+            }
+            (world, geographic) => world.map(|of| of.0).or(geographic.map(|of| of.0)).unwrap_or_default(),
+        };
+        Ok(Area {
+            ball: ball.map(|(centre, radius)| AreaBall { centre, radius }),
+            bounds: self.bounds.map(|BoxText(of)| AreaBox { from: corner(of.min), to: corner(of.max) }),
+            polygon,
+        })
+    }
+}
+
+/// A ball, where near and radius are given.
+#[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
+pub struct BallParams {
+    /// With radius: only what lies within this distance; of a move, one end counts.
+    #[schemars(example = &"2,1.5,0")]
+    near: Option<XyzText>,
+    /// The same on the earth, WGS 84: lat,lon or lat,lon,height.
+    #[schemars(example = &"46.8,-92.1")]
+    near_lat_lon: Option<LatLonText>,
+    /// With near, world units.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
+    radius: Option<f64>,
+}
+
+impl BallParams {
+    /// # Errors
+    /// One is there without the other, or the radius is not positive.
+    pub fn ball(self) -> Result<Option<(Point, f64)>, RequestError> {
+        match (point(self.near, self.near_lat_lon)?, self.radius) {
+            (None, None) => Ok(None),
+            (Some(near), Some(radius)) if radius > 0.0 && radius.is_finite() => Ok(Some((near, radius))),
+            (Some(_), Some(radius)) => Err(RequestError::new("radius", &radius.to_string(), "more than 0")),
+            (None, Some(_)) => Err(RequestError::new("near", "nothing", "x,y,z, because there is a radius")),
+            (Some(_), None) => Err(RequestError::new("radius", "nothing", "a number, because there is near")),
+        }
     }
 }

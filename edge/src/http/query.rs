@@ -21,6 +21,7 @@ use tokio::sync::mpsc::{Receiver, Sender, channel};
 
 use super::app::App;
 use super::ask::{AskParams, ShortParams};
+use super::forms::AreaParams;
 use super::problem::query_problem;
 use crate::query::{AnswersOrBatch, Ask, Format, Page, RequestError};
 
@@ -40,24 +41,24 @@ const PLY: &str = "format=ply: a binary little-endian PLY with an element vertex
 pub fn parse_query(query_string: &str) -> Result<Ask, RequestError> {
     let uri: Result<Uri, _> = format!("/query?{query_string}").parse();
     let uri = uri.map_err(|e| RequestError::new("query string", &e.to_string(), "name=value pairs"))?;
-    let (params, short) = Params::<(AskParams, ShortParams)>::parse(&uri)?;
-    short.ask(params, &HeaderMap::new())
+    let (params, area, short) = Params::<(AskParams, AreaParams, ShortParams)>::parse(&uri)?;
+    short.ask(params, area, &HeaderMap::new())
 }
 
 pub async fn short(
     State(app): State<Arc<App>>,
     headers: HeaderMap,
-    params: Result<Params<(AskParams, ShortParams)>, Problem>,
+    params: Result<Params<(AskParams, AreaParams, ShortParams)>, Problem>,
 ) -> Result<As<Formats>, Problem> {
-    let ask = params.and_then(|Params((params, short))| Ok(short.ask(params, &headers)?));
+    let ask = params.and_then(|Params((params, area, short))| Ok(short.ask(params, area, &headers)?));
     answer(&app, ask).await.map(As::new)
 }
 
 pub async fn get(
     State(app): State<Arc<App>>,
-    params: Result<Params<AskParams>, Problem>,
+    params: Result<Params<(AskParams, AreaParams)>, Problem>,
 ) -> Result<As<Json<Page<'static>>>, Problem> {
-    answer(&app, params.and_then(|Params(params)| Ok(params.ask()?))).await.map(As::new)
+    answer(&app, params.and_then(|Params((params, area))| Ok(params.ask(area)?))).await.map(As::new)
 }
 
 pub async fn post(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Json<Page<'static>>>, Problem> {
@@ -112,7 +113,6 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
     Ok(response)
 }
 
-/// Answers in any format of this build.
 pub struct Formats;
 
 impl Described for Formats {

@@ -456,7 +456,6 @@ async fn rest(mut stream: TcpStream) -> String {
 
 const ASK_AND_WAIT: &str = "GET /query?text=wait HTTP/1.1\r\nhost: localhost\r\n\r\n";
 
-/// Resolves once a query is being answered.
 async fn until_in_flight(service: &Service) {
     while service.app.permits.available_permits() == service.app.settings.max_queries {
         tokio::task::yield_now().await;

@@ -128,7 +128,6 @@ impl Found {
         }
     }
 
-    /// Returns the bytes that the answers take in memory.
     pub fn len_bytes(&self) -> usize {
         match self {
             Self::Clusters(answers) => {

@@ -59,7 +59,6 @@ pub struct Clusters {
     pub clusters: Vec<Cluster>,
     /// Clusters with too few members.
     pub n_small: u64,
-    /// Gaussians in clusters with too few members.
     pub n_gaussians_in_small: u64,
     /// Edge of the voxels: as requested, or doubled until 21 bits could number them along each axis.
     pub voxel: f64,

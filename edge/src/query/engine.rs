@@ -27,7 +27,6 @@ const KEPT_BYTES: u64 = 32 << 20;
 /// or too many files open.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
-/// Reasons for which a question cannot be answered.
 #[derive(Debug, thiserror::Error)]
 pub enum QueryError {
     #[error(transparent)]

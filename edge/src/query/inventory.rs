@@ -44,7 +44,6 @@ pub enum ObjectOrder {
 pub struct ObjectFilter {
     pub after: Option<u64>,
     pub region: Region,
-    /// Least length of the longest edge of the box.
     pub min_size: f64,
     pub order: ObjectOrder,
 }

@@ -84,7 +84,6 @@ pub const TRIMMED: f64 = 0.02;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Extent {
-    /// Mean of the points inside the box.
     pub position_in_world: DVec3,
     /// From the 2nd to the 98th percentile along each axis (all points if they are fewer than 51).
     pub box_in_world: Aabb,

@@ -32,7 +32,6 @@ struct Place {
 }
 
 impl<R: Borrow<Reply>> Pieces<R> {
-    /// Starts a file of a reply's Gaussians.
     pub fn new(reply: R) -> Self {
         let properties = PointProperties {
             question: reply.borrow().outcomes.len() != 1,

@@ -89,7 +89,6 @@ pub fn of_objects(
     reason((kind, detail), best, (shards, place))
 }
 
-/// Returns why no Gaussian or cluster was found.
 pub fn of_gaussians(
     search: &Search<'_>,
     scale: Scale,

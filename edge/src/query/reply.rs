@@ -54,7 +54,6 @@ pub struct RelatedAnswers {
     /// What was asked in place of words that the model does not know.
     pub asked_as: BTreeMap<String, String>,
     pub parts: Vec<relations::Found>,
-    /// The part that failed, if nothing was found.
     pub miss: Option<Miss>,
     /// The answers, best first, each with its degree and what it is related to.
     pub answers: Vec<(ClusterAnswer, f64, Vec<Witness>)>,

@@ -25,7 +25,6 @@ pub enum OverBudget {
     Time { time: Duration },
 }
 
-/// Bytes that all requests may use together.
 #[derive(Debug)]
 pub struct Pool {
     bytes: u64,

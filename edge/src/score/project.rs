@@ -87,7 +87,6 @@ pub struct Tables {
     pub error: f32,
 }
 
-/// A vector projected on a cell's basis.
 #[derive(Clone, Debug, Default)]
 pub struct Projection {
     /// Product with the cell's mean.
@@ -110,7 +109,6 @@ pub struct Projection {
 }
 
 impl Projection {
-    /// Projects a vector on a cell's basis.
     pub fn set(&mut self, instructions: InstructionSet, shard: &ShardView<'_>, vector: &Vector) {
         self.components.clear();
         let m = shard.header.n_components as usize;

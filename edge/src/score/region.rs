@@ -25,7 +25,6 @@ impl Ball {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Region {
     pub ball: Option<Ball>,
-    /// The box, aligned with the world's axes.
     pub bounds: Option<Aabb>,
     /// The polygon, seen from above.
     pub polygon: Option<Arc<Polygon>>,
@@ -38,7 +37,6 @@ impl Region {
             && self.polygon.as_ref().is_none_or(|polygon| polygon.contains(point.truncate()))
     }
 
-    /// Returns whether every point of a box lies inside.
     pub fn covers(&self, of: &Aabb) -> bool {
         // Rounded as in `contains`; the rounding grows with every component.
         let in_ball = |ball: Ball| {

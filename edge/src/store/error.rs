@@ -10,7 +10,6 @@ use slag_common::shard::Profile;
 
 use super::files::is_bad_medium;
 
-/// Reasons for which a cache cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     #[error("{0}; check the cache's folder and its permissions")]

@@ -9,7 +9,6 @@ use super::cache::EdgeCache;
 use super::damaged;
 use super::snapshot::Snapshot;
 
-/// Knows which shards it read, in which order.
 #[derive(Debug, Default)]
 pub struct Scrubber {
     read: BTreeMap<Hash32, u64>,

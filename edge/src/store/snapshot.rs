@@ -22,7 +22,6 @@ const MAX_RACES: usize = 16;
 /// An open generation: immutable however many fetches follow.
 #[derive(Debug)]
 pub struct Snapshot {
-    /// The generation pointer it was opened from.
     pub current: Current,
     /// State of `current` just before it was read, for comparison with [`EdgeCache::current_stat`].
     pub current_stat: Option<Stat>,
@@ -114,7 +113,6 @@ impl Snapshot {
         Ok(Self { current, current_stat, manifest, shards, bad_cells, may_recover, objects })
     }
 
-    /// Returns the shards on board that do not open.
     pub fn unreadable(&self) -> impl Iterator<Item = Hash32> + '_ {
         let cells = self.bad_cells.iter().filter(|bad| bad.fault == CellFault::Unreadable);
         cells.filter_map(|bad| {

@@ -42,7 +42,6 @@ pub struct Published {
     pub objects: BTreeMap<Hash32, Vec<u8>>,
 }
 
-/// What distinguishes one shard's content from another's.
 pub struct ShardSpec {
     pub cell_id: u32,
     pub content: u64,

@@ -8,7 +8,6 @@ use slag_common::{Gaussians, Similarity, View};
 
 use crate::raster::RasterView;
 
-/// A common mistake in poses, intrinsics or splat.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mistake {

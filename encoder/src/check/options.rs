@@ -17,7 +17,6 @@ pub struct CheckOptions {
     pub diagnosis_views: usize,
     /// Similarities between the worlds of poses and splat that are tried beside common mistakes.
     pub frames: Vec<FrameCandidate>,
-    /// What the data alone says against the inputs.
     pub suspicions: Vec<Suspicion>,
 }
 

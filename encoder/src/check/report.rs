@@ -29,7 +29,6 @@ impl ViewCheck {
     }
 }
 
-/// Comparison of a scene with its photos.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {
     pub views: Vec<ViewCheck>,
@@ -40,7 +39,6 @@ pub struct CheckReport {
     pub unusable_gaussians: usize,
     /// Why photos were left out: they cannot be read.
     pub unreadable: Vec<String>,
-    /// What the data alone say against the inputs.
     pub suspicions: Vec<String>,
     /// What else is known of the inputs, a sentence each.
     pub notes: Vec<String>,

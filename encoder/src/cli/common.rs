@@ -26,7 +26,6 @@ use crate::ingest::{Activated, FrameChoice};
 use crate::store::StoreReader;
 use crate::store::metadata::{MetadataReader, clock_unix_secs};
 
-/// How a run of the program ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
     Done,
@@ -143,7 +142,6 @@ fn parse_activated(text: &str) -> Result<Activated, String> {
     Ok(found)
 }
 
-/// Parses the file that states the splat's frame.
 pub fn parse_frame(text: &str) -> Result<FrameChoice, String> {
     Ok(match text {
         "" => return Err("expected auto, none or a file".into()),

@@ -9,7 +9,6 @@ const MIN_MEMORY_BYTES: u64 = 64 << 20;
 /// Working memory on machines that do not report free memory.
 const UNKNOWN_MEMORY_BYTES: u64 = 2 << 30;
 
-/// Reads the size of the working memory, see [`ByteSize`].
 pub(crate) fn parse_memory(text: &str) -> Result<u64, String> {
     let ByteSize(bytes) = text.parse().map_err(|e: ByteSizeError| e.to_string())?;
     if bytes < MIN_MEMORY_BYTES {

@@ -30,7 +30,6 @@ struct Cluster {
 }
 
 impl Clusters {
-    /// Drops the clusters without points, and renumbers the others.
     pub(crate) fn drop_empty(&mut self, width: usize) {
         let mut numbers = vec![None; self.centres.len() / width];
         let mut kept = Vec::with_capacity(self.centres.len());

@@ -11,7 +11,6 @@ use slag_common::objects::{Moved, Place, Thing, changes, is_unchanged};
 
 use crate::store::{Published, StoreError, StoreReader};
 
-/// What changed from one generation to another.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Diff {
     pub(crate) old_generation: u64,

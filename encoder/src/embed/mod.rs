@@ -39,7 +39,6 @@ impl EmbedError {
     }
 }
 
-/// How the vectors of a photo's patches are used.
 pub(crate) enum PatchUse {
     /// Each of these patches is a region with a vector of its own; numbers row by row.
     Regions(Vec<usize>),

@@ -65,7 +65,6 @@ struct Request {
     is_done: Arc<Condvar>,
 }
 
-/// Reason why crops could not be embedded.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Failure {
     #[error(transparent)]
@@ -159,7 +158,6 @@ impl Shared {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Runs batches until there will be no more.
     fn work(&self) {
         let guard = AbandonOnPanic(self);
         let mut queue = self.queue();

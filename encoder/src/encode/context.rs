@@ -104,7 +104,6 @@ impl<'a> RunContext<'a> {
         result
     }
 
-    /// Returns the seconds spent in each stage so far.
     pub(crate) fn busy_secs(&self) -> BTreeMap<String, f64> {
         let times = self.times.0.lock().unwrap_or_else(PoisonError::into_inner);
         times.iter().map(|(stage, secs)| ((*stage).to_owned(), *secs)).collect()

@@ -62,9 +62,6 @@ pub struct CoverageReport {
 
 impl Coverage {
     /// Rasterises every view of a loaded scene of `n_gaussians`; `None` if cancelled.
-    ///
-    /// # Errors
-    /// Number of the view that cannot be rasterised, and why.
     pub fn measure(
         scene: &dyn LoadedScene,
         n_gaussians: usize,

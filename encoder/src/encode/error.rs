@@ -16,7 +16,6 @@ use crate::segment::SegmentError;
 use crate::store::StoreError;
 use crate::viewpoints::{DrawError, ViewpointError};
 
-/// Why an encode ended without a new generation.
 #[derive(Debug, thiserror::Error)]
 pub enum EncodeError {
     #[error("{setting}: {problem}")]

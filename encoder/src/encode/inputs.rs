@@ -36,7 +36,6 @@ pub(crate) struct Inputs {
     /// The views whose photo is missing, in the same order.
     pub(super) missing: Vec<SkippedView>,
     pub(super) geo_reference: Option<GeoReference>,
-    /// Views whose images are drawings of the splat.
     pub(super) n_drawn: usize,
 }
 

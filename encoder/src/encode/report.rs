@@ -149,7 +149,6 @@ pub struct EncodeSummary {
     pub generation: u64,
     pub n_gaussians: u64,
     pub n_without_evidence: u64,
-    /// Unusable Gaussians, which are in no cell.
     pub n_rejected: u64,
     pub n_views: usize,
     pub n_views_with_photo: usize,
@@ -160,7 +159,6 @@ pub struct EncodeSummary {
     pub coverage: Option<CoverageReport>,
     /// Seconds spent on rasterising all views to find that order.
     pub coverage_secs: f64,
-    /// Used views that an earlier run had finished.
     pub n_views_resumed: usize,
     /// Kept views that were done anew, and why; absent where none were kept, or those could be taken over.
     pub lost_views: Option<LostViews>,
@@ -185,7 +183,6 @@ pub struct EncodeSummary {
     pub(crate) busy_secs: BTreeMap<String, f64>,
     /// The load of the views' stages, in their order.
     pub view_stages: Vec<StageReport>,
-    /// The parts of the run, in their order.
     pub(crate) phases: Vec<PhaseReport>,
     /// Seconds from the first view to the last.
     pub views_secs: f64,

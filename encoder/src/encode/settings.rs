@@ -156,7 +156,6 @@ impl RasterWidth {
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellSettings {
     pub limits: CellLimits,
-    /// Which shards are made, and how fine they are.
     pub shards: ShardSettings,
     /// Whether masks that views agree on become objects.
     pub objects: bool,
@@ -307,7 +306,6 @@ impl EncodeSettings {
         }
     }
 
-    /// Checks every setting that has a range.
     pub(crate) fn validate(&self) -> Result<(), EncodeError> {
         let Self { view, aggregation, cells, run, .. } = self;
         let (limits, codebook) = (&cells.limits, &cells.shards.codebook);

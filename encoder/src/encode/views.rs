@@ -29,7 +29,6 @@ pub(super) struct DoneViews<'a> {
     pub(super) skipped: Vec<SkippedView>,
     /// Views left out for an error in this run.
     pub(super) n_failed: usize,
-    /// Used views that an earlier run had finished.
     pub(super) n_resumed: usize,
     pub(super) coverage: Option<CoverageReport>,
     pub(super) stages: Vec<StageReport>,

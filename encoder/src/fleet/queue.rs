@@ -190,7 +190,6 @@ pub(super) struct Queue {
     max_deliver: i64,
 }
 
-/// What a worker holds of the queue.
 struct Held {
     runtime: tokio::runtime::Handle,
     n_most: usize,

@@ -53,7 +53,6 @@ struct Things {
     is_narrow: Vec<bool>,
 }
 
-/// What some of the Gaussians cover of the ground.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Footprint {
     n: u32,

@@ -84,7 +84,6 @@ impl PackedEntry {
         Self { key: in_slice << REGION_BITS | entry.region, weight: entry.weight }
     }
 
-    /// Returns the Gaussian's index within the slice.
     pub(super) fn in_slice(self) -> usize {
         (self.key >> REGION_BITS) as usize
     }
@@ -105,7 +104,6 @@ pub struct ViewContributions {
     pub entries_of_cell: Vec<(u32, Vec<Contribution>)>,
 }
 
-/// A contribution file cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum ContributionError {
     #[error(transparent)]

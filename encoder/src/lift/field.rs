@@ -95,9 +95,6 @@ impl CellField {
     }
 
     /// Writes the file form.
-    ///
-    /// # Errors
-    /// Errors of the writer.
     pub fn write(&self, out: impl Write) -> io::Result<()> {
         let header = [self.len() as u64, self.regions.len() as u64];
         let sections = [
@@ -113,9 +110,6 @@ impl CellField {
     }
 
     /// Reads the file form; regions must be below `n_regions`.
-    ///
-    /// # Errors
-    /// [`ContainerError`], naming the byte.
     pub fn from_bytes(bytes: &AlignedBytes, n_regions: usize) -> Result<Self, ContainerError> {
         let layout = Layout::check(bytes, MAGIC, VERSION)?;
         let [n, n_entries]: [u64; 2] = layout.value(bytes, 1, "header")?;

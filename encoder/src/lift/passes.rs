@@ -25,7 +25,6 @@ pub(crate) struct SceneContributions<'a> {
     pub photos: &'a [Photo],
     /// Bytes for the contributions of a group of parts.
     pub(crate) group_bytes: u64,
-    /// Set when the user asks to stop.
     pub cancel: &'a AtomicBool,
 }
 

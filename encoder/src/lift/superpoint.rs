@@ -99,7 +99,6 @@ pub struct Graph {
 }
 
 impl Graph {
-    /// Finds and measures the edges of a scene.
     pub fn new(
         scene: &Gaussians,
         standing: &Standing,

@@ -115,9 +115,6 @@ impl RegionTable {
     }
 
     /// Appends a region that is a mixture of masks, `(mask, weight)`, and returns its number.
-    ///
-    /// # Errors
-    /// [`ContributionError::TooManyInAll`] if it can no longer be numbered.
     pub(super) fn append_mixture(&mut self, mixture: &[(u32, f32)]) -> Result<u32, ContributionError> {
         let number = first_number(self.len(), 1, "regions")?;
         self.shares.resize(self.masks.len(), 1.0);
@@ -180,9 +177,6 @@ impl RegionTable {
     }
 
     /// Writes the file form.
-    ///
-    /// # Errors
-    /// Errors of the writer.
     pub fn write(&self, out: impl Write) -> io::Result<()> {
         let header = [self.dim, self.len(), self.n_masks(), self.masks.len()].map(|n| n as u64);
         let mut sections = vec![
@@ -201,9 +195,6 @@ impl RegionTable {
     }
 
     /// Reads the file form.
-    ///
-    /// # Errors
-    /// [`ContainerError`], naming the byte.
     pub fn from_bytes(bytes: &AlignedBytes) -> Result<Self, ContainerError> {
         let layout = Layout::check(bytes, MAGIC, VERSION)?;
         let [dim, n, n_masks, n_listed] =

@@ -19,7 +19,6 @@ pub struct Rle {
     counts: Vec<u32>,
 }
 
-/// Reason why a run-length encoding is rejected.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum RleError {
     #[error("runs add up to {found} pixels, expected {expected}; encode the mask again")]
@@ -83,7 +82,6 @@ impl Rle {
         Self::from_counts(width_px, height_px, counts)
     }
 
-    /// Returns the image's width and height, pixels.
     pub fn size_px(&self) -> [u32; 2] {
         [self.width_px, self.height_px]
     }

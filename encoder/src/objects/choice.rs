@@ -55,7 +55,6 @@ struct NodeView {
 
 type NodeViews = BTreeMap<u32, NodeView>;
 
-/// What is known of masks and superpoints.
 #[derive(Clone, Copy)]
 pub(super) struct Sizes<'a> {
     /// `[n_masks]`: sightings under each mask.
@@ -93,7 +92,6 @@ impl NodeView {
         });
     }
 
-    /// Returns the masks with their intersections over union.
     fn ious(&self, n_of_mask: &[u32]) -> impl Iterator<Item = (u32, f64)> {
         self.masks.iter().map(|(mask, both)| {
             let union = u64::from(self.n) + u64::from(n_of_mask[*mask as usize]) - u64::from(*both);

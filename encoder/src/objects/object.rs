@@ -68,7 +68,6 @@ pub struct ObjectsReport {
     pub n_masks: usize,
     /// Masks that show an object; others cover several things, or parts.
     pub n_masks_of_objects: usize,
-    /// Longest side of the largest object's box, metres.
     pub largest_m: f64,
 }
 

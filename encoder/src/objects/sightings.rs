@@ -37,7 +37,6 @@ pub(super) struct MaskSighting {
     pub(super) weight: f64,
 }
 
-/// What all views show of all superpoints.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Sightings {
     /// `[n + 1]`: where each superpoint's views start.
@@ -47,7 +46,6 @@ pub(super) struct Sightings {
     masks: Vec<MaskSighting>,
 }
 
-/// What a region shows of a superpoint.
 #[derive(Clone, Copy)]
 struct Entry {
     superpoint: u32,

@@ -22,7 +22,6 @@ impl Lattice {
         (at.abs().max_element() < MAX_BLOCK * f64::from(BLOCK_EDGE)).then_some(at)
     }
 
-    /// Returns the edge of a block, world units.
     pub(super) fn block(self) -> f64 {
         self.voxel * f64::from(BLOCK_EDGE)
     }

@@ -21,7 +21,6 @@ const MAX_SKY: f32 = 0.1;
 /// Nearest depth at which a voxel is looked for, world units.
 const NEAR: f64 = 0.01;
 
-/// A block that views may look through.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Candidate {
     pub(super) at: BlockAt,

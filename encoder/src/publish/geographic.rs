@@ -8,7 +8,6 @@ use serde_json::json;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::Manifest;
 
-/// Why a scene cannot be placed on the earth.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub(crate) enum GeographicError {
     #[error(

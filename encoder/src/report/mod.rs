@@ -15,7 +15,6 @@ use crate::progress::FoundObject;
 
 pub(crate) use recorder::Recorder;
 
-/// Makes the page of an encode that was recorded.
 pub(crate) fn of_encode(
     scene: &str,
     summary: &EncodeSummary,

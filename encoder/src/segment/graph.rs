@@ -143,9 +143,6 @@ impl GraphSegmenter {
 
     /// Creates a segmenter with the embedded model, which runs on one thread per image; `gpus`: those that share
     /// the photos, where the session asks for GPUs.
-    ///
-    /// # Errors
-    /// [`SessionError`] if ONNX Runtime does not load.
     pub fn learnt(
         settings: GraphSettings,
         session: &SessionOptions,

@@ -104,7 +104,6 @@ impl Segmenter for NoMasks {
     }
 }
 
-/// Reason why masks cannot be found or read.
 #[derive(Debug, thiserror::Error)]
 pub enum SegmentError {
     #[error("{0}; check that the file exists and may be read")]

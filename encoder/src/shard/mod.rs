@@ -22,7 +22,6 @@ use crate::memory::{MemoryPlan, Phase};
 use crate::objects::SceneObjects;
 use crate::objects::shards::{CellObjects, CentroidBasis};
 
-/// A cell's shard, with its entry in the manifest.
 pub struct BuiltShard {
     pub profile: Profile,
     pub bytes: Vec<u8>,
@@ -40,7 +39,6 @@ pub struct BuiltCell {
     pub n_without_evidence: usize,
 }
 
-/// The profiles to build, and their precision.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ShardSettings {
     pub profiles: Vec<Profile>,

@@ -16,7 +16,6 @@ use super::error::StoreError;
 use super::metadata::{Metadata, MetadataReader, ROOT_SECS, RootFile};
 use super::{files, roles};
 
-/// Which keys are replaced by new ones.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Change {
     /// All keys of these roles; of no role, the root is signed anew for its whole time.
@@ -47,7 +46,6 @@ pub(crate) struct KeysStatus {
     pub(crate) root_version: u64,
     pub root_sha256: String,
     pub(crate) root_expires_unix_secs: u64,
-    /// Root's keys that must sign a change.
     pub(crate) threshold: u32,
     pub(crate) keys: Vec<KeyStatus>,
     /// When the timestamp expires, seconds since 1970; absent before the first publication.
@@ -178,9 +176,6 @@ impl MetadataReader {
 }
 
 /// Signs a draft with all keys of a folder, and returns how many these are.
-///
-/// # Errors
-/// [`StoreError::RootDraft`] if it is no root; [`StoreError`] otherwise.
 pub(crate) fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, StoreError> {
     let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
     let bytes = fs_err::read(draft)?;

@@ -8,7 +8,6 @@ use slag_common::container::ContainerError;
 use slag_common::manifest::ManifestError;
 use slag_common::tuf::TufError;
 
-/// Why a store cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     #[error("{0}; check permissions and free space")]

@@ -41,7 +41,6 @@ pub(super) const RELEASE_UNIX_SECS: u64 = 1_767_225_600;
 pub(crate) struct Refreshed {
     pub(crate) timestamp_version: u64,
     pub(crate) snapshot_version: u64,
-    /// When clients refuse it, seconds since 1970.
     pub(crate) expires_unix_secs: u64,
 }
 
@@ -215,9 +214,6 @@ impl Metadata {
     }
 
     /// Makes keys and the first root. `root_folder`: where root's keys lie, `n_root_keys` of them.
-    ///
-    /// # Errors
-    /// [`StoreError::HasRoot`]; [`StoreError`] otherwise.
     pub(crate) fn make_root(
         &self,
         root_folder: &Path,
@@ -284,7 +280,6 @@ impl Metadata {
     }
 }
 
-/// Returns the system's time, seconds since 1970.
 pub(crate) fn clock_unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
@@ -300,9 +295,6 @@ pub(super) fn signing_time(clock_unix_secs: u64) -> u64 {
 }
 
 /// Reads a metadata file of a store by the name that clients ask for; `None` if there is no such file.
-///
-/// # Errors
-/// [`StoreError::Io`]; [`StoreError::Metadata`] for one that is too long.
 pub(crate) fn read_published(store: &Path, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
     let max_bytes = match name.split_once('.') {
         Some(("timestamp", "json")) => MAX_TIMESTAMP_BYTES,

@@ -57,7 +57,6 @@ impl OpenedText {
         true
     }
 
-    /// Returns the words that the model knows.
     fn known(&self) -> impl Iterator<Item = (&str, &[f32])> {
         self.words.iter().zip(&self.vectors).filter_map(|(word, vector)| Some((&**word, vector.as_deref()?)))
     }

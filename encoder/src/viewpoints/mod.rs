@@ -145,7 +145,6 @@ fn is_object(looked: &[Look], space: &Space, kind: SceneKind) -> bool {
         && (is_tall || n_with(looked, kind, None) < MIN_GOOD)
 }
 
-/// Returns how many views fail for which reason.
 fn faults(bad: &[Look], kind: SceneKind) -> String {
     let all = Fault::ALL.map(|fault| (fault, n_with(bad, kind, Some(fault))));
     let told = all.iter().filter(|(_, n)| *n > 0).map(|(fault, n)| format!("{n} {fault}"));

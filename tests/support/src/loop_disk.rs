@@ -26,7 +26,6 @@ impl LoopDisk {
         disk
     }
 
-    /// Returns the folder of the mounted disk.
     pub fn path(&self) -> &Path {
         &self.at
     }

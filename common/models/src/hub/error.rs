@@ -9,7 +9,6 @@ use crate::description::{DescriptionError, Sha256};
 use crate::download::{DownloadError, DownloadFailure};
 use crate::error::ModelError;
 
-/// Error of pulling, finding or verifying a model.
 #[derive(Debug, thiserror::Error)]
 pub enum HubError {
     #[error("unknown model {name:?}; there are {}: choose one, or give the folder of your own model", known.join(", "))]

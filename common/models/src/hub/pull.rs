@@ -13,7 +13,6 @@ use crate::description::Sha256;
 use crate::download::{Client, DownloadError, Part};
 use crate::model_dir::hash_file;
 
-/// The files of a model to pull.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
     Text,

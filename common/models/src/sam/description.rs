@@ -17,7 +17,6 @@ pub struct SamDescription {
     /// Folder of the files, relative to the description's folder.
     #[serde(default = "crate::description::here")]
     pub files_root: PathBuf,
-    /// The files and how to feed them.
     pub segment: SegmentDescription,
 }
 

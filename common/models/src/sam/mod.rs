@@ -64,7 +64,6 @@ pub struct Sam {
 pub struct Embedding {
     /// Tensors by the name of the decoder's input.
     tensors: Vec<(String, Held)>,
-    /// Placement of the image in the encoder's square.
     pub letterbox: Letterbox,
 }
 
@@ -345,10 +344,8 @@ impl Decoded {
 /// the bottom (SAM), or the image is stretched over it (SAM 2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Letterbox {
-    /// Edge length of the square, in pixels.
     pub size_px: u32,
     pub image_px: [u32; 2],
-    /// Width and height of the resized image, in pixels.
     pub resized_px: [u32; 2],
     /// Whether the image is stretched over the square; masks then go to the image's size in one step.
     pub is_stretched: bool,

@@ -35,7 +35,6 @@ const GEOMETRY: [&str; 10] =
 /// The third scale, which the flat Gaussians of 2DGS lack.
 const THIRD_SCALE: &str = "scale_2";
 
-/// Reads a PLY file, plain or compressed.
 pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let ply = Ply::open(input)?;
     let vertex = ply.require_element(VERTEX, NOT_A_SPLAT)?;

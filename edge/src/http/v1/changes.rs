@@ -12,13 +12,13 @@ use slag_service::params::Params;
 use slag_service::problem::Problem;
 
 use crate::http::app::App;
-use crate::http::forms::{self, LatLonText, XyzText};
+use crate::http::forms::BallParams;
 use crate::http::problem::query_problem;
 use crate::query::{ChangesError, ChangesRequest, MAX_TEXTS, RequestError, Words};
-use crate::score::MAX_COORDINATE;
 
 /// Which changes are asked for.
 #[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
 pub struct ChangesParams {
     /// The earlier generation; by default the newest before the later one that is remembered.
     #[schemars(example = 3)]
@@ -26,15 +26,6 @@ pub struct ChangesParams {
     /// The later generation; by default that on board.
     #[schemars(example = 4)]
     to: Option<u64>,
-    /// With radius: only changes within this distance; of a move, one end counts.
-    #[schemars(example = &"2,1.5,0")]
-    near: Option<XyzText>,
-    /// The same on the earth, WGS 84: lat,lon or lat,lon,height.
-    #[schemars(example = &"46.8,-92.1")]
-    near_lat_lon: Option<LatLonText>,
-    /// With near, world units.
-    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
-    radius: Option<f64>,
     /// A kind of thing: each thing names the one it is most like; may be repeated.
     #[serde(default)]
     #[schemars(with = "Vec<Words>", length(max = MAX_TEXTS), example = ["chair"])]
@@ -43,14 +34,14 @@ pub struct ChangesParams {
 
 pub async fn changes(
     State(app): State<Arc<App>>,
-    Params(params): Params<ChangesParams>,
+    Params((params, ball)): Params<(ChangesParams, BallParams)>,
 ) -> Result<Json<ChangesReply>, Problem> {
-    let ChangesParams { from, to, near, near_lat_lon, radius, text: texts } = params;
+    let ChangesParams { from, to, text: texts } = params;
     if texts.len() > MAX_TEXTS {
         let (found, expected) = (texts.len().to_string(), format!("at most {MAX_TEXTS} texts"));
         return Err(RequestError::new("text", &found, expected).into());
     }
-    let ball = forms::ball(forms::point(near, near_lat_lon)?, radius)?;
+    let ball = ball.ball()?;
     let answering = app.within_limits(None, move |app, budget| {
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
         let ball = match ball {

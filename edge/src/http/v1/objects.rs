@@ -14,16 +14,16 @@ use slag_service::problem::Problem;
 use slag_service::replies::{As, Binary, Described, Reply};
 
 use crate::http::app::App;
-use crate::http::forms::{self, BoxText, LatLonPolygonText, LatLonText, ObjectIdText, PolygonText, XyzText};
+use crate::http::forms::{AreaParams, BallParams, ObjectIdText};
 use crate::http::problem::query_problem;
 use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError, object_id};
-use crate::score::MAX_COORDINATE;
 
 const DEFAULT_PAGE: usize = 100;
 const MAX_PAGE: usize = 1000;
 
 /// Which objects are listed.
 #[derive(Deserialize, JsonSchema)]
+#[schemars(inline)]
 pub struct ListParams {
     /// Objects in a page.
     #[serde(default = "default_page")]
@@ -36,25 +36,6 @@ pub struct ListParams {
     #[serde(default)]
     #[schemars(example = &"id")]
     sort: ObjectOrder,
-    /// With radius: only objects with their position within this distance.
-    #[schemars(example = &"2,1.5,0")]
-    near: Option<XyzText>,
-    /// The same on the earth, WGS 84: lat,lon or lat,lon,height.
-    #[schemars(example = &"46.8,-92.1")]
-    near_lat_lon: Option<LatLonText>,
-    /// With near, world units.
-    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE), example = 5)]
-    radius: Option<f64>,
-    /// Only between two opposite corners.
-    #[serde(rename = "box")]
-    #[schemars(example = &"0,0,0,4,3,2")]
-    bounds: Option<BoxText>,
-    /// Only inside this outline of 3 to 256 corners, seen from above.
-    #[schemars(example = &"0,0,4,0,4,3")]
-    polygon: Option<PolygonText>,
-    /// The same on the earth.
-    #[schemars(example = &"46.8,-92.1,46.8,-92,46.9,-92")]
-    polygon_lat_lon: Option<LatLonPolygonText>,
     /// Least length of the box's longest edge, world units.
     #[serde(default)]
     #[schemars(range(min = 0), example = 0.5)]
@@ -70,13 +51,7 @@ fn default_page() -> usize {
 }
 
 impl ListParams {
-    fn area(&mut self) -> Result<Area, RequestError> {
-        let near = forms::point(self.near.take(), self.near_lat_lon.take())?;
-        let ball = forms::ball(near, self.radius)?;
-        forms::area(ball, self.bounds.take(), self.polygon.take(), self.polygon_lat_lon.take())
-    }
-
-    fn filter(mut self, manifest: &Manifest) -> Result<ObjectFilter, RequestError> {
+    fn filter(self, area: Area, manifest: &Manifest) -> Result<ObjectFilter, RequestError> {
         let refuse =
             |parameter, found: String, expected: String| Err(RequestError::new(parameter, &found, expected));
         if !(1..=MAX_PAGE).contains(&self.limit) {
@@ -87,7 +62,7 @@ impl ListParams {
         }
         self.format.check(manifest)?;
         Ok(ObjectFilter {
-            region: self.area()?.in_world(manifest)?,
+            region: area.in_world(manifest)?,
             after: self.after.map(|ObjectIdText(id)| id),
             min_size: self.min_size,
             order: self.sort,
@@ -97,12 +72,12 @@ impl ListParams {
 
 pub async fn list(
     State(app): State<Arc<App>>,
-    Params(params): Params<ListParams>,
+    Params((params, ball, area)): Params<(ListParams, BallParams, AreaParams)>,
 ) -> Result<As<ListFormats>, Problem> {
-    let (limit, format) = (params.limit, params.format);
+    let (limit, format, area) = (params.limit, params.format, area.area(ball.ball()?)?);
     let listing = app.within_limits(None, move |app, budget| {
         let on_board = app.engine.on_board().map_err(query_problem)?;
-        let filter = params.filter(&on_board.snapshot.manifest)?;
+        let filter = params.filter(area, &on_board.snapshot.manifest)?;
         let page =
             app.engine.objects(&on_board, &filter, limit, NAMES_WAIT, budget).map_err(query_problem)?;
         format.write(&page).map_err(Problem::internal)

@@ -78,7 +78,6 @@ pub async fn words(State(app): State<Arc<App>>) -> Result<Json<slag_view::Words>
         .await
 }
 
-/// Makes a message within the limits of a query.
 async fn message(
     app: &Arc<App>,
     make: impl FnOnce(&App, &Budget) -> Result<Option<Vec<u8>>, QueryError> + Send + 'static,

@@ -193,7 +193,6 @@ impl<'b> Measure<'_, 'b> {
         Ok(found.map(anchor).collect())
     }
 
-    /// Returns the one that is meant of several.
     fn picked(&self, phrase: &Phrase, pick: &Pick, mut found: Vec<Related>) -> Result<Vec<Related>, Miss> {
         let all = self.things.of(&phrase.thing);
         let from = match (&pick.from, pick.by.is_distance()) {

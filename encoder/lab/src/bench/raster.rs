@@ -53,7 +53,6 @@ struct BenchScene {
     views: Vec<RasterView>,
 }
 
-/// A backend and its name in the report.
 type Device = (String, Box<dyn Rasterizer>);
 
 #[derive(Clone, Debug, Serialize)]

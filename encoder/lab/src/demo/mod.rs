@@ -154,7 +154,6 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     Ok(Demo { report, edge: options.edge.clone(), cache })
 }
 
-/// Photographs the scene and encodes it into a store.
 fn encode(
     options: &DemoOptions,
     scene: &mut Scene,

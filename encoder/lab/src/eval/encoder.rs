@@ -40,7 +40,6 @@ pub(crate) struct EncoderArgs {
     seed: u64,
 }
 
-/// Correct answers over a set of crops.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 struct Tally {
     n_crops: usize,
@@ -64,7 +63,6 @@ pub(crate) struct EncoderReport {
     encoder: String,
     n_scenes: u64,
     first_seed: u64,
-    /// Tallies of several sets of crops, with their names.
     tallies: Vec<(String, Tally)>,
     nouns: Vec<NounReport>,
     /// Lowest cosine of a match.
@@ -163,7 +161,6 @@ pub(crate) fn run(args: &EncoderArgs, progress: &dyn Progress) -> Result<Encoder
 
 /// A crop's label, and its best noun, colour and material.
 type Seen = (Label, usize, usize, usize);
-/// Whether a crop belongs to a set.
 type IsIn = fn(&Label) -> bool;
 
 fn is_whole(label: &Label) -> bool {

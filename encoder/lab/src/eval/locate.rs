@@ -82,7 +82,6 @@ enum Change {
     Moved,
 }
 
-/// A scene, its map and its queries.
 struct Located {
     name: String,
     /// The scene as a robot has it.
@@ -263,7 +262,6 @@ fn query(view: &View, change: Change, drawn: Option<&dyn LoadedScene>) -> Result
     Ok(Query { grey, intrinsics, camera_from_world })
 }
 
-/// Locates a photo in a scene's map.
 fn attempt(scene: &Located, query: &Query, renderer: Option<&(dyn Renderer + Sync)>) -> Try {
     let photo =
         Photo { grey: &query.grey, intrinsics: &query.intrinsics, gravity_in_camera: None, prior: None };

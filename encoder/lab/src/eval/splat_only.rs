@@ -16,7 +16,6 @@ use super::run::{MaskSource, Runner, ScenesArgs, truth_of};
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure};
 
-/// Figures of one scene, or their means.
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     scene: String,

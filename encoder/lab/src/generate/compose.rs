@@ -19,7 +19,6 @@ const CAMERA_HEIGHT_M: f64 = 1.5;
 const ROBOT_HEIGHT_M: f64 = 0.6;
 /// Gap between things on the ground, so that cameras can walk around them.
 const GAP_M: f64 = 0.3;
-/// Smallest distance between a camera and a thing.
 const CAMERA_CLEARANCE_M: f64 = 0.35;
 /// Poses tried for a thing before it is left out.
 const N_TRIES: usize = 30;
@@ -241,7 +240,6 @@ impl Layout {
         })
     }
 
-    /// Returns whether a camera may stand at a point.
     pub fn is_walkable(&self, at: DVec3) -> bool {
         let inside = self.areas.iter().any(|area| {
             let p = at.truncate();
@@ -253,7 +251,6 @@ impl Layout {
             && self.placed.iter().filter(|p| !p.shell).all(|p| p.bounds.distance_to(at) > CAMERA_CLEARANCE_M)
     }
 
-    /// Returns the cameras of a scene's photos.
     pub fn photos(&self, walk: Walk, n_views: u32) -> Vec<RasterView> {
         match walk {
             Walk::Oval => self.walk(n_views, 0.0, photo_intrinsics()),

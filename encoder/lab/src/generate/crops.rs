@@ -26,7 +26,6 @@ const PHOTO_PX: u32 = 208;
 const N_PHOTOS: usize = 14;
 /// Masks with fewer pixels are ignored, as in `encode`.
 const MIN_MASK_PX: u32 = 200;
-/// Smallest visible share of a cropped thing.
 const MIN_SHOWN: f64 = 0.3;
 /// Smallest share of a segment's pixels that show its thing.
 const MIN_PURITY: f64 = 0.8;

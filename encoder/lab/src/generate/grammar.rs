@@ -133,7 +133,6 @@ struct PartRule {
     condition: Option<Expression>,
 }
 
-/// A thing made by its noun's rules.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {
     /// Its parts, in its own frame: z up, the ground at 0, the front along +y.
@@ -162,9 +161,6 @@ fn exactly<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; 
 
 impl Noun {
     /// Parses an object file's text.
-    ///
-    /// # Errors
-    /// The number of the wrong line, and what is wrong.
     fn parse(name: String, text: &str) -> Result<Self, String> {
         let mut noun = Self {
             name,
@@ -289,12 +285,10 @@ impl Noun {
         part
     }
 
-    /// Returns the main colours that its things may have.
     pub fn colours(&self) -> &[Colour] {
         &self.paints[0].colours
     }
 
-    /// Returns the main materials that its things may have.
     pub fn materials(&self) -> &[Material] {
         &self.paints[0].materials
     }

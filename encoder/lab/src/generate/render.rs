@@ -190,7 +190,6 @@ impl Solids {
         nearest
     }
 
-    /// Takes a photo with an ideal pinhole camera.
     pub fn photo(&self, view: &RasterView) -> Photo {
         let k = view.intrinsics;
         let world_from_camera = view.camera_from_world.inverse();

@@ -50,7 +50,6 @@ pub struct TrueObject {
     /// Whether it is background, such as floor and walls.
     pub background: bool,
     pub centre: DVec3,
-    /// Smallest corner of the box around it.
     pub aabb_min: DVec3,
     /// Largest corner.
     pub aabb_max: DVec3,

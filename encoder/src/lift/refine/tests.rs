@@ -102,7 +102,6 @@ fn photos() -> Vec<Photo> {
     (0..7).map(photo).collect()
 }
 
-/// A field with its table and embeddings.
 struct Lifted {
     field: CellField,
     table: RegionTable,

@@ -296,7 +296,6 @@ impl CellShard {
     }
 }
 
-/// Returns the generation as the database's integer type.
 pub(super) fn generation(manifest: &Manifest) -> i64 {
     i64::try_from(manifest.generation).unwrap_or(i64::MAX)
 }

@@ -85,7 +85,6 @@ pub(crate) struct PushProgress {
     pub(crate) n_points_expected: u64,
 }
 
-/// A snapshot of a collection, on the database's disk.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Snapshot {
     pub(crate) collection: String,
@@ -105,7 +104,6 @@ pub(crate) struct PushReport {
     pub(crate) n_without_evidence: u64,
     pub(crate) n_retries: u64,
     pub(crate) n_collections: usize,
-    /// How many of them this run created.
     pub(crate) n_created_collections: usize,
     /// Collections of cells that this generation no longer has, deleted.
     pub(crate) deleted_collections: Vec<String>,

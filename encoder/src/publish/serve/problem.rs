@@ -8,7 +8,6 @@ use crate::publish::geographic::GeographicError;
 /// Time after which a request beyond a limit may succeed.
 const RETRY_SECS: u32 = 2;
 
-/// A parameter is missing, superfluous or out of range.
 pub(super) fn bad_parameter(detail: impl Into<String>) -> Problem {
     Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", detail)
 }
@@ -34,7 +33,6 @@ pub(super) fn range_not_satisfiable(len_bytes: u64) -> Problem {
     }
 }
 
-/// A limit on requests or downloads is reached.
 pub(super) fn busy() -> Problem {
     Problem::overloaded("the server is at its limit; try again in a few seconds", RETRY_SECS)
 }

@@ -47,9 +47,6 @@ pub(crate) fn router(dir: &Path, limits: Limits, access: Access) -> Result<Route
 }
 
 /// As [`router`], with a page's routes beside the store's.
-///
-/// # Errors
-/// As [`router`].
 pub(crate) fn router_with(
     dir: &Path,
     limits: Limits,

@@ -91,7 +91,6 @@ pub(super) struct Service {
     n_reloads: AtomicU64,
     n_reload_failures: AtomicU64,
     max_downloads: usize,
-    /// A permit for each object being sent.
     pub(super) downloads: Arc<Semaphore>,
     pub(super) responses: Arc<ResponseCounts>,
 }

@@ -110,7 +110,6 @@ pub(crate) struct RegionSum {
 }
 
 impl RegionSum {
-    /// Returns the sum from its two words.
     pub fn fixed(&self) -> u64 {
         u64::from(self.high) << 32 | u64::from(self.low)
     }
@@ -205,7 +204,6 @@ impl ViewBlock {
         Self { reals, words }
     }
 
-    /// Encodes the block for a device of this precision.
     pub fn to_bytes(&self, precision: Precision) -> Vec<u8> {
         let mut bytes: Vec<u8> = match precision {
             Precision::F64 => self.reals.iter().flat_map(|r| r.to_le_bytes()).collect(),

@@ -53,7 +53,6 @@ impl Workspace {
         device.buffer("staging", bytes, Usage::MAP_READ | Usage::COPY_DST)
     }
 
-    /// Returns whether a band of this size fits.
     pub fn holds(&self, n_tiles: u32, n_px: u32) -> bool {
         n_tiles <= self.n_tiles && n_px <= self.n_px
     }
@@ -288,17 +287,42 @@ mod tests {
     use crate::raster::gpu::device::adapters;
     use crate::raster::gpu::jobs::Scan;
 
+    /// Opens the first GPU; `None` without one.
+    fn opened(capacities: Capacities) -> Option<(Device, Workspace)> {
+        let Some(adapter) = adapters().into_iter().next() else {
+            println!("skipped: no GPU");
+            return None;
+        };
+        let device = adapter.open(adapter.report.precision).expect("opens");
+        let size = Size { capacities, n_tiles: 1, n_px: 1, n_chunk: 1 };
+        let workspace = Workspace::new(&device, size).expect("there is memory");
+        Some((device, workspace))
+    }
+
+    /// Runs what is recorded and reads a buffer from its start.
+    fn read_back(
+        device: &Device,
+        mut recorded: wgpu::CommandEncoder,
+        buffer: &wgpu::Buffer,
+        len_bytes: u64,
+    ) -> Vec<u32> {
+        let staging =
+            device.buffer("staging", len_bytes, Usage::MAP_READ | Usage::COPY_DST).expect("there is memory");
+        recorded.copy_buffer_to_buffer(buffer, 0, &staging, 0, len_bytes);
+        let submission = device.queue.submit([recorded.finish()]);
+        staging.map_async(wgpu::MapMode::Read, .., |_| {});
+        device.wait(submission).expect("no error");
+        let bytes = staging.get_mapped_range(..).expect("mapped");
+        bytemuck::cast_slice::<u8, u32>(&bytes)[..(len_bytes / 4) as usize].to_vec()
+    }
+
     /// 40 blocks of 2^27 pairs each, more than 2^32: the total stays at the largest number, which no buffer holds.
     #[test]
     fn counts_that_would_wrap_stay_at_the_largest() {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
+        let Some((device, mut workspace)) = opened(Capacities { visible: 10_000, pairs: 1, entries: 1 })
+        else {
             return;
         };
-        let device = adapter.open(adapter.report.precision).expect("opens");
-        let capacities = Capacities { visible: 10_000, pairs: 1, entries: 1 };
-        let size = Size { capacities, n_tiles: 1, n_px: 1, n_chunk: 1 };
-        let mut workspace = Workspace::new(&device, size).expect("there is memory");
         for (of_block, expected) in [(1 << 20, 40 << 20), (1 << 27, u32::MAX)] {
             let Buffers { counters, block_counts, .. } = &workspace.stages.buffers;
             let mut counts: Counts = Zeroable::zeroed();
@@ -309,16 +333,8 @@ mod tests {
             let mut pass = encoder.begin_compute_pass(&Default::default());
             workspace.stages.scan(&device, &mut pass, Scan::Pairs);
             drop(pass);
-            let staging = device
-                .buffer("staging", COUNTERS_BYTES, Usage::MAP_READ | Usage::COPY_DST)
-                .expect("there is memory");
             let counters = &workspace.stages.buffers.counters;
-            encoder.copy_buffer_to_buffer(counters, 0, &staging, 0, COUNTERS_BYTES);
-            let submission = device.queue.submit([encoder.finish()]);
-            staging.map_async(wgpu::MapMode::Read, .., |_| {});
-            device.wait(submission).expect("no error");
-            let bytes = staging.get_mapped_range(..).expect("mapped");
-            let found = bytemuck::cast_slice::<u8, u32>(&bytes)[Counter::Pairs as usize];
+            let found = read_back(&device, encoder, counters, COUNTERS_BYTES)[Counter::Pairs as usize];
             assert_eq!(found, expected, "{of_block} a block");
         }
     }
@@ -327,14 +343,10 @@ mod tests {
     /// of a block. Half of the keys repeat, which reveals an unstable sort.
     #[test]
     fn the_sort_is_stable_at_every_size() {
-        let Some(adapter) = adapters().into_iter().next() else {
-            println!("skipped: no GPU");
+        let Some((device, mut workspace)) = opened(Capacities { visible: 1, pairs: 1, entries: 70_000 })
+        else {
             return;
         };
-        let device = adapter.open(adapter.report.precision).expect("opens");
-        let capacities = Capacities { visible: 1, pairs: 1, entries: 70_000 };
-        let size = Size { capacities, n_tiles: 1, n_px: 1, n_chunk: 1 };
-        let mut workspace = Workspace::new(&device, size).expect("there is memory");
         workspace.set_region_bits(&device, bits_of(300));
         for n in [0, 1, 2, 255, 256, 257, 2047, 2048, 2049, 4096, 70_000] {
             let key = |i: u32, salt: u32| (i ^ salt).wrapping_mul(0x9e37_79b9) >> 8;
@@ -349,21 +361,8 @@ mod tests {
             workspace.stages.scan(&device, &mut pass, Scan::Entries);
             let last = workspace.stages.sort(&device, &mut pass, (SortKey::MemberRegion, 32 + bits_of(300)));
             drop(pass);
-            let staging = device
-                .buffer("staging", u64::from(n) * 4, Usage::MAP_READ | Usage::COPY_DST)
-                .expect("there is memory");
-            encoder.copy_buffer_to_buffer(
-                &workspace.stages.buffers.entry_order[last],
-                0,
-                &staging,
-                0,
-                u64::from(n) * 4,
-            );
-            let submission = device.queue.submit([encoder.finish()]);
-            staging.map_async(wgpu::MapMode::Read, .., |_| {});
-            device.wait(submission).expect("no error");
-            let bytes = staging.get_mapped_range(..).expect("mapped");
-            let found = bytemuck::cast_slice::<u8, u32>(&bytes)[..n as usize].to_vec();
+            let order = &workspace.stages.buffers.entry_order[last];
+            let found = read_back(&device, encoder, order, u64::from(n) * 4);
             let mut expected: Vec<u32> = (0..n).collect();
             expected.sort_by_key(|i| (entries[*i as usize][0], entries[*i as usize][1]));
             assert!(found == expected, "{n} items");

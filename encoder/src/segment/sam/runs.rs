@@ -54,14 +54,12 @@ impl RunMask {
         self.area_px
     }
 
-    /// Returns the intersection over union of two sets.
     pub(super) fn iou(&self, other: &Self) -> f64 {
         let both_px = self.intersection_px(other);
         let areas_px = u64::from(self.area_px) + u64::from(other.area_px);
         both_px as f64 / (areas_px - both_px) as f64
     }
 
-    /// Returns the number of pixels in both sets.
     pub(super) fn intersection_px(&self, other: &Self) -> u64 {
         let (mut a, mut b) = (self.runs.iter().peekable(), other.runs.iter().peekable());
         let mut both_px = 0_u64;

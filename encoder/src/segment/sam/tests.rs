@@ -428,16 +428,12 @@ fn the_identity_holds_model_and_settings() {
 /// Noise contains all neighbourhoods of pixels, including contacts at corners.
 #[test]
 fn healing_of_noise_equals_a_plain_recomputation() {
-    let mut state = 5_u64;
-    let mut random = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 33) as f64 / (1_u64 << 31) as f64
-    };
+    let mut random = Random::new(5);
     for round in 0..300 {
         let [width, height] = [1 + round % 19, 1 + round % 13];
-        let density = 0.2 + 0.6 * random();
-        let inside: Vec<bool> = (0..width * height).map(|_| random() < density).collect();
-        let min_region_px = (random() * 12.0) as u32;
+        let density = 0.2 + 0.6 * random.unit();
+        let inside: Vec<bool> = (0..width * height).map(|_| random.unit() < density).collect();
+        let min_region_px = (random.unit() * 12.0) as u32;
         let mut runs = Vec::new();
         for (y, row) in inside.chunks_exact(width).enumerate() {
             // Runs must be disjoint: each begins after a pixel outside.

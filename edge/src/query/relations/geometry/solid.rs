@@ -7,7 +7,6 @@ use slag_common::frames::Aabb;
 /// Share of the smaller of two boxes that lies in the larger one if they are of one thing.
 const PIECE: f64 = 0.6;
 
-/// An upright box in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Solid {
     pub centre: DVec3,
@@ -30,7 +29,6 @@ impl Solid {
         }
     }
 
-    /// Takes a box along the world's axes.
     pub(crate) fn of_aabb(bounds: &Aabb) -> Self {
         Self { centre: bounds.centre(), half: bounds.size() * 0.5, along: DVec2::X }
     }

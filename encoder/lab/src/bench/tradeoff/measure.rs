@@ -170,7 +170,6 @@ impl Run<'_> {
         json_of(command.args(&self.programs.models).args(views).args(lift))
     }
 
-    /// Evaluates the store's shards of the point's profile.
     fn evaluate(&self) -> Result<Value> {
         let mut command = Command::new(&self.programs.lab);
         command.args(["--json", "eval", "labelled", "--truth"]).arg(&self.scene.dir);

@@ -128,7 +128,6 @@ fn judge(
     Ok(())
 }
 
-/// Judges the robot's best pose for a thing.
 fn verdict(truth: &Truth<'_>, thing: usize, reply: &Value) -> Result<Verdict> {
     let Some(goal) = reply["goals"].as_array().map(|goals| goals.first()) else {
         return Err(anyhow!("the robot refused: {reply}"));
@@ -180,7 +179,6 @@ fn objects_of_things(thing_of: &[u16], object_of: &[u32]) -> BTreeMap<u16, u32> 
     most.into_iter().map(|(thing, (_, object))| (thing, object)).collect()
 }
 
-/// What the robot's program said of a thing.
 #[derive(Clone, Debug)]
 enum Verdict {
     /// The thing is no object on board.

@@ -26,7 +26,6 @@ const MAX_PLACES: usize = 60;
 /// The picture that decides whether a thing is shown.
 const PICTURE_PX: [u32; 2] = [240, 240];
 const FIELD_OF_VIEW_RAD: f64 = 110.0 * PI / 180.0;
-/// Least pixels that a thing must have.
 const MIN_SHOWN_PX: u32 = 12;
 
 /// Returns the request of places to stand near what a parameter names, of a robot that is somewhere on the floor.

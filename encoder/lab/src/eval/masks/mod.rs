@@ -70,7 +70,6 @@ pub(crate) struct MasksArgs {
     how: RunArgs,
 }
 
-/// Figures of a segmenter on a scene.
 #[derive(Clone, Debug, Default, Serialize)]
 struct Row {
     scene: String,
@@ -215,7 +214,6 @@ impl Judge<'_> {
     }
 }
 
-/// Reads the labelled id of each pixel.
 fn true_ids(dir: &Path, view: &View, size_px: [u32; 2]) -> Result<Vec<u16>> {
     let path = slag_encoder::segment::mask_file(dir, view)
         .with_context(|| format!("{}: no mask of {}", dir.display(), view.name))?;

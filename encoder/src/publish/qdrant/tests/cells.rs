@@ -13,7 +13,7 @@ fn vectors() -> qdrant_client::qdrant::VectorParams {
     VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build()
 }
 
-fn held_of(scene: &str) -> Held {
+pub(super) fn held_of(scene: &str) -> Held {
     let mut held = Held::new(vectors());
     held.points
         .insert(7, Stored { vector: vec![1.0; DIM], payload: [("scene".to_owned(), scene.into())].into() });

@@ -367,11 +367,7 @@ async fn collections_that_do_not_fit_are_refused() {
         );
         assert_eq!(refused, expected);
     }
-    let mut held = server::Held::new(VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build());
-    let foreign =
-        server::Stored { vector: vec![1.0; DIM], payload: [("scene".to_owned(), "attic".into())].into() };
-    held.points.insert(7, foreign);
-    server.with(|state| state.collections.insert("yard".into(), held));
+    server.with(|state| state.collections.insert("yard".into(), cells::held_of("attic")));
     let refused = fixture.push(&options(&url)).await.expect_err("another scene");
     assert!(matches!(refused, PushError::OtherScene { n_points: 1, .. }), "{refused}");
     assert_eq!(

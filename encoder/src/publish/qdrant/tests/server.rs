@@ -63,7 +63,6 @@ pub(super) struct State {
 }
 
 impl State {
-    /// Returns a collection, as every service finds it.
     pub(super) fn held(&mut self, name: &str) -> Result<&mut Held, Status> {
         self.collections.get_mut(name).ok_or_else(|| Status::not_found(format!("no collection {name}")))
     }
@@ -80,7 +79,6 @@ pub(super) struct Server {
 }
 
 impl Server {
-    /// Starts listening; returns the server and its URL.
     pub(super) async fn start(api_key: Option<&'static str>) -> (Self, String) {
         let server = Self { state: Arc::default(), watcher: Arc::default(), api_key };
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
