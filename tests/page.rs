@@ -61,6 +61,25 @@ fn scores_are_those_of_the_command_line() {
     assert!(expected[expected.len() - 1] - expected[0] > 0.5, "the question tells Gaussians apart");
 }
 
+/// A store is drawn in the colours of its balanced shards; compact ones, which robots fetch, have the same places alone.
+#[test]
+fn a_store_shows_colours_that_compact_shards_lack() {
+    let site = Site::new();
+    let robot = site.robot(&[]);
+    let id = &site.store.get("/v1/view")["cells"][0]["cell"];
+    let cell_of = |service: &Service| {
+        let url = format!("{}/v1/view/cells/{id}", service.url);
+        ureq::get(url).call().expect("answers").body_mut().read_to_vec().expect("bytes")
+    };
+    let (of_store, of_robot) = (cell_of(&site.store), cell_of(&robot));
+    let flags = |bytes: &[u8]| u32::from_le_bytes(bytes[24..28].try_into().expect("4 bytes"));
+    assert_eq!((flags(&of_store) & 1, flags(&of_robot) & 1), (1, 0));
+    // What names the cell, and its centres of 6 bytes.
+    let n = u32::from_le_bytes(of_store[8..12].try_into().expect("4 bytes")) as usize;
+    let places = 32..32 + 6 * n;
+    assert!(n > 100 && of_store[..24] == of_robot[..24] && of_store[places.clone()] == of_robot[places]);
+}
+
 /// Answers of the store's service are the robot's: same things, scores and places.
 #[test]
 fn the_store_finds_what_the_robot_finds() {
