@@ -54,7 +54,7 @@ pub(crate) struct LocateArgs {
     change: Change,
     /// The map has only photos of these places in the order of names, from A to before B; the others are queries
     /// [default: all].
-    #[arg(long, value_name = "A,B", value_delimiter = ',', num_args = 2)]
+    #[arg(long, value_names = ["A", "B"], num_args = 2)]
     map_views: Option<Vec<usize>>,
     /// Of each four photos in the order of names, the one that is a query: 0 to 3.
     #[arg(long, value_name = "N", default_value_t = HELD_OUT - 1, value_parser = RangedU64ValueParser::<usize>::new().range(0..HELD_OUT as u64))]
