@@ -56,7 +56,8 @@ pub(crate) struct GoalArgs {
     /// Radius of the robot.
     #[arg(long, value_name = "M", default_value_t = 0.3)]
     radius_m: f64,
-    /// Goes the whole road instead: from photos that no map has seen to what words name, with masks of the encoder's own.
+    /// Goes the whole road instead: from photos that no map has seen to what words name, with the encoder's own
+    /// masks.
     #[arg(long)]
     from_photos: bool,
     /// Tell each thing and pose that was not as it should be.

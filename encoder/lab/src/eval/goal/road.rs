@@ -1,5 +1,5 @@
-//! The whole road: a photo that no map has seen, where it was taken, a word, a place to stand in the frame of the robot's
-//! odometry. Judged at the place where that leads.
+//! The whole road: a photo that no map has seen, where it was taken, a word, a place to stand in the frame of the
+//! robot's odometry. Judged at the place where that leads.
 
 use std::collections::BTreeSet;
 use std::path::Path;
