@@ -247,7 +247,7 @@ fn spz() -> Vec<u8> {
     bytes
 }
 
-/// Folders of versions 1 and 2 whose images are all the same one.
+/// Folders of versions 1 and 2 that use one image for all columns.
 fn sog_folders() -> Vec<Vec<u8>> {
     // Small, so that any of its pixels is a label, and any of its rows a quaternion.
     let pixels =

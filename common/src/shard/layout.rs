@@ -75,7 +75,7 @@ impl ShardLayout {
         })
     }
 
-    /// Returns what the checked bytes carry beyond the columns of [`ShardLayout::view`], under its conditions.
+    /// Returns the parts of a shard besides the columns of [`ShardLayout::view`]; `bytes` must be those checked.
     pub fn additions<'a>(&self, bytes: &'a [u8]) -> Additions<'a> {
         let appearance = self.appearance.as_ref().map(|columns| {
             let [colours, sizes, rotations] = columns.clone().map(|range| &bytes[range]);

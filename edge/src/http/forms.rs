@@ -104,7 +104,7 @@ pub fn point(near: Option<XyzText>, near_lat_lon: Option<LatLonText>) -> Result<
     }
 }
 
-/// Where what is asked for lies, besides a ball.
+/// A box and an outline that answers must lie in.
 #[derive(Deserialize, JsonSchema)]
 #[schemars(inline)]
 pub struct AreaParams {

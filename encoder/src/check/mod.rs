@@ -85,7 +85,7 @@ where
     })
 }
 
-/// The views that could be compared with their photos, and what is left of them for a diagnosis.
+/// Results of the views whose photos could be read, and samples of them for a diagnosis.
 struct Compared {
     checks: Vec<ViewCheck>,
     unreadable: Vec<IngestError>,

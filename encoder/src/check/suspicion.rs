@@ -70,7 +70,7 @@ fn undrawable(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
     found
 }
 
-/// Says which columns of the file may be something else than what they are read as.
+/// Says which columns of the file may hold other quantities than expected.
 fn misread(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
     let mut found: Vec<String> = Vec::new();
     if usable.len() < MANY {

@@ -151,10 +151,12 @@ impl ShardBuilder<'_> {
         };
         let objects = extras.objects.map(of_cell);
         let objects = objects.as_ref().map(CellObjects::view);
-        let appearance = AppearanceColumns::of(self.scene, &order.in_input());
+        let tells = |profile: &Profile| *profile != Profile::Compact || settings.compact_appearance;
+        let is_told = settings.profiles.iter().any(tells);
+        let appearance = is_told.then(|| AppearanceColumns::of(self.scene, &order.in_input()));
         let additions = Additions {
             objects,
-            appearance: Some(appearance.view()),
+            appearance: appearance.as_ref().map(AppearanceColumns::view),
             occupancy: extras.occupancy,
             photo_poses: extras.photo_poses,
             landmarks: extras.landmarks,

@@ -50,17 +50,13 @@ pub(super) fn smallest_with_appearance(
     reader: &StoreReader,
     cell: &CellRecord,
 ) -> Result<Option<StoredShard>, StoreError> {
-    let mut shards = cell.shards.values().map(|record| reader.read_shard(record));
-    let smallest = shards.next().transpose()?;
-    let tells = |shard: &StoredShard| shard.layout.additions(&shard.bytes).appearance.is_some();
-    if smallest.as_ref().is_none_or(tells) {
-        return Ok(smallest);
-    }
-    for shard in shards {
-        let shard = shard?;
-        if tells(&shard) {
+    let mut smallest = None;
+    for record in cell.shards.values() {
+        let shard = reader.read_shard(record)?;
+        if shard.layout.additions(&shard.bytes).appearance.is_some() {
             return Ok(Some(shard));
         }
+        smallest.get_or_insert(shard);
     }
     Ok(smallest)
 }

@@ -299,7 +299,7 @@ mod tests {
         Some((device, workspace))
     }
 
-    /// Runs what is recorded and reads a buffer from its start.
+    /// Submits the recorded commands and reads the start of a buffer.
     fn read_back(
         device: &Device,
         mut recorded: wgpu::CommandEncoder,

@@ -44,12 +44,12 @@ impl Road {
         let things = || (0..layout.placed.len()).filter(|at| !layout.placed[*at].shell);
         let noun = |at: usize| NOUNS[layout.placed[at].noun].name.as_str();
         let reachable: BTreeSet<_> = things().filter(|at| truth.is_reachable(*at)).map(noun).collect();
+        let odom_from_scene =
+            DAffine3::from_rotation_translation(DQuat::from_rotation_z(TURNED_RAD), MOVED_M);
         for photo in poses::read(&scene.join("test/transforms.json"), None)?.views {
             self.n_photos += 1;
             let Some(found) = located(service, &photo)? else { continue };
             self.n_located += 1;
-            let odom_from_scene =
-                DAffine3::from_rotation_translation(DQuat::from_rotation_z(TURNED_RAD), MOVED_M);
             // The odometry tells where the camera is, the photo where that is in the scene.
             let odom_from_camera = odom_from_scene * photo.camera_from_world.inverse();
             let odom_from_scene_as_found = odom_from_camera * found.inverse();

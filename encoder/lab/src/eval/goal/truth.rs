@@ -28,7 +28,7 @@ const PICTURE_PX: [u32; 2] = [240, 240];
 const FIELD_OF_VIEW_RAD: f64 = 110.0 * PI / 180.0;
 const MIN_SHOWN_PX: u32 = 12;
 
-/// Returns the request of places to stand near what a parameter names, of a robot that is somewhere on the floor.
+/// Returns the path that asks for places to stand near a thing, for a robot on the floor. `what`: `id=` or `text=`.
 pub(super) fn goal_request(what: &str, at: DVec3, radius_m: f64) -> String {
     format!(
         "/v1/goal?{what}&near={},{},0&radius_m={radius_m}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
