@@ -81,6 +81,53 @@ fn a_store_shows_colours_that_compact_shards_lack() {
     assert!(n > 100 && of_store[..24] == of_robot[..24] && of_store[places.clone()] == of_robot[places]);
 }
 
+/// Things of balanced shards carry a picture: the part of their best photo around their box.
+///
+/// Oracle: the mean colour of that part of the generated photo.
+#[test]
+fn things_carry_pictures_of_themselves() {
+    let site = Site::new();
+    let cache = site.cache().with_file_name("balanced");
+    let at =
+        ["fetch", "--trust-first", "--from", &site.store.url, "--profile", "balanced", "--at", "3.5,2.7,0"];
+    run(edge(&at).args(["--cache", text(&cache)]));
+    let robot = Service::start(&mut edge(&["serve", "--models", "colours", "--cache", text(&cache)]));
+    let photos = generated(&ROOM);
+    let objects = robot.get("/v1/objects?limit=1000")["objects"].clone();
+    let objects = objects.as_array().expect("objects");
+    assert!(objects.len() > 5);
+    for object in objects {
+        let path = format!("/v1/objects/{}/thumbnail", object["id"].as_str().expect("an id"));
+        let picture_of = |service: &Service| {
+            let url = format!("{}{path}", service.url);
+            ureq::get(url).call().expect("a picture").body_mut().read_to_vec().expect("bytes")
+        };
+        let picture = picture_of(&robot);
+        assert_eq!(picture, picture_of(&site.store));
+        let picture =
+            image::load_from_memory_with_format(&picture, image::ImageFormat::Jpeg).expect("a JPEG");
+        let photo = photos.join("images").join(object["evidence"]["photo"].as_str().expect("a name"));
+        let photo = image::open(photo).expect("a photo").to_rgb8();
+        let edges: Vec<u32> =
+            (0..4).map(|at| object["evidence"]["box_px"][at].as_u64().expect("px") as u32).collect();
+        let margin = (0.15 * f64::from((edges[2] - edges[0]).max(edges[3] - edges[1]))).round() as u32;
+        let [x0, y0] = [0, 1].map(|at| edges[at].saturating_sub(margin));
+        let (x1, y1) = ((edges[2] + margin).min(photo.width()), (edges[3] + margin).min(photo.height()));
+        let cut = image::imageops::crop_imm(&photo, x0, y0, x1 - x0, y1 - y0).to_image();
+        for (found, expected) in mean_colour(&picture.to_rgb8()).iter().zip(mean_colour(&cut)) {
+            assert!((found - expected).abs() < 4.0, "{path}: {found} {expected}");
+        }
+    }
+    let on_compact = site.robot(&[]);
+    let listed = on_compact.get("/v1/objects");
+    assert_eq!(listed["objects"][0]["evidence"]["has_thumbnail"], false);
+}
+
+fn mean_colour(picture: &image::RgbImage) -> [f64; 3] {
+    let n = f64::from(picture.width() * picture.height());
+    [0, 1, 2].map(|channel| picture.pixels().map(|pixel| f64::from(pixel[channel])).sum::<f64>() / n)
+}
+
 /// Answers of the store's service are the robot's: same things, scores and places.
 #[test]
 fn the_store_finds_what_the_robot_finds() {

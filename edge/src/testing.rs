@@ -82,6 +82,7 @@ impl BuiltShard {
                 n_gaussians: object.n_gaussians,
                 photo: format!("{}.jpg", object.id),
                 photo_box_px: [1, 2, 30, 40],
+                thumbnail: b"\xff\xd8\xff\xe0".to_vec(),
             }
         };
         let Calibration { score_mean, score_spread } = calibration;

@@ -209,6 +209,7 @@ fn with_additions(view: &ShardView<'_>) -> Vec<u8> {
         n_gaussians: 40,
         photo: "a.jpg".into(),
         photo_box_px: [10, 20, 110, 70],
+        thumbnail: b"\xff\xd8\xff\xe0".to_vec(),
     };
     let objects = vec![object(1, std::slice::from_ref(&(3..5))), object(7, &[0..2, 5..6])];
     let objects = SampleObjects { objects, score_mean: 0.02, score_spread: 0.1, score_error_bound: 0.02 };

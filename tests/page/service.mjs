@@ -118,6 +118,7 @@ export async function startService(behaviour = {}) {
     if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(behaviour.things, url.searchParams.get("text").replace("seat", "chair"), behaviour.generation));
     if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: behaviour.words, complete: behaviour.hasAllWords });
     if (url.pathname === "/v1/map") return json(response, 200, { age_secs: behaviour.ageSecs, is_expired: false });
+    if (url.pathname === "/v1/objects/o1/thumbnail") return response.writeHead(200, { "content-type": "image/svg+xml" }).end(PICTURE);
     if (url.pathname.startsWith("/v1/view/photos/")) return response.writeHead(200, { "content-type": "image/svg+xml" }).end(PICTURE);
     if (url.pathname === "/v1/locate") {
       behaviour.focalPx = Number(url.searchParams.get("focal_px"));

@@ -81,6 +81,15 @@ test("cards have the photo's crop, whereabouts, size and how sure; the chosen on
   assert.ok(await page.locator("#details").isHidden());
 }, { behaviour: { photos: [PHOTO], evidence: EVIDENCE, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
 
+test("where photos are not at hand, answers have the small picture that the scene carries", () => opened(async (page) => {
+  await answered(page, "chair");
+  const picture = page.locator("#answers .card img.crop");
+  await picture.waitFor();
+  await page.waitForFunction(() => document.querySelector("#answers .card img").naturalWidth > 0);
+  await page.locator("#answers .card").first().click();
+  assert.ok(await picture.isVisible());
+}, { behaviour: { photos: [{ ...PHOTO, has_picture: false }], evidence: { ...EVIDENCE, has_thumbnail: true }, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
+
 test("what no object answers, groups of what is lit do; what nothing answers lights nothing, nor does a failure", () => opened(async (page, service) => {
   await drawn(page);
   await answered(page, "seat");

@@ -183,6 +183,12 @@ class Robot:
         found: dict[str, Any] = self._send("/v1/objects/" + urllib.parse.quote(id, safe=""))
         return found
 
+    def thumbnail(self, id: str) -> bytes:
+        """Returns the small picture of one thing on board, a JPEG file; balanced and exact shards have them."""
+        with self._open(f"/v1/objects/{urllib.parse.quote(id, safe='')}/thumbnail", None, self.timeout_secs) as reply:
+            picture: bytes = reply.read()
+        return picture
+
     def map(self) -> dict[str, Any]:
         """Returns the area on board, its age, and what is missing."""
         place: dict[str, Any] = self._send("/v1/map")

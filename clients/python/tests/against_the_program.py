@@ -22,6 +22,11 @@ def main(url: str, word: str) -> None:
     assert len(things) == place["n_objects"] > 0, (len(things), place["n_objects"])
     assert len({one["id"] for one in things}) == len(things)
     assert robot.object(things[0]["id"]) == things[0]
+    try:
+        picture = robot.thumbnail(things[0]["id"])
+        assert things[0]["evidence"]["has_thumbnail"] and picture.startswith(b"\xff\xd8\xff")
+    except SlagError as error:
+        assert error.status == 404 and not things[0]["evidence"]["has_thumbnail"], error
 
     result = robot.find(word, near=[0.0, 0.0, 0.0])
     assert result.none is None and result.understood is None, result

@@ -86,6 +86,9 @@ pub struct Evidence {
     pub photo: String,
     /// The object's box in the undistorted photo: x0, y0, x1, y1, the latter exclusive.
     pub box_px: [u32; 4],
+    /// Whether `GET /v1/objects/{id}/thumbnail` has a small picture cut from it.
+    #[serde(default)]
+    pub has_thumbnail: bool,
 }
 
 /// Permitted orientations of a box.

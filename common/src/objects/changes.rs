@@ -189,6 +189,13 @@ pub fn public_id(id: u64) -> String {
     format!("o{id:016x}")
 }
 
+/// Returns the id that answers name so: `o` and 16 hex digits.
+pub fn parse_public_id(text: &str) -> Option<u64> {
+    let digits = text.strip_prefix('o')?;
+    let is_hex = digits.len() == 16 && digits.bytes().all(|b| b.is_ascii_hexdigit());
+    is_hex.then(|| u64::from_str_radix(digits, 16).ok())?
+}
+
 fn as_hex<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
     // JSON numbers have 53 bits.
     serializer.collect_str(&format_args!("{id:016x}"))

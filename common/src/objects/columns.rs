@@ -5,6 +5,7 @@ use std::ops::Range;
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
+use super::thumbnails::{Thumbnails, ThumbnailsLayout};
 use crate::container::{self, ContainerError, Layout, damaged};
 use crate::frames::Aabb;
 use crate::quantise::quantise;
@@ -94,12 +95,13 @@ pub struct Objects<'a> {
     /// `[n_runs]`.
     pub run_objects: &'a [u16],
     pub photos: &'a [u8],
+    pub thumbnails: Option<Thumbnails<'a>>,
 }
 
 impl<'a> Objects<'a> {
     /// Returns the sections, to be written after the shard's own.
-    pub fn sections(&self) -> [(u32, &[u8]); 7] {
-        [
+    pub fn sections(&self) -> impl Iterator<Item = (u32, &[u8])> {
+        let columns = [
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::RECORDS, container::bytes_of(self.records)),
             (section::VECTORS, container::bytes_of(self.vectors)),
@@ -107,7 +109,8 @@ impl<'a> Objects<'a> {
             (section::RUN_ENDS, container::bytes_of(self.run_ends)),
             (section::RUN_OBJECTS, container::bytes_of(self.run_objects)),
             (section::PHOTOS, self.photos),
-        ]
+        ];
+        columns.into_iter().chain(self.thumbnails.iter().flat_map(Thumbnails::sections))
     }
 
     /// Returns the name of the photo that shows an object best.
@@ -152,6 +155,7 @@ const MAX_ERROR: f32 = 4.0;
 pub(crate) struct ObjectsLayout {
     header: ObjectsHeader,
     columns: [Range<usize>; 6],
+    thumbnails: Option<ThumbnailsLayout>,
 }
 
 impl ObjectsLayout {
@@ -205,7 +209,8 @@ impl ObjectsLayout {
                 return Err(damaged(offset, format!("object {at}: {what}")));
             }
         }
-        Ok(Some(Self { header, columns }))
+        let thumbnails = ThumbnailsLayout::check(bytes, layout, n)?;
+        Ok(Some(Self { header, columns, thumbnails }))
     }
 
     pub(crate) fn view<'a>(&self, bytes: &'a [u8]) -> Objects<'a> {
@@ -219,6 +224,7 @@ impl ObjectsLayout {
             run_ends: bytemuck::cast_slice(run_ends),
             run_objects: bytemuck::cast_slice(run_objects),
             photos,
+            thumbnails: self.thumbnails.as_ref().map(|thumbnails| thumbnails.view(bytes)),
         }
     }
 }

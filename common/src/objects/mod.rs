@@ -7,10 +7,12 @@
 
 mod changes;
 mod columns;
+mod thumbnails;
 
-pub use changes::{Changes, Moved, Place, Thing, changes, is_unchanged, public_id};
+pub use changes::{Changes, Moved, Place, Thing, changes, is_unchanged, parse_public_id, public_id};
 pub(crate) use columns::ObjectsLayout;
 pub use columns::{
     MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs,
     object_score, quantise_vectors, section,
 };
+pub use thumbnails::{MAX_THUMBNAIL_BYTES, Thumbnails};

@@ -6,7 +6,8 @@ use super::*;
 use crate::container::{self, AlignedBytes, Layout};
 use crate::frames::Aabb;
 use crate::objects::{
-    NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, object_score, quantise_vectors,
+    MAX_THUMBNAIL_BYTES, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, Thumbnails, collect_runs,
+    object_score, quantise_vectors,
 };
 
 /// The parts of a shard's objects that a test edits before they are written.
@@ -17,7 +18,11 @@ struct Parts {
     run_ends: Vec<u32>,
     run_objects: Vec<u16>,
     photos: Vec<u8>,
+    /// Ends and pictures.
+    thumbnails: Option<(Vec<u32>, Vec<u8>)>,
 }
+
+const PICTURE: [u8; 5] = [0xff, 0xd8, 0xff, 1, 2];
 
 fn record(id: u64, n_here: u32, photo: std::ops::Range<u32>) -> ObjectRecord {
     ObjectRecord {
@@ -51,6 +56,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
         run_ends: vec![2, 3, 5, 6],
         run_objects: vec![1, NO_OBJECT, 0, 1],
         photos: "a.jpgü.png".bytes().take(10).collect(),
+        thumbnails: Some((vec![0, 5], PICTURE.into())),
     };
     // The umlaut has two bytes: "a.jpg" and "ü.pn".
     edit(&mut parts);
@@ -71,6 +77,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
         run_ends: &parts.run_ends,
         run_objects: &parts.run_objects,
         photos: &parts.photos,
+        thumbnails: parts.thumbnails.as_ref().map(|(ends, pictures)| Thumbnails { ends, pictures }),
     };
     let sections: Vec<(u32, Vec<u8>)> = {
         let out = shard.to_bytes();
@@ -92,6 +99,8 @@ fn round_trip() {
     let objects = layout.additions(&bytes).objects.expect("has objects");
     assert_eq!(objects.records, [record(0xdead_beef_0000_0001, 2, 0..5), record(7, 3, 5..10)]);
     assert_eq!(objects.records.iter().map(|r| objects.photo(r)).collect::<Vec<_>>(), ["a.jpg", "ü.pn"]);
+    let thumbnails = objects.thumbnails.expect("has thumbnails");
+    assert_eq!([0, 1].map(|object| thumbnails.get(object)), [None, Some(&PICTURE[..])]);
     let runs: Vec<_> = objects.runs().collect();
     assert!(runs.iter().enumerate().all(|(at, (run, _))| objects.run(at) == *run));
     assert_eq!(runs, [(0..2, Some(1)), (2..3, None), (3..5, Some(0)), (5..6, Some(1))]);
@@ -146,6 +155,19 @@ fn invalid_contents_are_refused() {
     assert!(refused(|p| p.records[0].photo_bytes = 6).contains("name"), "cuts a character");
     assert!(refused(|p| p.photos[0] = 0xff).contains("UTF-8"));
     assert!(refused(|p| p.photos[0] = 0x1b).contains("UTF-8"), "an escape");
+    let refused = |ends: &[u32], pictures: &[u8]| {
+        let bytes = written(|p| p.thumbnails = Some((ends.into(), pictures.into())));
+        ShardLayout::check(&bytes).expect_err("must be refused").to_string()
+    };
+    assert!(refused(&[5], &PICTURE).contains("bytes"));
+    assert!(refused(&[5, 4], &PICTURE).contains("ascend"));
+    assert!(refused(&[6, 5], &PICTURE).contains("ascend"));
+    assert!(refused(&[0, 6], &PICTURE).contains("ascend"));
+    assert!(refused(&[2, 5], &PICTURE).contains("thumbnail of object 0"));
+    assert!(refused(&[0, 4], &PICTURE[1..]).contains("thumbnail of object 1"));
+    let mut long = PICTURE.to_vec();
+    long.resize(MAX_THUMBNAIL_BYTES + 1, 0);
+    assert!(refused(&[0, long.len() as u32], &long).contains("thumbnail of object 1"));
 }
 
 /// The runs of the Gaussians of [`written`].

@@ -11,7 +11,9 @@ use crate::Hash32;
 use crate::container::AlignedBytes;
 use crate::frames::Aabb;
 use crate::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use crate::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
+use crate::objects::{
+    NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, Thumbnails, collect_runs, quantise_vectors,
+};
 
 /// Returns the header of a shard without basis and codes, with 16-bit positions over a box.
 pub fn header(cell_id: u32, n_gaussians: usize, n_centroids: usize, dim: usize, bounds: Aabb) -> ShardHeader {
@@ -86,6 +88,8 @@ pub struct SampleObject {
     pub photo: String,
     /// x0, y0, x1, y1.
     pub photo_box_px: [u32; 4],
+    /// A JPEG file; empty: none.
+    pub thumbnail: Vec<u8>,
 }
 
 /// Objects with three vectors each, as scored over a bank of texts.
@@ -123,6 +127,12 @@ impl SampleObjects {
             vectors.extend(components);
             steps.extend(of_vectors);
         }
+        let pictures: Vec<u8> = self.objects.iter().flat_map(|object| object.thumbnail.clone()).collect();
+        let ends = self.objects.iter().scan(0, |end, object| {
+            *end += object.thumbnail.len() as u32;
+            Some(*end)
+        });
+        let ends: Vec<u32> = ends.collect();
         let (run_ends, run_objects) = collect_runs(object_of);
         let header = ObjectsHeader {
             n_objects: records.len() as u32,
@@ -141,6 +151,7 @@ impl SampleObjects {
             run_ends: &run_ends,
             run_objects: &run_objects,
             photos: photos.as_bytes(),
+            thumbnails: (!pictures.is_empty()).then_some(Thumbnails { ends: &ends, pictures: &pictures }),
         };
         let mut bytes = Vec::new();
         shard

@@ -4,11 +4,12 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
-use crate::query::{object_id, parse_point};
+use crate::query::parse_point;
 use crate::score::Budget;
 use clap::Args;
 use glam::DVec3;
 use slag_api::goal::{Goal, GoalReply};
+use slag_common::objects::parse_public_id;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
@@ -49,7 +50,7 @@ pub struct GoalArgs {
 
 pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let target =
-        object_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
+        parse_public_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
     let request = GoalRequest { target, near: args.near, robot: args.robot, stand: args.stand };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
     args.threads.apply()?;

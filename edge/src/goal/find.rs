@@ -2,12 +2,12 @@
 
 use glam::DVec3;
 use slag_api::goal::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
-use slag_common::objects::public_id;
+use slag_common::objects::{parse_public_id, public_id};
 
 use super::choose::choose;
 use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings};
-use crate::query::{Ask, Engine, Outcome, Point, object_id};
+use crate::query::{Ask, Engine, Outcome, Point};
 use crate::score::Budget;
 use crate::store::Snapshot;
 
@@ -119,7 +119,7 @@ fn things(
             position_in_world: answer.position_in_world,
             score: Some(answer.score),
         };
-        Some((object_id(&answer.id)?, thing))
+        Some((parse_public_id(&answer.id)?, thing))
     };
     let (things, none): (Things, Option<&str>) = match found.outcomes.first() {
         Some(Outcome::Plain(answers)) => {

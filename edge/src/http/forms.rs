@@ -5,9 +5,10 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Deserialize;
 use serde::de::{Deserializer, Error};
 use slag_common::frames::Aabb;
+use slag_common::objects::parse_public_id;
 
 use crate::query::{
-    Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, object_id, parse_box,
+    Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, parse_box,
     parse_point,
 };
 use crate::score::{MAX_COORDINATE, MAX_CORNERS};
@@ -92,7 +93,7 @@ fn pairs(text: &str) -> Result<Vec<[f64; 2]>, &'static str> {
 }
 
 fn id(text: &str) -> Result<u64, &'static str> {
-    object_id(text).ok_or("o and 16 hex digits")
+    parse_public_id(text).ok_or("o and 16 hex digits")
 }
 
 /// Returns the point that is given in one of two ways.

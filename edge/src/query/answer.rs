@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 use rayon::prelude::*;
-use slag_api::objects::Evidence;
 
 use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Found, Reason, Searched, Whole};
-use super::cluster::{Cluster, Grouping, cluster};
+use super::cluster::{Cluster, Clusters, Grouping, cluster};
 use super::objects::{self, FoundObject};
 use super::oriented::Extent;
 use super::rank::{Order, Ranked};
 use super::reason;
+use super::relations::ClustersOfThing;
 use super::reply::RelatedAnswers;
 use super::request::{AnswerKind, QueryRequest};
 use super::scale::{Scale, ThresholdSource};
@@ -212,16 +212,11 @@ impl Answering<'_> {
         scale: Scale,
         threshold: f32,
     ) -> (Found, u64, Option<Clustering>) {
-        let (scene, request, manifest) = (self.scene, self.request, self.scene.manifest);
-        let mut matches = search.matching(scale.to_score(threshold));
-        matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
-        let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
-        let (min_count, alignment, with_members) = (request.min_count, alignment(manifest), request.members);
-        let grouping = Grouping { voxel, min_count, threshold, alignment, with_members };
-        let grouped = cluster(scene.shards, &matches.runs, &grouping, &self.budget);
+        let (request, manifest) = (self.request, self.scene.manifest);
+        let (grouped, n_matching) = self.grouped(search, scale, threshold);
         let clustering = Clustering {
             voxel: grouped.voxel,
-            min_count,
+            min_count: request.min_count,
             n_clusters: grouped.clusters.len() as u64,
             n_small_clusters: grouped.n_small,
             n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
@@ -230,7 +225,37 @@ impl Answering<'_> {
         let order = Order::new(scale.base(manifest.encoder.calibration), manifest, request);
         let ranked = order.rank(grouped.clusters, key);
         let answers = ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect();
-        (Found::Clusters(answers), matches.n_gaussians, Some(clustering))
+        (Found::Clusters(answers), n_matching, Some(clustering))
+    }
+
+    /// Returns the clusters of the Gaussians that match, and how many match.
+    fn grouped(&self, search: &Search<'_>, scale: Scale, threshold: f32) -> (Clusters, u64) {
+        let (scene, request, manifest) = (self.scene, self.request, self.scene.manifest);
+        let mut matches = search.matching(scale.to_score(threshold));
+        matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
+        let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
+        let (min_count, alignment, with_members) = (request.min_count, alignment(manifest), request.members);
+        let grouping = Grouping { voxel, min_count, threshold, alignment, with_members };
+        (cluster(scene.shards, &matches.runs, &grouping, &self.budget), matches.n_gaussians)
+    }
+
+    /// Returns the clusters of things anywhere on board, which phrases are about where no object answers.
+    pub(super) fn clusters_of_things(
+        &self,
+        scratch: &mut Scratch,
+        questions: &[Question],
+    ) -> Result<Vec<ClustersOfThing>, ScoreError> {
+        let manifest = self.scene.manifest;
+        let precision = self.request.precision;
+        let searches = Search::batch(scratch, self.scene.shards, questions, Region::default(), precision)?;
+        let of_thing = |(question, search): (&Question, &Search<'_>)| {
+            let (scale, calibration) = (Scale::of(question), manifest.encoder.calibration);
+            let (threshold, _) = scale.threshold(self.request, manifest, calibration);
+            let (grouped, _) = self.grouped(search, scale, threshold);
+            self.budget.check()?;
+            Ok(ClustersOfThing { clusters: grouped.clusters, threshold, base: scale.base(calibration) })
+        };
+        questions.iter().zip(&searches).map(of_thing).collect()
     }
 
     /// Returns the answers to a phrase as answers to a text: without degrees, and without what they are related to.
@@ -310,12 +335,12 @@ fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Optio
     ball.into_iter().chain(bounds).reduce(|a, b| a || b)
 }
 
-fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
+pub(super) fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
     let Ranked { found: cluster, rank, relevance, distance } = ranked;
     let Extent { position_in_world, box_in_world } = cluster.extent;
     ClusterAnswer {
         rank,
-        id: format!("{}-{}", cluster.first.0, cluster.first.1),
+        id: cluster.public_id(),
         position_in_world,
         geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
         box_min_in_world: box_in_world.min,
@@ -363,10 +388,7 @@ pub(super) fn object_answer(
         n_gaussians,
         n_gaussians_in_scene: Some(u64::from(record.n_gaussians)),
         whole,
-        evidence: Some(Evidence {
-            photo: objects::photo(scene, object).to_owned(),
-            box_px: record.photo_box_px,
-        }),
+        evidence: Some(objects::evidence(scene, object)),
         relevance,
         distance,
         members: if with_members { objects::members(scene, object, region, score) } else { Vec::new() },

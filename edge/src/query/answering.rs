@@ -5,14 +5,14 @@ use std::sync::Arc;
 
 use slag_service::params::RequestError;
 
-use super::answer::{Answering, answer, object_answer};
+use super::answer::{Answering, answer, cluster_answer, object_answer};
 use super::ask::Ask;
 use super::engine::{Engine, OnBoard, QueryError};
 use super::rank::Ranked;
 use super::reason;
-use super::relations::{self, Phrase, Things, Viewer};
+use super::relations::{self, CandidateOf, Phrase, Things, Viewer};
 use super::reply::{Outcome, RelatedAnswers, Reply};
-use super::request::{Asked, QueryRequest, unit_vector};
+use super::request::{AnswerKind, Asked, QueryRequest, unit_vector};
 use super::scene::Scene;
 use crate::score::{Budget, Question, Region, ScoreError, Scratch, score_objects};
 
@@ -95,9 +95,9 @@ impl Engine {
         let snapshot = &on_board.snapshot;
         budget.take(questions.len() * (snapshot.objects.len() * size_of::<f32>() + CANDIDATES_BYTES));
         budget.check().map_err(ScoreError::from)?;
-        let outcome = self.on_scene(snapshot, budget, |_, scene| {
-            let related = related(scene, phrase, questions, request)?;
+        let outcome = self.on_scene(snapshot, budget, |scratch, scene| {
             let answering = Answering { scene, request, budget: budget.clone() };
+            let related = related(scratch, &answering, phrase, questions)?;
             Ok::<_, QueryError>(match request.paged {
                 true => Outcome::Related(related),
                 false => Outcome::Plain(answering.of_related(label, related, &questions[0])),
@@ -131,11 +131,12 @@ fn vector_of(vector: &[f32], dim: u32) -> Result<Arc<[f32]>, QueryError> {
 }
 
 fn related(
-    scene: &Scene<'_>,
+    scratch: &mut Scratch,
+    answering: &Answering<'_>,
     phrase: &Phrase,
     questions: &[Question],
-    request: &QueryRequest,
 ) -> Result<RelatedAnswers, QueryError> {
+    let Answering { scene, request, .. } = *answering;
     let has_up = scene.manifest.metric || scene.manifest.geo_reference.is_some();
     if !has_up && needs_up(phrase) {
         let expected =
@@ -143,7 +144,14 @@ fn related(
         return Err(RequestError::new("phrases", &phrase.thing, expected).into());
     }
     let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
-    let things = Things::find(scene, &phrase.things(), questions, &scored, request);
+    let mut things = Things::find(scene, &phrase.things(), questions, &scored, request);
+    let open = if request.kind == Some(AnswerKind::Objects) { Vec::new() } else { things.open() };
+    if !open.is_empty() {
+        let of_open: Vec<Question> = open.iter().map(|at| questions[*at].clone()).collect();
+        for (at, found) in open.into_iter().zip(answering.clusters_of_things(scratch, &of_open)?) {
+            things.set_clusters(at, found, scene, &request.region);
+        }
+    }
     let metre = relations::metre(scene.manifest);
     let parts = things.found();
     let viewer =
@@ -164,14 +172,17 @@ fn related(
     let of = things.of(&phrase.thing);
     let described = found.into_iter().take(request.n_ranked()).enumerate().map(|(at, related)| {
         let candidate = &of[related.candidate];
-        let place = candidate.found.record.position();
-        let ranked = Ranked {
-            found: candidate.found,
-            rank: at + 1,
-            relevance: related.score as f32,
-            distance: request.near.map(|near| near.distance(place)),
+        let (rank, relevance) = (at + 1, related.score as f32);
+        let distance = request.near.map(|near| near.distance(candidate.position_in_world()));
+        let answer = match candidate.of.clone() {
+            CandidateOf::Object(found) => {
+                let ranked = Ranked { found, rank, relevance, distance };
+                object_answer(scene, ranked, candidate.score, &Region::default(), request.members)
+            }
+            CandidateOf::Cluster(found) => {
+                cluster_answer(Ranked { found, rank, relevance, distance }, scene.manifest)
+            }
         };
-        let answer = object_answer(scene, ranked, candidate.score, &Region::default(), request.members);
         (answer, related.degree, related.to)
     });
     Ok(RelatedAnswers { asked_as: BTreeMap::new(), parts, miss: None, answers: described.collect() })

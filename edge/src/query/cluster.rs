@@ -53,6 +53,12 @@ pub struct Cluster {
     pub members: Vec<Run>,
 }
 
+impl Cluster {
+    pub fn public_id(&self) -> String {
+        format!("{}-{}", self.first.0, self.first.1)
+    }
+}
+
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clusters {
     /// Clusters with enough members, by first member, ascending.

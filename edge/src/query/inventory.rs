@@ -8,7 +8,7 @@ use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use slag_api::FRAME;
-use slag_api::objects::{Evidence, MAX_NAMES, ObjectOnBoard, ObjectPage, OrientedBox};
+use slag_api::objects::{MAX_NAMES, ObjectOnBoard, ObjectPage, OrientedBox};
 use slag_common::frames::Aabb;
 use slag_common::objects::public_id;
 
@@ -48,12 +48,6 @@ pub struct ObjectFilter {
     pub order: ObjectOrder,
 }
 
-pub fn object_id(text: &str) -> Option<u64> {
-    let digits = text.strip_prefix('o')?;
-    let is_hex = digits.len() == 16 && digits.bytes().all(|b| b.is_ascii_hexdigit());
-    is_hex.then(|| u64::from_str_radix(digits, 16).ok())?
-}
-
 impl Engine {
     /// Returns the objects on board that pass a filter, at most `limit`; waits at most `wait` for their names.
     pub fn objects(
@@ -88,6 +82,22 @@ impl Engine {
         });
         budget.check().map_err(ScoreError::from)?;
         Ok(found)
+    }
+
+    /// Returns the small picture of an object on board, a JPEG file; the outer `None`: there is no such object.
+    pub fn thumbnail(
+        &self,
+        snapshot: &Snapshot,
+        id: u64,
+        budget: &Budget,
+    ) -> Result<Option<Option<Vec<u8>>>, QueryError> {
+        let picture = self.on_scene(snapshot, budget, |_, scene| {
+            let picture = objects::thumbnail(scene, number_of(scene, id)?);
+            budget.take(picture.map_or(0, <[u8]>::len));
+            Some(picture.map(<[u8]>::to_vec))
+        });
+        budget.check().map_err(ScoreError::from)?;
+        Ok(picture)
     }
 
     /// Returns the positions of Gaussians of an object on board, evenly spread over their order, at most `limit`:
@@ -240,6 +250,6 @@ fn describe(
             .get_or_init(|| objects::oriented_box(scene, &found, &everywhere, alignment(scene.manifest))),
         n_gaussians,
         n_gaussians_in_scene: u64::from(record.n_gaussians),
-        evidence: Evidence { photo: objects::photo(scene, object).to_owned(), box_px: record.photo_box_px },
+        evidence: objects::evidence(scene, object),
     }
 }

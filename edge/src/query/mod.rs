@@ -39,7 +39,7 @@ pub use ask::Ask;
 pub use changes::{ChangesError, ChangesRequest};
 pub use engine::{Engine, OnBoard, QueryError};
 pub use format::Format;
-pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder, object_id};
+pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOrder};
 pub use listing::ListFormat;
 pub(crate) use naming::NAMES_WAIT;
 pub use page::Page;

@@ -4,7 +4,7 @@
 //! Gaussians are those on board in the region asked for.
 
 use glam::DVec3;
-use slag_api::objects::{Alignment, OrientedBox};
+use slag_api::objects::{Alignment, Evidence, OrientedBox};
 use slag_common::manifest::Calibration;
 use slag_common::objects::{ObjectRecord, Objects, public_id};
 
@@ -87,8 +87,19 @@ pub fn record<'a>(scene: &Scene<'a>, object: usize) -> &'a ObjectRecord {
     &of_part(scene, first).records[first.number as usize]
 }
 
-pub fn photo<'a>(scene: &Scene<'a>, object: usize) -> &'a str {
-    of_part(scene, scene.index.parts(object)[0]).photo(record(scene, object))
+pub fn evidence(scene: &Scene<'_>, object: usize) -> Evidence {
+    let record = record(scene, object);
+    Evidence {
+        photo: of_part(scene, scene.index.parts(object)[0]).photo(record).to_owned(),
+        box_px: record.photo_box_px,
+        has_thumbnail: thumbnail(scene, object).is_some(),
+    }
+}
+
+/// Returns an object's small picture, a JPEG file, if one of its shards has it.
+pub fn thumbnail<'a>(scene: &Scene<'a>, object: usize) -> Option<&'a [u8]> {
+    let of_part = |part: &Part| of_part(scene, *part).thumbnails?.get(part.number as usize);
+    scene.index.parts(object).iter().find_map(of_part)
 }
 
 /// Returns a box around an object's Gaussians in a region.

@@ -138,6 +138,7 @@ mod tests {
                 run_ends,
                 run_objects,
                 photos: b"",
+                thumbnails: None,
             });
             let objects: Vec<_> =
                 objects.map(|objects| Some(objects).filter(|objects| !objects.records.is_empty())).collect();

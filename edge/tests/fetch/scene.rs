@@ -96,6 +96,7 @@ fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
             n_gaussians: 1,
             photo: format!("{}.png", thing.id),
             photo_box_px: [0, 0, 1, 1],
+            thumbnail: Vec::new(),
         }
     };
     let objects = (0..).zip(things).map(object).collect();

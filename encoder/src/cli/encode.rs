@@ -129,8 +129,8 @@ pub struct EncodeArgs {
     /// do: at most 4 bytes a Gaussian, 2.5 in a scene of a million.
     #[arg(long, help_heading = "Output", hide_short_help = true)]
     input_indices: bool,
-    /// Compact shards tell how their Gaussians look, too, as balanced and exact ones always do: 10 bytes a Gaussian,
-    /// for a robot's page in colours, and to verify where it is.
+    /// Compact shards tell how their Gaussians and objects look, too, as balanced and exact ones always do: 10 bytes a
+    /// Gaussian and some kB an object, for a robot's page in colours and pictures, and to verify where it is.
     #[arg(long, help_heading = "Output")]
     appearance: bool,
     /// Shards say which places are free, occupied or unknown, so that robots find places to stand; with a value:

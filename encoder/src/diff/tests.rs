@@ -33,6 +33,7 @@ fn shard(seed: u16, ids: &[u64]) -> Vec<u8> {
             n_gaussians: 1,
             photo: "p".into(),
             photo_box_px: [0, 0, 1, 1],
+            thumbnail: Vec::new(),
         }
     };
     let objects = (0..).zip(ids).map(object).collect();

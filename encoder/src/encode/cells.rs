@@ -12,6 +12,7 @@ use slag_common::{Hash32, View};
 use super::cell::{CellMaker, CellsBudget, FinishedCell};
 use super::context::RunContext;
 use super::error::EncodeError;
+use super::inputs;
 use super::plan::Plan;
 use super::report::{Phase, ViewsReport};
 use super::sink::ViewRecord;
@@ -105,12 +106,17 @@ fn build(
         group_bytes: pass_bytes,
         cancel: context.cancel(),
     };
-    context.progress().begin("cells", "cell", inputs.split.cells.len() as u64, 0);
     // Before refinement adds superpoints to the regions.
     let counts = Counts::of(views, &index, &table);
-    let Refined { table, refinement, objects } = refine(plan, &scene, table, &score_context, context)?;
+    let Refined { table, refinement, mut objects } = refine(plan, &scene, table, &score_context, context)?;
+    if let Some(found) = &mut objects
+        && settings.cells.shards.have_appearance()
+    {
+        found.thumbnails = thumbnails(&found.objects, views, context)?;
+    }
     let extras = put_extras(plan, &table, context)?;
     context.begin_phase(Phase::Cells);
+    context.progress().begin("cells", "cell", inputs.split.cells.len() as u64, 0);
     let has_poses = settings.cells.photo_poses;
     let maker = CellMaker {
         scene: &inputs.scene,
@@ -163,12 +169,15 @@ fn refine(
 ) -> Result<Refined, EncodeError> {
     let settings = plan.settings;
     context.begin_phase(Phase::Superpoints);
+    context.progress().begin("objects", "step", 3, 0);
     let begin = || context.install(|| PendingRefinement::begin(settings.aggregation, scene, table));
     let pending = context.time("superpoints", begin)?;
+    context.progress().advance(1);
     // From all masks alike, whatever weight they have in the refinement.
     context.begin_phase(Phase::Objects);
     let find = || context.install(|| objects::find(scene, &pending, score_context));
     let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
+    context.progress().advance(1);
     if let Some(found) = &objects {
         context.progress().objects(&mut found.objects.iter().map(Object::found));
     }
@@ -176,7 +185,27 @@ fn refine(
     let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
     let finish = || context.install(|| pending.finish(scene, object_of));
     let (table, refinement) = context.time("refine", finish)?;
+    context.progress().advance(1);
+    context.progress().end();
     Ok(Refined { table, refinement, objects })
+}
+
+/// Cuts a small picture of each object.
+fn thumbnails(
+    objects: &[Object],
+    views: &DoneViews<'_>,
+    context: &RunContext<'_>,
+) -> Result<Vec<Vec<u8>>, EncodeError> {
+    let cut = || objects::cut_thumbnails(objects, &views.used, context.progress(), context.cancel());
+    let (thumbnails, fault) = context.time("thumbnails", || context.install(cut));
+    if context.is_cancelled() {
+        return Err(ContributionError::Cancelled.into());
+    }
+    if let Some(fault) = fault {
+        let n = thumbnails.iter().filter(|thumbnail| thumbnail.is_empty()).count();
+        tracing::warn!("{n} objects have no picture of their own, as a photo cannot be read: {fault}");
+    }
+    Ok(thumbnails)
 }
 
 /// Puts what later questions need beside the cells into the store.
@@ -271,6 +300,9 @@ impl Opened {
         Refinement::reserve_contributions(&mut memory, aggregation, table.len(), n_entries);
         if plan.settings.cells.objects {
             objects::reserve_contributions(&mut memory, n_entries);
+            if plan.settings.cells.shards.have_appearance() {
+                inputs::reserve_thumbnails(&mut memory, &plan.inputs.views, plan.settings.run.threads);
+            }
         }
         let pass_bytes = memory.rest(index.largest_part_bytes())?;
         let cell_bytes = shard::largest_cell_bytes(split, models.dim()) + index.largest_part_bytes();

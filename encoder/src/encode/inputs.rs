@@ -105,12 +105,24 @@ pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
 
 /// Reserves the largest photos: those that threads work on, and those that wait for a device or in a queue.
 pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work: usize, n_under_way: usize) {
-    let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
-    areas_px.sort_unstable_by(|a, b| b.cmp(a));
+    let areas_px = areas_px(views);
     let (in_work, rest) = areas_px.split_at(n_in_work.min(areas_px.len()));
     let waiting_px: u64 = rest.iter().take(n_under_way.saturating_sub(n_in_work)).sum();
     memory.reserve(Phase::Views, "photos in work", in_work.iter().sum::<u64>() * PHOTO_BYTES_PER_PX);
     memory.reserve(Phase::Views, "photos that wait", waiting_px * WAITING_BYTES_PER_PX);
+}
+
+/// Reserves the largest photos that threads cut thumbnails from.
+pub(super) fn reserve_thumbnails(memory: &mut MemoryPlan, views: &[View], n_threads: usize) {
+    let in_work_px: u64 = areas_px(views).iter().take(n_threads).sum();
+    memory.reserve(Phase::Refine, "photos that thumbnails are cut from", in_work_px * PHOTO_BYTES_PER_PX);
+}
+
+/// Returns the areas of photos, largest first.
+fn areas_px(views: &[View]) -> Vec<u64> {
+    let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
+    areas_px.sort_unstable_by(|a, b| b.cmp(a));
+    areas_px
 }
 
 /// Returns the numbers of views with a photo and of Gaussians.

@@ -85,7 +85,7 @@ pub(super) fn find_among(
         n_masks_of_objects: objects.iter().map(|object| object.n_masks as usize).sum(),
         largest_m: objects.iter().map(|object| object.box_in_world.size().max_element()).fold(0.0, f64::max),
     };
-    Ok(SceneObjects { objects, object_of, calibration, report })
+    Ok(SceneObjects { objects, object_of, thumbnails: Vec::new(), calibration, report })
 }
 
 /// The masks of each object, and how well each mask shows its object.

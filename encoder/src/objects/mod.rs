@@ -11,6 +11,7 @@
 //! | `tree` | superpoints joined pair by pair |
 //! | `choice` | the nodes of the tree that views agree on: the objects, and their masks |
 //! | `vectors` | the few vectors that represent an object's masks |
+//! | `thumbnails` | a small picture of each object |
 //! | [`shards`] | the objects of a cell, as its shards store them |
 //! | `object` | the result |
 //!
@@ -22,12 +23,14 @@ mod near;
 mod object;
 pub(crate) mod shards;
 mod sightings;
+mod thumbnails;
 mod tree;
 
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
 use crate::memory::{MemoryPlan, Phase};
 pub(crate) use find::find;
 pub use object::{NONE, Object, ObjectsReport, SceneObjects};
+pub(crate) use thumbnails::cut as cut_thumbnails;
 
 /// Reserves what finding the objects of a scene takes, and the object of each Gaussian. `has_superpoints`: they
 /// are given.

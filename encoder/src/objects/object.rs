@@ -56,6 +56,8 @@ pub struct SceneObjects {
     pub objects: Vec<Object>,
     /// `[cell][N of the cell]`: index of each Gaussian's object, or [`NONE`].
     pub object_of: Vec<Vec<u32>>,
+    /// `[n]`: a small picture of each object, a JPEG file or nothing; empty where none are asked for.
+    pub thumbnails: Vec<Vec<u8>>,
     /// Mean and spread of the text bank's scores over the objects.
     pub calibration: Calibration,
     pub report: ObjectsReport,

@@ -2,7 +2,8 @@
 
 use half::f16;
 use slag_common::objects::{
-    MAX_PHOTO_BYTES, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors,
+    MAX_PHOTO_BYTES, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, Thumbnails, collect_runs,
+    quantise_vectors,
 };
 use slag_common::shard::Basis;
 use slag_math::cholesky::{SmallPivots, cholesky};
@@ -108,6 +109,8 @@ pub struct CellObjects {
     run_ends: Vec<u32>,
     run_objects: Vec<u16>,
     photos: String,
+    /// Ends, and JPEG files one after the other.
+    thumbnails: (Vec<u32>, Vec<u8>),
 }
 
 impl CellObjects {
@@ -136,11 +139,15 @@ impl CellObjects {
             run_ends: Vec::new(),
             run_objects: Vec::new(),
             photos: String::new(),
+            thumbnails: Default::default(),
         };
         let mut number_of = vec![NO_OBJECT; n_here.len()];
         for (number, object) in here.into_iter().enumerate() {
             number_of[object] = number as u16;
             cell.add(&scene.objects[object], n_here[object], basis);
+            let (ends, pictures) = &mut cell.thumbnails;
+            pictures.extend(scene.thumbnails.get(object).into_iter().flatten());
+            ends.push(pictures.len() as u32);
         }
         (cell.run_ends, cell.run_objects) =
             collect_runs(locals.iter().map(|local| match object_of[*local as usize] {
@@ -178,6 +185,7 @@ impl CellObjects {
     }
 
     pub fn view(&self) -> Objects<'_> {
+        let (ends, pictures) = &self.thumbnails;
         Objects {
             header: self.header,
             records: &self.records,
@@ -186,6 +194,7 @@ impl CellObjects {
             run_ends: &self.run_ends,
             run_objects: &self.run_objects,
             photos: self.photos.as_bytes(),
+            thumbnails: (!pictures.is_empty()).then_some(Thumbnails { ends, pictures }),
         }
     }
 }

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::hash::Hash32;
 use slag_common::landmarks::{BuiltLandmarks, Landmark, Landmarks};
+use slag_common::objects::Objects;
 use slag_common::occupancy::Occupancy;
 use slag_common::photo_poses::{BuiltPhotoPoses, PhotoPoses};
 use slag_common::shard::{
@@ -46,8 +47,15 @@ pub struct ShardSettings {
     pub codebook: CodebookSettings,
     /// Whether compact and balanced shards have the indices of their Gaussians in the input splat file, too.
     pub input_indices: bool,
-    /// Whether compact shards tell how their Gaussians look, as the others do.
+    /// Whether compact shards tell how their Gaussians and objects look, as the others do.
     pub compact_appearance: bool,
+}
+
+impl ShardSettings {
+    /// Returns whether some shards tell how their Gaussians and objects look.
+    pub fn have_appearance(&self) -> bool {
+        self.compact_appearance || self.profiles.iter().any(|profile| *profile != Profile::Compact)
+    }
 }
 
 pub struct CellEmbeddings {
@@ -151,9 +159,8 @@ impl ShardBuilder<'_> {
         };
         let objects = extras.objects.map(of_cell);
         let objects = objects.as_ref().map(CellObjects::view);
-        let tells = |profile: &Profile| *profile != Profile::Compact || settings.compact_appearance;
-        let is_told = settings.profiles.iter().any(tells);
-        let appearance = is_told.then(|| AppearanceColumns::of(self.scene, &order.in_input()));
+        let appearance =
+            settings.have_appearance().then(|| AppearanceColumns::of(self.scene, &order.in_input()));
         let additions = Additions {
             objects,
             appearance: appearance.as_ref().map(AppearanceColumns::view),
@@ -163,9 +170,10 @@ impl ShardBuilder<'_> {
         };
         let chosen = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
         let shards = chosen.map(|profile| match profile {
+            Profile::Compact if settings.compact_appearance => built(profile, &compact, additions),
             Profile::Compact => {
-                let appearance = additions.appearance.filter(|_| settings.compact_appearance);
-                built(profile, &compact, Additions { appearance, ..additions })
+                let objects = objects.map(|objects| Objects { thumbnails: None, ..objects });
+                built(profile, &compact, Additions { appearance: None, objects, ..additions })
             }
             Profile::Balanced => built(profile, &balanced, additions),
             Profile::Exact => {

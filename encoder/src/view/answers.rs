@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 
 use serde_json::{Value, json};
-use slag_common::manifest::{Calibration, Manifest};
+use slag_common::manifest::{Calibration, CellRecord, Manifest};
 use slag_common::objects::{ObjectRecord, public_id};
 use slag_models::names::{Confidence, Naming, Spread};
 
@@ -16,26 +16,44 @@ const SPREADS_ABOVE_MEAN: f32 = 3.0;
 /// Relevancy from which a question with negatives is answered, as on robots.
 const RELEVANCY_THRESHOLD: f32 = 0.5;
 
+/// The things that are scored in a shard.
+struct ThingsHere {
+    shard: StoredShard,
+    /// Their numbers among the shard's objects.
+    numbers: Vec<usize>,
+    /// Whether a shard of the cell may have their pictures.
+    have_thumbnails: bool,
+}
+
 /// The things of a generation: each is scored in the first shard that has it.
 #[derive(Default)]
 pub(super) struct Things {
-    /// Shards, and which of their objects are scored there.
-    shards: Vec<(StoredShard, Vec<usize>)>,
+    shards: Vec<ThingsHere>,
     calibration: Option<Calibration>,
     ids: BTreeSet<u64>,
 }
 
 impl Things {
     /// Adds the objects of the next cell's smallest shard.
-    pub(super) fn add(&mut self, shard: StoredShard) {
+    pub(super) fn add(&mut self, cell: &CellRecord, shard: StoredShard) {
         let Some(objects) = shard.objects() else { return };
+        let have_thumbnails = objects.thumbnails.is_some() || cell.shards.len() > 1;
         let (score_mean, score_spread) = (objects.header.score_mean, objects.header.score_spread);
         self.calibration.get_or_insert(Calibration { score_mean, score_spread });
         let is_first = |at: &usize| self.ids.insert(objects.records[*at].id);
-        let here: Vec<usize> = (0..objects.records.len()).filter(is_first).collect();
-        if !here.is_empty() {
-            self.shards.push((shard, here));
+        let numbers: Vec<usize> = (0..objects.records.len()).filter(is_first).collect();
+        if !numbers.is_empty() {
+            self.shards.push(ThingsHere { shard, numbers, have_thumbnails });
         }
+    }
+
+    /// Returns the cell in whose shard a thing is scored.
+    pub(super) fn cell_of(&self, id: u64) -> Option<u32> {
+        let is_here = |of: &&ThingsHere| {
+            let records = of.shard.objects().map_or(&[][..], |objects| objects.records);
+            of.numbers.iter().any(|at| records[*at].id == id)
+        };
+        self.shards.iter().find(is_here).map(|of| of.shard.layout.header.cell_id)
     }
 
     /// Returns the score from which a thing answers a question with negatives, or one without.
@@ -55,12 +73,12 @@ impl Things {
         words: &[(&'a str, &[f32])],
     ) -> Vec<(&'a str, f32)> {
         let mut of_things: Vec<Vec<f32>> = Vec::new();
-        for (shard, here) in &self.shards {
+        for ThingsHere { shard, numbers, .. } in &self.shards {
             let Some(objects) = shard.objects() else { continue };
             let view = shard.view();
             let of_words: Vec<Vec<f32>> =
                 words.iter().map(|(_, vector)| view.object_scores(&objects, vector)).collect();
-            of_things.extend(here.iter().map(|at| of_words.iter().map(|scores| scores[*at]).collect()));
+            of_things.extend(numbers.iter().map(|at| of_words.iter().map(|scores| scores[*at]).collect()));
         }
         let mut spread = Spread::default();
         of_things.iter().for_each(|scores| spread.add(scores));
@@ -82,19 +100,20 @@ impl Things {
         limit: usize,
     ) -> Value {
         let threshold = self.threshold(manifest, vectors.len() > 1);
-        let mut found: Vec<(f32, ObjectRecord, String)> = Vec::new();
-        for (shard, here) in &self.shards {
+        let mut found: Vec<Found> = Vec::new();
+        for ThingsHere { shard, numbers, have_thumbnails } in &self.shards {
             let Some(objects) = shard.objects() else { continue };
             let view = shard.view();
             let scores =
                 combined(vectors.iter().map(|vector| view.object_scores(&objects, vector)).collect());
-            let matching = here.iter().filter(|at| scores[**at] >= threshold);
+            let matching = numbers.iter().filter(|at| scores[**at] >= threshold);
             found.extend(matching.map(|at| {
                 let record = objects.records[*at];
-                (scores[*at], record, objects.photo(&record).to_owned())
+                let photo = objects.photo(&record).to_owned();
+                Found { score: scores[*at], record, photo, has_thumbnail: *have_thumbnails }
             }));
         }
-        found.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
+        found.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.record.id.cmp(&b.record.id)));
         found.truncate(limit);
         let answers = found.iter().zip(1..).map(|(found, rank)| answer(manifest, rank, found));
         let answers: Vec<Value> = answers.collect();
@@ -114,13 +133,20 @@ impl Things {
     }
 }
 
-fn answer(manifest: &Manifest, rank: usize, (score, record, photo): &(f32, ObjectRecord, String)) -> Value {
+struct Found {
+    score: f32,
+    record: ObjectRecord,
+    photo: String,
+    has_thumbnail: bool,
+}
+
+fn answer(manifest: &Manifest, rank: usize, Found { score, record, photo, has_thumbnail }: &Found) -> Value {
     let (position, bounds) = (record.position(), record.bounds());
     let mut answer = json!({
         "rank": rank, "id": public_id(record.id), "frame": "world", "generation": manifest.generation,
         "position_in_world": position, "box_min_in_world": bounds.min, "box_max_in_world": bounds.max,
         "score": score, "n_gaussians": record.n_gaussians,
-        "evidence": { "photo": photo, "box_px": record.photo_box_px },
+        "evidence": { "photo": photo, "box_px": record.photo_box_px, "has_thumbnail": has_thumbnail },
     });
     if let Some(geo) = manifest.geo_reference {
         answer["geographic"] = json!(geo.geographic_from_world(position));

@@ -11,7 +11,7 @@ use super::shards::{combined, photos_of, scores_of, smallest_shard, smallest_wit
 use super::splat::{PROGRAM, Splat};
 use crate::lift::published::{read_field, read_regions};
 use crate::lift::{CellField, RegionTable};
-use crate::store::StoreReader;
+use crate::store::{StoreReader, StoredShard};
 
 pub(super) struct Generation {
     pub(super) reader: StoreReader,
@@ -35,7 +35,7 @@ impl Generation {
         for cell in &reader.manifest().cells {
             let Some(shard) = smallest_shard(&reader, cell)? else { continue };
             photos.extend(photos_of(&shard));
-            things.add(shard);
+            things.add(cell, shard);
         }
         let Some(splat) = splat else { return Ok(Self { reader, things, photos, scored: Scored::Shards }) };
         let manifest = reader.manifest();
@@ -104,6 +104,19 @@ impl Generation {
                 Ok(cell_message(&positions.collect::<Vec<DVec3>>(), appearance, step))
             }
         }
+    }
+
+    /// Returns the small picture of a thing, a JPEG file.
+    pub(super) fn thumbnail(&self, id: u64) -> Result<Option<Vec<u8>>, ViewError> {
+        let cell_id = self.things.cell_of(id);
+        let cell = self.reader.manifest().cells.iter().find(|cell| Some(cell.cell_id) == cell_id);
+        let shard = cell.map(|cell| smallest_with_appearance(&self.reader, cell)).transpose()?.flatten();
+        let of_shard = |shard: StoredShard| {
+            let objects = shard.objects()?;
+            let at = objects.records.iter().position(|record| record.id == id)?;
+            objects.thumbnails?.get(at).map(<[u8]>::to_vec)
+        };
+        Ok(shard.and_then(of_shard))
     }
 
     /// Returns the message of every Gaussian's score with a question, the first of `vectors`, against its

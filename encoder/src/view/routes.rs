@@ -9,6 +9,7 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Json, Router};
 use serde_json::{Value, json};
+use slag_common::objects::parse_public_id;
 use slag_service::problem::Problem;
 use slag_view::{Description, Step, Words};
 
@@ -34,6 +35,7 @@ pub(crate) fn router(viewer: Viewer) -> Router {
         .route("/v1/view/words", axum::routing::get(words))
         .route("/v1/view/cells/{id}", axum::routing::get(cell))
         .route("/v1/view/photos/{number}", axum::routing::get(photo))
+        .route("/v1/objects/{id}/thumbnail", axum::routing::get(thumbnail))
         .route("/v1/query", axum::routing::get(query))
         .merge(slag_view::router())
         .with_state(Arc::new(viewer))
@@ -93,6 +95,17 @@ async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Pro
 /// Compares the published generation with the one before it.
 async fn changes(State(viewer): AppState) -> Result<Json<Diff>, Problem> {
     blocking(viewer, |viewer| viewer.changes()).await.map(Json)
+}
+
+/// Sends the small picture of a thing, by its id.
+async fn thumbnail(State(viewer): AppState, Path(id): Path<String>) -> Result<Response, Problem> {
+    let wanted = parse_public_id(&id).ok_or_else(|| bad("id: expected o and 16 hex digits"))?;
+    let picture = blocking(viewer, move |viewer| viewer.thumbnail(wanted)).await?;
+    let gone = || {
+        let detail = format!("the store has no picture of {id}");
+        Problem::new(StatusCode::NOT_FOUND, "no-thumbnail", "No thumbnail", detail)
+    };
+    Ok(([(header::CONTENT_TYPE, "image/jpeg")], picture.ok_or_else(gone)?).into_response())
 }
 
 /// Sends a photo as it lies on disk, by its number in the description.

@@ -132,6 +132,10 @@ impl Viewer {
         }
     }
 
+    pub(super) fn thumbnail(&self, id: u64) -> Result<Option<Vec<u8>>, ViewError> {
+        self.generation()?.thumbnail(id)
+    }
+
     /// Returns the file of a photo, by its number in the description.
     pub(super) fn photo(&self, number: usize) -> Option<PathBuf> {
         self.shown.views.get(number).map(|view| view.image_path.clone())

@@ -3,7 +3,7 @@
 import { copies, metres, sizeText, strengthOf, whereabouts, type Viewpoint } from "./answers";
 import type { Answer, Description, Goal, Photo } from "./network";
 import { panel } from "./panel";
-import { crop, photoWithBox } from "./photos";
+import { crop, photoWithBox, thumbnail } from "./photos";
 
 /** What all cards of one question share. */
 export interface Asked {
@@ -33,6 +33,14 @@ export function photoOf(answer: Answer, { views }: Description): number {
   return views.findIndex(({ name }) => name === answer.evidence?.photo);
 }
 
+/** A picture of an answer: cut from its best photo, or the small one that the scene carries; null without either. */
+function pictureOf(answer: Answer, description: Description): Promise<Element> | null {
+  const photo = photoOf(answer, description);
+  const view = description.views[photo];
+  if (view?.has_picture && answer.evidence) return crop(photo, view, answer.evidence.box_px);
+  return answer.id && answer.evidence?.has_thumbnail ? thumbnail(answer.id) : null;
+}
+
 export function showCards(answers: Answer[], asked: Asked, onChoose: (index: number) => void): void {
   panel.aside.append(panel.details);
   panel.answers.replaceChildren(...answers.map((answer, index) => {
@@ -47,9 +55,7 @@ export function showCards(answers: Answer[], asked: Asked, onChoose: (index: num
     card.append(number, text, make("span", strength, `strength ${strength}`));
     const item = make("li");
     item.append(card);
-    const photo = photoOf(answer, asked.description);
-    const view = asked.description.views[photo];
-    if (view?.has_picture && answer.evidence) crop(photo, view, answer.evidence.box_px).then((cut) => number.replaceWith(cut), () => {});
+    pictureOf(answer, asked.description)?.then((picture) => number.replaceWith(picture), () => {});
     return item;
   }));
 }

@@ -50,7 +50,7 @@ export interface Answer {
   oriented_box?: { centre_in_world: Vector; size: Vector; rotation_world_from_box: [number, number, number, number] };
   score: number;
   n_gaussians?: number;
-  evidence?: { photo: string; box_px: [number, number, number, number] };
+  evidence?: { photo: string; box_px: [number, number, number, number]; has_thumbnail?: boolean };
   geographic?: { latitude_deg: number; longitude_deg: number; height_m: number };
   /** How well the relation of a phrase holds, 0.5 to 1. */
   degree?: number;
@@ -204,6 +204,11 @@ export async function fetchWords(): Promise<{ words: Word[]; complete: boolean }
 /** The picture of a photo, by its index in the description. */
 export async function fetchPhoto(index: number): Promise<Blob> {
   return (await get(`/v1/view/photos/${index}`)).blob();
+}
+
+/** The small picture of an object. */
+export async function fetchThumbnail(id: string): Promise<Blob> {
+  return (await get(`/v1/objects/${id}/thumbnail`)).blob();
 }
 
 /** Hands on a robot's events until the connection ends. */

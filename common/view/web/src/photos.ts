@@ -1,6 +1,6 @@
-// Pictures of photos: fetched once each, whole or cut to a box.
+// Pictures of photos: fetched once each, whole or cut to a box; and the small ones that a scene carries.
 
-import { fetchPhoto, type Photo } from "./network";
+import { fetchPhoto, fetchThumbnail, type Photo } from "./network";
 
 const SVG = "http://www.w3.org/2000/svg";
 /** A crop shows so much around its box, by the box's longer side. */
@@ -42,6 +42,15 @@ export function photoWithBox(url: string, photo: Photo, boxPx: number[] | null):
     svg.append(box);
   }
   return svg;
+}
+
+/** The small picture of an object. */
+export async function thumbnail(id: string): Promise<HTMLImageElement> {
+  const image = document.createElement("img");
+  const url = URL.createObjectURL(await fetchThumbnail(id));
+  image.addEventListener("load", () => URL.revokeObjectURL(url));
+  Object.assign(image, { src: url, alt: "", className: "crop" });
+  return image;
 }
 
 /** A square cut around a box. */

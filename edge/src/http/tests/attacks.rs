@@ -119,6 +119,7 @@ async fn every_route_keeps_within_its_budget() {
             "/query" => "/query?text=0&format=ply",
             "/v1/query" => "/v1/query?text=0",
             "/v1/objects/{id}" => "/v1/objects/o0000000000000001",
+            "/v1/objects/{id}/thumbnail" => "/v1/objects/o0000000000000001/thumbnail",
             "/v1/goal" => "/v1/goal?text=0&near=2,3,0&step_m=0.15",
             "/v1/floor" => "/v1/floor?near=2,3,0&step_m=0.15",
             "/v1/view/scores" => "/v1/view/scores?text=0",

@@ -13,6 +13,8 @@ use crate::testing::{manifest_of, write_manifest};
 const FIRST: &str = "o0000000000000001";
 const SECOND: &str = "o0000000000000002";
 const THIRD: &str = "o0000000000000003";
+/// The second one's.
+const PICTURE: [u8; 6] = [0xff, 0xd8, 0xff, 0xe0, 1, 2];
 
 /// Three things along x, by their ids: two of axis 1 and one of axis 0. The second has the largest face, the third the
 /// largest volume.
@@ -29,6 +31,7 @@ fn things() -> [BuiltShard; 1] {
             n_gaussians: runs[1] - runs[0],
             photo: format!("{id}, \"a\".jpg"),
             photo_box_px: [1, 2, 30, 40],
+            thumbnail: if id == 2 { PICTURE.to_vec() } else { Vec::new() },
         }
     };
     let objects = vec![
@@ -40,6 +43,29 @@ fn things() -> [BuiltShard; 1] {
     let bytes = AlignedBytes::copy_of(&objects.add_to(&room.view(), Additions::default()));
     let layout = ShardLayout::check(&bytes).expect("a valid shard");
     [BuiltShard { bytes, layout, embeddings: room.embeddings.clone() }]
+}
+
+/// Of three things one has a picture.
+#[tokio::test]
+async fn things_have_their_own_pictures() {
+    let service = Service::new(Some(&things()), Settings::default());
+    let response = service.send("GET", &format!("/v1/objects/{SECOND}/thumbnail")).await;
+    assert_eq!(response.status(), StatusCode::OK);
+    assert_eq!(response.headers()["content-type"], "image/jpeg");
+    assert_eq!(to_bytes(response.into_body(), 1 << 20).await.expect("a body"), &PICTURE[..]);
+    for (id, has_one) in [(FIRST, false), (SECOND, true), (THIRD, false)] {
+        let (_, _, object) = service.get(&format!("/v1/objects/{id}")).await;
+        assert_eq!(object["evidence"]["has_thumbnail"], has_one, "{id}");
+        if !has_one {
+            let (status, _, problem) = service.get(&format!("/v1/objects/{id}/thumbnail")).await;
+            let expected = (StatusCode::NOT_FOUND, "urn:slag:problem:no-thumbnail");
+            assert_eq!((status, problem["type"].as_str().expect("a type")), expected);
+        }
+    }
+    let (status, _, problem) = service.get("/v1/objects/o00000000000000ff/thumbnail").await;
+    let expected = (StatusCode::NOT_FOUND, "urn:slag:problem:no-such-object");
+    assert_eq!((status, problem["type"].as_str().expect("a type")), expected);
+    assert_eq!(service.get("/v1/objects/7/thumbnail").await.0, StatusCode::BAD_REQUEST);
 }
 
 async fn ids_of(service: &Service, query: &str) -> Vec<String> {

@@ -182,6 +182,55 @@ async fn relations_are_answered_and_say_what_failed() {
     }
 }
 
+/// The room with a lamp (axis 2) on the table that is no object, and with the mug on the floor as two objects that
+/// touch.
+fn room_in_pieces() -> [BuiltShard; 1] {
+    let pieces = [
+        (lattice([50, 40, 75], [60, 50, 88], [4, 4, 4], 0), Some((1, 0))),
+        (lattice([300, 40, 0], [310, 50, 13], [4, 4, 4], 0), Some((2, 0))),
+        (lattice([312, 40, 0], [322, 50, 13], [4, 4, 4], 0), Some((4, 0))),
+        (lattice([0, 0, 0], [160, 90, 74], [9, 7, 6], 1), Some((3, 1))),
+        (lattice([120, 40, 75], [130, 50, 105], [4, 4, 6], 2), None),
+    ];
+    let (mut members, mut objects, mut end) = (vec![Vec::new(); 3], Vec::new(), 0);
+    for (axis, piece) in [0, 0, 0, 1, 2].into_iter().zip(&pieces) {
+        let n = piece.0.len() as u32;
+        members[axis].extend(piece.0.iter().cloned());
+        if let Some((id, axis)) = piece.1 {
+            let vectors = (0..9).map(|i| f32::from(i % 3 == axis)).collect();
+            let runs = std::iter::once(end..end + n).collect();
+            objects.push(TestObject { id, vectors, runs, n_gaussians: n });
+        }
+        end += n;
+    }
+    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
+    [TestShard::new(members).build(false).with_objects_and_places(&objects, calibration, None)]
+}
+
+/// What no object answers, clusters do, in phrases as in plain questions; pieces that touch are counted once.
+#[tokio::test]
+async fn phrases_take_clusters_and_whole_things() {
+    let service = Service::new(Some(&room_in_pieces()), Settings::default());
+    let asks =
+        [("2 on the 1", 1, None), ("2nd 0 from the 1", 1, None), ("3rd 0 from the 1", 0, Some("too-few"))];
+    for (text, n_answers, none) in asks {
+        let (_, _, body) = post(&service, &json!({"texts": [text]})).await;
+        let result = &body["results"][0];
+        assert_eq!((ids(result).len(), result["none"]["kind"].as_str()), (n_answers, none), "{text}: {body}");
+    }
+    let (_, _, body) = post(&service, &json!({"texts": ["2 on the 1", "0 near the 2"]})).await;
+    let [lamp, beside_it] = [0, 1].map(|at| &body["results"][at]);
+    let top = lamp["answers"][0]["box_max_in_world"][2].as_f64().expect("metres");
+    assert!((top - 1.05).abs() < 0.05 && lamp["answers"][0]["evidence"].is_null(), "{body}");
+    assert_eq!(lamp["answers"][0]["related_to"][0]["id"], TABLE);
+    assert_eq!(ids(beside_it), [MUG_ON_TABLE]);
+    assert_eq!(beside_it["answers"][0]["related_to"][0]["id"], lamp["answers"][0]["id"]);
+    let (_, _, body) = post(&service, &json!({"texts": ["2 on the 1"], "kind": "objects"})).await;
+    assert_eq!(body["results"][0]["none"]["kind"], "no-such-thing", "{body}");
+    let (_, _, body) = post(&service, &json!({"texts": ["2nd 0 from the 1"]})).await;
+    assert_eq!(ids(&body["results"][0]), [MUG_ON_FLOOR], "the better of two equal pieces, by its number");
+}
+
 #[tokio::test]
 async fn wrong_requests_are_refused_by_name() {
     let service = Service::new(Some(&room()), Settings::default());

@@ -1,4 +1,4 @@
-//! `GET /v1/objects` and `GET /v1/objects/{id}`: the things on board.
+//! `GET /v1/objects` and below: the things on board.
 
 use std::sync::Arc;
 
@@ -9,6 +9,7 @@ use schemars::{JsonSchema, SchemaGenerator};
 use serde::Deserialize;
 use slag_api::objects::{ObjectOnBoard, ObjectPage};
 use slag_common::manifest::Manifest;
+use slag_common::objects::parse_public_id;
 use slag_service::params::Params;
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Binary, Described, Reply};
@@ -16,7 +17,8 @@ use slag_service::replies::{As, Binary, Described, Reply};
 use crate::http::app::App;
 use crate::http::forms::{AreaParams, BallParams, ObjectIdText};
 use crate::http::problem::query_problem;
-use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError, object_id};
+use crate::query::{Area, ListFormat, NAMES_WAIT, ObjectFilter, ObjectOrder, RequestError};
+use crate::store::Snapshot;
 
 const DEFAULT_PAGE: usize = 100;
 const MAX_PAGE: usize = 1000;
@@ -98,25 +100,60 @@ impl Described for ListFormats {
     }
 }
 
+/// Returns the object that a path names.
+fn wanted(id: &str) -> Result<u64, RequestError> {
+    parse_public_id(id).ok_or_else(|| RequestError::new("id", id, "o and 16 hex digits"))
+}
+
+fn not_on_board(id: &str, snapshot: &Snapshot) -> Problem {
+    let generation = snapshot.manifest.generation;
+    let detail =
+        format!("generation {generation} has no object {id} on board; GET /v1/objects lists those it has");
+    Problem::new(StatusCode::NOT_FOUND, "no-such-object", "No such object", detail)
+}
+
 pub async fn one(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
 ) -> Result<Json<ObjectOnBoard>, Problem> {
-    let refused = || RequestError::new("id", &id, "o and 16 hex digits");
-    let wanted = object_id(&id).ok_or_else(refused)?;
+    let wanted = wanted(&id)?;
     app.within_limits(None, move |app, budget| {
         let on_board = app.engine.on_board().map_err(query_problem)?;
         let snapshot = &on_board.snapshot;
         let names = app.engine.names(&on_board, NAMES_WAIT, budget).map_err(query_problem)?;
         let found = app.engine.object(snapshot, names, wanted, budget).map_err(query_problem)?;
-        let Some(object) = found else {
-            let detail = format!(
-                "generation {} has no object {id} on board; GET /v1/objects lists those it has",
-                snapshot.manifest.generation
-            );
-            return Err(Problem::new(StatusCode::NOT_FOUND, "no-such-object", "No such object", detail));
-        };
-        Ok(Json(object))
+        found.map(Json).ok_or_else(|| not_on_board(&id, snapshot))
     })
     .await
+}
+
+/// Sends the small picture of an object.
+pub async fn thumbnail(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+) -> Result<As<JpegPicture>, Problem> {
+    let wanted = wanted(&id)?;
+    let picture = app.within_limits(None, move |app, budget| {
+        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        let picture = app.engine.thumbnail(&snapshot, wanted, budget).map_err(query_problem)?;
+        picture.ok_or_else(|| not_on_board(&id, &snapshot))?.ok_or_else(|| {
+            let detail = format!(
+                "{id} has no small picture on board; balanced and exact shards carry them, and compact ones of a store encoded with --appearance"
+            );
+            Problem::new(StatusCode::NOT_FOUND, "no-thumbnail", "No thumbnail", detail)
+        })
+    });
+    Ok(As::new(([(header::CONTENT_TYPE, JpegPicture::MEDIA_TYPE)], picture.await?)))
+}
+
+pub struct JpegPicture;
+
+impl JpegPicture {
+    const MEDIA_TYPE: &str = "image/jpeg";
+}
+
+impl Described for JpegPicture {
+    fn replies(_: &mut SchemaGenerator) -> Vec<Reply> {
+        vec![Reply::ok(Self::MEDIA_TYPE, Binary::schema())]
+    }
 }

@@ -1,18 +1,20 @@
-//! The objects that may be meant by the words of a phrase.
+//! What may be meant by the words of a phrase: objects, or groups of Gaussians where no object reaches the threshold.
 
+use glam::DVec3;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::manifest::Manifest;
 
 use super::geometry::Solid;
+use crate::query::cluster::Cluster;
 use crate::query::objects::{self, FoundObject};
 use crate::query::request::QueryRequest;
 use crate::query::scale::Scale;
 use crate::query::scene::{Scene, alignment, default_voxel};
 use crate::score::{ObjectScores, Question, Region};
 
-/// Most objects that are weighed for a thing, best first.
+/// Most candidates that are weighed for a thing, best first.
 const MAX_CANDIDATES: usize = 256;
 
 /// Metres by which a piece may stick out of the thing that it is a piece of.
@@ -20,10 +22,12 @@ const PIECE_SLACK_M: f64 = 0.1;
 /// Default voxels in a metre of a metric scene; in others as many stand for a metre.
 const VOXELS_PER_METRE: f64 = 4.0;
 
-/// An object that may be meant. Objects that lie inside a better one of the same words are pieces of it, and are
-/// left out: they must not be counted, or compared with it.
+/// What may be meant. Candidates that lie inside a better one of the same words are pieces of it, and are left out:
+/// they must not be counted, or compared with it.
 pub struct Candidate<'a> {
-    pub found: FoundObject<'a>,
+    pub of: CandidateOf<'a>,
+    /// Its public id.
+    pub id: String,
     pub solid: Solid,
     pub score: f32,
     /// From 0, the score of what has nothing to do with the words, to 1, the best score on board.
@@ -32,15 +36,38 @@ pub struct Candidate<'a> {
     pub is_inside: bool,
 }
 
+#[derive(Clone)]
+pub enum CandidateOf<'a> {
+    Object(FoundObject<'a>),
+    Cluster(Cluster),
+}
+
+impl Candidate<'_> {
+    pub fn position_in_world(&self) -> DVec3 {
+        match &self.of {
+            CandidateOf::Object(found) => found.record.position(),
+            CandidateOf::Cluster(cluster) => cluster.extent.position_in_world,
+        }
+    }
+}
+
+/// The clusters of a thing, with the threshold that their Gaussians reach.
+pub struct ClustersOfThing {
+    pub clusters: Vec<Cluster>,
+    pub threshold: f32,
+    /// What has nothing to do with the words.
+    pub base: f32,
+}
+
 /// What was found for one thing of a phrase.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[schemars(rename = "Part")]
 pub struct Found {
     /// The thing.
     pub thing: String,
-    /// Objects on board that reach the threshold.
+    /// Objects on board that reach the threshold; where none does, groups of Gaussians.
     pub n_found: usize,
-    /// Score at or above which an object counts.
+    /// Score at or above which they count.
     pub threshold: f32,
     /// Best score on board.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -63,6 +90,30 @@ impl<'a> Things<'a> {
         let of = things.iter().zip(questions).zip(scored);
         let of = of.map(|((thing, question), scored)| candidates(scene, thing, question, scored, request));
         Self { of: of.collect() }
+    }
+
+    /// Returns the numbers of things without a candidate.
+    pub fn open(&self) -> Vec<usize> {
+        (0..self.of.len()).filter(|at| self.of[*at].1.is_empty()).collect()
+    }
+
+    /// Makes clusters the candidates of a thing, by its number.
+    pub fn set_clusters(&mut self, at: usize, found: ClustersOfThing, scene: &Scene<'_>, region: &Region) {
+        let ClustersOfThing { mut clusters, threshold, base } = found;
+        let (part, candidates) = &mut self.of[at];
+        clusters.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.first.cmp(&b.first)));
+        let Some(best) = clusters.first().map(|best| best.score) else { return };
+        (part.n_found, part.threshold, part.best_score) = (clusters.len(), threshold, Some(best));
+        clusters.truncate(MAX_CANDIDATES);
+        let candidate = |cluster: Cluster| Candidate {
+            id: cluster.public_id(),
+            solid: Solid::of(&cluster.oriented_box, &cluster.extent.box_in_world),
+            score: cluster.score,
+            confidence: confidence(cluster.score, best, base),
+            is_inside: region.contains(cluster.extent.position_in_world),
+            of: CandidateOf::Cluster(cluster),
+        };
+        *candidates = whole(clusters.into_iter().map(candidate), metre(scene.manifest));
     }
 
     pub fn found(&self) -> Vec<Found> {
@@ -93,7 +144,6 @@ fn candidates<'a>(
     found.truncate(MAX_CANDIDATES);
     let best_score = objects::best(&scored.scores).map(|best| scale.shown(scored.scores[best]));
     let base = scale.base(calibration);
-    let margin = f64::from(best_score.unwrap_or(base) - base).max(f64::MIN_POSITIVE);
     let (region, alignment) = (&request.region, alignment(scene.manifest));
     let candidate = |found: FoundObject<'a>| {
         let oriented = objects::oriented_box(scene, &found, &everywhere, alignment);
@@ -101,13 +151,25 @@ fn candidates<'a>(
         Candidate {
             solid: Solid::of(&oriented, &found.record.bounds()),
             score,
-            confidence: (f64::from(score - base) / margin).clamp(0.0, 1.0),
+            confidence: confidence(score, best_score.unwrap_or(base), base),
             is_inside: objects::in_region(scene, found.object, region, request.min_count),
-            found,
+            id: found.public_id(),
+            of: CandidateOf::Object(found),
         }
     };
     let candidates: Vec<Candidate<'a>> = found.into_par_iter().map(candidate).collect();
-    let metre = metre(scene.manifest);
+    let candidates = whole(candidates, metre(scene.manifest));
+    (Found { thing: thing.to_owned(), n_found, threshold, best_score }, candidates)
+}
+
+/// Returns how surely a score names a thing, 0 to 1, between what has nothing to do with the words and the best.
+fn confidence(score: f32, best: f32, base: f32) -> f64 {
+    let margin = f64::from(best - base).max(f64::MIN_POSITIVE);
+    (f64::from(score - base) / margin).clamp(0.0, 1.0)
+}
+
+/// Leaves out candidates, best first, that are pieces of better ones.
+fn whole<'a>(candidates: impl IntoIterator<Item = Candidate<'a>>, metre: f64) -> Vec<Candidate<'a>> {
     let mut whole: Vec<Candidate<'a>> = Vec::new();
     for candidate in candidates {
         let is_piece = |of: &Candidate<'_>| candidate.solid.is_piece_of(&of.solid, PIECE_SLACK_M * metre);
@@ -115,7 +177,7 @@ fn candidates<'a>(
             whole.push(candidate);
         }
     }
-    (Found { thing: thing.to_owned(), n_found, threshold, best_score }, whole)
+    whole
 }
 
 /// Returns a metre in world units; in a scene that is not metric, what stands for one.

@@ -1,5 +1,5 @@
 //! Relations between things: "mug on the table", "second pallet from the gate". Plain geometry over the objects on
-//! board, without a language model; the same scene and phrase give the same answer.
+//! board, or groups of Gaussians where no object answers, without a language model; the same scene and phrase give the same answer.
 
 mod candidates;
 mod geometry;
@@ -7,7 +7,7 @@ mod grammar;
 mod phrase;
 mod rank;
 
-pub use candidates::{Found, Things, metre};
+pub use candidates::{CandidateOf, ClustersOfThing, Found, Things, metre};
 pub use geometry::{HOLDS, Viewer};
 pub use grammar::{asked_thing, understand};
 pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation};

@@ -12,6 +12,8 @@ use crate::query::answers::ReasonKind;
 /// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not
 /// win over a sure one.
 const SURE: f64 = 0.5;
+/// Distance, in metres, up to which things of the same words are pieces of one.
+const TOUCHES_M: f64 = 0.05;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
@@ -67,8 +69,8 @@ struct Anchor {
     solid: Solid,
     score: f64,
     witness: Witness,
-    /// The object; absent for the asker.
-    object: Option<usize>,
+    /// Its public id; absent for the asker.
+    id: Option<String>,
 }
 
 struct Measure<'a, 'b> {
@@ -142,7 +144,7 @@ impl<'b> Measure<'_, 'b> {
                     best = Some(Related { candidate, score, degree, to });
                 }
             };
-            let is_other = |anchor: &&Anchor| anchor.object != Some(thing.found.object);
+            let is_other = |anchor: &&Anchor| anchor.id.as_deref() != Some(&thing.id);
             for one in ones.iter().filter(is_other) {
                 match &others {
                     None => {
@@ -151,7 +153,7 @@ impl<'b> Measure<'_, 'b> {
                         consider(degree, one.score, &[one]);
                     }
                     Some((_, others)) => {
-                        for other in others.iter().filter(is_other).filter(|o| o.object != one.object) {
+                        for other in others.iter().filter(is_other).filter(|other| other.id != one.id) {
                             let degree = geometry::between(&thing.solid, &one.solid, &other.solid);
                             consider(degree, one.score * other.score, &[one, other]);
                         }
@@ -176,7 +178,7 @@ impl<'b> Measure<'_, 'b> {
             let at = self.viewer.map_or(DVec3::ZERO, |viewer| viewer.position_in_world);
             let witness =
                 Witness { thing: phrase.thing.clone(), id: None, position_in_world: at, score: None };
-            return Ok(vec![Anchor { solid: Solid::point(at), score: 1.0, witness, object: None }]);
+            return Ok(vec![Anchor { solid: Solid::point(at), score: 1.0, witness, id: None }]);
         }
         let all = self.things.of(&phrase.thing);
         let found = self.matches(phrase, |_| true)?.into_iter();
@@ -184,13 +186,28 @@ impl<'b> Measure<'_, 'b> {
             let of = &all[related.candidate];
             let witness = Witness {
                 thing: phrase.thing.clone(),
-                id: Some(of.found.public_id()),
-                position_in_world: of.found.record.position(),
+                id: Some(of.id.clone()),
+                position_in_world: of.position_in_world(),
                 score: Some(of.score),
             };
-            Anchor { solid: of.solid, score: related.score, witness, object: Some(of.found.object) }
+            Anchor { solid: of.solid, score: related.score, witness, id: Some(of.id.clone()) }
         };
         Ok(found.map(anchor).collect())
+    }
+
+    /// Joins things, best first, that touch a better one: what is compared and counted are whole things, and masks
+    /// split some into pieces. Returns the best piece of each with the box of all its pieces.
+    fn joined(&self, all: &[Candidate<'_>], found: Vec<Related>) -> Vec<(Related, Solid)> {
+        let mut joined: Vec<(Related, Solid)> = Vec::new();
+        for related in found {
+            let solid = all[related.candidate].solid;
+            let touching = joined.iter_mut().find(|(_, of)| solid.gap(of) <= TOUCHES_M * self.metre);
+            match touching {
+                Some((_, whole)) => *whole = whole.joined(&solid),
+                None => joined.push((related, solid)),
+            }
+        }
+        joined
     }
 
     fn picked(&self, phrase: &Phrase, pick: &Pick, mut found: Vec<Related>) -> Result<Vec<Related>, Miss> {
@@ -205,25 +222,25 @@ impl<'b> Measure<'_, 'b> {
         // The surest of those that it is counted from.
         let origin = from.first();
         found.retain(|related| {
-            origin.is_none_or(|origin| origin.object != Some(all[related.candidate].found.object))
+            origin.is_none_or(|origin| origin.id.as_ref() != Some(&all[related.candidate].id))
         });
-        let key = |related: &Related| {
-            let solid = &all[related.candidate].solid;
-            match (pick.by, origin) {
-                (By::Largest, _) => -solid.volume(),
-                (By::Smallest, _) => solid.volume(),
-                (By::Nearest, Some(origin)) => solid.gap(&origin.solid),
-                (By::Farthest, Some(origin)) => -solid.gap(&origin.solid),
-                _ => 0.0,
-            }
+        let mut found = self.joined(all, found);
+        let key = |solid: &Solid| match (pick.by, origin) {
+            (By::Largest, _) => -solid.volume(),
+            (By::Smallest, _) => solid.volume(),
+            (By::Nearest, Some(origin)) => solid.gap(&origin.solid),
+            (By::Farthest, Some(origin)) => -solid.gap(&origin.solid),
+            _ => 0.0,
         };
-        found.sort_by(|a, b| key(a).total_cmp(&key(b)).then(a.candidate.cmp(&b.candidate)));
+        found.sort_by(|(a, of_a), (b, of_b)| {
+            key(of_a).total_cmp(&key(of_b)).then(a.candidate.cmp(&b.candidate))
+        });
         let n = found.len();
         if n < pick.n {
             let detail = format!("{} was asked for, but {n} fit", nth(pick.n, &phrase.thing));
             return Err(Miss::new(ReasonKind::TooFew, &phrase.thing, detail));
         }
-        let mut chosen = found.swap_remove(pick.n - 1);
+        let (mut chosen, _) = found.swap_remove(pick.n - 1);
         chosen.to.extend(origin.map(|origin| origin.witness.clone()));
         Ok(vec![chosen])
     }

@@ -52,7 +52,7 @@ fn objects_answer_first_and_once() {
         (object.n_gaussians, object.n_gaussians_in_scene, answers.searched.n_matching),
         (42, Some(50), 42)
     );
-    let evidence = Evidence { photo: "21.jpg".into(), box_px: [1, 2, 30, 40] };
+    let evidence = Evidence { photo: "21.jpg".into(), box_px: [1, 2, 30, 40], has_thumbnail: true };
     assert_eq!(object.evidence.as_ref(), Some(&evidence));
     assert_eq!((object.position_in_world, object.distance), (DVec3::new(21.0, 0.0, 0.0), Some(21.0)));
     assert_eq!(object.size, DVec3::splat(2.0));

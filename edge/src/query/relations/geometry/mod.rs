@@ -63,7 +63,7 @@ fn resting(thing: &Solid, support: &Solid, metre: f64) -> f64 {
     let gap = thing.bottom() - support.top();
     let sunk = -gap / (SUNK * support.height()).max(TOUCHES_M * metre);
     let touches = falling(gap, TOUCHES_M * metre, APART_M * metre) * falling(sunk, 1.0, 1.5);
-    touches * falling(-over, -OVER[0], -OVER[1])
+    touches.min(falling(-over, -OVER[0], -OVER[1]))
 }
 
 fn hanging(thing: &Solid, panel: &Solid, metre: f64) -> f64 {
@@ -99,6 +99,8 @@ const OF_SIZE: f64 = 0.5;
 const BESIDE_M: [f64; 2] = [0.4, 1.2];
 /// Share of the lower thing's height that both must have in common.
 const LEVEL: [f64; 2] = [0.5, 0.1];
+/// Share of the smaller thing's outline that may lie over the other: boxes of things that stand close overlap.
+const APART: [f64; 2] = [0.5, 0.9];
 /// A thing between two others is off the line from one to the other by at most this share of its length.
 const OFF_LINE: [f64; 2] = [0.2, 0.5];
 
@@ -112,8 +114,9 @@ fn beside(thing: &Solid, other: &Solid, metre: f64) -> f64 {
     let lower = thing.height().min(other.height()).max(f64::MIN_POSITIVE);
     let level = falling(-thing.shared_height(other) / lower, -LEVEL[0], -LEVEL[1]);
     let smaller = thing.area().min(other.area()).max(f64::MIN_POSITIVE);
-    let apart = falling(thing.shared_area(other) / smaller, 0.2, 0.6);
-    level * apart * falling(thing.horizontal_gap(other), BESIDE_M[0] * metre, BESIDE_M[1] * metre)
+    let apart = falling(thing.shared_area(other) / smaller, APART[0], APART[1]);
+    let close = falling(thing.horizontal_gap(other), BESIDE_M[0] * metre, BESIDE_M[1] * metre);
+    level.min(apart).min(close)
 }
 
 pub fn between(thing: &Solid, one: &Solid, other: &Solid) -> f64 {
@@ -148,10 +151,10 @@ fn inside(thing: &Solid, container: &Solid, metre: f64) -> f64 {
 
 /// Angles from the direction that is meant, in degrees: the relation holds fully up to the first, not at all from
 /// the second.
-const OFF_DEG: [f64; 2] = [30.0, 70.0];
-/// Distances of the outlines, in metres, from which the degree falls, and at which half of it is left: a thing at
-/// the far end of a hall is no answer to "left of the door" if there is another beside it.
-const REACH_M: [f64; 2] = [3.0, 12.0];
+const OFF_DEG: [f64; 2] = [30.0, 60.0];
+/// Distances of the outlines, in metres: the relation holds fully up to the first, not at all from the second. Of a
+/// thing at the far end of a hall nobody says that it is left of the door.
+const REACH_M: [f64; 2] = [3.0, 7.0];
 
 /// Where the asker is, and where it looks.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -199,8 +202,7 @@ fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, metre: f64)
     }
     let angle = offset.angle_to(meant).abs().min(FRAC_PI_2).to_degrees();
     let gap = thing.horizontal_gap(of) / metre;
-    let reach = 1.0 - 0.5 * (1.0 - falling(gap, REACH_M[0], REACH_M[1]));
-    falling(angle, OFF_DEG[0], OFF_DEG[1]) * reach
+    falling(angle, OFF_DEG[0], OFF_DEG[1]).min(falling(gap, REACH_M[0], REACH_M[1]))
 }
 
 #[cfg(test)]

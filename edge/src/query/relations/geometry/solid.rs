@@ -69,6 +69,25 @@ impl Solid {
         Self { half: self.half + DVec3::splat(by), ..*self }
     }
 
+    /// Returns the smallest box along its edges around both.
+    pub(crate) fn joined(&self, other: &Self) -> Self {
+        let across = self.along.perp();
+        let range = |direction: DVec2| {
+            let places =
+                self.corners().into_iter().chain(other.corners()).map(|corner| corner.dot(direction));
+            places.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], at| [low.min(at), high.max(at)])
+        };
+        let heights = [self.bottom().min(other.bottom()), self.top().max(other.top())];
+        let [x, y, z] = [range(self.along), range(across), heights];
+        let middle = |[low, high]: [f64; 2]| (low + high) / 2.0;
+        let half = |[low, high]: [f64; 2]| (high - low) / 2.0;
+        Self {
+            centre: (self.along * middle(x) + across * middle(y)).extend(middle(z)),
+            half: DVec3::new(half(x), half(y), half(z)),
+            along: self.along,
+        }
+    }
+
     /// Returns half its reach along a horizontal direction.
     pub fn reach(&self, direction: DVec2) -> f64 {
         self.half.x * direction.dot(self.along).abs() + self.half.y * direction.dot(self.along.perp()).abs()

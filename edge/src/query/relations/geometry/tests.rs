@@ -108,6 +108,29 @@ fn the_asker_has_a_left_and_a_front() {
     assert_eq!(degree(Relation::LeftOf, &at(-2.0, 0.0), &me, Some(&blind), METRES), 0.0);
 }
 
+/// A thing is left of another up to 5 m away and 45 degrees off: four directions share no thing.
+#[test]
+fn directions_end_somewhere() {
+    let viewer = Viewer { position_in_world: DVec3::new(0.0, -4.0, 0.0), heading_rad: None };
+    let door = solid([0.0, 0.0, 1.0], [1.0, 0.1, 2.0]);
+    let left = |x: f64, y: f64| {
+        degree(Relation::LeftOf, &solid([x, y, 0.5], [0.2; 3]), &door, Some(&viewer), METRES)
+    };
+    assert_eq!(left(-2.0, 0.0), 1.0);
+    assert!(left(-5.5, 0.0) > HOLDS && left(-5.7, 0.0) < HOLDS && left(-8.0, 0.0) == 0.0);
+    assert!(left(-2.0, 1.9) > HOLDS && left(-2.0, 2.1) < HOLDS);
+}
+
+/// By hand, along the edges of the first, which is turned by a right angle.
+#[test]
+fn pieces_are_joined_along_the_first_ones_edges() {
+    let first = turned(solid([0.0, 0.0, 0.5], [2.0, 1.0, 1.0]), std::f64::consts::FRAC_PI_2, DVec2::ZERO);
+    let whole = first.joined(&solid([1.0, 0.0, 1.0], [1.0, 1.0, 1.0]));
+    assert!((whole.centre - DVec3::new(0.5, 0.0, 0.75)).length() < 1e-12, "{whole:?}");
+    assert!((whole.half - DVec3::new(1.0, 1.0, 0.75)).length() < 1e-12, "{whole:?}");
+    assert!((whole.gap(&solid([3.0, 0.0, 0.5], [1.0, 1.0, 1.0])) - 1.0).abs() < 1e-12);
+}
+
 proptest! {
     /// Oracle: points on a lattice, one by one.
     #[test]

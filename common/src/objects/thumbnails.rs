@@ -1,0 +1,76 @@
+//! Small pictures of a shard's objects, each cut from the photo that shows the object best.
+
+use std::ops::Range;
+
+use crate::container::{ContainerError, Layout, damaged};
+
+pub mod section {
+    /// `[n_objects]` u32: the end of each picture, ascending; an object without one has an empty one.
+    pub const ENDS: u32 = 29;
+    /// JPEG files, one after the other.
+    pub const PICTURES: u32 = 30;
+}
+
+pub const MAX_THUMBNAIL_BYTES: usize = 16 << 10;
+
+/// What JPEG files begin with.
+const JPEG: [u8; 3] = [0xff, 0xd8, 0xff];
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Thumbnails<'a> {
+    /// `[n_objects]`.
+    pub ends: &'a [u32],
+    pub pictures: &'a [u8],
+}
+
+impl<'a> Thumbnails<'a> {
+    /// Returns the JPEG file of an object, if it has one.
+    pub fn get(&self, object: usize) -> Option<&'a [u8]> {
+        let start = object.checked_sub(1).map_or(0, |before| self.ends[before]);
+        let picture = &self.pictures[start as usize..self.ends[object] as usize];
+        (!picture.is_empty()).then_some(picture)
+    }
+
+    pub(super) fn sections(&self) -> [(u32, &'a [u8]); 2] {
+        [(section::ENDS, bytemuck::cast_slice(self.ends)), (section::PICTURES, self.pictures)]
+    }
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct ThumbnailsLayout {
+    ends: Range<usize>,
+    pictures: Range<usize>,
+}
+
+impl ThumbnailsLayout {
+    /// Checks the pictures of a shard of `n` objects; returns `None` if it has none.
+    pub(super) fn check(bytes: &[u8], layout: &Layout, n: usize) -> Result<Option<Self>, ContainerError> {
+        let Some(pictures) = layout.find(section::PICTURES) else { return Ok(None) };
+        let columns =
+            Self { ends: layout.column::<u32>(section::ENDS, "ends of the thumbnails", n)?, pictures };
+        let ends: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[columns.ends.clone()]);
+        let len = columns.pictures.len();
+        if !ends.is_sorted() || ends.last().map_or(0, |end| *end as usize) != len {
+            let what = format!("the ends of the thumbnails do not ascend to {len}");
+            return Err(damaged(columns.ends.start, what));
+        }
+        let view = Thumbnails { ends: &ends, pictures: &bytes[columns.pictures.clone()] };
+        let is_sound = |picture: &[u8]| picture.len() <= MAX_THUMBNAIL_BYTES && picture.starts_with(&JPEG);
+        match (0..n).find(|object| view.get(*object).is_some_and(|picture| !is_sound(picture))) {
+            Some(object) => {
+                let what = format!(
+                    "the thumbnail of object {object} is no JPEG file of at most {MAX_THUMBNAIL_BYTES} bytes"
+                );
+                Err(damaged(columns.pictures.start, what))
+            }
+            None => Ok(Some(columns)),
+        }
+    }
+
+    pub(super) fn view<'a>(&self, bytes: &'a [u8]) -> Thumbnails<'a> {
+        Thumbnails {
+            ends: bytemuck::cast_slice(&bytes[self.ends.clone()]),
+            pictures: &bytes[self.pictures.clone()],
+        }
+    }
+}
