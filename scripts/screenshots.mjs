@@ -1,8 +1,10 @@
-// Pictures of the page in six states, on a desk and on a phone, to be looked at; README and docs show some of them.
+// Pictures of the page in six states, on a desk and on a phone, and page.webp, which goes through some of them, to be looked at;
+// README and docs show some of them. img2webp is in Debian's package webp.
 // usage: node scripts/screenshots.mjs OUT_DIR SCENE_DIR POSES QUESTION SECOND [flags of `slag-encoder encode`]
 //   after `scripts/setup.sh page` and a build with the page. SCENE_DIR has the splat and POSES; `generate` makes a room and a
 //   yard instead, whose POSES are transforms.json.
 
+import { execFileSync } from "node:child_process";
 import { mkdirSync, mkdtempSync, readdirSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
@@ -36,8 +38,8 @@ const STATES = {
     await ask(page, question);
     await page.locator("#question").blur();
   },
-  chosen: async (page) => {
-    await page.locator("#answers .card").first().click();
+  chosen: async (page, isOpen = false) => {
+    if (!isOpen) await page.locator("#answers .card").first().click();
     await page.locator("#details figure svg").waitFor(WAIT).catch(() => {});
   },
   compared: async (page) => {
@@ -52,6 +54,41 @@ const STATES = {
   },
 };
 
+/** A film: the question is typed, the scene lights, the camera flies to the best answer, whose photo opens. */
+async function film(page) {
+  const frames = [];
+  const take = async (milliseconds) => {
+    const path = join(folder, `${frames.length}.png`);
+    await page.screenshot({ path });
+    frames.push("-d", String(milliseconds), path);
+  };
+  await take(900);
+  // A frame takes longer than what it shows: time stands still meanwhile.
+  const stop = async () => page.clock.pauseAt((await page.evaluate(() => Date.now())) + 1000);
+  await page.clock.install();
+  await stop();
+  await page.locator("#question").focus();
+  for (const letter of question) {
+    await page.keyboard.type(letter);
+    await take(170);
+  }
+  await page.clock.resume();
+  await asked(page, question);
+  await picture(page, null);
+  await take(1500);
+  await stop();
+  await page.locator("#answers .card").first().click();
+  for (let i = 0; i < 16; i++) {
+    await page.clock.runFor(60);
+    await take(80);
+  }
+  await page.clock.resume();
+  await STATES.chosen(page, true);
+  await picture(page, null);
+  await take(3500);
+  execFileSync("img2webp", ["-loop", "0", "-lossy", "-q", "55", "-m", "6", ...frames, "-o", join(out, "page.webp")]);
+}
+
 const splat = join(dir, readdirSync(dir).find((name) => name.endsWith(".ply")));
 const poses = join(dir, posesName);
 const store = join(folder, "store");
@@ -60,6 +97,11 @@ const viewer = await serve("slag-encoder", ["view", "--store", store, "--scene",
 mkdirSync(out, { recursive: true });
 await openBrowser();
 try {
+  await opened(viewer.url, async (page) => {
+    await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined, null, WAIT);
+    await picture(page, null);
+    await film(page);
+  }, { isLookedAt: true, options: { viewport: { width: 960, height: 600 }, reducedMotion: "no-preference" }, expected: /422/ });
   for (const [name, viewport] of Object.entries(WIDTHS)) {
     await opened(viewer.url, async (page) => {
       await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined, null, WAIT);
