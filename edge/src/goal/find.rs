@@ -7,7 +7,7 @@ use slag_common::objects::{parse_public_id, public_id};
 use super::choose::choose;
 use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings};
-use crate::query::{Ask, Engine, Outcome, Point};
+use crate::query::{AnswerKind, Ask, Engine, Outcome, Point};
 use crate::score::Budget;
 use crate::store::Snapshot;
 
@@ -111,7 +111,9 @@ fn things(
         GoalTarget::Text(text) => text,
     };
     let near = Some(Point::World(near.to_array()));
-    let ask = Ask { texts: vec![text.clone()], near, limit: Some(MAX_THINGS), ..Ask::default() };
+    // Clusters have no id to go to.
+    let kind = Some(AnswerKind::Objects);
+    let ask = Ask { texts: vec![text.clone()], near, kind, limit: Some(MAX_THINGS), ..Ask::default() };
     let found = engine.ask(ask, budget)?;
     let thing = |answer: &crate::query::ClusterAnswer| {
         let thing = TargetThing {
