@@ -63,7 +63,7 @@ async function film(page) {
     frames.push("-d", String(milliseconds), path);
   };
   await take(900);
-  // A frame takes longer than what it shows: time stands still meanwhile.
+  // A screenshot takes longer than its frame is shown, so the page's clock is stopped meanwhile.
   const stop = async () => page.clock.pauseAt((await page.evaluate(() => Date.now())) + 1000);
   await page.clock.install();
   await stop();

@@ -85,7 +85,7 @@ where
     })
 }
 
-/// Results of the views whose photos could be read, and samples of them for a diagnosis.
+/// Results for the views with readable photos, and samples for the diagnosis.
 struct Compared {
     checks: Vec<ViewCheck>,
     unreadable: Vec<IngestError>,

@@ -24,8 +24,8 @@ const JPEG_QUALITIES: [u8; 2] = [75, 30];
 /// Objects and their JPEG files.
 type Cuts = Vec<(usize, Vec<u8>)>;
 
-/// Cuts a JPEG file of each object, `[n]`. Those whose photos cannot be read, or that follow a cancellation, are
-/// empty; the first error is told. `views`: in the order of their names.
+/// Cuts a JPEG thumbnail for each object, `[n]`: empty if its photo is unreadable or the run was cancelled. Returns
+/// the first error, too. `views`: sorted by name.
 pub(crate) fn cut(
     objects: &[Object],
     views: &[&View],
@@ -90,7 +90,7 @@ mod tests {
 
     use super::*;
 
-    /// By hand: a box of 300 x 100 px at (90, 30), whose margin of 45 px the photo's upper edge cuts to 30.
+    /// By hand: a box of 300 x 100 px at (90, 30). The margin is 45 px, but above the box there are only 30.
     #[test]
     fn the_box_is_shown_with_a_margin_and_made_small() {
         let is_inside = |x: u32, y: u32| (90..390).contains(&x) && (30..130).contains(&y);

@@ -47,7 +47,7 @@ impl Things {
         }
     }
 
-    /// Returns the cell in whose shard a thing is scored.
+    /// Returns the id of the cell whose shard scores a thing.
     pub(super) fn cell_of(&self, id: u64) -> Option<u32> {
         let is_here = |of: &&ThingsHere| {
             let records = of.shard.objects().map_or(&[][..], |objects| objects.records);

@@ -195,8 +195,8 @@ impl<'b> Measure<'_, 'b> {
         Ok(found.map(anchor).collect())
     }
 
-    /// Joins things, best first, that touch a better one: what is compared and counted are whole things, and masks
-    /// split some into pieces. Returns the best piece of each with the box of all its pieces.
+    /// Merges pieces that touch, because masks split some things and picks compare whole ones. `found`: best first.
+    /// Returns the best piece of each thing, with the box around all its pieces.
     fn joined(&self, all: &[Candidate<'_>], found: Vec<Related>) -> Vec<(Related, Solid)> {
         let mut joined: Vec<(Related, Solid)> = Vec::new();
         for related in found {

@@ -152,8 +152,8 @@ fn inside(thing: &Solid, container: &Solid, metre: f64) -> f64 {
 /// Angles from the direction that is meant, in degrees: the relation holds fully up to the first, not at all from
 /// the second.
 const OFF_DEG: [f64; 2] = [30.0, 60.0];
-/// Distances of the outlines, in metres: the relation holds fully up to the first, not at all from the second. Of a
-/// thing at the far end of a hall nobody says that it is left of the door.
+/// Distances of the outlines, in metres: the relation holds fully up to the first, not at all from the second.
+/// Nobody calls a thing at the far end of a hall left of the door.
 const REACH_M: [f64; 2] = [3.0, 7.0];
 
 /// Where the asker is, and where it looks.
