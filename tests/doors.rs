@@ -43,7 +43,7 @@ fn the_client_of_the_mcp_project_asks_a_robot() {
     let robot = site.robot(&[]);
     let mcp = program("slag-mcp");
     let door = Service::start(Command::new(&mcp).args(["--robot", &robot.url]));
-    let args = [text(&mcp), &robot.url, "red", &door.url];
+    let args = [text(&mcp), &robot.url, "red", &site.store.url, &door.url];
     let printed = judge(&python, "doors/mcp/tests/against_the_program.py", &args);
     assert!(printed.contains("stdio: ") && printed.contains("http: "), "{printed}");
 }

@@ -18,6 +18,12 @@ fn robots_fetch_from_static_files() {
     let n_shards = content(&store).into_iter().map(|(_, hash)| hash).collect::<BTreeSet<_>>().len();
     assert_eq!(export()["n_files"], n_shards);
     assert_eq!(export()["n_files"], 0, "a second export has nothing to write");
+    let object =
+        std::fs::read_dir(site.join("v1/objects")).expect("listed").next().expect("one").expect("read");
+    let mut bytes = std::fs::read(object.path()).expect("read");
+    bytes[7] ^= 1;
+    std::fs::write(object.path(), bytes).expect("written");
+    assert_eq!(export()["n_files"], 1, "what was damaged is written again");
 
     let files = Service::of_files(&site);
     let fetch = |cache: &str, from: &str| {

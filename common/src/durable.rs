@@ -3,8 +3,8 @@
 //! Instead of the crate `atomic-write-file`: it needs the final name first (objects are named by the hash of their
 //! content) and makes up temporary names, which a restart could not find and remove.
 
-use std::io::{self, Write};
-use std::path::Path;
+use std::io::{self, BufWriter, ErrorKind, Write};
+use std::path::{Path, PathBuf};
 
 use fs_err::File;
 
@@ -20,13 +20,54 @@ pub enum Access {
 /// Replaces a file through `PATH.part`: after a crash it has either its complete old content or its complete new
 /// one.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let part = part_of(path);
+    if part.exists() {
+        fs_err::remove_file(&part)?;
+    }
+    replace(&part, path, bytes, Access::Shared)
+}
+
+fn part_of(path: &Path) -> PathBuf {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
-    let part = Path::new(&part);
-    if part.exists() {
-        fs_err::remove_file(part)?;
+    part.into()
+}
+
+/// Writes a file that a user named: what stood there stays until the whole is written. Pipes, devices and files in
+/// folders that take no new ones are written in place.
+pub fn write_result<E: From<io::Error>>(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
+) -> Result<(), E> {
+    // The name stays a link.
+    let path = &std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    let is_device = path.starts_with("/dev") || std::fs::metadata(path).is_ok_and(|about| !about.is_file());
+    let part = part_of(path);
+    let beside = if is_device { None } else { File::create(&part).map(Some).or_else(in_place)? };
+    let is_beside = beside.is_some();
+    let mut out = BufWriter::new(beside.map_or_else(|| File::create(path), Ok)?);
+    let finish = || {
+        write(&mut out)?;
+        out.flush()?;
+        if is_beside {
+            out.get_ref().sync_all()?;
+            move_into_place(&part, path)?;
+        }
+        Ok(())
+    };
+    let finished = finish();
+    if finished.is_err() && is_beside {
+        // The first error is the one to tell.
+        let _ = std::fs::remove_file(&part);
     }
-    replace(part, path, bytes, Access::Shared)
+    finished
+}
+
+fn in_place(error: io::Error) -> io::Result<Option<File>> {
+    match error.kind() {
+        ErrorKind::PermissionDenied => Ok(None),
+        _ => Err(error),
+    }
 }
 
 /// Replaces the content of `path` by `bytes` through `part`, which must not exist and must be on the same file
@@ -40,9 +81,13 @@ pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Re
         options.mode(0o600);
     }
     let mut file = options.open(part)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    move_into_place(part, path)
+    let written =
+        file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| move_into_place(part, path));
+    if written.is_err() {
+        // A full disk would stay full; the first error is the one to tell.
+        let _ = fs_err::remove_file(part);
+    }
+    written
 }
 
 /// Renames a synced file, durably.
@@ -75,5 +120,42 @@ mod tests {
         }
         std::fs::remove_file(path).expect("written above");
         assert!(!std::fs::exists(format!("{name}.part")).expect("a path"));
+    }
+
+    /// A result that fails half way leaves what was there, and nothing beside it.
+    #[test]
+    fn a_result_is_whole_or_not_there() {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let path = dir.path().join("result");
+        let write = |bytes: &'static [u8], is_full: bool| {
+            write_result(&path, |out| {
+                out.write_all(bytes)?;
+                if is_full { Err(io::Error::from(ErrorKind::StorageFull)) } else { Ok(()) }
+            })
+        };
+        let files = || std::fs::read_dir(dir.path()).expect("listed").count();
+        assert!(write(b"cut", true).is_err());
+        assert_eq!(files(), 0);
+        write(b"old", false).expect("written");
+        assert!(write(b"cut", true).is_err());
+        assert_eq!((std::fs::read(&path).expect("read"), files()), (b"old".to_vec(), 1));
+        write(b"new", false).expect("written");
+        assert_eq!((std::fs::read(&path).expect("read"), files()), (b"new".to_vec(), 1));
+    }
+
+    /// The link, and who may read, stay.
+    #[cfg(unix)]
+    #[test]
+    fn links_and_devices_are_written_through() {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let [target, link] = ["target", "link"].map(|name| dir.path().join(name));
+        std::fs::write(&target, "old").expect("written");
+        std::os::unix::fs::symlink(&target, &link).expect("linked");
+        let write = |path: &Path| write_result(path, |out| out.write_all(b"new"));
+        write(&link).expect("written");
+        assert!(std::fs::symlink_metadata(&link).expect("there").is_symlink());
+        assert_eq!(std::fs::read(&target).expect("read"), b"new");
+        write(Path::new("/dev/null")).expect("written");
+        assert!(!std::fs::exists("/dev/null.part").expect("a path"));
     }
 }

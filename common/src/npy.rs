@@ -1,12 +1,14 @@
 //! NumPy arrays (`.npy` version 1.0), written.
 
-use std::io::{self, BufReader, BufWriter, Read, Write};
+use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
 use bytemuck::NoUninit;
 use fs_err::File;
 use zip::ZipArchive;
 use zip::result::ZipError;
+
+use crate::durable;
 
 pub trait Element: NoUninit {
     /// Its NumPy description: byte order, kind and size.
@@ -26,9 +28,7 @@ impl Element for f32 {
 }
 
 pub fn write_file<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> io::Result<()> {
-    let mut file = BufWriter::new(File::create(path)?);
-    write(&mut file, shape, values)?;
-    file.flush()
+    durable::write_result(path, |file| write(file, shape, values))
 }
 
 /// Writes an array, row-major and little-endian.

@@ -241,7 +241,8 @@ class Robot:
             request.data = json.dumps(body).encode()
             request.add_header("Content-Type", "application/json")
         if self.token is not None:
-            request.add_header("Authorization", f"Bearer {self.token}")
+            # A redirect must not take it to another machine.
+            request.add_unredirected_header("Authorization", f"Bearer {self.token}")
         try:
             return self._opener.open(request, timeout=timeout_secs)
         except urllib.error.HTTPError as error:

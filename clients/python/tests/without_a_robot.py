@@ -12,12 +12,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from slag_robot import Robot, SlagError  # noqa: E402
 
 ASKED: list[tuple[str, str]] = []
+TOKENS: list[str | None] = []
 
 
 class Listener(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         ASKED.append((self.server.name, self.path))  # type: ignore[attr-defined]
-        self.send_response(503)
+        TOKENS.append(self.headers.get("Authorization"))
+        if self.path == "/v1/map":
+            self.send_response(302)
+            self.send_header("Location", "/elsewhere")
+        else:
+            self.send_response(503)
         self.end_headers()
 
     def log_message(self, *_: object) -> None:
@@ -53,6 +59,12 @@ def main() -> None:
         [(name, path)] = ASKED
         assert name == "robot", "a proxy was asked for this machine"
         assert dict(urllib.parse.parse_qsl(urllib.parse.urlsplit(path).query)) == expected, path
+    TOKENS.clear()
+    try:
+        robot.map()
+    except SlagError as error:
+        assert error.status == 503, error
+    assert TOKENS == ["Bearer secret", None], "a redirect takes no token along"
     for wrong in [{"lat": 1.0}, {"x": 1.0, "y": 2.0}, {"lat": 1.0, "lon": 2.0, "alt": 3.0}]:
         try:
             robot.goal("chair", near=wrong)

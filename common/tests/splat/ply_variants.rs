@@ -111,7 +111,7 @@ fn rows_that_cannot_be_drawn_keep_their_place() {
     let header = "ply\nformat ascii 1.0\nelement vertex 4\n";
     let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
     let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
-    let rows = "nan 0 0 0 1 0 0 0 0 0 0 0 0 0\n0 0 0 0 0 0 0 0 0 0 0 0 0 0\n\
+    let rows = "-nan(ind) 0 0 0 1 0 0 0 0 0 0 0 0 0\n0 0 0 0 0 0 0 0 0 0 0 0 0 0\n\
                 0 0 0 inf 1 0 0 0 -inf 0 0 0 0 0\n0 0 0 0 1 0 0 0 inf 0 0 0 0 0\n";
     let folder = tempfile::tempdir().expect("a folder");
     let text = format!("{header}{floats}end_header\n{rows}");

@@ -1,8 +1,7 @@
 //! The file: a channel for each topic, one message each, with its schema.
 
 use std::collections::BTreeMap;
-use std::io::{BufWriter, Seek, Write};
-use std::path::Path;
+use std::io::{Seek, Write};
 
 use anyhow::Result;
 use mcap::records::MessageHeader;
@@ -14,17 +13,14 @@ pub struct File<W: Write + Seek> {
     time_ns: u64,
 }
 
-impl File<BufWriter<fs_err::File>> {
-    /// Creates a file. `time_ns`: time of all its messages, nanoseconds since 1970.
-    pub fn create(path: &Path, time_ns: u64) -> Result<Self> {
+impl<W: Write + Seek> File<W> {
+    /// Begins a file. `time_ns`: time of all its messages, nanoseconds since 1970.
+    pub fn new(out: W, time_ns: u64) -> Result<Self> {
         let options =
             WriteOptions::new().compression(None).library(concat!("slag-mcap ", env!("CARGO_PKG_VERSION")));
-        let writer = Writer::with_options(BufWriter::new(fs_err::File::create(path)?), options)?;
-        Ok(Self { writer, time_ns })
+        Ok(Self { writer: Writer::with_options(out, options)?, time_ns })
     }
-}
 
-impl<W: Write + Seek> File<W> {
     pub fn write(&mut self, topic: &str, (name, schema): Schema, message: &Value) -> Result<()> {
         let schema = self.writer.add_schema(name, "jsonschema", schema().to_string().as_bytes())?;
         let channel_id = self.writer.add_channel(schema, topic, "json", &BTreeMap::new())?;
@@ -35,7 +31,7 @@ impl<W: Write + Seek> File<W> {
 
     pub fn finish(mut self) -> Result<()> {
         self.writer.finish()?;
-        Ok(self.writer.into_inner().flush()?)
+        Ok(())
     }
 }
 

@@ -13,6 +13,7 @@ use serde_json::json;
 pub use args::Args;
 use file::File;
 use messages::Stamp;
+use slag_robot::durable;
 
 /// Asks a robot and writes its answers; returns the number of messages. A robot that refuses leaves no file.
 pub fn record(args: &Args) -> Result<usize> {
@@ -48,10 +49,11 @@ pub fn record(args: &Args) -> Result<usize> {
         let ground = ground.context("the robot's ground has other cells than it says")?;
         messages.push(("/slag/ground".to_owned(), file::GROUND, ground));
     }
-    let mut file = File::create(&args.out, time_ns)?;
-    for (topic, schema, message) in &messages {
-        file.write(topic, *schema, message)?;
-    }
-    file.finish().with_context(|| args.out.display().to_string())?;
+    let written = durable::write_result(&args.out, |out| {
+        let mut file = File::new(out, time_ns)?;
+        messages.iter().try_for_each(|(topic, schema, message)| file.write(topic, *schema, message))?;
+        file.finish()
+    });
+    written.with_context(|| args.out.display().to_string())?;
     Ok(messages.len())
 }

@@ -8,6 +8,7 @@ mod find;
 pub mod http;
 mod list;
 mod locate;
+mod picture;
 mod place;
 mod stand;
 mod tools;

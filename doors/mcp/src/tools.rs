@@ -2,7 +2,7 @@
 
 use rmcp::handler::server::router::tool::ToolRouter;
 use rmcp::handler::server::wrapper::Parameters;
-use rmcp::model::{Implementation, ServerCapabilities, ServerConfig};
+use rmcp::model::{ContentBlock, Implementation, ServerCapabilities, ServerConfig};
 use rmcp::{Json, ServerHandler, tool, tool_handler, tool_router};
 use slag_robot::Robot;
 
@@ -10,6 +10,7 @@ use crate::changes::{Compare, Difference};
 use crate::find::{Found, Wanted};
 use crate::list::{Listed, Listing};
 use crate::locate::{Places, Seen};
+use crate::picture::Shown;
 use crate::place::{Asked, Description};
 use crate::stand::{Going, Stands};
 
@@ -44,6 +45,12 @@ impl Tools {
     async fn list(&self, Parameters(listing): Parameters<Listing>) -> Result<Json<Listed>, String> {
         let parameters = listing.parameters()?;
         self.blocking(move |robot| robot.objects(&parameters).map(Listed::from)).await
+    }
+
+    /// Show a thing of the robot's map as the best photo of it has it. Some maps carry no pictures.
+    #[tool(annotations(title = "Picture of a thing", read_only_hint = true, open_world_hint = false))]
+    async fn picture(&self, Parameters(shown): Parameters<Shown>) -> Result<ContentBlock, String> {
+        self.blocking(move |robot| shown.picture(robot)).await.map(|Json(picture)| picture)
     }
 
     /// Find where the robot can stand near a thing: places that it reaches, has room at, and sees the thing from,

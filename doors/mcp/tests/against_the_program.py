@@ -1,8 +1,9 @@
 """Drives slag-mcp with the client of the MCP project.
 
-python3 against_the_program.py PROGRAM ROBOT_URL WORD [MCP_URL]
+python3 against_the_program.py PROGRAM ROBOT_URL WORD STORE_URL MCP_URL
 
-WORD: something that the robot's scene has. MCP_URL: slag-mcp over HTTP, in front of the same robot.
+WORD: something that the robot's scene has. STORE_URL: the service of its store, whose shards carry pictures.
+MCP_URL: slag-mcp over HTTP, in front of the same robot.
 """
 
 import asyncio
@@ -42,10 +43,10 @@ async def check(client, robot, word):
     assert client.server_info.name == "slag-mcp", client.server_info
     assert "world frame" in client.instructions
     tools = {tool.name: tool for tool in (await client.list_tools()).tools}
-    assert sorted(tools) == ["describe_place", "find", "list", "what_changed", "where_am_i", "where_to_stand"], sorted(tools)
+    assert sorted(tools) == ["describe_place", "find", "list", "picture", "what_changed", "where_am_i", "where_to_stand"], sorted(tools)
     for tool in tools.values():
         assert tool.description and tool.annotations.read_only_hint, tool
-        assert tool.output_schema["type"] == "object", tool.output_schema
+        assert tool.name == "picture" or tool.output_schema["type"] == "object", tool.output_schema
 
     # The robot's own answers are the oracle. The client checks them against the tool's schema.
     truth = get(f"{robot}/v1/query?text={word}&near=1,2,0&limit=2")
@@ -142,6 +143,9 @@ async def check(client, robot, word):
         ("list", {"limit": 1000}, "expected 1 to 200"),
         ("list", {"after": "3"}, "after"),
         ("where_to_stand", {"what": word, "radius_m": 9.0}, "radius_m"),
+        ("picture", {"id": listed[0]["id"]}, "no small picture"),
+        ("picture", {"id": "o0123456789abcdef"}, "has no object o0123456789abcdef"),
+        ("picture", {"id": "../map?"}, "no id of a thing"),
         ("what_changed", {"from_generation": 10**6}, "generation"),
         ("where_am_i", {"photo_base64": "no base64", "focal_px": 80}, "photo_base64"),
         ("where_am_i", {**seen, "near": [0, 0, 0]}, "sigma"),
@@ -150,6 +154,16 @@ async def check(client, robot, word):
         refused = await client.call_tool(name, asked)
         assert refused.is_error and expected in refused.content[0].text, (asked, refused)
     return len(found["things"])
+
+
+async def check_pictures(client, store):
+    """The service of the store answers what a robot with balanced shards does."""
+    for thing in (await client.call_tool("list", {"limit": 3})).structured_content["things"]:
+        with urllib.request.urlopen(f"{store}/v1/objects/{thing['id']}/thumbnail", timeout=20) as reply:
+            truth = reply.read()
+        [shown] = (await client.call_tool("picture", {"id": thing["id"]})).content
+        assert shown.mime_type == "image/jpeg" and base64.b64decode(shown.data) == truth, shown
+        assert truth.startswith(b"\xff\xd8\xff"), truth[:8]
 
 
 def status(url, headers):
@@ -172,16 +186,17 @@ def check_strangers(url):
     assert status(url, {"origin": "null"}) == 403
 
 
-async def main(program, robot, word, url=None):
+async def main(program, robot, word, store, url):
     over_stdio = StdioServerParameters(command=program, args=["--robot", robot])
     async with Client(over_stdio) as client:
         n = await check(client, robot, word)
     said = [f"stdio: {n} things"]
-    if url is not None:
-        async with Client(url) as client:
-            n = await check(client, robot, word)
-        check_strangers(url)
-        said.append(f"http: {n} things")
+    async with Client(url) as client:
+        n = await check(client, robot, word)
+    check_strangers(url)
+    said.append(f"http: {n} things")
+    async with Client(StdioServerParameters(command=program, args=["--robot", store])) as client:
+        await check_pictures(client, store)
     # A robot that does not answer is an error of the call; the door stays open.
     async with Client(StdioServerParameters(command=program, args=["--robot", "http://127.0.0.1:9"])) as client:
         refused = await client.call_tool("find", {"what": word})

@@ -16,7 +16,11 @@ use crate::reply::{PointAnswer, Reply};
 
 /// Longest reply that is read: ten thousand answers are 10 MB.
 const MAX_REPLY_BYTES: u64 = 64 << 20;
+/// Characters of what is no id that an error shows.
+const MAX_ID_CHARS: usize = 40;
 const TIMEOUT: Duration = Duration::from_secs(20);
+
+type Response = Result<ureq::http::Response<ureq::Body>, ureq::Error>;
 
 /// A robot's `slag-edge serve`. Calls block.
 #[derive(Clone, Debug)]
@@ -72,6 +76,15 @@ impl Robot {
             parameters.extend([("near", xyz(centre)), ("radius", radius.to_string())]);
         }
         Ok(self.objects(&parameters)?.n_objects)
+    }
+
+    /// Returns the small picture of a thing: a JPEG file.
+    pub fn thumbnail(&self, id: &str) -> Result<Vec<u8>, RobotError> {
+        if !id.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
+            return Err(RobotError::NoId { id: id.chars().take(MAX_ID_CHARS).collect() });
+        }
+        let path = format!("/v1/objects/{id}/thumbnail");
+        self.read_bytes(&path, self.agent.get(self.address(&path)).call())
     }
 
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<GoalReply, RobotError> {
@@ -133,20 +146,21 @@ impl Robot {
         self.read(path, request.send(body))
     }
 
-    fn read<T: DeserializeOwned>(
-        &self,
-        path: &str,
-        response: Result<ureq::http::Response<ureq::Body>, ureq::Error>,
-    ) -> Result<T, RobotError> {
+    fn read<T: DeserializeOwned>(&self, path: &str, response: Response) -> Result<T, RobotError> {
+        let body = self.read_bytes(path, response)?;
+        let foreign = |cause: serde_json::Error| RobotError::Foreign { url: self.address(path), cause };
+        serde_json::from_slice(&body).map_err(foreign)
+    }
+
+    fn read_bytes(&self, path: &str, response: Response) -> Result<Vec<u8>, RobotError> {
         let unreachable = |cause| RobotError::Unreachable { url: self.address(path), cause: Box::new(cause) };
         let mut response = response.map_err(unreachable)?;
-        let body = response.body_mut().with_config().limit(MAX_REPLY_BYTES).read_to_string();
+        let body = response.body_mut().with_config().limit(MAX_REPLY_BYTES).read_to_vec();
         let (status, body) = (response.status(), body.map_err(unreachable)?);
         if !status.is_success() {
-            return Err(RobotError::refused(status.as_u16(), &body));
+            return Err(RobotError::refused(status.as_u16(), &String::from_utf8_lossy(&body)));
         }
-        let foreign = |cause: serde_json::Error| RobotError::Foreign { url: self.address(path), cause };
-        serde_json::from_str(&body).map_err(foreign)
+        Ok(body)
     }
 
     fn address(&self, path: &str) -> String {

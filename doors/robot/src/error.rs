@@ -15,6 +15,8 @@ pub enum RobotError {
     Refused { status: u16, detail: String },
     #[error("a text has {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}; name the thing in a few words")]
     TooLong { n_bytes: usize },
+    #[error("{id:?} is no id of a thing; give one that the robot named, such as o00d1f3a5b7c9e0d2")]
+    NoId { id: String },
     #[error(
         "{url} answers, but not as slag-edge does: {cause}; see that --robot names a slag-edge of this version"
     )]

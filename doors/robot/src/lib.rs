@@ -10,4 +10,4 @@ pub use client::{Robot, xyz};
 pub use error::RobotError;
 pub use reply::{Answer, Nothing, PointAnswer, Reply, Results, Witness};
 pub use slag_api as api;
-pub use slag_common::note;
+pub use slag_common::{durable, note};

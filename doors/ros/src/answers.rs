@@ -3,6 +3,7 @@
 use glam::DVec3;
 use ros2_client::builtin_interfaces::{Duration, Time};
 use slag_robot::api::goal::Goal;
+use slag_robot::api::objects::{ObjectPage, OrientedBox};
 use slag_robot::{Answer, PointAnswer};
 
 use crate::geometry::{Point, Pose};
@@ -13,6 +14,8 @@ use crate::messages::{
 
 /// Points in a message, so that it stays below 64 kB: UDP takes no more at once.
 const POINTS_IN_CLOUD: usize = 3500;
+/// Things in a list of what is on board, for the same reason: one with three names takes 1.3 kB.
+pub const MAX_OBJECTS: usize = 45;
 /// Bytes of a point: x, y, z and score.
 const POINT_BYTES: u32 = 16;
 /// `sensor_msgs/PointField.FLOAT32`.
@@ -32,27 +35,49 @@ pub fn header(frame_id: &str) -> Header {
     Header { stamp: Time::now(), frame_id: frame_id.to_owned() }
 }
 
-fn pose(answer: &Answer) -> Pose {
-    let oriented = &answer.oriented_box;
+fn pose(oriented: &OrientedBox) -> Pose {
     Pose {
         position: oriented.centre_in_world.to_array().into(),
         orientation: oriented.rotation_world_from_box.to_array().into(),
     }
 }
 
-/// Returns the answers to a text, best first. The covariance is unknown: zero.
-pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3DArray {
-    let detection = |answer: &Answer| Detection3D {
+/// Returns a thing with what it may be, best first, each with its score. The covariance is unknown: zero.
+fn detection<'a>(
+    header: &Header,
+    id: &str,
+    oriented: &OrientedBox,
+    classes: impl Iterator<Item = (&'a str, f64)>,
+) -> Detection3D {
+    let hypothesis = |(class, score): (&str, f64)| ObjectHypothesisWithPose {
+        class_id: class.to_owned(),
+        score,
+        pose: PoseWithCovariance { pose: pose(oriented), covariance: [[0.0; 6]; 6] },
+    };
+    Detection3D {
         header: header.clone(),
-        results: vec![ObjectHypothesisWithPose {
-            class_id: text.to_owned(),
-            score: f64::from(answer.score),
-            pose: PoseWithCovariance { pose: pose(answer), covariance: [[0.0; 6]; 6] },
-        }],
-        bbox: BoundingBox3D { center: pose(answer), size: answer.oriented_box.size.to_array().into() },
-        id: answer.id.clone(),
+        results: classes.map(hypothesis).collect(),
+        bbox: BoundingBox3D { center: pose(oriented), size: oriented.size.to_array().into() },
+        id: id.to_owned(),
+    }
+}
+
+/// Returns the answers to a text, best first.
+pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3DArray {
+    let detection = |answer: &Answer| {
+        let score = f64::from(answer.score);
+        detection(header, &answer.id, &answer.oriented_box, std::iter::once((text, score)))
     };
     Detection3DArray { header: header.clone(), detections: answers.iter().map(detection).collect() }
+}
+
+/// Returns what is on board, each thing with its names and the chances that they are right.
+pub fn objects(header: &Header, page: &ObjectPage) -> Detection3DArray {
+    let detections = page.objects.iter().map(|object| {
+        let names = object.names.iter().map(|name| (name.name.as_str(), name.confidence));
+        detection(header, &object.id, &object.oriented_box, names)
+    });
+    Detection3DArray { header: header.clone(), detections: detections.collect() }
 }
 
 pub fn goal_pose(header: &Header, goal: &Goal) -> PoseStamped {
@@ -64,7 +89,7 @@ pub fn goal_pose(header: &Header, goal: &Goal) -> PoseStamped {
 }
 
 pub fn best_pose(header: &Header, answers: &[Answer]) -> Option<PoseStamped> {
-    answers.first().map(|best| PoseStamped { header: header.clone(), pose: pose(best) })
+    answers.first().map(|best| PoseStamped { header: header.clone(), pose: pose(&best.oriented_box) })
 }
 
 /// Returns boxes with their words and scores; the first marker removes those before.
@@ -74,7 +99,7 @@ pub fn markers(header: &Header, text: &str, answers: &[Answer]) -> MarkerArray {
         let edges = answer.oriented_box.size.max(DVec3::splat(MIN_EDGE_M));
         markers.push(Marker {
             kind: CUBE,
-            pose: pose(answer),
+            pose: pose(&answer.oriented_box),
             scale: edges.to_array().into(),
             ..marker(header, "boxes", id)
         });

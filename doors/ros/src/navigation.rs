@@ -3,21 +3,21 @@
 use std::time::Duration;
 
 use anyhow::{Result, anyhow};
-use ros2_client::action::{ActionClient, ActionClientQosPolicies, GoalStatusEnum};
-use ros2_client::{ActionTypeName, Name, Node, QosProfile, ServiceMapping};
+use ros2_client::action::{ActionClient, ActionClientQosPolicies, GoalId, GoalStatusEnum};
+use ros2_client::{ActionTypeName, Name, Node, QosProfile, RmwRequestId, ServiceMapping};
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
 use crate::messages::{NavigationFeedback, NavigationGoal, NavigationResult, PoseStamped};
 
 /// Longest wait for the server to take a goal.
-const ACCEPT_TIMEOUT: Duration = Duration::from_secs(10);
+pub const ACCEPT_TIMEOUT: Duration = Duration::from_secs(10);
 
 pub enum Ended {
     Reached,
     Cancelled,
-    /// Another goal took its place.
-    Replaced,
+    /// Nav2 gave the goal up, for this reason.
+    Failed(String),
 }
 
 pub struct Navigator {
@@ -44,33 +44,47 @@ impl Navigator {
         Ok(Self { client: client.map_err(|e| anyhow!("cannot use the action navigate_to_pose: {e}"))? })
     }
 
-    /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended. A message of `stop`
-    /// cancels the goal; its end alone means that another goal takes its place, for which Nav2 gives this one up.
+    /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended. `stop` cancels the goal,
+    /// and so does whatever leaves its end unknown.
     pub async fn drive(
         &self,
         pose: PoseStamped,
-        mut stop: oneshot::Receiver<()>,
-        mut remaining: impl AsyncFnMut(f32),
+        stop: oneshot::Receiver<()>,
+        remaining: impl AsyncFnMut(f32),
     ) -> Result<Ended, String> {
         let goal = NavigationGoal { pose, behavior_tree: String::new() };
-        let sent = timeout(ACCEPT_TIMEOUT, self.client.async_send_goal(goal)).await;
-        let sent = sent.map_err(|_| "no server of /navigate_to_pose takes goals; is Nav2 running?")?;
-        let (id, response) = sent.map_err(|e| format!("the goal cannot be sent: {e:?}"))?;
-        if !response.accepted {
-            return Err("Nav2 rejects the goal".into());
+        let (request, id) =
+            self.client.send_goal(goal).map_err(|e| format!("the goal cannot be sent: {e:?}"))?;
+        let followed = async {
+            // Nav2 takes no call to cancel a goal that it has not taken yet.
+            if !self.is_accepted(request).await? {
+                return Ok(Ended::Failed("Nav2 rejects the goal".into()));
+            }
+            tokio::select! {
+                _ = stop => Ok(Ended::Cancelled),
+                ended = self.follow(id, remaining) => ended,
+            }
+        };
+        let followed = followed.await;
+        if matches!(followed, Err(_) | Ok(Ended::Cancelled)) {
+            let cancelled = self.client.cancel_goal(id);
+            cancelled.map_err(|e| format!("the goal cannot be cancelled: {e:?}"))?;
         }
-        let ended = self.client.async_request_result(id);
-        let mut ended = std::pin::pin!(ended);
+        followed
+    }
+
+    async fn is_accepted(&self, request: RmwRequestId) -> Result<bool, String> {
+        let answered = self.client.goal_client().async_receive_response(request);
+        let answered = timeout(ACCEPT_TIMEOUT, answered).await;
+        let answered =
+            answered.map_err(|_| "no server of /navigate_to_pose takes goals; is Nav2 running?")?;
+        answered.map(|answer| answer.accepted).map_err(|e| format!("Nav2's answer cannot be read: {e:?}"))
+    }
+
+    async fn follow(&self, id: GoalId, mut remaining: impl AsyncFnMut(f32)) -> Result<Ended, String> {
+        let mut ended = std::pin::pin!(self.client.async_request_result(id));
         let (status, result) = loop {
             tokio::select! {
-                told = &mut stop => {
-                    if told.is_err() {
-                        return Ok(Ended::Replaced);
-                    }
-                    let cancelled = self.client.cancel_goal(id);
-                    cancelled.map_err(|e| format!("the goal cannot be cancelled: {e:?}"))?;
-                    return Ok(Ended::Cancelled);
-                }
                 ended = &mut ended => break ended.map_err(|e| format!("the result cannot be read: {e:?}"))?,
                 told = self.client.feedback_subscription().async_take() => match told {
                     Ok((told, _)) if told.goal_id == id => remaining(told.feedback.distance_remaining).await,
@@ -79,10 +93,10 @@ impl Navigator {
                 },
             }
         };
-        match status {
-            GoalStatusEnum::Succeeded => Ok(Ended::Reached),
-            status => Err(format!("Nav2 ends the goal: {status:?}{}", result.reason())),
-        }
+        Ok(match status {
+            GoalStatusEnum::Succeeded => Ended::Reached,
+            status => Ended::Failed(format!("Nav2 ends the goal: {status:?}{}", result.reason())),
+        })
     }
 }
 

@@ -25,7 +25,7 @@ use crate::messages::{
     OccupancyGrid, Odometry, PointCloud2, PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped,
     StandReply, StandRequest, Text, TransformStamped, Transforms as TransformMessages,
 };
-use crate::navigation::{Ended, Navigator};
+use crate::navigation::{ACCEPT_TIMEOUT, Ended, Navigator};
 use crate::position;
 use crate::stand;
 use crate::transforms::Transforms;
@@ -34,10 +34,11 @@ use crate::transforms::Transforms;
 const KEPT: usize = 4;
 /// Longest pause for subscribers that do not keep up.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
-const STOP_TIMEOUT: Duration = Duration::from_secs(3);
+/// Longest wait for a goal to end once it is cancelled: it must have been taken before.
+const STOP_TIMEOUT: Duration = ACCEPT_TIMEOUT.saturating_add(Duration::from_secs(2));
 /// Time for what was written last to leave the process.
 const SEND_TIME: Duration = Duration::from_millis(500);
-/// Time between looks whether the robot's program answers.
+/// Time between looks whether the robot's program answers, and what it has on board.
 const WATCH_PERIOD: Duration = Duration::from_secs(5);
 /// Least time between two photos that are located.
 const PHOTO_PERIOD: Duration = Duration::from_secs(2);
@@ -51,6 +52,7 @@ struct Shared {
     /// Place of the robot in the scene, and when it was posted last.
     place: Mutex<(Option<[f64; 3]>, Option<Instant>)>,
     detections: Publisher<Detection3DArray>,
+    objects: Publisher<Detection3DArray>,
     markers: Publisher<MarkerArray>,
     points: Publisher<PointCloud2>,
     best_pose: Publisher<PoseStamped>,
@@ -76,8 +78,7 @@ struct Locating {
 struct Navigation {
     navigator: Navigator,
     state: Publisher<Text>,
-    /// Cancels the newest goal with a message, and ends with that goal. If it is dropped, another goal takes its
-    /// place.
+    /// Cancels the newest goal with a message, and ends with that goal.
     newest: Mutex<Option<(oneshot::Sender<()>, oneshot::Receiver<()>)>>,
 }
 
@@ -164,6 +165,7 @@ impl Shared {
         let kept = reliable(KEPT).durability(Durability::TransientLocal);
         let now = reliable(1).durability(Durability::Volatile);
         let pose = ("geometry_msgs", "PoseStamped");
+        let detections = ("vision_msgs", "Detection3DArray");
         let own = |topic: &str| args.own(topic);
         let goal_pose = match args.send_goals {
             Goals::Topic => Some(publisher(node, Name::new("/", "goal_pose")?, pose, &now)?),
@@ -178,7 +180,8 @@ impl Shared {
             None => None,
         };
         Ok(Self {
-            detections: publisher(node, own("detections")?, ("vision_msgs", "Detection3DArray"), &latest)?,
+            detections: publisher(node, own("detections")?, detections, &latest)?,
+            objects: publisher(node, own("objects")?, detections, &latest)?,
             markers: publisher(node, own("markers")?, ("visualization_msgs", "MarkerArray"), &latest)?,
             points: publisher(node, own("points")?, ("sensor_msgs", "PointCloud2"), &kept)?,
             best_pose: publisher(node, own("best_pose")?, pose, &latest)?,
@@ -372,6 +375,8 @@ impl Shared {
             publish(goal_pose, reply.pose.clone()).await;
         }
         if let Some(navigation) = &self.navigation {
+            // Nav2 may reject the new goal: the robot must not drive on to the old one.
+            navigation.stop().await;
             let ((stop, stopped), (ended, has_ended)) = (oneshot::channel(), oneshot::channel());
             *navigation.newest.lock().expect("no holder panics") = Some((stop, has_ended));
             let (shared, tokio) = (Arc::clone(&self), Handle::current());
@@ -392,9 +397,7 @@ impl Shared {
         match navigator.drive(pose, stop, remaining).await {
             Ok(Ended::Reached) => say("reached".into()).await,
             Ok(Ended::Cancelled) => say("cancelled".into()).await,
-            // What replaced it tells of itself.
-            Ok(Ended::Replaced) => {}
-            Err(reason) => {
+            Ok(Ended::Failed(reason)) | Err(reason) => {
                 tracing::warn!("{text:?}: {reason}");
                 say(format!("failed: {reason}")).await;
             }
@@ -410,16 +413,26 @@ impl Shared {
         }
     }
 
-    /// Reports when the robot's program stops or begins to answer: topics alone are silent then.
+    /// Publishes what is on board whenever that changes. Reports when the robot's program stops or begins to answer:
+    /// topics alone are silent then.
     async fn watch(self: Arc<Self>) {
-        let mut answered = None;
+        let (mut answered, mut on_board) = (None, None);
         loop {
             let shared = Arc::clone(&self);
-            let asked = tokio::task::spawn_blocking(move || shared.robot.place()).await;
-            let error = match asked {
-                Ok(Err(error @ RobotError::Unreachable { .. })) => Some(error),
-                _ => None,
+            let listing = [("limit", answers::MAX_OBJECTS.to_string())];
+            let asked = tokio::task::spawn_blocking(move || shared.robot.objects(&listing)).await;
+            let (listed, error) = match asked {
+                Ok(Ok(page)) => (Some(page), None),
+                Ok(Err(error @ RobotError::Unreachable { .. })) => (None, Some(error)),
+                _ => (None, None),
             };
+            if let Some(page) = listed
+                && on_board.as_ref() != Some(&page)
+            {
+                let header = answers::header(&self.args.scene_frame);
+                publish(&self.objects, answers::objects(&header, &page)).await;
+                on_board = Some(page);
+            }
             if answered != Some(error.is_none()) {
                 match &error {
                     Some(error) => tracing::error!("{error}"),

@@ -148,6 +148,25 @@ def check_answers(ros, robot, word):
     return len(truth), len(expected)
 
 
+def check_objects(ros, robot):
+    """A node that joins late hears what is on board, once the robot's model has encoded the words for names."""
+    objects = ros.reader("rt/slag/objects", Detection3DArray, LATCHED)
+
+    def named():
+        truth, heard = get(f"{robot}/v1/objects?limit=45"), objects.take()
+        return (truth, heard[-1]) if truth["named"] and heard and heard[-1].detections[0].results else None
+
+    truth, found = until("things with names", named)
+    assert found.header.frame_id == "map" and len(found.detections) == len(truth["objects"]) > 0
+    for detection, thing in zip(found.detections, truth["objects"]):
+        names = [(result.hypothesis.class_id, result.hypothesis.score) for result in detection.results]
+        assert detection.id == thing["id"] and names == [(name["name"], name["confidence"]) for name in thing["names"]]
+        box = thing["oriented_box"]
+        assert close(xyz(detection.bbox.center.position), box["centre_in_world"])
+        assert close(xyz(detection.results[0].pose.pose.position), box["centre_in_world"])
+    return len(found.detections)
+
+
 def check_service(ros, word):
     # rmw_cyclonedds_cpp offers Find_Request_ and Find_Response_ on these topics.
     replies = ros.reader("rr/slag/findReply", FindResponse)
@@ -290,10 +309,17 @@ def check_action(ros, node, word, distribution):
     said = set()
     until("both ends", lambda: said.update(state.data for state in states.take()) or len(said) == 2)
     assert f"{word}: cancelled" in said and any(text.startswith("?: failed: ") for text in said), said
+    # A new wish cancels the goal before, even if Nav2 then rejects what takes its place.
+    old = drive()
+    going.write(String(word))
+    cancelled(old)
+    [request] = until("the next goal", asked.take)
+    assert list(request.goal_id.uuid) != old
+    taken.write(SendGoalResponse(request.client, request.number, False, Time(1, 2)))
     goal = drive()
     node.process.terminate()
     cancelled(goal)
-    return len(ends) + 2
+    return len(ends) + 3
 
 
 def stamped(parent, child, translation, rotation):
@@ -364,12 +390,22 @@ class Node:
         self.process.wait(10)
 
 
+def check_absent(program, domain):
+    """A robot's program that is not there is reported: topics alone would be silent."""
+    command = [program, "--robot", "http://127.0.0.1:9", "--domain-id", str(domain), "--localhost-only", "1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as node:
+        said = next(line for line in node.stderr if "does not answer" in line)
+        node.terminate()
+    assert "slag-edge serve" in said, said
+
+
 def main(program, robot, word, domain, distribution):
     domain = int(domain)
     body = ["--robot-radius", str(BODY["radius_m"]), "--sensor-height", str(BODY["sensor_height_m"])]
     with Node(program, robot, domain, *body, "--reach", str(BODY["reach_m"]), "--send-goals", "topic"):
         ros = Ros(domain)
         n_things, n_points = check_answers(ros, robot, word)
+        n_on_board = check_objects(ros, robot)
         check_service(ros, word)
         check_transforms(ros, robot)
         n_free, place = check_places(ros, robot)
@@ -381,7 +417,8 @@ def main(program, robot, word, domain, distribution):
         check_odometry(Ros(domain + 1), robot)
     with Node(program, robot, domain + 2, "--position", "fix"):
         check_fix(Ros(domain + 2), robot)
-    print(f"{n_things} things, {n_points} points, service, tf, odometry, fix, {n_free} free cells, {n_goals} goals")
+    check_absent(program, domain + 4)
+    print(f"{n_on_board} on board, {n_things} things, {n_points} points, service, tf, odometry, fix, {n_free} free cells, {n_goals} goals")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ use clap::Args;
 use glam::DVec3;
 use slag_api::goal::{Goal, GoalReply};
 use slag_common::objects::parse_public_id;
+use slag_common::{durable, files};
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
@@ -53,14 +54,16 @@ pub fn run(args: GoalArgs) -> Result<(), Failure> {
         parse_public_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
     let request = GoalRequest { target, near: args.near, robot: args.robot, stand: args.stand };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
+    args.map.iter().try_for_each(|path| files::check_writable(path))?;
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
+    let on_board = engine.on_board()?;
     if let Some(path) = &args.map {
-        let map = goal::floor_map(&engine, &request, &Budget::default()).map_err(failure)?;
-        map.write_pgm(std::io::BufWriter::new(fs_err::File::create(path)?))?;
+        let map = goal::floor_map(&on_board.snapshot, &request, &Budget::default()).map_err(failure)?;
+        durable::write_result(path, |file| map.write_pgm(file))?;
     }
-    let reply = goal::find(&engine, &request, &Budget::default()).map_err(failure)?;
+    let reply = goal::find(&engine, &on_board, &request, &Budget::default()).map_err(failure)?;
     if args.json {
         return print_json(&reply);
     }

@@ -11,7 +11,7 @@ use crate::score::{Ball, Budget, Precision, Region};
 use clap::Args;
 use glam::DVec3;
 use slag_common::frames::Aabb;
-use slag_common::note;
+use slag_common::{durable, files, note};
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
@@ -91,6 +91,7 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
         ..QueryRequest::new(args.text)
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
+    args.ply.iter().try_for_each(|path| files::check_writable(path))?;
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
@@ -102,11 +103,7 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
 }
 
 fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
-    let mut file = fs_err::File::create(path)?;
-    for piece in reply.ply() {
-        file.write_all(&piece?)?;
-    }
-    Ok(())
+    durable::write_result(path, |file| reply.ply().try_for_each(|piece| Ok(file.write_all(&piece?)?)))
 }
 
 /// Prints a reply as one JSON object, piece by piece.

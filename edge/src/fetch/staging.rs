@@ -53,12 +53,22 @@ pub fn clear_manifests(cache: &EdgeCache, needed: &BTreeSet<Hash32>) -> Result<(
     Ok(())
 }
 
+/// Names that are tried in `staging/` before the medium is given up.
+const MAX_BAD_NAMES: u32 = 4;
+
 /// Replaces a small file durably: its path always holds the old or the new content, whole.
 pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchError> {
     let files = cache.files();
-    let aside = staging(cache).join("put");
-    files.write_from(&aside, 0, bytes)?;
-    files.sync(&aside)?;
+    let mut n = 0;
+    let aside = loop {
+        let aside = staging(cache).join(format!("put{n}"));
+        match files.write_from(&aside, 0, bytes).and_then(|()| files.sync(&aside)) {
+            Ok(()) => break aside,
+            // The name stays taken where its inode cannot be read.
+            Err(e) if is_bad_medium(&e) && n < MAX_BAD_NAMES => n += 1,
+            Err(e) => return Err(e.into()),
+        }
+    };
     files.rename(&aside, path)?;
     Ok(files.sync_dir(path.parent().unwrap_or(cache.dir()))?)
 }

@@ -7,9 +7,8 @@ use slag_common::objects::{parse_public_id, public_id};
 use super::choose::choose;
 use super::request::{GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use super::surroundings::{START_M, Surroundings};
-use crate::query::{AnswerKind, Ask, Engine, Outcome, Point};
+use crate::query::{AnswerKind, Ask, Engine, OnBoard, Outcome, Point};
 use crate::score::Budget;
-use crate::store::Snapshot;
 
 const MAX_THINGS: usize = 5;
 const MAX_POINTS: usize = 4096;
@@ -18,15 +17,20 @@ const MAX_POINTS: usize = 4096;
 ///
 /// # Errors
 /// [`GoalError`]. That there is no such place is a reply.
-pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<GoalReply, GoalError> {
+pub fn find(
+    engine: &Engine,
+    on_board: &OnBoard,
+    request: &GoalRequest,
+    budget: &Budget,
+) -> Result<GoalReply, GoalError> {
     request.check()?;
-    let snapshot = engine.snapshot()?;
+    let snapshot = &on_board.snapshot;
     let manifest = &snapshot.manifest;
     if snapshot.objects.is_empty() {
         return Err(GoalError::NoObjects);
     }
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
-    let things = match things(engine, &snapshot, request, near, budget)? {
+    let things = match things(engine, on_board, request, near, budget)? {
         Ok(things) => things,
         Err(detail) => {
             let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, 0.0, near);
@@ -34,7 +38,7 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
             return Ok(reply);
         }
     };
-    let seen = Surroundings::look(&snapshot, request, near, budget)?;
+    let seen = Surroundings::look(snapshot, request, near, budget)?;
     let voxel = seen.space.window.voxel;
     let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, voxel, near);
     let Some(start) = seen.start(near, request.robot.radius_m) else {
@@ -48,7 +52,7 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
     };
     let mut around = seen.around(start);
     for (id, thing) in things {
-        let points = engine.object_points(&snapshot, id, MAX_POINTS, budget);
+        let points = engine.object_points(snapshot, id, MAX_POINTS, budget);
         budget.check().map_err(GoalError::spent)?;
         let chosen = choose(&mut around, request, &points);
         // What looks end early for.
@@ -93,15 +97,15 @@ type Things = Vec<(u64, TargetThing)>;
 /// Returns the things to go to, best first, or why there is none.
 fn things(
     engine: &Engine,
-    snapshot: &Snapshot,
+    on_board: &OnBoard,
     request: &GoalRequest,
     near: DVec3,
     budget: &Budget,
 ) -> Result<Result<Things, String>, GoalError> {
     let text = match &request.target {
         GoalTarget::Object(id) => {
-            let Some(object) = engine.object(snapshot, None, *id, budget)? else {
-                let generation = snapshot.manifest.generation;
+            let Some(object) = engine.object(&on_board.snapshot, None, *id, budget)? else {
+                let generation = on_board.snapshot.manifest.generation;
                 return Ok(Err(format!("generation {generation} has no object {} on board", public_id(*id))));
             };
             let thing =
@@ -114,7 +118,7 @@ fn things(
     // Clusters have no id to go to.
     let kind = Some(AnswerKind::Objects);
     let ask = Ask { texts: vec![text.clone()], near, kind, limit: Some(MAX_THINGS), ..Ask::default() };
-    let found = engine.ask(ask, budget)?;
+    let found = engine.ask_on(on_board, ask, budget)?;
     let thing = |answer: &crate::query::ClusterAnswer| {
         let thing = TargetThing {
             id: answer.id.clone(),

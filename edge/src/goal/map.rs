@@ -9,8 +9,8 @@ use super::ground::Floor;
 use super::paths::Paths;
 use super::request::{GoalError, GoalRequest};
 use super::surroundings::Surroundings;
-use crate::query::Engine;
 use crate::score::Budget;
+use crate::store::Snapshot;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct FloorMap {
@@ -24,11 +24,10 @@ pub struct FloorMap {
 }
 
 /// Maps the ground around a robot; the request's thing counts for nothing.
-pub fn floor_map(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<FloorMap, GoalError> {
+pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) -> Result<FloorMap, GoalError> {
     request.check()?;
-    let snapshot = engine.snapshot()?;
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
-    let seen = Surroundings::look(&snapshot, request, near, budget)?;
+    let seen = Surroundings::look(snapshot, request, near, budget)?;
     let start = seen.start(near, request.robot.radius_m);
     let paths = start.map(|start| {
         let mut paths = Paths::from(start, &seen.is_safe, &seen.ground, seen.step);

@@ -51,6 +51,13 @@ pub(super) struct Answering<'a> {
 
 impl Answering<'_> {
     fn answers(&self, scratch: &mut Scratch, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
+        let mut answers = self.found(scratch, asked)?;
+        let reasons = answers.iter_mut().filter_map(|answers| answers.reason.as_mut());
+        reasons.for_each(|reason| reason::add_seen(reason, self.scene.shards, &self.request.region));
+        Ok(answers)
+    }
+
+    fn found(&self, scratch: &mut Scratch, asked: Questions<'_>) -> Result<Vec<Answers>, ScoreError> {
         match self.request.kind {
             Some(AnswerKind::Objects) => return self.by_objects(asked),
             Some(kind) => return self.by_gaussians(scratch, asked, kind),
@@ -148,7 +155,7 @@ impl Answering<'_> {
                 score_error_bound: scale.error_bound(scored.error_bound),
                 ..empty.searched
             },
-            reason: found.is_empty().then(|| reason::of_objects(scene.shards, request, threshold.0, best)),
+            reason: found.is_empty().then(|| reason::of_objects(request, threshold.0, best)),
             answers: found,
             ..empty
         }

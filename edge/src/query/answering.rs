@@ -23,7 +23,11 @@ impl Engine {
     /// Answers questions from the loaded generation. Blocks for milliseconds of computing, at most as long as the
     /// budget says.
     pub fn ask(&self, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
-        let on_board = self.on_board()?;
+        self.ask_on(&self.on_board()?, ask, budget)
+    }
+
+    /// Answers as [`Engine::ask`] does, from a generation that may be loaded no more.
+    pub(crate) fn ask_on(&self, on_board: &OnBoard, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
         on_board.check()?;
         let request = ask.understand(&on_board.snapshot)?;
         self.answer_on(on_board, request, budget)
@@ -35,12 +39,12 @@ impl Engine {
         on_board.check()?;
         request.understand(&on_board.snapshot)?;
         request.check()?;
-        self.answer_on(on_board, request, budget)
+        self.answer_on(&on_board, request, budget)
     }
 
     fn answer_on(
         &self,
-        on_board: OnBoard,
+        on_board: &OnBoard,
         request: QueryRequest,
         budget: &Budget,
     ) -> Result<Reply, QueryError> {
@@ -58,7 +62,7 @@ impl Engine {
                     let questions = things.into_iter().map(|thing| Ok(question(on_board.encode(thing)?)));
                     let questions = questions.collect::<Result<Vec<_>, QueryError>>()?;
                     let outcome =
-                        self.relate(&on_board, asked.label(), phrase, &questions, &request, budget)?;
+                        self.relate(on_board, asked.label(), phrase, &questions, &request, budget)?;
                     outcomes[at] = Some(outcome);
                     continue;
                 }
@@ -76,10 +80,10 @@ impl Engine {
             }
         }
         for (outcome, asked) in outcomes.iter_mut().flatten().zip(&request.asked) {
-            outcome.set_asked_as(asked_as(&on_board, asked, &request));
+            outcome.set_asked_as(asked_as(on_board, asked, &request));
         }
         let outcomes = outcomes.into_iter().flatten().collect();
-        Ok(Reply { request, outcomes, snapshot: on_board.snapshot })
+        Ok(Reply { request, outcomes, snapshot: Arc::clone(snapshot) })
     }
 
     /// Answers a phrase. `questions`: its things, in their order.

@@ -49,24 +49,20 @@ pub fn looked(
     }
 }
 
-/// Returns a reason. `best`: score and position of the best miss.
-fn reason(
-    told: (ReasonKind, String),
-    best: Option<(f32, DVec3)>,
-    (shards, region): (&[ShardView<'_>], &Region),
-) -> Reason {
-    let (kind, detail, seen_share) = looked(shards, region, told);
+/// Says in a reason how much views saw, as [`looked`] does.
+pub fn add_seen(reason: &mut Reason, shards: &[ShardView<'_>], region: &Region) {
+    let told = (reason.kind, std::mem::take(&mut reason.detail));
+    (reason.kind, reason.detail, reason.seen_share) = looked(shards, region, told);
+}
+
+/// `best`: score and position of the best miss.
+fn reason((kind, detail): (ReasonKind, String), best: Option<(f32, DVec3)>) -> Reason {
     let (best_score, best_position_in_world) = best.unzip();
-    Reason { kind, detail, seen_share, best_score, best_position_in_world }
+    Reason { kind, detail, seen_share: None, best_score, best_position_in_world }
 }
 
 /// Returns why no object was found. `best`: score and position of the best object on board.
-pub fn of_objects(
-    shards: &[ShardView<'_>],
-    request: &QueryRequest,
-    threshold: f32,
-    best: Option<(f32, DVec3)>,
-) -> Reason {
+pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVec3)>) -> Reason {
     let place = &request.region;
     let (kind, detail) = match best {
         None => (
@@ -86,7 +82,7 @@ pub fn of_objects(
             ),
         ),
     };
-    reason((kind, detail), best, (shards, place))
+    reason((kind, detail), best)
 }
 
 pub fn of_gaussians(
@@ -122,5 +118,5 @@ pub fn of_gaussians(
             )
         }
     };
-    reason((kind, detail), best, (search.shards(), place))
+    reason((kind, detail), best)
 }

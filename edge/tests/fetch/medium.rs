@@ -81,6 +81,10 @@ fn an_inode_that_cannot_be_read_fails_no_fetch() {
     assert_holds(&robot.snapshot(), &second, 0..3);
     // One copy of what the robot believes: the other counts, and is written on.
     drop(Records::open(&robot.cache).expect("free"));
+    // What a crash left under the name that files are written by.
+    let left = robot.cache.dir().join("staging/put0");
+    std::fs::write(&left, "half").expect("written");
+    disk.break_inode(&left);
     disk.break_inode(&robot.cache.dir().join("trust/0"));
     for generation in 3..5 {
         server.publish(Published::new(generation, &[0, 7, 0], N));

@@ -14,7 +14,7 @@ mod suspicion;
 mod tests;
 mod view;
 
-use slag_common::Gaussians;
+use slag_common::{Gaussians, durable};
 
 use crate::ingest::IngestError;
 use crate::raster::{LoadedScene, Rasterizer};
@@ -114,7 +114,8 @@ fn compare(
         let drawing = small.draw(scene)?;
         unusable_gaussians = unusable_gaussians.max(drawing.counters.unusable);
         if let Some(dir) = &options.pictures_dir {
-            fs_err::write(dir.join(picture_name(index, &view.name)), picture(&small, &drawing)?)?;
+            let picture = picture(&small, &drawing)?;
+            durable::write(&dir.join(picture_name(index, &view.name)), &picture)?;
         }
         checks.push(ViewCheck {
             name: view.name.clone(),

@@ -1,12 +1,13 @@
 //! `encode`: a scene into a store.
 
+use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
 use clap::{Args, FromArgMatches};
 use slag_common::shard::Profile;
-use slag_common::{ByteSize, files};
+use slag_common::{ByteSize, durable, files};
 use slag_models::commands;
 use slag_models::gpus::GpuChoice;
 
@@ -269,13 +270,15 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     #[cfg(not(feature = "fleet"))]
     let summary = encode::encode(&settings, &engines, progress, cancel.as_ref())?;
     let lines = lines(&settings, &summary, expected.as_ref());
-    let next = if json { String::new() } else { next::of_store(&settings.output.store)? };
+    let next = if json { String::new() } else { next::of_store(&settings.output.store).unwrap_or_default() };
     print(json, &summary, lines + &next)?;
     warn_of_expiry(&settings.output.store);
     if let (Some(path), Some(recorder)) = (&args.report, &recorder) {
-        fs_err::write(path, report::of_encode(&settings.output.scene_name, &summary, recorder)?)?;
+        let report = report::of_encode(&settings.output.scene_name, &summary, recorder)?;
+        let written = durable::write_result(path, |file| file.write_all(report.as_ref()));
+        written.context("the store is published, but the report is not written")?;
     }
-    Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
+    Ok(if summary.is_whole() { Exit::Done } else { Exit::Partly })
 }
 
 /// A target instead of a preset.

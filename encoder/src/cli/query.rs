@@ -1,5 +1,6 @@
 //! `query`: scores of every Gaussian against a text, and the Gaussians that match it.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow};
@@ -7,7 +8,7 @@ use clap::Args;
 use serde_json::json;
 use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
-use slag_common::{Gaussians, files, npy};
+use slag_common::{Gaussians, durable, files, npy};
 use slag_models::words_to_find;
 
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
@@ -118,5 +119,6 @@ fn write_ply(
             matching.len()
         ));
     }
-    Ok(fs_err::write(path, query::points_ply(located, &[format!("text {text}")]))?)
+    let points = query::points_ply(located, &[format!("text {text}")]);
+    Ok(durable::write_result(path, |file| file.write_all(&points))?)
 }

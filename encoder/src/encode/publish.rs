@@ -17,6 +17,7 @@ use super::error::EncodeError;
 use super::executor::Executor;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary};
+use super::settings::Masks;
 use super::views::DoneViews;
 use crate::store::{ModelsRecord, Store};
 
@@ -37,6 +38,7 @@ pub(super) fn publish(
         let n_views = views.used.len();
         return Err(EncodeError::NoEvidence { n_views, n_views_without_masks, n_masks, n_entries });
     }
+    warn_of_single_masks(&plan, &built.counts, views.used.len());
     let generation = plan.store.next_generation()?;
     let text_model = plan
         .settings
@@ -90,6 +92,17 @@ fn carry_text_model(store: &Store, models: &ModelDir) -> Result<TextModelRecord,
     let names: Vec<_> = files.iter().map(|file| file.hash).collect();
     let (hash, len_bytes) = store.put_bytes(&text_side.description(&names)?)?;
     Ok(TextModelRecord { description: ObjectRecord { hash, len_bytes }, files })
+}
+
+/// Warns where given masks may be of what to keep or to ignore, as trainers take them.
+fn warn_of_single_masks(plan: &Plan<'_>, counts: &Counts, n_views: usize) {
+    let is_given = matches!(plan.settings.view.masks, Masks::Given { .. });
+    let n_with_masks = n_views - counts.n_views_without_masks;
+    if is_given && n_with_masks > 1 && counts.n_masks == n_with_masks {
+        tracing::warn!(
+            "each photo has one mask, as if of what to keep or ignore; objects need a mask for each thing"
+        );
+    }
 }
 
 fn manifest(

@@ -191,3 +191,10 @@ pub struct EncodeSummary {
     pub(crate) images_on: Option<String>,
     pub encoder: String,
 }
+
+impl EncodeSummary {
+    /// Returns whether every view was used, and most of the splat.
+    pub(crate) fn is_whole(&self) -> bool {
+        self.skipped_views.is_empty() && self.n_rejected <= self.n_gaussians
+    }
+}

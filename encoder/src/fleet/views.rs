@@ -58,7 +58,8 @@ impl ViewWork<'_> {
         let source = views_to_do(self.dispatcher, &prepared.views, || context.is_cancelled());
         let source = source.map(|view| (true, view));
         let reports = work_off(&stages, self.n_threads, source, context, |view, error| {
-            tracing::warn!("view {} fails: {error}", view.name);
+            // The coordinator warns of the first few.
+            tracing::info!("view {} fails: {error}", view.name);
             Ok(self.fail(view, &error.to_string())?)
         });
         reports.map(drop).map_err(of_encode)
@@ -120,8 +121,8 @@ impl ViewSink for ViewWork<'_> {
     }
 }
 
-/// Yields the views that are to be had at present. The pipeline asks for them with its lock held, so nothing here
-/// waits for the bucket: whether another worker did a view meanwhile is found where its photo is fetched.
+/// Yields the views that are to be had at present. Nothing here waits for the bucket: whether another worker did a
+/// view meanwhile is found where its photo is fetched.
 fn views_to_do<'a>(
     dispatcher: &'a dyn Dispatcher,
     views: &'a [View],

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use slag_common::Gaussians;
 use slag_raster::{Drawing, RasterView};
@@ -182,7 +183,8 @@ impl Rasterizer for Devices {
         }
         let lanes = (0..gpus.len() as u32).map(|gpu| (gpu, vec![(); self.views_in_flight]));
         let lanes = Lanes::new(lanes);
-        Ok(Box::new(SharedScene { gpus, views_in_flight: self.views_in_flight, cpu, lanes }))
+        let (views_in_flight, is_told) = (self.views_in_flight, AtomicBool::new(false));
+        Ok(Box::new(SharedScene { gpus, views_in_flight, cpu, lanes, is_told }))
     }
 }
 
@@ -192,6 +194,8 @@ struct SharedScene<'s> {
     views_in_flight: usize,
     cpu: Box<dyn LoadedScene + 's>,
     lanes: Lanes<()>,
+    /// Whether it was said that the CPU does what no GPU can.
+    is_told: AtomicBool,
 }
 
 impl SharedScene<'_> {
@@ -205,7 +209,9 @@ impl SharedScene<'_> {
                     }
                 }
                 Err(error @ RasterError::DeviceCapacity { .. }) => {
-                    tracing::warn!("rasterising a view on the CPU: {error}");
+                    if !self.is_told.swap(true, Ordering::Relaxed) {
+                        tracing::warn!("such views are rasterised on the CPU: {error}");
+                    }
                     return work(self.cpu.as_ref());
                 }
                 result => return result,
@@ -248,6 +254,7 @@ mod tests {
             views_in_flight: 1,
             cpu: cpu(),
             lanes: Lanes::new([(0, vec![()])]),
+            is_told: AtomicBool::new(false),
         };
         let panics = || scene.run(|_| -> Result<(), RasterError> { panic!("a broken view") });
         std::panic::catch_unwind(std::panic::AssertUnwindSafe(panics)).expect_err("it panics");

@@ -15,6 +15,7 @@ use slag_common::tuf::TargetFile;
 use slag_common::{Hash32, durable, manifest};
 
 use super::error::StoreError;
+use super::files;
 use super::metadata::{self, TIMESTAMP_FILE};
 use super::reader::{Published, StoreReader};
 
@@ -47,11 +48,11 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     }
     let generations = || reader.previous().into_iter().chain([reader.current()]);
     let lens: BTreeMap<Hash32, u64> = generations().flat_map(Published::object_lens).collect();
-    let is_there = |(hash, len_bytes): &(&Hash32, &u64)| {
-        let found = std::fs::metadata(objects.join(hash.to_string()));
-        found.is_ok_and(|found| found.len() == **len_bytes)
+    // A folder on a stick or a server's disk may have been damaged since.
+    let is_there = |hash: &Hash32| {
+        files::hash_of(&objects.join(hash.to_string())).is_ok_and(|(found, _)| found == *hash)
     };
-    let fresh: Vec<(&Hash32, &u64)> = lens.iter().filter(|object| !is_there(object)).collect();
+    let fresh: Vec<(&Hash32, &u64)> = lens.par_iter().filter(|(hash, _)| !is_there(hash)).collect();
     fresh.par_iter().try_for_each(|(hash, _)| {
         let bytes = reader.read_object(**hash)?;
         Ok::<_, StoreError>(durable::write(&objects.join(hash.to_string()), &bytes)?)

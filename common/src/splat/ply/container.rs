@@ -360,7 +360,7 @@ fn read_ascii_row(
         }
         *line_number += 1;
         for word in line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()) {
-            match std::str::from_utf8(word).ok().and_then(|word| word.parse().ok()) {
+            match number(word) {
                 Some(value) => values.push(value),
                 None => {
                     let found: String = String::from_utf8_lossy(word).chars().take(60).collect();
@@ -375,6 +375,14 @@ fn read_ascii_row(
         }
     }
     Ok(())
+}
+
+/// Reads a number. C libraries of Windows write what is none as `-nan(ind)` or `1.#QNAN`.
+fn number(word: &[u8]) -> Option<f64> {
+    let text = std::str::from_utf8(word).ok()?;
+    let bare = text.trim_start_matches('-').to_ascii_lowercase();
+    let is_none = bare.starts_with("nan(") || bare.starts_with("1.#");
+    if is_none { Some(f64::NAN) } else { text.parse().ok() }
 }
 
 /// The part of a header read so far.

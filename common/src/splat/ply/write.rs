@@ -1,17 +1,16 @@
 //! Writes PLY files.
 
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
 use crate::Gaussians;
+use crate::durable;
 use crate::splat::error::SplatError;
 
 /// Writes Gaussians in the layout of 3DGS: binary little-endian, zero normals, logarithms of scales, logits of
 /// opacities.
 pub fn write(path: &Path, gaussians: &Gaussians) -> Result<(), SplatError> {
-    let mut writer = BufWriter::new(fs_err::File::create(path)?);
-    write_to(&mut writer, gaussians)?;
-    Ok(writer.flush()?)
+    Ok(durable::write_result(path, |file| write_to(file, gaussians))?)
 }
 
 /// Writes like [`write()`] to any writer, preferably a buffered one.

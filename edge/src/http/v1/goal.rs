@@ -17,7 +17,7 @@ use crate::goal::{self, GoalError, GoalRequest, GoalTarget, Robot, Stand};
 use crate::http::app::App;
 use crate::http::forms::{self, LatLonText, ObjectIdText, XyzText};
 use crate::http::problem::query_problem;
-use crate::query::{RequestError, Words};
+use crate::query::{OnBoard, RequestError, Words};
 use crate::score::Budget;
 
 #[derive(Deserialize, JsonSchema)]
@@ -53,7 +53,10 @@ pub async fn goal(
         _ => return Err(RequestError::new("text", "nothing", "the thing to go to, or its id as id").into()),
     };
     let request = GoalRequest { target, near: None, robot, stand };
-    answer(&app, place, request, |app, request, budget| goal::find(&app.engine, request, budget)).await
+    answer(&app, place, request, |app, on_board, request, budget| {
+        goal::find(&app.engine, on_board, request, budget)
+    })
+    .await
 }
 
 pub async fn floor(
@@ -61,11 +64,10 @@ pub async fn floor(
     Params((place, robot)): Params<(PlaceParams, Robot)>,
 ) -> Result<Json<Floor>, Problem> {
     let request = GoalRequest { robot, ..GoalRequest::new(GoalTarget::Text(String::new())) };
-    answer(&app, place, request, |app, request, budget| {
-        let generation = app.engine.snapshot()?.manifest.generation;
-        let map = goal::floor_map(&app.engine, request, budget)?;
+    answer(&app, place, request, |_, on_board, request, budget| {
+        let map = goal::floor_map(&on_board.snapshot, request, budget)?;
         Ok(Floor {
-            generation,
+            generation: on_board.snapshot.manifest.generation,
             frame: FRAME.into(),
             cell_m: map.cell_m,
             origin_in_world: map.origin_in_world,
@@ -80,17 +82,18 @@ async fn answer<T: Send + 'static>(
     app: &Arc<App>,
     place: PlaceParams,
     mut request: GoalRequest,
-    work: impl FnOnce(&App, &GoalRequest, &Budget) -> Result<T, GoalError> + Send + 'static,
+    work: impl FnOnce(&App, &OnBoard, &GoalRequest, &Budget) -> Result<T, GoalError> + Send + 'static,
 ) -> Result<Json<T>, Problem> {
     let near = forms::point(place.near, place.near_lat_lon)?;
     request.check()?;
     let answering = app.within_limits(None, move |app, budget| {
-        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        let on_board = app.engine.on_board().map_err(query_problem)?;
+        let manifest = &on_board.snapshot.manifest;
         request.near = match near {
-            Some(near) => Some(near.in_world("near", &snapshot.manifest)?),
-            None => app.last_position(&snapshot.manifest),
+            Some(near) => Some(near.in_world("near", manifest)?),
+            None => app.last_position(manifest),
         };
-        work(app, &request, budget).map(Json).map_err(problem)
+        work(app, &on_board, &request, budget).map(Json).map_err(problem)
     });
     answering.await
 }

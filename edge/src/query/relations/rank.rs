@@ -11,9 +11,11 @@ use crate::query::answers::ReasonKind;
 
 /// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not
 /// win over a sure one.
-const SURE: f64 = 0.5;
+const SURE: f64 = 0.65;
 /// Distance, in metres, up to which things of the same words are pieces of one.
 const TOUCHES_M: f64 = 0.05;
+/// The same for a thing above another, such as the back of a chair above its seat.
+const ABOVE_M: f64 = 0.25;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
@@ -195,14 +197,18 @@ impl<'b> Measure<'_, 'b> {
         Ok(found.map(anchor).collect())
     }
 
-    /// Merges pieces that touch, because masks split some things and picks compare whole ones. `found`: best first.
+    /// Merges pieces that touch or are close above each other, because masks split some things and picks compare
+    /// whole ones. `found`: best first.
     /// Returns the best piece of each thing, with the box around all its pieces.
     fn joined(&self, all: &[Candidate<'_>], found: Vec<Related>) -> Vec<(Related, Solid)> {
         let mut joined: Vec<(Related, Solid)> = Vec::new();
         for related in found {
             let solid = all[related.candidate].solid;
-            let touching = joined.iter_mut().find(|(_, of)| solid.gap(of) <= TOUCHES_M * self.metre);
-            match touching {
+            let is_piece = |of: &Solid| {
+                let above_m = -solid.shared_height(of) / self.metre;
+                solid.horizontal_gap(of) <= TOUCHES_M * self.metre && above_m <= ABOVE_M
+            };
+            match joined.iter_mut().find(|(_, of)| is_piece(of)) {
                 Some((_, whole)) => *whole = whole.joined(&solid),
                 None => joined.push((related, solid)),
             }

@@ -96,7 +96,7 @@ const FAR_M: f64 = 1.5;
 /// Share of the smaller thing's size that is added to both.
 const OF_SIZE: f64 = 0.5;
 /// The same for things beside each other.
-const BESIDE_M: [f64; 2] = [0.4, 1.2];
+const BESIDE_M: [f64; 2] = [0.6, 1.4];
 /// Share of the lower thing's height that both must have in common.
 const LEVEL: [f64; 2] = [0.5, 0.1];
 /// Share of the smaller thing's outline that may lie over the other: boxes of things that stand close overlap.
@@ -111,8 +111,10 @@ fn near(thing: &Solid, other: &Solid, metre: f64) -> f64 {
 
 /// Returns the degree to which two things stand side by side.
 fn beside(thing: &Solid, other: &Solid, metre: f64) -> f64 {
-    let lower = thing.height().min(other.height()).max(f64::MIN_POSITIVE);
-    let level = falling(-thing.shared_height(other) / lower, -LEVEL[0], -LEVEL[1]);
+    // A rug and a wardrobe stand on the same ground, though the boxes of their Gaussians may share no height.
+    let touches = TOUCHES_M * metre;
+    let lower = thing.height().min(other.height()).max(touches);
+    let level = falling(-(thing.shared_height(other) + touches) / lower, -LEVEL[0], -LEVEL[1]);
     let smaller = thing.area().min(other.area()).max(f64::MIN_POSITIVE);
     let apart = falling(thing.shared_area(other) / smaller, APART[0], APART[1]);
     let close = falling(thing.horizontal_gap(other), BESIDE_M[0] * metre, BESIDE_M[1] * metre);

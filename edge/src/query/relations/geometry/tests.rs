@@ -38,6 +38,8 @@ fn a_room_by_hand() {
     let rug = solid([0.0, 0.0, 0.01], [3.0, 2.0, 0.02]);
     let cupboard = solid([-2.0, 2.5, 0.9], [1.0, 0.5, 1.8]);
     let plate = solid([-2.0, 2.5, 1.0], [0.3, 0.3, 0.05]);
+    // The box of what is seen of it begins above its feet.
+    let wardrobe = solid([2.1, 0.0, 1.0], [1.0, 0.6, 1.88]);
     let lamp = solid([0.0, 0.0, 2.2], [0.4, 0.4, 0.3]);
     // From the south, looking north.
     let viewer = Viewer { position_in_world: DVec3::new(0.0, -4.0, 0.0), heading_rad: Some(1.57) };
@@ -55,6 +57,7 @@ fn a_room_by_hand() {
         (Relation::Near, &mug, &table),
         (Relation::Near, &chair, &table),
         (Relation::Beside, &chair, &table),
+        (Relation::Beside, &wardrobe, &rug),
         (Relation::RightOf, &chair, &table),
         (Relation::Behind, &wall, &table),
         (Relation::InFrontOf, &table, &wall),
