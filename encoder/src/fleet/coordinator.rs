@@ -58,11 +58,11 @@ impl Coordinator {
         let open: Vec<usize> = plan.order.iter().copied().filter(is_open).collect();
         let run_plan = inputs::upload(&self.bucket, plan, &open, context)?;
         let run = Run::begin(&self.bucket, &run_plan)?;
-        let open_queue = |queue| Enqueuer::open(self.bucket.runtime(), queue, run, run_plan.of_scene);
+        let open_queue = |queue| Enqueuer::open(&self.bucket.runtime, queue, run, run_plan.of_scene);
         let queue = self.queue.as_ref().map(open_queue).transpose()?;
         let heartbeat = Heartbeat::start(&self.bucket, run);
         *self.run.lock().unwrap_or_else(PoisonError::into_inner) = Some((run, heartbeat));
-        let (n_open, url) = (open.len(), self.bucket.url());
+        let (n_open, url) = (open.len(), &self.bucket.url);
         tracing::info!(
             "run {}: {n_open} views to do; workers join with `slag-encoder worker --blobs {url}`",
             run.0
@@ -126,7 +126,7 @@ impl ViewsInWork<'_> {
             self.open.iter().filter(|(id, _)| there.contains(id)).collect();
         let fetch = |(id, (_, name)): &(&Hash32, &(usize, String))| {
             self.fetch_view(plan, **id, name)?;
-            context.progress().advance(1);
+            context.progress.advance(1);
             Ok::<_, FleetError>(())
         };
         context.install(|| fresh.par_iter().try_for_each(fetch))?;

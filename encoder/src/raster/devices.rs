@@ -143,10 +143,6 @@ impl Devices {
         Self { gpus, views_in_flight: views_in_flight.max(1) }
     }
 
-    pub fn gpus(&self) -> &[GpuRasterizer] {
-        &self.gpus
-    }
-
     pub fn names(&self) -> Vec<String> {
         match self.gpus.is_empty() {
             true => vec!["CPU".into()],

@@ -118,7 +118,6 @@ impl TradeoffReport {
             settings: kept.collect(),
         }
     }
-
 }
 
 impl fmt::Display for TradeoffReport {
@@ -130,9 +129,8 @@ impl fmt::Display for TradeoffReport {
         let mut table = Table::new(columns);
         for scene in self.scenes() {
             let of_scene: Vec<&Figures> = self.figures.iter().filter(|f| f.scene == scene).collect();
-            let fronts = COSTS.map(|cost| {
-                pareto(&of_scene.iter().map(|f| (cost(f), f.miou)).collect::<Vec<(f64, f64)>>())
-            });
+            let fronts = COSTS
+                .map(|cost| pareto(&of_scene.iter().map(|f| (cost(f), f.miou)).collect::<Vec<(f64, f64)>>()));
             for (number, p) in of_scene.into_iter().enumerate() {
                 let marks = ["s", "b"].into_iter().zip(&fronts).filter(|(_, front)| front[number]);
                 table.row([

@@ -51,10 +51,7 @@ pub(super) struct Truth<'a> {
 
 impl<'a> Truth<'a> {
     /// Makes the true map of a robot that starts below the first camera with room for it.
-    pub(super) fn new(
-        layout: &'a Layout,
-        cameras: impl Iterator<Item = DVec3>,
-    ) -> Result<Self> {
+    pub(super) fn new(layout: &'a Layout, cameras: impl Iterator<Item = DVec3>) -> Result<Self> {
         let shell = || layout.placed.iter().filter(|placed| placed.shell);
         let low = shell().fold(DVec2::INFINITY, |low, placed| low.min(placed.bounds.min.truncate()));
         let high = shell().fold(DVec2::NEG_INFINITY, |high, placed| high.max(placed.bounds.max.truncate()));
@@ -138,7 +135,7 @@ impl<'a> Truth<'a> {
 
     /// Returns the share of a thing's outline that a sensor sees, of what it would see without the other things.
     pub(super) fn shown(&self, thing: usize, sensor: DVec3) -> f64 {
-        let towards = self.solids.things()[thing].centre() - sensor;
+        let towards = self.solids.things[thing].centre - sensor;
         let level = towards.with_z(0.0).length().max(0.05);
         // A camera that looks straight up has no right.
         let heading = towards.with_z(towards.z.clamp(-10.0 * level, 10.0 * level));

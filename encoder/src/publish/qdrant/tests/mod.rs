@@ -226,7 +226,6 @@ async fn every_point_arrives() {
         server.with(|state| state.collections["yard"].indexed.clone()),
         ["scene", "generation", "location"]
     );
-
 }
 
 /// The client repeats a request once by itself, so three failures in a row need a repetition of ours.
