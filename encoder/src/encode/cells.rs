@@ -78,22 +78,6 @@ pub(super) fn build_cells(
     landmarks: Option<Vec<BuiltLandmarks>>,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
-    let n_views = views.used.len();
-    build(plan, views, occupancy, landmarks, context).map_err(|error| match error {
-        EncodeError::Contributions(ContributionError::Cancelled) => {
-            EncodeError::Interrupted { n_done: n_views, n_views }
-        }
-        error => error,
-    })
-}
-
-fn build(
-    plan: &Plan<'_>,
-    views: &DoneViews<'_>,
-    occupancy: Option<SceneOccupancy>,
-    landmarks: Option<Vec<BuiltLandmarks>>,
-    context: &RunContext<'_>,
-) -> Result<BuiltCells, EncodeError> {
     let Plan { inputs, store, settings, .. } = *plan;
     let opened = context.install(|| Opened::of(plan, views, occupancy.as_ref(), context))?;
     let Opened { index, table, score_context, photos, pass_bytes, cells: budget } = opened;

@@ -2,7 +2,6 @@
 //! makes the cells.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -17,9 +16,8 @@ use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{Executor, LeftOut, Plan, RunContext, ViewRecord, ViewsRun};
-use crate::encode::{self, EncodeError, EncodeSettings, EncodeSummary, Engines, SkippedView};
-use crate::progress::Progress;
+use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, RunContext, ViewRecord, ViewsRun};
+use crate::encode::{EncodeError, Engines, SkippedView};
 
 /// The executor of an encode whose views are done by workers.
 pub(crate) struct Coordinator {
@@ -34,17 +32,6 @@ impl Coordinator {
     /// `queue`: where work is handed out; without it, workers have shares.
     pub(crate) fn new(bucket: Arc<Bucket>, queue: Option<QueueSettings>) -> Self {
         Self { bucket, queue, run: Mutex::default() }
-    }
-
-    /// Encodes a scene as [`encode::encode`] does, by the fleet.
-    pub(crate) fn encode(
-        &self,
-        settings: &EncodeSettings,
-        engines: &Engines<'_>,
-        progress: &dyn Progress,
-        cancel: &AtomicBool,
-    ) -> Result<EncodeSummary, EncodeError> {
-        encode::encode_by(self, settings, engines, progress, cancel)
     }
 
     /// Uploads what the open views need, and begins a run of them.
@@ -75,7 +62,7 @@ impl Coordinator {
 
 impl Executor for Coordinator {
     fn rasterizer(&self, _: &Engines<'_>) -> String {
-        crate::encode::fleet_parts::OF_A_FLEET.into()
+        OF_A_FLEET.into()
     }
 
     fn run_views(
