@@ -24,7 +24,8 @@ fn random(seed: u64) -> f64 {
 
 /// Three patches of 30 Gaussians, far apart and each of a colour.
 fn gaussians() -> Gaussians {
-    let at = |i: usize| DVec3::new((i / 30 * 10) as f64 + (i % 6) as f64 * 0.1, (i % 30 / 6) as f64 * 0.1, 0.0);
+    let at =
+        |i: usize| DVec3::new((i / 30 * 10) as f64 + (i % 6) as f64 * 0.1, (i % 30 / 6) as f64 * 0.1, 0.0);
     let mut scene = Gaussians::balls((0..N).map(at).collect(), 0.1);
     scene.scales.fill([0.1, 0.1, 0.01]);
     scene.opacities.fill(0.9);
