@@ -84,8 +84,7 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
                 open_browser(&link);
             }
         };
-        serve::serve_router(viewer, args.listen.clone(), serve::Limits::default(), None, opened, stopped())
-            .await
+        serve::serve(viewer, args.listen.clone(), serve::Limits::default(), None, opened, stopped()).await
     })?;
     Ok(Exit::Done)
 }

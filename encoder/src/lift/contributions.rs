@@ -215,7 +215,7 @@ pub struct ContributionFile {
     pub(super) n_entries: u64,
     entries_at_bytes: u64,
     /// By (cell, slice), ascending.
-    pub(super) runs: Vec<Run>,
+    pub runs: Vec<Run>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
