@@ -57,10 +57,8 @@ pub(crate) use report::SkippedView;
 pub(crate) use report::{GpuReport, Phase, StageReport};
 #[cfg(feature = "fleet")]
 pub(crate) use settings::ViewSettings;
-pub use settings::{
-    CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit,
-};
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
+pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit};
 
 /// The parts of which a fleet makes its own encode.
 #[cfg(feature = "fleet")]

@@ -14,12 +14,10 @@ use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 use super::lerf::{self, LerfLabels};
 use super::scannet::{self, Scan, ScanReport, ScannetReport, ScannetSettings};
 use slag_encoder::cells::CellLimits;
-use slag_encoder::codebook::CodebookSettings;
-use slag_encoder::encode::{self, CellSettings, EncodeSettings, Engines, Masks};
+use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, RasterView, Rasterizer, pinhole};
-use slag_encoder::shard::ShardSettings;
 use slag_encoder::store::StoreReader;
 
 /// Gaussians across and down, 0.1 m apart, 2 m in front of the camera.
@@ -81,19 +79,9 @@ impl Wall {
         settings.view.masks = Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() };
         settings.view.min_mask_px = 10;
         settings.aggregation = Aggregation::PLAIN;
-        settings.cells = CellSettings {
-            limits: CellLimits::by_count(4096),
-            shards: ShardSettings {
-                profiles: vec![Profile::Compact],
-                codebook: CodebookSettings::default(),
-                input_indices: false,
-                compact_appearance: false,
-            },
-            objects: false,
-            occupancy: None,
-            photo_poses: false,
-            landmarks: false,
-        };
+        settings.cells.limits = CellLimits::by_count(4096);
+        settings.cells.shards.profiles = vec![Profile::Compact];
+        settings.cells.objects = false;
         settings.run.threads = 1;
         settings.run.memory_bytes = 1 << 28;
         settings.run.strict = true;
