@@ -76,7 +76,7 @@ pub enum DeviceError {
 
 /// A backend that distributes views over several devices.
 pub struct Devices {
-    gpus: Vec<GpuRasterizer>,
+    pub gpus: Vec<GpuRasterizer>,
     views_in_flight: usize,
 }
 
