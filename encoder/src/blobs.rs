@@ -44,9 +44,10 @@ pub(crate) enum BlobError {
 pub(crate) struct Bucket {
     store: Arc<dyn ObjectStore>,
     prefix: Key,
-    url: String,
-    is_local: bool,
-    runtime: Arc<Runtime>,
+    pub(crate) url: String,
+    /// Whether it is a folder, which answers at once.
+    pub(crate) is_local: bool,
+    pub(crate) runtime: Arc<Runtime>,
 }
 
 impl Bucket {
@@ -84,19 +85,6 @@ impl Bucket {
             object_store::parse_url_opts(&url, variables).map_err(|e| refuse(e.to_string()))?;
         let url = address.trim_end_matches('/').to_owned();
         Ok(Self { store: Arc::from(store), prefix, url, is_local: false, runtime })
-    }
-
-    pub(crate) fn url(&self) -> &str {
-        &self.url
-    }
-
-    /// Returns whether it is a folder, which answers at once.
-    pub(crate) fn is_local(&self) -> bool {
-        self.is_local
-    }
-
-    pub(crate) fn runtime(&self) -> &Arc<Runtime> {
-        &self.runtime
     }
 
     fn ask<T, F>(&self, request: impl Fn() -> F) -> object_store::Result<T>

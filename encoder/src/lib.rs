@@ -38,7 +38,7 @@ pub mod encode;
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet;
 pub(crate) mod ground;
-pub mod html;
+mod html;
 pub mod ingest;
 pub mod landmarks;
 mod lanes;

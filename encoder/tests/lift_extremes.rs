@@ -7,7 +7,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout, ShardView};
 use slag_common::{Gaussians, Hash32};
 use slag_encoder::cells::{self, Cell, CellLimits, PositionError};
-use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
+use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable, ViewContributions};
 use slag_encoder::shard::{CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
 use slag_math::matrix::Rows;
@@ -219,12 +219,7 @@ fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (
     let bank = TextBank::directions(embeddings.dim);
     let metric = ScoreMetric::new(embeddings.dim, &bank);
     let spread = metric.spread(Rows::all(&embeddings.vectors, embeddings.dim));
-    let settings = ShardSettings {
-        profiles: vec![Profile::Exact],
-        codebook: CodebookSettings::default(),
-        input_indices: false,
-        compact_appearance: false,
-    };
+    let settings = ShardSettings { profiles: vec![Profile::Exact], ..ShardSettings::default() };
     let score_context = ScoreMetricContext { metric, bank, spread };
     let builder = ShardBuilder {
         scene,

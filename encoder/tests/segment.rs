@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use glam::DAffine3;
-use image::{GrayImage, ImageBuffer, Luma, RgbImage};
+use image::{GrayImage, RgbImage};
 use proptest::prelude::*;
 use slag_common::{Distortion, View, poses};
-use slag_encoder::ingest::{Undistorter, load_image};
+use slag_encoder::ingest::Undistorter;
 use slag_encoder::masks::regions::{absorb_slivers, partition};
 use slag_encoder::masks::rle::{Rle, RleError};
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, RegionMap};
@@ -468,32 +468,6 @@ fn a_mask_cut_into_slivers_keeps_one() {
     assert_eq!(masks_of_region.iter().filter(|set| set.contains(&9)).count(), 1);
 }
 
-/// Regions of a real photo's masks, written as 16-bit ids, are read back as the same masks.
-#[needs_shared]
-#[test]
-fn a_loaded_photo_makes_the_input() {
-    let scene = shared("scenes/house_a");
-    let loaded = load_image(&poses::read(&scene, None).unwrap().views[5]).unwrap();
-    let masks = GivenMasks::open(&scene.join("gt/masks"), Vec::new()).unwrap();
-    let masks = masks.segment(&SegmentInput::new(&loaded, None)).unwrap();
-    let (map, masks_of_region) = partition(&masks, 640, 480, 640, 480, None);
-    assert_eq!(map.n_regions as usize, masks.len(), "id images do not overlap");
-    assert!(masks_of_region.iter().all(|set| set.len() == 1));
-    let wide: ImageBuffer<Luma<u16>, Vec<u16>> = ImageBuffer::from_fn(640, 480, |x, y| {
-        Luma([map.region_of_pixel[(y * 640 + x) as usize] as u16 + 300])
-    });
-    let dir = tempfile::tempdir().unwrap();
-    wide.save(dir.path().join("0005.png")).unwrap();
-    let again =
-        GivenMasks::open(dir.path(), Vec::new()).unwrap().segment(&SegmentInput::new(&loaded, None)).unwrap();
-    let by_box = |masks: Vec<Mask>| {
-        let mut masks = masks;
-        masks.sort_by_key(|m| (m.box_px.y0, m.box_px.x0, m.area_px));
-        masks
-    };
-    assert_eq!(by_box(again), by_box(masks));
-}
-
 /// Masks that match no photo are refused by name; folders of `amg.py` and entries with other folders are found.
 #[test]
 fn masks_are_matched_with_their_photos() {
@@ -511,7 +485,7 @@ fn masks_are_matched_with_their_photos() {
     let white = |at: usize| (0..12).map(|i| if i == at { 255 } else { 0 }).collect::<Vec<u8>>();
     for number in [0, 1, 10] {
         let path = amg.join(format!("{number}.png"));
-        write_png_sized(&path, 4, 3, &white(number));
+        GrayImage::from_raw(4, 3, white(number)).unwrap().save(path).unwrap();
     }
     assert!(
         check(dir.path(), false)
@@ -554,8 +528,4 @@ fn masks_are_matched_with_their_photos() {
     }
     let said = check(dir.path(), true).unwrap().unwrap();
     assert!(said.contains("b.png is read") && said.ends_with("b.json beside it is not"), "{said}");
-}
-
-fn write_png_sized(path: &Path, width: u32, height: u32, pixels: &[u8]) {
-    GrayImage::from_raw(width, height, pixels.to_vec()).expect("the size").save(path).unwrap();
 }

@@ -146,17 +146,11 @@ fn labelled_scenes_are_never_upside_down() {
 #[test]
 fn a_thing_by_itself_is_seen_from_around() {
     let mut random = Random::new(9);
-    let mut ball = Gaussians::default();
-    while ball.len() < 6000 {
-        let at = DVec3::from([0; 3].map(|_| random.between(-1.0, 1.0)));
-        if at.length() <= 1.0 {
-            ball.means_in_world.push(at);
-            ball.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-            ball.scales.push([0.06; 3]);
-            ball.opacities.push(0.97);
-            ball.sh_dc.push([0.1; 3]);
-        }
-    }
+    let places = std::iter::repeat_with(|| DVec3::from([0; 3].map(|_| random.between(-1.0, 1.0))));
+    let means = places.filter(|at| at.length() <= 1.0).take(6000).collect();
+    let mut ball = Gaussians::balls(means, 0.06);
+    ball.opacities.fill(0.97);
+    ball.sh_dc.fill([0.1; 3]);
     let plan = plan_of(&ball, None).unwrap();
     assert_eq!((plan.kind, plan.views.len()), (SceneKind::Object, 16));
     assert!(plan.up_in_world.dot(DVec3::NEG_Y) > 0.9999, "{:?}", plan.up_in_world);
@@ -178,15 +172,9 @@ fn splats_that_tell_too_little_are_refused() {
     assert!(message.contains("--views"), "{message}");
     let mut random = Random::new(7);
     // A round cave of round Gaussians.
-    let mut cave = Gaussians::default();
-    for _ in 0..6000 {
-        let at = [0; 3].map(|_| random.between(-1.0, 1.0));
-        cave.means_in_world.push(DVec3::from(at).normalize_or_zero());
-        cave.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        cave.scales.push([0.03; 3]);
-        cave.opacities.push(0.97);
-        cave.sh_dc.push([0.0; 3]);
-    }
+    let mut direction = || DVec3::from([0; 3].map(|_| random.between(-1.0, 1.0))).normalize_or_zero();
+    let mut cave = Gaussians::balls((0..6000).map(|_| direction()).collect(), 0.03);
+    cave.opacities.fill(0.97);
     assert!(refused(&cave, None).contains("which way is up"));
     // Floaters in all free places of the room.
     let mut floaters = room();

@@ -350,7 +350,7 @@ pub fn contributions(data: &[u8]) -> bool {
         let opened = ContributionFile::open(path);
         if let Ok((file, regions)) = &opened {
             std::hint::black_box(regions.masks_of_region().map(<[u32]>::len).sum::<usize>());
-            for run in 0..file.runs().len() {
+            for run in 0..file.runs.len() {
                 std::hint::black_box(file.entries_of_run(run));
             }
         }

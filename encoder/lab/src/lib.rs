@@ -11,7 +11,6 @@ mod eval;
 pub mod generate;
 #[cfg(feature = "measure")]
 mod harness;
-#[cfg(feature = "measure")]
 mod programs;
 #[cfg(feature = "measure")]
 mod scenes;

@@ -1,33 +1,24 @@
 //! The project's programs, run as a user runs them.
 
+#[cfg(feature = "measure")]
+mod prepared;
+
 use std::ffi::OsStr;
-use std::fmt::Debug;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
 
-use anyhow::{Context, Result, anyhow, bail};
-use clap::ValueEnum;
+use anyhow::{Context, Result, bail};
 use serde_json::Value;
-use slag_encoder::progress::Progress;
 
-use crate::generate::compose::Walk;
-use crate::generate::grammar::SceneKind;
-
-const TIMEOUT: Duration = Duration::from_secs(60);
+#[cfg(feature = "measure")]
+pub(crate) use prepared::{Prepared, agent, fetch_all, flag_value, remove};
 
 /// Returns the path of a program beside this one.
 pub(crate) fn sibling(name: &str) -> Result<PathBuf> {
     let lab = std::env::current_exe().context("cannot find the path of this program")?;
     let path = lab.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX));
     if path.is_file() { Ok(path) } else { bail!("{} does not exist; build it first", path.display()) }
-}
-
-pub(crate) fn finish(command: &mut Command) -> Result<()> {
-    let output = command.stdin(Stdio::null()).output().with_context(|| line(command))?;
-    let message = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-    if output.status.success() { Ok(()) } else { Err(anyhow!("{}: {message}", line(command))) }
 }
 
 /// Runs a command and parses the JSON that it prints. Exit code 3 is no error: some inputs were left out, and the
@@ -49,15 +40,6 @@ pub(crate) fn json_of(command: &mut Command) -> Result<Value> {
 fn line(command: &Command) -> String {
     let words = std::iter::once(command.get_program()).chain(command.get_args());
     words.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(" ")
-}
-
-pub(crate) fn remove(dir: &Path) -> std::io::Result<()> {
-    if dir.exists() { fs_err::remove_dir_all(dir) } else { Ok(()) }
-}
-
-pub(crate) fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
-    let name = value.to_possible_value().map(|value| value.get_name().to_owned());
-    name.ok_or_else(|| anyhow!("{value:?} has no name"))
 }
 
 /// A program's `serve` on a free port, which is stopped when dropped.
@@ -82,28 +64,6 @@ impl Service {
             url.with_context(|| format!("{}: expected its address, found {first:?}", line(&command)))?.into();
         Ok(service)
     }
-
-    /// Returns the JSON of a resource, whatever its status.
-    pub(crate) fn get(&self, path: &str) -> Result<Value> {
-        let body = agent().get(format!("{}{path}", self.url)).call()?.body_mut().read_to_string()?;
-        serde_json::from_str(&body).with_context(|| path.to_owned())
-    }
-
-    /// Sends JSON and returns the JSON of the answer, whatever its status.
-    pub(crate) fn post(&self, path: &str, body: &Value) -> Result<Value> {
-        self.send(path, "application/json", body.to_string().as_bytes())
-    }
-
-    /// Sends a PNG as [`Self::post`] sends JSON.
-    pub(crate) fn post_image(&self, path: &str, png: &[u8]) -> Result<Value> {
-        self.send(path, "image/png", png)
-    }
-
-    fn send(&self, path: &str, media_type: &str, body: &[u8]) -> Result<Value> {
-        let request = agent().post(format!("{}{path}", self.url)).content_type(media_type);
-        let body = request.send(body)?.body_mut().read_to_string()?;
-        serde_json::from_str(&body).with_context(|| path.to_owned())
-    }
 }
 
 impl Drop for Service {
@@ -113,77 +73,10 @@ impl Drop for Service {
     }
 }
 
-/// Returns a client that asks without a proxy and returns replies of every status.
-pub(crate) fn agent() -> ureq::Agent {
-    let config = ureq::Agent::config_builder().proxy(None).http_status_as_error(false);
-    config.timeout_global(Some(TIMEOUT)).build().into()
-}
-
-/// Copies a whole store to an empty cache as a robot does.
-pub(crate) fn fetch_all(store: &Path, cache: &Path, profile: &str) -> Result<()> {
-    remove(cache)?;
+/// Copies what `flags` ask for of a store to a cache, as a robot does; returns what the robot's program prints.
+pub(crate) fn fetch(store: &Path, cache: &Path, flags: &[&str]) -> Result<Value> {
     let service = Service::start(&sibling("slag-encoder")?, "--store", store)?;
     let mut fetch = Command::new(sibling("slag-edge")?);
-    fetch.args(["fetch", "--trust-first", "--json", "--quiet", "--at", "0,0,0", "--radius", "1e6"]);
-    fetch.args(["--from", &service.url, "--profile", profile, "--cache"]).arg(cache);
-    json_of(&mut fetch).map(|_| ())
-}
-
-/// Generated scenes on robots, of each kind and seed in a folder of its own: `scene`, `store` and `cache`.
-pub(crate) struct Prepared<'a> {
-    /// Folder of the scenes' folders.
-    pub(crate) out: &'a Path,
-    pub(crate) kinds: &'a [SceneKind],
-    pub(crate) seeds: &'a [u64],
-    pub(crate) n_views: u32,
-    pub(crate) walk: Walk,
-    /// Further flags of `encode`; `SCENE` in them stands for the scene's folder.
-    pub(crate) encode_flags: &'a [&'a str],
-}
-
-impl Prepared<'_> {
-    /// Judges each scene by its kind, seed and folder; returns their names.
-    pub(crate) fn judge(
-        &self,
-        progress: &dyn Progress,
-        mut judge: impl FnMut(SceneKind, u64, &Path) -> Result<()>,
-    ) -> Result<Vec<String>> {
-        let mut names = Vec::new();
-        progress.begin("judge", "scene", (self.kinds.len() * self.seeds.len()) as u64, 0);
-        for (kind, seed) in
-            self.kinds.iter().flat_map(|kind| self.seeds.iter().map(move |seed| (*kind, *seed)))
-        {
-            let name = format!("{}-{seed}", flag_value(&kind)?);
-            let dir = self.out.join(&name);
-            let judged = self.make(kind, seed, &dir).and_then(|()| judge(kind, seed, &dir));
-            judged.with_context(|| dir.display().to_string())?;
-            names.push(name);
-            progress.advance(1);
-        }
-        progress.end();
-        Ok(names)
-    }
-
-    /// Generates, encodes and fetches a scene, as far as that was not done before.
-    fn make(&self, kind: SceneKind, seed: u64, dir: &Path) -> Result<()> {
-        let [scene, store, cache] = ["scene", "store", "cache"].map(|name| dir.join(name));
-        let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));
-        if !poses.is_file() {
-            let (kind, seed, n_views) = (flag_value(&kind)?, seed.to_string(), self.n_views.to_string());
-            let mut command = Command::new(sibling("slag-lab")?);
-            command.args(["generate", "scene", "--kind", &kind, "--seed", &seed, "--n-views", &n_views]);
-            finish(command.args(["--walk", &flag_value(&self.walk)?, "--out"]).arg(&scene))?;
-        }
-        if !store.join("manifest").is_file() {
-            let mut command = Command::new(sibling("slag-encoder")?);
-            command.args(["encode", "--metric", "--scene"]).arg(&splat).arg("--views").arg(&poses);
-            let folder = scene.to_string_lossy();
-            command.args(self.encode_flags.iter().map(|flag| flag.replace("SCENE", &folder)));
-            finish(command.arg("--store").arg(&store))?;
-        }
-        if !cache.join("current").is_file() {
-            fetch_all(&store, &cache, "compact")?;
-        }
-        Ok(())
-    }
+    fetch.args(["fetch", "--trust-first", "--json", "--quiet", "--from", &service.url]).args(flags);
+    json_of(fetch.arg("--cache").arg(cache))
 }

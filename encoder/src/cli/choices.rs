@@ -39,10 +39,6 @@ pub(crate) struct ChoiceArgs {
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX", help_heading = "Speed and accuracy", hide_short_help = true)]
     min_mask_px: Option<u32>,
-    /// Keeps slivers, which ragged edges of overlapping masks leave, as regions; without it they join their
-    /// neighbours.
-    #[arg(long, help_heading = "Speed and accuracy", hide_short_help = true)]
-    keep_slivers: bool,
     /// Width at which weights are rasterised: a number of pixels, or `photo` for the photo's own width, at most 1024
     /// [default: the preset's].
     #[arg(long, value_name = "photo|PX", value_parser = parse_raster_width, help_heading = "Speed and accuracy", hide_short_help = true)]
@@ -63,9 +59,6 @@ pub(crate) struct ChoiceArgs {
     /// Weight of the larger superpoint's mean, relative to the result so far
     #[arg(long, value_name = "TIMES", help_heading = "Speed and accuracy", hide_short_help = true)]
     coarse: Option<f32>,
-    /// Weight of the mean of the Gaussian's object, relative to the result so far
-    #[arg(long, value_name = "TIMES", help_heading = "Speed and accuracy", hide_short_help = true)]
-    object: Option<f32>,
     /// Whether Gaussians without evidence take their superpoint's mean
     #[arg(long, value_name = "BOOL", help_heading = "Speed and accuracy", hide_short_help = true)]
     fill: Option<bool>,
@@ -73,9 +66,6 @@ pub(crate) struct ChoiceArgs {
     /// preset's].
     #[arg(long, value_name = "E", help_heading = "Speed and accuracy", hide_short_help = true)]
     compact_error: Option<f32>,
-    /// The same for the balanced profile.
-    #[arg(long, value_name = "E", help_heading = "Speed and accuracy", hide_short_help = true)]
-    balanced_error: Option<f32>,
     /// Most components of a vector in compact and balanced shards, even [default: as many as the errors need, at
     /// most 128].
     #[arg(long, value_name = "N", help_heading = "Speed and accuracy", hide_short_help = true)]
@@ -98,7 +88,6 @@ impl ChoiceArgs {
         set(&mut view.min_mask_px, &self.min_mask_px);
         set(&mut view.raster_width, &self.raster_width);
         set(&mut view.masks, &self.mask_levels.map(|n_levels| Masks::Auto { n_levels }));
-        view.merges_slivers &= !self.keep_slivers;
         set(&mut run.views_limit, &self.views_limit);
         let is_limited = run.views_limit != ViewsLimit::All || run.time_budget.is_some();
         run.view_order = if is_limited { ViewOrder::Coverage } else { ViewOrder::Names };
@@ -107,12 +96,10 @@ impl ChoiceArgs {
         set(&mut aggregation.truncation_power, &self.truncation_power);
         set(&mut aggregation.superpoint, &self.superpoint);
         set(&mut aggregation.coarse, &self.coarse);
-        set(&mut aggregation.object, &self.object);
         set(&mut aggregation.fill, &self.fill);
         cells.objects &= !self.no_objects && view.regions.have_masks();
         let codebook = &mut cells.shards.codebook;
         set(&mut codebook.compact_error, &self.compact_error);
-        set(&mut codebook.balanced_error, &self.balanced_error);
         set(&mut codebook.max_components, &self.max_components);
     }
 }

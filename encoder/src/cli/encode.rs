@@ -452,8 +452,7 @@ mod tests {
             let line = format!("slag-encoder encode --scene a --views b --store c {flags}");
             Cli::command().try_get_matches_from(line.split_whitespace())
         };
-        for flag in ["--preset fast", "--keep-slivers", "--max-components 8", "--fill true", "--segmenter x"]
-        {
+        for flag in ["--preset fast", "--no-objects", "--max-components 8", "--fill true", "--segmenter x"] {
             parse(flag).expect("a flag of encode");
             let error = parse(&format!("--front f.json --target-bytes 3MiB {flag}")).expect_err("excluded");
             assert_eq!(error.kind(), clap::error::ErrorKind::ArgumentConflict, "{flag}");

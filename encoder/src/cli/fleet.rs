@@ -87,7 +87,7 @@ impl CoordinatorArgs {
         match &self.blobs {
             Some(url) => {
                 let coordinator = Coordinator::new(open_bucket(url)?, queue);
-                Ok(coordinator.encode(settings, engines, progress, cancel)?)
+                Ok(encode::encode_by(&coordinator, settings, engines, progress, cancel)?)
             }
             None if queue.is_some() => Err(anyhow!("--fleet needs the bucket of the fleet: give --blobs")),
             None => Ok(encode::encode(settings, engines, progress, cancel)?),

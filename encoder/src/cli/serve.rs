@@ -58,6 +58,12 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
     let access = if is_any_host { access.with_any_host() } else { access };
     let files = args.tls_cert.clone().zip(args.tls_key.clone());
     let tls = args.listen.tls(files.map(|(cert, key)| TlsFiles { cert, key }))?;
+    let limits = serve::Limits::default();
+    let open_text = open_text(args.models.clone());
+    let shown =
+        Viewed { store: Some(args.store.clone()), splat: None, views: Vec::new(), up: None, open_text };
+    let page = view::router(Viewer::new(shown));
+    let router = serve::router(&args.store, limits, access, page)?;
     runtime()?.block_on(async {
         // On stdout: with port 0 this is where a script learns the port.
         let listening = |url: String| {
@@ -68,12 +74,6 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
                 note(lines.trim_end());
             }
         };
-        let limits = serve::Limits::default();
-        let open_text = open_text(args.models.clone());
-        let shown =
-            Viewed { store: Some(args.store.clone()), splat: None, views: Vec::new(), up: None, open_text };
-        let page = view::router(Viewer::new(shown));
-        let router = serve::router_with(&args.store, limits, access, page)?;
         let store = args.store.clone();
         tokio::spawn(async move {
             let mut days = tokio::time::interval(EXPIRY_INTERVAL);
@@ -82,7 +82,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
                 warn_of_expiry(&store);
             }
         });
-        serve::serve_router(router, args.listen.clone(), limits, tls, listening, stopped()).await
+        serve::serve(router, args.listen.clone(), limits, tls, listening, stopped()).await
     })?;
     Ok(Exit::Done)
 }

@@ -111,7 +111,9 @@ fn of_stages(stages: &[StageReport]) -> String {
     let line = |name: &str, n: usize, secs: f64, share: f64| {
         format!("  {name:<9}{n:>8}{secs:>10.1}{:>7.0} %\n", 100.0 * share)
     };
-    let of_gpu = |g: &GpuReport| line(&format!("  GPU {}", g.gpu), g.n_lanes, g.busy_secs, g.busy_share);
+    let of_gpu = |GpuReport { load, busy_share }: &GpuReport| {
+        line(&format!("  GPU {}", load.gpu), load.n_lanes, load.busy_secs, *busy_share)
+    };
     let of_stage = |stage: &StageReport| {
         line(&stage.stage, stage.n_slots, stage.busy_secs, stage.busy_share)
             + &stage.gpus.iter().map(of_gpu).collect::<String>()

@@ -49,9 +49,6 @@ pub struct ViewArgs {
     /// Models; they must be those that the store was encoded with.
     #[command(flatten)]
     pub models: ModelArgs,
-    /// Question that the page opens with.
-    #[arg(long, value_name = "TEXT", requires = "store")]
-    pub ask: Option<String>,
     /// Address to listen on.
     #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7735")]
     pub listen: Listen,
@@ -81,14 +78,13 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
     let viewer = serve::bounded(router(Viewer::new(shown)), serve::Limits::default(), access);
     runtime()?.block_on(async {
         let opened = |url: String| {
-            let link = link(&url, args.ask.as_deref());
+            let link = format!("{url}/view");
             let _ = writeln!(io::stdout(), "{link}");
             if !args.no_open {
                 open_browser(&link);
             }
         };
-        serve::serve_router(viewer, args.listen.clone(), serve::Limits::default(), None, opened, stopped())
-            .await
+        serve::serve(viewer, args.listen.clone(), serve::Limits::default(), None, opened, stopped()).await
     })?;
     Ok(Exit::Done)
 }
@@ -121,15 +117,6 @@ fn shown(args: &ViewArgs) -> Result<Viewed> {
     Ok(Viewed { store: args.store.clone(), splat, views, up, open_text })
 }
 
-fn link(url: &str, question: Option<&str>) -> String {
-    let encode = |byte: u8| match byte {
-        b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'_' | b'.' => char::from(byte).to_string(),
-        other => format!("%{other:02X}"),
-    };
-    let question = question.map(|text| format!("#q={}", text.bytes().map(encode).collect::<String>()));
-    format!("{url}/view{}", question.unwrap_or_default())
-}
-
 /// Opens a link; where that fails, the link stands on the terminal already.
 fn open_browser(link: &str) {
     let (program, arguments): (&str, &[&str]) = match std::env::consts::OS {
@@ -141,17 +128,5 @@ fn open_browser(link: &str) {
     command.args(arguments).arg(link).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     if let Err(error) = command.spawn().with_context(|| format!("cannot start {program}")) {
         tracing::info!("no browser was opened ({error:#}); open the link yourself");
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn links_hold_the_question() {
-        assert_eq!(link("http://127.0.0.1:1", None), "http://127.0.0.1:1/view");
-        let asked = link("http://127.0.0.1:1", Some("Stuhl & Tür"));
-        assert_eq!(asked, "http://127.0.0.1:1/view#q=Stuhl%20%26%20T%C3%BCr");
     }
 }

@@ -84,20 +84,16 @@ fn bounds_and_errors_are_those_of_what_readers_decode() {
         for balanced in [false, true] {
             let bytes = shard_of(&codebook, dim, balanced);
             let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
-            let (mut largest, mut reached) =
-                (vec![0.0f64; codebook.radii.len()], vec![0.0f64; codebook.radii.len()]);
+            let mut largest = vec![0.0f64; codebook.radii.len()];
             let (mut error_sum, mut error_max, mut n_errors) = (0.0, 0.0f64, 0);
-            let (mut decoded, mut of_centroid) = (vec![0.0; dim], vec![0.0; dim]);
+            let mut decoded = vec![0.0; dim];
             for (place, at) in codebook.order.iter().enumerate() {
                 let truth = &vectors[*at as usize * dim..][..dim];
                 shard.decode(place, &mut decoded);
                 let centroid = shard.centroid_of(place);
-                shard.decode_centroid(centroid, &mut of_centroid);
                 let missed: Vec<f64> = truth.iter().zip(&decoded).map(|(t, d)| f64::from(*t) - d).collect();
                 let length = missed.iter().map(|v| v * v).sum::<f64>().sqrt();
                 largest[centroid] = largest[centroid].max(length);
-                reached[centroid] = reached[centroid]
-                    .max(decoded.iter().zip(&of_centroid).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt());
                 if n <= 1024 {
                     for text in score_context.bank.vectors.chunks_exact(dim) {
                         let error: f64 = text.iter().zip(&missed).map(|(t, m)| f64::from(*t) * m).sum();

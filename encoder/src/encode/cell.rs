@@ -93,7 +93,7 @@ impl CellMaker<'_> {
         let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
         let has_failed = AtomicBool::new(false);
         let is_stopped = || context.is_cancelled() || has_failed.load(Ordering::Relaxed);
-        let workers = context.workers();
+        let workers = &context.workers;
         let n_alone = workers.n_alone(self.split.cells.len(), budget.n_at_once);
         std::thread::scope(|scope| -> Result<(), EncodeError> {
             let mut parts = context.install(|| index.transposed_parts(&self.table, budget.group_bytes));
@@ -117,7 +117,7 @@ impl CellMaker<'_> {
                         let result = added.and_then(|()| self.finish(cell_id, &mut cell));
                         has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
                         finished.lock().unwrap_or_else(PoisonError::into_inner).insert(cell_id, result);
-                        context.progress().advance(1);
+                        context.progress.advance(1);
                     }
                     drop(cell);
                 };

@@ -78,22 +78,6 @@ pub(super) fn build_cells(
     landmarks: Option<Vec<BuiltLandmarks>>,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
-    let n_views = views.used.len();
-    build(plan, views, occupancy, landmarks, context).map_err(|error| match error {
-        EncodeError::Contributions(ContributionError::Cancelled) => {
-            EncodeError::Interrupted { n_done: n_views, n_views }
-        }
-        error => error,
-    })
-}
-
-fn build(
-    plan: &Plan<'_>,
-    views: &DoneViews<'_>,
-    occupancy: Option<SceneOccupancy>,
-    landmarks: Option<Vec<BuiltLandmarks>>,
-    context: &RunContext<'_>,
-) -> Result<BuiltCells, EncodeError> {
     let Plan { inputs, store, settings, .. } = *plan;
     let opened = context.install(|| Opened::of(plan, views, occupancy.as_ref(), context))?;
     let Opened { index, table, score_context, photos, pass_bytes, cells: budget } = opened;
@@ -104,7 +88,7 @@ fn build(
         standing: &inputs.standing,
         photos: &photos,
         group_bytes: pass_bytes,
-        cancel: context.cancel(),
+        cancel: context.cancel,
     };
     // Before refinement adds superpoints to the regions.
     let counts = Counts::of(views, &index, &table);
@@ -116,7 +100,7 @@ fn build(
     }
     let extras = put_extras(plan, &table, context)?;
     context.begin_phase(Phase::Cells);
-    context.progress().begin("cells", "cell", inputs.split.cells.len() as u64, 0);
+    context.progress.begin("cells", "cell", inputs.split.cells.len() as u64, 0);
     let has_poses = settings.cells.photo_poses;
     let maker = CellMaker {
         scene: &inputs.scene,
@@ -134,7 +118,7 @@ fn build(
         context,
     };
     let finished = maker.build(&index, budget)?;
-    context.progress().end();
+    context.progress.end();
     let mut n_entries = vec![0; inputs.split.cells.len()];
     index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
     let mut built = BuiltCells {
@@ -169,24 +153,24 @@ fn refine(
 ) -> Result<Refined, EncodeError> {
     let settings = plan.settings;
     context.begin_phase(Phase::Superpoints);
-    context.progress().begin("objects", "step", 3, 0);
+    context.progress.begin("objects", "step", 3, 0);
     let begin = || context.install(|| PendingRefinement::begin(settings.aggregation, scene, table));
     let pending = context.time("superpoints", begin)?;
-    context.progress().advance(1);
+    context.progress.advance(1);
     // From all masks alike, whatever weight they have in the refinement.
     context.begin_phase(Phase::Objects);
     let find = || context.install(|| objects::find(scene, &pending, score_context));
     let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
-    context.progress().advance(1);
+    context.progress.advance(1);
     if let Some(found) = &objects {
-        context.progress().objects(&mut found.objects.iter().map(Object::found));
+        context.progress.objects(&mut found.objects.iter().map(Object::found));
     }
     context.begin_phase(Phase::Refine);
     let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
     let finish = || context.install(|| pending.finish(scene, object_of));
     let (table, refinement) = context.time("refine", finish)?;
-    context.progress().advance(1);
-    context.progress().end();
+    context.progress.advance(1);
+    context.progress.end();
     Ok(Refined { table, refinement, objects })
 }
 
@@ -196,7 +180,7 @@ fn thumbnails(
     views: &DoneViews<'_>,
     context: &RunContext<'_>,
 ) -> Result<Vec<Vec<u8>>, EncodeError> {
-    let cut = || objects::cut_thumbnails(objects, &views.used, context.progress(), context.cancel());
+    let cut = || objects::cut_thumbnails(objects, &views.used, context.progress, context.cancel);
     let (thumbnails, fault) = context.time("thumbnails", || context.install(cut));
     if context.is_cancelled() {
         return Err(ContributionError::Cancelled.into());
@@ -310,7 +294,8 @@ impl Opened {
         // and objects took is free again.
         let rest_bytes = memory.rest_of(memory::Phase::Cells);
         let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
-        let n_more = (spare_bytes / cell_bytes.max(1)).min(context.pool().current_num_threads() as u64 - 1);
+        let n_more =
+            (spare_bytes / cell_bytes.max(1)).min(context.workers.shared.current_num_threads() as u64 - 1);
         let group_bytes = (rest_bytes - n_more * cell_bytes).min(pass_bytes);
         let score_context = context.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);

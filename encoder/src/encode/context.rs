@@ -24,12 +24,13 @@ struct Began {
 }
 
 pub(crate) struct RunContext<'a> {
-    start: Instant,
-    progress: &'a dyn Progress,
-    cancel: &'a AtomicBool,
+    pub(super) start: Instant,
+    pub(crate) progress: &'a dyn Progress,
+    /// Asks the run to stop.
+    pub(crate) cancel: &'a AtomicBool,
     times: StageTimes,
     phases: Mutex<Vec<Began>>,
-    workers: Workers,
+    pub(crate) workers: Workers,
 }
 
 impl<'a> RunContext<'a> {
@@ -65,30 +66,8 @@ impl<'a> RunContext<'a> {
         phases.iter().zip(ends).map(report).collect()
     }
 
-    pub(super) fn start(&self) -> Instant {
-        self.start
-    }
-
-    pub(crate) fn progress(&self) -> &'a dyn Progress {
-        self.progress
-    }
-
-    /// Returns the flag that asks the run to stop, for steps that poll it themselves.
-    pub(crate) fn cancel(&self) -> &'a AtomicBool {
-        self.cancel
-    }
-
     pub(crate) fn is_cancelled(&self) -> bool {
         self.cancel.load(Ordering::Relaxed)
-    }
-
-    /// Returns the run's threads, for a step that waits for a device and needs them only in between.
-    pub(crate) fn pool(&self) -> &ThreadPool {
-        self.workers.shared()
-    }
-
-    pub(crate) fn workers(&self) -> &Workers {
-        &self.workers
     }
 
     /// Runs work on the run's threads: parallel iterators inside use these alone.
@@ -114,7 +93,8 @@ impl<'a> RunContext<'a> {
 const STACK_BYTES: usize = 8 << 20;
 
 pub(crate) struct Workers {
-    shared: ThreadPool,
+    /// For all work that is not done alone, and for steps that wait for a device and need threads in between.
+    pub(crate) shared: ThreadPool,
     /// Pools of one thread that have no work; made as they are needed.
     alone: Mutex<Vec<ThreadPool>>,
 }
@@ -126,10 +106,6 @@ fn start(n_threads: usize) -> Result<ThreadPool, ThreadPoolBuildError> {
 impl Workers {
     pub(crate) fn start(n_threads: usize) -> Result<Self, ThreadPoolBuildError> {
         Ok(Self { shared: start(n_threads)?, alone: Mutex::default() })
-    }
-
-    pub(crate) fn shared(&self) -> &ThreadPool {
-        &self.shared
     }
 
     /// Returns how many of `n_pieces`, the first ones, get a thread of their own where `n_at_once` are worked on

@@ -288,17 +288,12 @@ mod tests {
     /// from behind. The hidden wall is seen from behind only, so that view is second; near before far and aslant.
     #[test]
     fn occlusion_distance_and_angle_count() {
-        let mut scene = Gaussians::default();
-        for z in [0.0, 1.0] {
-            for i in 0..400 {
-                let (x, y) = (f64::from(i % 20) * 0.1 - 0.95, f64::from(i / 20) * 0.1 - 0.95);
-                scene.means_in_world.push(glam::DVec3::new(x, y, z));
-                scene.scales.push([0.06, 0.06, 0.002]);
-                scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-                scene.opacities.push(0.99);
-                scene.sh_dc.push([0.0; 3]);
-            }
-        }
+        let place = |i: i32| {
+            [f64::from(i % 20) * 0.1 - 0.95, f64::from(i / 20 % 20) * 0.1 - 0.95, f64::from(i / 400)]
+        };
+        let mut scene = Gaussians::balls((0..800).map(|i| place(i).into()).collect(), 0.06);
+        scene.scales.fill([0.06, 0.06, 0.002]);
+        scene.opacities.fill(0.99);
         let intrinsics = pinhole([640, 480], 500.0);
         let at = |eye: [f64; 3]| RasterView {
             camera_from_world: glam::DAffine3::from_mat4(glam::DMat4::look_at_rh(

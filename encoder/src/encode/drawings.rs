@@ -34,7 +34,7 @@ pub(super) fn make(
     }
     let make = || {
         let memory_bytes = settings.run.memory_bytes;
-        viewpoints::plan(&scene, engines.rasterizer, planned, memory_bytes, context.cancel())
+        viewpoints::plan(&scene, engines.rasterizer, planned, memory_bytes, context.cancel)
     };
     let plan = context.time("plan views", || context.install(make));
     let plan = plan.map_err(|error| match error {
@@ -48,7 +48,7 @@ pub(super) fn make(
     }
     let name = inputs.scene.file_name().unwrap_or_default().to_string_lossy();
     let (views, about) = (viewpoints::views_of(&plan), json!({ "plan": id.to_string() }));
-    let (rasterizer, progress) = (engines.rasterizer, context.progress());
+    let (rasterizer, progress) = (engines.rasterizer, context.progress);
     let draw = || viewpoints::draw_sharpened(folder, &views, &mut scene, rasterizer, &name, about, progress);
     context.time("draw", || context.install(draw))?;
     Ok(())

@@ -33,11 +33,11 @@ impl Executor for Here {
         let stages = ViewStages::new(plan.view_tools(), context);
         let views = || plan.order.iter().map(|view| &plan.inputs.views[*view]);
         let open = views().filter(|view| !done.contains_key(&view.name));
-        let deadline = run.time_budget.and_then(|budget| context.start().checked_add(budget));
+        let deadline = run.time_budget.and_then(|budget| context.start.checked_add(budget));
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let mut budget = Budget { has_some: views().any(|view| done.contains_key(&view.name)) };
         // After ctrl-c no view is begun; those in work are finished.
-        let n_alone = context.workers().n_alone(open.clone().count(), run.threads);
+        let n_alone = context.workers.n_alone(open.clone().count(), run.threads);
         let source = open
             .take_while(|_| !context.is_cancelled() && budget.may_begin(is_over()))
             .enumerate()
@@ -49,7 +49,7 @@ impl Executor for Here {
                 return Err(error);
             }
             let reason = error.to_string();
-            context.progress().left_out(&view.name, &reason);
+            context.progress.left_out(&view.name, &reason);
             skipped.lock().unwrap_or_else(PoisonError::into_inner).push(view.name.clone(), reason);
             Ok(())
         })?;
@@ -85,7 +85,7 @@ pub(crate) fn work_off<'v>(
         let view = work.view();
         // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
         let result = match list[at].on_cpu {
-            true => context.workers().run(is_alone, || stages.step(work)),
+            true => context.workers.run(is_alone, || stages.step(work)),
             false => stages.step(work),
         };
         match result {

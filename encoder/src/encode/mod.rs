@@ -40,6 +40,7 @@ mod views;
 
 use std::sync::atomic::AtomicBool;
 
+use crate::lift::ContributionError;
 use crate::progress::Progress;
 use crate::store::Store;
 use context::RunContext;
@@ -56,10 +57,8 @@ pub(crate) use report::SkippedView;
 pub(crate) use report::{GpuReport, Phase, StageReport};
 #[cfg(feature = "fleet")]
 pub(crate) use settings::ViewSettings;
-pub use settings::{
-    CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit,
-};
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
+pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit};
 
 /// The parts of which a fleet makes its own encode.
 #[cfg(feature = "fleet")]
@@ -129,7 +128,14 @@ fn encode_into(
     let landmarks = views::find_landmarks(&plan, &views, context)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
-    let built = cells::build_cells(&plan, &views, occupancy, landmarks, context)?;
+    let n_views = views.used.len();
+    let built = cells::build_cells(&plan, &views, occupancy, landmarks, context);
+    let built = built.map_err(|error| match error {
+        EncodeError::Contributions(ContributionError::Cancelled) => {
+            EncodeError::Interrupted { n_done: n_views, n_views }
+        }
+        error => error,
+    })?;
     context.begin_phase(Phase::Publish);
     plan.job.begin("publish")?;
     publish::publish(plan, views, built, executor, context)

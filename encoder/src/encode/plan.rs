@@ -248,7 +248,7 @@ fn choose_views(
         ViewOrder::Nth => (spread(limit), None),
         ViewOrder::Coverage => {
             let raster_views: Vec<RasterView> = views.iter().map(RasterView::of).collect();
-            let measured = Coverage::measure(scene, inputs.scene.len(), &raster_views, context.cancel());
+            let measured = Coverage::measure(scene, inputs.scene.len(), &raster_views, context.cancel);
             let coverage = measured
                 .map_err(|(view, source)| EncodeError::Raster { view: views[view].name.clone(), source })?
                 .ok_or(EncodeError::Interrupted { n_done: 0, n_views: limit })?;

@@ -62,7 +62,7 @@ pub(super) fn publish(
         *summary.busy_secs.entry(stage.stage.clone()).or_default() += stage.busy_secs;
     }
     let end = Instant::now();
-    summary.wall_secs = end.duration_since(context.start()).as_secs_f64();
+    summary.wall_secs = end.duration_since(context.start).as_secs_f64();
     summary.phases = context.phases(end);
     Ok(summary)
 }

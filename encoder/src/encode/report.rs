@@ -90,23 +90,15 @@ pub struct StageReport {
 
 #[derive(Clone, Debug, Serialize)]
 pub struct GpuReport {
-    /// The GPU, as CUDA numbers it.
-    pub gpu: u32,
-    /// Lanes: models that may be at work at once.
-    pub(crate) n_lanes: usize,
-    pub(crate) busy_secs: f64,
-    /// Their share of the time, 0 to 1.
-    pub busy_share: f64,
+    #[serde(flatten)]
+    pub(crate) load: GpuLoad,
+    /// The share of the time in which it was busy, 0 to 1.
+    pub(crate) busy_share: f64,
 }
 
 impl StageReport {
     pub(super) fn add_gpus(&mut self, loads: Vec<GpuLoad>, wall_secs: f64) {
-        let report = |GpuLoad { gpu, n_lanes, busy_secs }| GpuReport {
-            gpu,
-            n_lanes,
-            busy_secs,
-            busy_share: busy_secs / wall_secs,
-        };
+        let report = |load: GpuLoad| GpuReport { busy_share: load.busy_secs / wall_secs, load };
         self.gpus = loads.into_iter().map(report).collect();
     }
 }

@@ -10,7 +10,6 @@ use slag_common::shard::Profile;
 
 use super::error::EncodeError;
 use crate::cells::{CellLimits, PositionError};
-use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
 use crate::ingest::{Activated, FrameChoice};
 use crate::lift::Aggregation;
@@ -273,12 +272,7 @@ impl EncodeSettings {
                     max_width: metric.then_some(DEFAULT_CELL_WIDTH_M),
                     position_error: PositionError::default_for(metric),
                 },
-                shards: ShardSettings {
-                    profiles: Profile::ALL.to_vec(),
-                    codebook: CodebookSettings::default(),
-                    input_indices: false,
-                    compact_appearance: false,
-                },
+                shards: ShardSettings { profiles: Profile::ALL.to_vec(), ..ShardSettings::default() },
                 objects: true,
                 occupancy: None,
                 photo_poses: false,

@@ -293,13 +293,13 @@ impl<'a> ViewStages<'a> {
     }
 
     fn segment(&self, view: &View, Photo { loaded, depth }: Photo) -> Result<Segmented, EncodeError> {
-        let pool = Some(self.context.pool());
+        let pool = Some(&self.context.workers.shared);
         let input = SegmentInput { pool, ..SegmentInput::new(&loaded, depth.as_deref()) };
         let mut masks = self.tools.segmenter.segment(&input)?;
         let min_mask_px = self.tools.settings.min_mask_px;
         masks.retain(|mask| mask.level == Mask::STANDING || mask.area_px >= min_mask_px);
         let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
-        self.context.progress().segmented(&view.name, masks.len(), &draw);
+        self.context.progress.segmented(&view.name, masks.len(), &draw);
         Ok(Segmented { loaded, masks })
     }
 
@@ -427,7 +427,7 @@ impl<'a> ViewStages<'a> {
     fn write(&self, view: &View, lifted: &Lifted, secs: f32) -> Result<(), EncodeError> {
         let record = ViewRecord { raster_width_px: lifted.raster_width_px, secs };
         self.tools.sink.keep(view, &lifted.contributions, &lifted.outlines, record)?;
-        self.context.progress().advance(1);
+        self.context.progress.advance(1);
         Ok(())
     }
 }

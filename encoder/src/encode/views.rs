@@ -51,11 +51,11 @@ pub(super) fn run_views<'a>(
     let n_resumed = plan.order.iter().filter(|view| done.contains_key(&views[**view].name)).count();
     let planned: Vec<&View> = plan.order.iter().map(|view| &views[*view]).collect();
     let cells: Vec<_> = plan.inputs.split.cells.iter().map(|cell| cell.mean_bounds).collect();
-    context.progress().plan(&planned, &cells);
+    context.progress.plan(&planned, &cells);
     let start = Instant::now();
-    context.progress().begin("views", "view", plan.order.len() as u64, n_resumed as u64);
+    context.progress.begin("views", "view", plan.order.len() as u64, n_resumed as u64);
     let ViewsRun { stages, skipped: failed, images_on } = executor.run_views(plan, &done, context)?;
-    context.progress().end();
+    context.progress.end();
     let secs = start.elapsed().as_secs_f64();
     let n_failed = failed.len();
     let mut skipped = [&plan.inputs.missing[..], &failed[..]].concat();
@@ -82,7 +82,7 @@ pub(super) fn look_around(
     let Some(settings) = plan.settings.cells.occupancy else { return Ok(None) };
     context.begin_phase(Phase::Occupancy);
     let Inputs { scene, split, .. } = plan.inputs;
-    let find = || occupancy::find(scene, split, plan.scene.as_ref(), &views.used, settings, context.cancel());
+    let find = || occupancy::find(scene, split, plan.scene.as_ref(), &views.used, settings, context.cancel);
     let found = context.time("occupancy", || context.install(find));
     let found = found
         .map_err(|(at, source)| EncodeError::Raster { view: views.used[at].name.clone(), source })?
@@ -101,19 +101,19 @@ pub(super) fn find_landmarks(
     }
     context.begin_phase(Phase::Landmarks);
     let n_views = views.used.len();
-    context.progress().begin("landmarks", "view", n_views as u64, 0);
+    context.progress.begin("landmarks", "view", n_views as u64, 0);
     let mut mapping = Vec::with_capacity(n_views);
     for (number, view) in views.used.iter().enumerate() {
-        if context.cancel().load(Ordering::Relaxed) {
+        if context.cancel.load(Ordering::Relaxed) {
             return Err(EncodeError::Interrupted { n_done: n_views, n_views });
         }
         let observe = || landmarks::observe(plan.scene.as_ref(), number as u16, view);
         let observed = context.time("landmarks", || context.install(observe));
         let failed = |source| EncodeError::Landmarks { view: view.name.clone(), source };
         mapping.push(observed.map_err(failed)?);
-        context.progress().advance(1);
+        context.progress.advance(1);
     }
-    context.progress().end();
+    context.progress.end();
     let Inputs { scene, split, .. } = plan.inputs;
     let found = context.time("landmarks", || landmarks::landmarks(&mapping, scene.len()));
     Ok(Some(shard::landmarks(split, slag_locate::CODE_VERSION, &found)))

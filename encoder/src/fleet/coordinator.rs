@@ -2,7 +2,6 @@
 //! makes the cells.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -17,9 +16,8 @@ use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
 use crate::blobs::Bucket;
-use crate::encode::fleet_parts::{Executor, LeftOut, Plan, RunContext, ViewRecord, ViewsRun};
-use crate::encode::{self, EncodeError, EncodeSettings, EncodeSummary, Engines, SkippedView};
-use crate::progress::Progress;
+use crate::encode::fleet_parts::{Executor, LeftOut, OF_A_FLEET, Plan, RunContext, ViewRecord, ViewsRun};
+use crate::encode::{EncodeError, Engines, SkippedView};
 
 /// The executor of an encode whose views are done by workers.
 pub(crate) struct Coordinator {
@@ -36,17 +34,6 @@ impl Coordinator {
         Self { bucket, queue, run: Mutex::default() }
     }
 
-    /// Encodes a scene as [`encode::encode`] does, by the fleet.
-    pub(crate) fn encode(
-        &self,
-        settings: &EncodeSettings,
-        engines: &Engines<'_>,
-        progress: &dyn Progress,
-        cancel: &AtomicBool,
-    ) -> Result<EncodeSummary, EncodeError> {
-        encode::encode_by(self, settings, engines, progress, cancel)
-    }
-
     /// Uploads what the open views need, and begins a run of them.
     fn begin(
         &self,
@@ -58,11 +45,11 @@ impl Coordinator {
         let open: Vec<usize> = plan.order.iter().copied().filter(is_open).collect();
         let run_plan = inputs::upload(&self.bucket, plan, &open, context)?;
         let run = Run::begin(&self.bucket, &run_plan)?;
-        let open_queue = |queue| Enqueuer::open(self.bucket.runtime(), queue, run, run_plan.of_scene);
+        let open_queue = |queue| Enqueuer::open(&self.bucket.runtime, queue, run, run_plan.of_scene);
         let queue = self.queue.as_ref().map(open_queue).transpose()?;
         let heartbeat = Heartbeat::start(&self.bucket, run);
         *self.run.lock().unwrap_or_else(PoisonError::into_inner) = Some((run, heartbeat));
-        let (n_open, url) = (open.len(), self.bucket.url());
+        let (n_open, url) = (open.len(), &self.bucket.url);
         tracing::info!(
             "run {}: {n_open} views to do; workers join with `slag-encoder worker --blobs {url}`",
             run.0
@@ -75,7 +62,7 @@ impl Coordinator {
 
 impl Executor for Coordinator {
     fn rasterizer(&self, _: &Engines<'_>) -> String {
-        crate::encode::fleet_parts::OF_A_FLEET.into()
+        OF_A_FLEET.into()
     }
 
     fn run_views(
@@ -126,7 +113,7 @@ impl ViewsInWork<'_> {
             self.open.iter().filter(|(id, _)| there.contains(id)).collect();
         let fetch = |(id, (_, name)): &(&Hash32, &(usize, String))| {
             self.fetch_view(plan, **id, name)?;
-            context.progress().advance(1);
+            context.progress.advance(1);
             Ok::<_, FleetError>(())
         };
         context.install(|| fresh.par_iter().try_for_each(fetch))?;

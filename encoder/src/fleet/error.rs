@@ -43,7 +43,7 @@ pub(crate) enum FleetError {
 
 impl FleetError {
     pub(super) fn damaged(bucket: &crate::blobs::Bucket, key: &str, problem: impl ToString) -> Self {
-        Self::Damaged { url: bucket.url().to_owned(), key: key.to_owned(), problem: problem.to_string() }
+        Self::Damaged { url: bucket.url.clone(), key: key.to_owned(), problem: problem.to_string() }
     }
 }
 

@@ -71,7 +71,7 @@ impl HeartbeatWatch {
         if silence < self.patience {
             return Ok(());
         }
-        let (run, url) = (self.run.0, bucket.url().to_owned());
+        let (run, url) = (self.run.0, bucket.url.clone());
         Err(FleetError::Abandoned { run, secs: silence.as_secs(), url })
     }
 }

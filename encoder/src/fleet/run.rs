@@ -124,7 +124,7 @@ impl Run {
     }
 
     fn superseded(self, bucket: &Bucket) -> FleetError {
-        FleetError::Superseded { run: self.0, url: bucket.url().to_owned() }
+        FleetError::Superseded { run: self.0, url: bucket.url.clone() }
     }
 }
 

@@ -64,7 +64,7 @@ pub(crate) struct WorkReport {
 }
 
 pub(super) fn pause(bucket: &Bucket) -> Duration {
-    PAUSES[usize::from(!bucket.is_local())]
+    PAUSES[usize::from(!bucket.is_local)]
 }
 
 pub(crate) fn work(
@@ -93,7 +93,7 @@ pub(crate) fn work(
         }
     }
     if report == WorkReport::default() && !context.is_cancelled() && Run::is_first(bucket)? {
-        let (url, secs) = (bucket.url().to_owned(), settings.patience.as_secs_f64());
+        let (url, secs) = (bucket.url.clone(), settings.patience.as_secs_f64());
         return Err(FleetError::NoRun { url, secs });
     }
     Ok(report)
@@ -116,7 +116,7 @@ fn work_for(
         Dispatch::Share { index, of, help_after } => Box::new(Share::new(*index, *of, *help_after)),
         Dispatch::Queue(queue) => {
             let n_held = settings.n_threads + 1;
-            Box::new(Queue::open(bucket.runtime(), queue, run, of_scene, n_held)?)
+            Box::new(Queue::open(&bucket.runtime, queue, run, of_scene, n_held)?)
         }
     };
     let scene = context.install(|| engines.rasterizer.load(&prepared.scene)).map_err(EncodeError::from)?;

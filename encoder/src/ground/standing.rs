@@ -292,15 +292,12 @@ mod tests {
     /// of it are 10.5 m.
     #[test]
     fn a_wide_patch_is_bare_ground_and_under_a_roof_a_wider_one() {
-        let mut scene = Gaussians::default();
         let field = (0..90_000).map(|i| (f64::from(i % 300) * 0.1, f64::from(i / 300) * 0.1));
         let roof = field.clone().filter(|(x, _)| *x < 15.0).map(|(x, y)| DVec3::new(x, y, 3.0));
-        scene.means_in_world = field.map(|(x, y)| DVec3::new(x, y, 0.0)).chain(roof).collect();
-        let n = scene.len();
-        scene.rotations_wxyz = vec![[1.0, 0.0, 0.0, 0.0]; n];
-        scene.scales = vec![[0.1, 0.1, 0.01]; n];
-        scene.opacities = vec![0.9; n];
-        scene.sh_dc = vec![[0.0; 3]; n];
+        let means = field.map(|(x, y)| DVec3::new(x, y, 0.0)).chain(roof).collect();
+        let mut scene = Gaussians::balls(means, 0.1);
+        scene.scales.fill([0.1, 0.1, 0.01]);
+        scene.opacities.fill(0.9);
         let standing = Standing(Things::find(&scene, DVec3::Z));
         let is_bare = |x: f64, width: f64, z: f64| {
             let is_part = |mean: &DVec3| (x..x + width).contains(&mean.x) && mean.y < 2.0 && mean.z == z;

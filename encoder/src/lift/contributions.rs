@@ -210,12 +210,12 @@ impl ViewContributions {
 /// A contribution file, checked except for the contributions: these are checked on reading.
 #[derive(Clone, Debug)]
 pub struct ContributionFile {
-    path: PathBuf,
-    n_regions: usize,
-    n_entries: u64,
+    pub(super) path: PathBuf,
+    pub(super) n_regions: usize,
+    pub(super) n_entries: u64,
     entries_at_bytes: u64,
     /// By (cell, slice), ascending.
-    runs: Vec<Run>,
+    pub runs: Vec<Run>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -268,22 +268,6 @@ impl ContributionFile {
             runs,
         };
         Ok((file, regions))
-    }
-
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    pub fn runs(&self) -> &[Run] {
-        &self.runs
-    }
-
-    pub fn n_regions(&self) -> usize {
-        self.n_regions
-    }
-
-    pub fn n_entries(&self) -> u64 {
-        self.n_entries
     }
 
     pub fn entries_of_run(&self, run: usize) -> Range<u64> {

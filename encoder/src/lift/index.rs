@@ -100,13 +100,13 @@ impl ContributionIndex {
         let mut views = Vec::with_capacity(files.len());
         let mut entries_of_slice = vec![0u64; locals_of_slice.len()];
         for (file, first_region, n_masks) in files {
-            let slices = file.runs().iter().map(|run| {
+            let slices = file.runs.iter().map(|run| {
                 let of_cell = first_slice_of_cell.get(run.cell_id as usize..=run.cell_id as usize + 1)?;
                 let slice = of_cell[0] + run.slice as usize;
                 (slice < of_cell[1]).then_some(slice as u32)
             });
             let Some(slices) = slices.collect::<Option<Vec<u32>>>() else {
-                return Err(of_another_scene(file.path()));
+                return Err(of_another_scene(&file.path));
             };
             for (run, slice) in slices.iter().enumerate() {
                 let range = file.entries_of_run(run);
@@ -144,11 +144,11 @@ impl ContributionIndex {
     }
 
     pub(crate) fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
-        self.views.iter().map(|view| view.file.n_regions())
+        self.views.iter().map(|view| view.file.n_regions)
     }
 
     pub(crate) fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
-        self.views.iter().map(|view| view.file.n_entries())
+        self.views.iter().map(|view| view.file.n_entries)
     }
 
     pub fn len_bytes(&self) -> u64 {

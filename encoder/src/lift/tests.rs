@@ -178,39 +178,6 @@ proptest! {
     }
 }
 
-/// Thousands of entries a Gaussian, in 512 dimensions: against float64.
-#[test]
-fn many_views_keep_the_accuracy() {
-    let scene = scene_of(512, 20, 1500);
-    let Scene { index, table, .. } = &scene;
-    let raw = index.read(0..index.parts().len()).expect("reads");
-    let contributions = index.transpose(&raw, table).expect("transposes").remove(0);
-    let mut embeddings = vec![f32::NAN; 20 * 512];
-    let field = CellField::new((0..20).collect(), contributions, table, &mut embeddings);
-    let mut vector = vec![0.0; 512];
-    let mut largest = 0.0f64;
-    for k in 0..20 {
-        let entries = field.starts[k] as usize..field.starts[k + 1] as usize;
-        assert!(entries.len() > 1500, "{} entries", entries.len());
-        let mut expected = vec![0.0f64; 512];
-        for entry in entries {
-            table.components(field.regions[entry] as usize, 0, &mut vector);
-            let weight = f64::from(field.weights[entry]);
-            expected.iter_mut().zip(&vector).for_each(|(e, v)| *e += weight * f64::from(*v));
-        }
-        let length = expected.iter().map(|c| c * c).sum::<f64>().sqrt();
-        assert!(
-            (f64::from(field.mean_lengths[k]) * f64::from(field.total_weights[k]) / length - 1.0).abs()
-                < 1e-5
-        );
-        for (found, expected) in embeddings[k * 512..].iter().zip(&expected) {
-            largest = largest.max((f64::from(*found) - expected / length).abs());
-        }
-    }
-    println!("largest error of a component: {largest:.1e}");
-    assert!(largest < 1e-6, "{largest:e}");
-}
-
 #[test]
 fn same_bits_for_any_number_of_threads() {
     let with = |n_threads| {
@@ -223,24 +190,6 @@ fn same_bits_for_any_number_of_threads() {
         })
     };
     assert_eq!(with(1), with(3));
-}
-
-#[test]
-fn masks_that_cancel_are_no_evidence() {
-    let entry = |local, region| Contribution { local, region, weight: 3.0 };
-    let view = ViewContributions {
-        dim: 2,
-        mask_vectors: vec![1.0, 0.0, -1.0, 0.0],
-        masks_of_region: vec![vec![0], vec![1]],
-        entries_of_cell: vec![(0, vec![entry(0, 0), entry(0, 1), entry(1, 1)])],
-    };
-    let scene = open(&[view], 2, &[3], u64::MAX);
-    let mut embeddings = [f32::NAN; 6];
-    let field = CellField::new(vec![0, 1, 2], transpose(&scene, 0).remove(0), &scene.table, &mut embeddings);
-    assert_eq!((0..3).map(|k| field.has_evidence(k)).collect::<Vec<_>>(), [false, true, false]);
-    assert!(field.cosines(&scene.table.scores(&[1.0, 0.0]))[0].is_nan());
-    assert_eq!(field.total_weights, [6.0, 3.0, 0.0]);
-    assert_eq!(embeddings, [0.0, 0.0, -1.0, 0.0, 0.0, 0.0]);
 }
 
 /// A cell's parts, read one after the other, are the cell.

@@ -114,13 +114,13 @@ impl ContributionIndex {
 impl IndexedView {
     fn mask_counts(&self, table: &RegionTable) -> Vec<f32> {
         let first = self.first_region as usize;
-        table.mask_counts(first..first + self.file.n_regions())
+        table.mask_counts(first..first + self.file.n_regions)
     }
 
     fn foreign_gaussian(&self, in_slice: usize) -> ContributionError {
         let what = format!("a contribution of Gaussian {in_slice} to a slice with fewer Gaussians");
         ContributionError::Damaged {
-            path: self.file.path().to_owned(),
+            path: self.file.path.clone(),
             source: ContainerError::Damaged { offset_bytes: 0, what },
         }
     }

@@ -77,7 +77,7 @@ pub enum DeviceError {
 
 /// A backend that distributes views over several devices.
 pub struct Devices {
-    gpus: Vec<GpuRasterizer>,
+    pub gpus: Vec<GpuRasterizer>,
     views_in_flight: usize,
 }
 
@@ -142,10 +142,6 @@ impl Devices {
 
     pub fn of(gpus: Vec<GpuRasterizer>, views_in_flight: usize) -> Self {
         Self { gpus, views_in_flight: views_in_flight.max(1) }
-    }
-
-    pub fn gpus(&self) -> &[GpuRasterizer] {
-        &self.gpus
     }
 
     pub fn names(&self) -> Vec<String> {

@@ -8,7 +8,7 @@ pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
 use super::rasterizer::{LoadedScene, RasterError, Rasterizer};
 
-pub(crate) struct Adapter {
+pub struct Adapter {
     pub report: AdapterReport,
     none: Infallible,
 }

@@ -113,20 +113,13 @@ mod tests {
 
     /// A park of 60 x 60 m and two cars of 4 x 2 x 1 m, 2 m apart, all of one colour; a Gaussian every 10 cm.
     fn park() -> Gaussians {
-        let mut scene = Gaussians::default();
-        let mut push = |x: f64, y: f64, z: f64| {
-            scene.means_in_world.push(DVec3::new(x, y, z));
-            scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-            scene.scales.push([0.1, 0.1, 0.01]);
-            scene.opacities.push(0.9);
-            scene.sh_dc.push([0.0; 3]);
-        };
-        for i in 0..360_000 {
-            push(f64::from(i % 600) * 0.1 - 30.0, f64::from(i / 600) * 0.1 - 30.0, 0.0);
-        }
-        for (i, y) in (0..800).flat_map(|i| [(i, -2.0), (i, 2.0)]) {
-            push(f64::from(i % 40) * 0.1 - 2.0, f64::from(i / 40) * 0.1 + y - 1.0, 1.0);
-        }
+        let ground =
+            (0..360_000).map(|i| (f64::from(i % 600) * 0.1 - 30.0, f64::from(i / 600) * 0.1 - 30.0, 0.0));
+        let cars = (0..800).flat_map(|i| [(i, -2.0), (i, 2.0)]);
+        let cars = cars.map(|(i, y)| (f64::from(i % 40) * 0.1 - 2.0, f64::from(i / 40) * 0.1 + y - 1.0, 1.0));
+        let mut scene = Gaussians::balls(ground.chain(cars).map(Into::into).collect(), 0.1);
+        scene.scales.fill([0.1, 0.1, 0.01]);
+        scene.opacities.fill(0.9);
         scene
     }
 

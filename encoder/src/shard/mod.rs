@@ -40,7 +40,7 @@ pub struct BuiltCell {
     pub n_without_evidence: usize,
 }
 
-#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ShardSettings {
     pub profiles: Vec<Profile>,
     /// Precision of embeddings.

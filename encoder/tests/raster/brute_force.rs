@@ -1,10 +1,8 @@
 //! Contributions, drawings and their invariants on random scenes, against brute force and each other.
 
-use std::collections::BTreeMap;
-
 use glam::DVec3;
 use slag_common::{Distortion, Gaussians};
-use slag_encoder::masks::{NO_REGION, RegionMap};
+use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::{Drawing, InputError, RasterError, RasterView, ViewWeights, WeightKind};
 
 use super::backends::{Backend, backends};
@@ -92,44 +90,6 @@ fn the_number_of_threads_does_not_change_a_bit() {
     }
 }
 
-/// Contributions to a coarser partition are the sums over its parts, to the fixed point's 2^-33 for each part and
-/// tile and the final rounding to `f32`.
-#[test]
-fn sums_over_regions_add_up() {
-    for Backend { name, rasterizer, .. } in backends() {
-        // A GPU adds up to 8 pixels of a region in f32, the CPU a tile's in f64.
-        let rounding = if *name == "cpu" { 2.0_f64.powi(-23) } else { 2.0_f64.powi(-21) };
-        let random = &mut Random::new(6);
-        let view = random_view(random, 100, 90);
-        let scene = random_scene(random, 3000, &view, 0);
-        let fine = random_regions(random, &view, 200);
-        let coarse_of = |region: u32| if region == NO_REGION { NO_REGION } else { region % 4 };
-        let coarse = RegionMap {
-            region_of_pixel: fine.region_of_pixel.iter().map(|&r| coarse_of(r)).collect(),
-            n_regions: 4,
-            ..fine
-        };
-        for kind in KINDS {
-            let mut sums = BTreeMap::<_, f64>::new();
-            let mut n_parts = BTreeMap::<_, usize>::new();
-            for entry in rasterizer.weights(&scene, &view, &fine, kind).unwrap().entries {
-                let key = (entry.gaussian, coarse_of(entry.region));
-                *sums.entry(key).or_default() += f64::from(entry.weight);
-                *n_parts.entry(key).or_default() += 1;
-            }
-            let found = rasterizer.weights(&scene, &view, &coarse, kind).unwrap().entries;
-            assert_eq!(found.len(), sums.len());
-            assert!(n_parts.values().any(|&n| n > 10));
-            for entry in found {
-                let key = (entry.gaussian, entry.region);
-                let weight = f64::from(entry.weight);
-                let allowed = weight * rounding + 42.0 * 50.0 * 2.0_f64.powi(-33);
-                assert!((weight - sums[&key]).abs() <= allowed, "{name} {key:?}: {weight} {}", sums[&key]);
-            }
-        }
-    }
-}
-
 #[test]
 fn nothing_to_see_is_no_error() {
     for Backend { rasterizer, .. } in backends() {
@@ -153,34 +113,19 @@ fn nothing_to_see_is_no_error() {
     }
 }
 
-/// Broken Gaussians are counted and do not affect the others.
+/// A broken higher coefficient costs the Gaussian its colour, no more.
 #[test]
-fn unusable_gaussians_are_skipped_and_counted() {
+fn broken_coefficients_cost_a_colour() {
     for Backend { rasterizer, .. } in backends() {
         let random = &mut Random::new(8);
         let view = random_view(random, 40, 40);
         let mut scene = random_scene(random, 100, &view, 1);
         let regions = random_regions(random, &view, 3);
-        let without = |scene: &Gaussians| {
-            let mut scene = scene.clone();
-            scene.opacities[..7].fill(0.0);
-            rasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap()
-        };
-        let expected = without(&scene);
-        scene.means_in_world[0].y = f64::NAN;
-        scene.means_in_world[1].x = f64::INFINITY;
-        scene.rotations_wxyz[2] = [0.0; 4];
-        scene.scales[3][1] = f32::NAN;
-        scene.opacities[4] = f32::NAN;
-        scene.sh_dc[5][0] = f32::INFINITY;
-        scene.scales[6] = [f32::MAX; 3];
-        scene.means_in_world[6] = view.camera_from_world.inverse().transform_point3(DVec3::Z);
-        scene.opacities[6] = 0.5;
-        // A broken higher coefficient costs the Gaussian its colour, no more.
+        let weights =
+            |scene: &Gaussians| rasterizer.weights(scene, &view, &regions, WeightKind::Blend).unwrap();
+        let expected = weights(&scene);
         scene.sh_rest[9 * 50] = f32::NAN;
-        let found = rasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
-        assert_eq!(found.counters.unusable, 7);
-        assert_eq!(found.entries, expected.entries);
+        assert_eq!(weights(&scene), expected);
         let drawing = rasterizer.draw(&scene, &view, [0.0; 3]).unwrap();
         assert!(drawing.rgb.iter().all(|c| c.is_finite()));
     }

@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use glam::{DAffine3, DQuat, DVec3};
-use slag_common::{Gaussians, Intrinsics, View};
+use glam::{DAffine3, DVec3};
+use slag_common::{Gaussians, Intrinsics, View, poses};
 use slag_encoder::check::{
     CheckError, CheckOptions, CheckReport, CheckView, FrameCause, Mistake, check, suspicions,
 };
@@ -15,56 +15,22 @@ use slag_encoder::raster::{
     pinhole,
 };
 
-use super::fixtures::{needs_shared, shared};
+use super::fixtures::{needs_shared, photo, read_splat, shared, shrunk};
 
 /// PSNR over all photos that the trainer (gsplat) reports at 1000 x 562.
 const TRAINER_PSNR_DB: f64 = 25.02;
 
-/// Reads the scene's PLY: 17 floats a vertex, logits and logs as the original 3DGS writes them.
-fn read_scene(path: &Path) -> Gaussians {
-    let bytes = fs_err::read(path).unwrap();
-    let end = b"end_header\n";
-    let start = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
-    let mut scene = Gaussians::default();
-    for row in bytes[start..].chunks_exact(17 * 4) {
-        let f: Vec<f32> = row.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
-        scene.means_in_world.push(DVec3::new(f[0].into(), f[1].into(), f[2].into()));
-        scene.sh_dc.push([f[6], f[7], f[8]]);
-        scene.opacities.push(1.0 / (1.0 + (-f[9]).exp()));
-        scene.scales.push([f[10].exp(), f[11].exp(), f[12].exp()]);
-        let norm = f[13..17].iter().map(|c| c * c).sum::<f32>().sqrt();
-        scene.rotations_wxyz.push([f[13] / norm, f[14] / norm, f[15] / norm, f[16] / norm]);
-    }
+fn read_scene(root: &Path) -> Gaussians {
+    let scene = read_splat(root);
     assert_eq!(scene.len(), 149_097);
     scene
 }
 
 /// Reads every `step`-th view of the model, by name.
 fn read_views(root: &Path, step: usize) -> Vec<CheckView> {
-    let intrinsics = pinhole([1574, 884], 924.0);
-    let text = fs_err::read_to_string(root.join("sparse/0/images.txt")).unwrap();
-    let mut lines: Vec<Vec<&str>> =
-        text.lines().filter(|line| line.ends_with(".jpg")).map(|line| line.split(' ').collect()).collect();
-    lines.sort_by_key(|fields| fields[9]);
-    assert_eq!(lines.len(), 18);
-    lines
-        .iter()
-        .step_by(step)
-        .map(|fields| {
-            let n: Vec<f64> = fields[1..8].iter().map(|v| v.parse().unwrap()).collect();
-            let rotation = DQuat::from_xyzw(n[1], n[2], n[3], n[0]).normalize();
-            let translation = DVec3::new(n[4], n[5], n[6]);
-            CheckView {
-                name: fields[9].to_owned(),
-                image: image::open(root.join("images").join(fields[9])).unwrap().into_rgb8(),
-                valid: None,
-                view: RasterView {
-                    camera_from_world: DAffine3::from_rotation_translation(rotation, translation),
-                    intrinsics,
-                },
-            }
-        })
-        .collect()
+    let views = poses::read(root, None).unwrap().views;
+    assert_eq!(views.len(), 18);
+    views.iter().step_by(step).map(photo).collect()
 }
 
 fn run(scene: &Gaussians, views: &[CheckView], options: &CheckOptions) -> CheckReport {
@@ -77,7 +43,7 @@ fn run(scene: &Gaussians, views: &[CheckView], options: &CheckOptions) -> CheckR
 #[test]
 fn a_scene_that_fits_its_photos_passes() {
     let root = shared("scenes/brighton");
-    let scene = read_scene(&root.join("point_cloud.ply"));
+    let scene = read_scene(&root);
     let pictures_dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("check");
     let options =
         CheckOptions { width_px: 1000, pictures_dir: Some(pictures_dir.clone()), ..CheckOptions::default() };
@@ -94,22 +60,10 @@ fn a_scene_that_fits_its_photos_passes() {
 #[ignore = "18 photos at full training size: half a minute"]
 fn psnr_is_what_the_trainer_reports() {
     let root = shared("scenes/brighton");
-    let scene = read_scene(&root.join("point_cloud.ply"));
+    let scene = read_scene(&root);
     let options = CheckOptions { width_px: 1000, ..CheckOptions::default() };
     let report = run(&scene, &read_views(&root, 1), &options);
     assert!((report.mean_psnr_db - TRAINER_PSNR_DB).abs() < 0.5, "{}", report.mean_psnr_db);
-}
-
-/// Shrinks photos by averaging 10 x 10 pixels, which makes repeated checks quicker.
-fn shrunk(view: &CheckView, width_px: u32) -> CheckView {
-    let intrinsics = view.view.intrinsics.scaled_to_width(width_px);
-    let (width, height) = (intrinsics.width_px, intrinsics.height_px);
-    CheckView {
-        name: view.name.clone(),
-        image: image::imageops::thumbnail(&view.image, width, height),
-        valid: None,
-        view: RasterView { intrinsics, ..view.view },
-    }
 }
 
 /// Plants each mistake as the inverse of its correction, written independently of the code.
@@ -117,8 +71,8 @@ fn shrunk(view: &CheckView, width_px: u32) -> CheckView {
 #[test]
 fn planted_mistakes_are_diagnosed() {
     let root = shared("scenes/brighton");
-    let scene = read_scene(&root.join("point_cloud.ply"));
-    let views: Vec<CheckView> = read_views(&root, 9).iter().map(|view| shrunk(view, 160)).collect();
+    let scene = read_scene(&root);
+    let views: Vec<CheckView> = read_views(&root, 9).into_iter().map(|photo| shrunk(photo, 160)).collect();
     let options = CheckOptions::default();
     let diagnosed = |scene: &Gaussians, plant: &dyn Fn(&mut RasterView)| {
         let mut views = views.clone();
@@ -223,8 +177,8 @@ fn tiny_view() -> CheckView {
 #[test]
 fn faults_of_the_data_are_suspected_and_confirmed() {
     let root = shared("scenes/brighton");
-    let scene = read_scene(&root.join("point_cloud.ply"));
-    let photos: Vec<CheckView> = read_views(&root, 9).iter().map(|view| shrunk(view, 160)).collect();
+    let scene = read_scene(&root);
+    let photos: Vec<CheckView> = read_views(&root, 9).into_iter().map(|photo| shrunk(photo, 160)).collect();
     let views = |photos: &[CheckView]| -> Vec<View> {
         let view = |photo: &CheckView| View {
             name: photo.name.clone(),

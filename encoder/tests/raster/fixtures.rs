@@ -1,11 +1,32 @@
 //! Reads the shared test data.
 
+use std::path::Path;
+
 use glam::{DAffine3, DMat3, DVec3};
 use npyz::{Deserialize, NpyFile};
-use slag_common::{Distortion, Gaussians, Intrinsics, npy};
+use slag_common::{Distortion, Gaussians, Intrinsics, View, npy, splat};
+use slag_encoder::check::CheckView;
+use slag_encoder::ingest::load_image;
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
 pub use slag_test_support::{needs_shared, shared};
+
+pub fn read_splat(root: &Path) -> Gaussians {
+    splat::read(&root.join("point_cloud.ply"), &splat::ReadOptions { with_sh_rest: false }).unwrap()
+}
+
+pub fn photo(view: &View) -> CheckView {
+    let loaded = load_image(view).unwrap();
+    let view = RasterView::of(&loaded.view);
+    CheckView { name: loaded.view.name, image: loaded.image, valid: None, view }
+}
+
+/// Shrinks a photo by averaging pixels, which makes repeated checks quicker.
+pub fn shrunk(photo: CheckView, width_px: u32) -> CheckView {
+    let intrinsics = photo.view.intrinsics.scaled_to_width(width_px);
+    let image = image::imageops::thumbnail(&photo.image, intrinsics.width_px, intrinsics.height_px);
+    CheckView { image, view: RasterView { intrinsics, ..photo.view }, ..photo }
+}
 
 pub struct Npz(npy::Npz);
 

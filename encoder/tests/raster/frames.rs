@@ -1,17 +1,16 @@
 //! Splats in another frame than their poses: the labelled house, moved on purpose.
 
 use glam::{DMat3, DQuat, DVec3};
-use slag_common::{Gaussians, Similarity, View, poses, splat};
+use slag_common::{Gaussians, Similarity, View, poses};
 use slag_encoder::check::{
     CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Mistake, align, check,
     nerfstudio_defaults,
 };
-use slag_encoder::ingest::load_image;
-use slag_encoder::raster::{CpuRasterizer, RasterView};
+use slag_encoder::raster::CpuRasterizer;
 
 use slag_test_support::nightly;
 
-use super::fixtures::{needs_shared, shared};
+use super::fixtures::{needs_shared, photo, read_splat, shared, shrunk};
 
 struct House {
     splat: Gaussians,
@@ -22,18 +21,9 @@ struct House {
 impl House {
     fn read() -> Self {
         let root = shared("scenes/house_a");
-        let splat =
-            splat::read(&root.join("point_cloud.ply"), &splat::ReadOptions { with_sh_rest: false }).unwrap();
         let views = poses::read(&root, None).unwrap().views;
-        let photo = |view: &View| {
-            let loaded = load_image(view).unwrap();
-            let intrinsics = loaded.view.intrinsics.scaled_to_width(160);
-            let image = image::imageops::thumbnail(&loaded.image, intrinsics.width_px, intrinsics.height_px);
-            let view = RasterView { camera_from_world: loaded.view.camera_from_world, intrinsics };
-            CheckView { name: loaded.view.name, image, valid: None, view }
-        };
-        let photos = views.iter().step_by(views.len() / 3).map(photo).collect();
-        Self { splat, views, photos }
+        let photos = views.iter().step_by(views.len() / 3).map(|view| shrunk(photo(view), 160)).collect();
+        Self { splat: read_splat(&root), views, photos }
     }
 
     fn check(&self, moved: &Similarity, frames: Vec<FrameCandidate>) -> CheckReport {

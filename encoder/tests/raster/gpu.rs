@@ -165,13 +165,13 @@ fn a_lost_device_loses_no_view() {
     let found = all();
     assert_eq!(found.len(), 24);
     near(&found);
-    devices.gpus()[0].lose();
+    devices.gpus[0].lose();
     near(&all());
-    devices.gpus()[1].lose();
+    devices.gpus[1].lose();
     let found = all();
     assert!(found.chunks(views.len()).all(|views| views == expected), "the CPU's own bits");
     // A scene that comes after the loss goes to the CPU, too.
-    assert!(matches!(devices.gpus()[0].load(&scene), Err(RasterError::Device { .. })));
+    assert!(matches!(devices.gpus[0].load(&scene), Err(RasterError::Device { .. })));
     assert_eq!(weights(devices.load(&scene).unwrap().as_ref(), &views[0], &regions), expected[0]);
 }
 
@@ -191,16 +191,16 @@ fn choices() {
         assert!(wrong.parse::<DeviceChoice>().unwrap_err().contains(&format!("{wrong:?}")));
     }
     let open = |choice| Devices::open(&choice, GpuOptions::default());
-    assert!(open(DeviceChoice::Cpu).unwrap().gpus().is_empty());
+    assert!(open(DeviceChoice::Cpu).unwrap().gpus.is_empty());
     let error = open(DeviceChoice::Adapters(vec![999, 0])).err().unwrap();
     assert!(matches!(error, DeviceError::NoSuchAdapter { number: 999, .. }), "{error}");
     // Imitated GPUs are slower than the CPU itself.
     let auto = open(DeviceChoice::Auto).unwrap();
-    assert!(auto.gpus().iter().all(|gpu| !gpu.report().is_software()));
+    assert!(auto.gpus.iter().all(|gpu| !gpu.report().is_software()));
     match open(DeviceChoice::Gpu) {
         Ok(devices) => {
-            assert!(!devices.gpus().is_empty());
-            assert_eq!(open(DeviceChoice::Adapters(vec![0])).unwrap().gpus().len(), 1);
+            assert!(!devices.gpus.is_empty());
+            assert_eq!(open(DeviceChoice::Adapters(vec![0])).unwrap().gpus.len(), 1);
         }
         Err(error) => assert!(matches!(error, DeviceError::NoAdapter) && !gpu_is_expected(), "{error}"),
     }

@@ -11,7 +11,7 @@ use slag_common::{Gaussians, Hash32};
 
 use super::embeddings::{Field, place_in_cube};
 use slag_encoder::cells::{CellLimits, PositionError, split};
-use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext};
+use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext};
 use slag_encoder::progress::Progress;
 use slag_encoder::shard::{CellEmbeddings, CellExtras, ShardBuilder, ShardSettings};
 use slag_encoder::store::{Extras, Store};
@@ -28,12 +28,7 @@ pub(super) fn publish(
     profiles: Vec<Profile>,
     progress: &dyn Progress,
 ) -> Result<()> {
-    let settings = ShardSettings {
-        profiles,
-        codebook: CodebookSettings::default(),
-        input_indices: false,
-        compact_appearance: false,
-    };
+    let settings = ShardSettings { profiles, ..ShardSettings::default() };
     let field = Field::new(n_gaussians, dim);
     let store = Store::create_or_open(dir)?;
     let bank = field.texts();

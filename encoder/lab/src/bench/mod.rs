@@ -3,7 +3,6 @@
 mod embeddings;
 mod field;
 pub(crate) mod load;
-mod plot;
 pub(crate) mod query;
 pub(crate) mod raster;
 pub(crate) mod robot;

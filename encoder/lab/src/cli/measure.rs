@@ -92,7 +92,7 @@ pub(crate) enum BenchCommand {
     Robot(robot::RobotArgs),
     /// Times the weights of a view: each device on generated scenes, or on one of yours.
     Raster(raster::RasterArgs),
-    /// Measures cost and accuracy of settings of `encode` on labelled scenes: table, Pareto front and its plots.
+    /// Measures cost and accuracy of settings of `encode` on labelled scenes: table and Pareto front.
     Tradeoff(tradeoff::TradeoffArgs),
 }
 

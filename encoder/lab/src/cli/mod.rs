@@ -8,7 +8,7 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::{Args, Parser, Subcommand};
-use slag_encoder::cli::common::{OutputArgs, cancel_flag, now_unix_secs, print, runtime, session_options};
+use slag_encoder::cli::common::{OutputArgs, cancel_flag, now_unix_secs, print, session_options};
 use slag_encoder::cli::{Exit, exit_of, progress};
 use slag_encoder::progress::Progress;
 use slag_models::commands::RunArgs;
@@ -75,15 +75,13 @@ struct DemoArgs {
 }
 
 fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let edge = std::env::current_exe()?.with_file_name(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
     let options = demo::DemoOptions {
         out: args.out.clone(),
         seed: args.seed,
         session: session_options(&args.how)?,
-        edge,
         created_unix_secs: now_unix_secs()?,
     };
-    let demo = runtime()?.block_on(async { demo::run(&options, progress, cancel_flag()?.as_ref()).await })?;
+    let demo = demo::run(&options, progress, cancel_flag()?.as_ref())?;
     print(json, &demo.report, &demo.report)?;
     if args.keep {
         demo.keep()?;

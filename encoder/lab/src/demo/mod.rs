@@ -5,7 +5,7 @@ mod questions;
 
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
@@ -18,10 +18,10 @@ pub use picture::EdgeAnswer;
 
 use crate::generate::Scene;
 use crate::generate::grammar::SceneKind;
+use crate::programs::{fetch, json_of, sibling};
 use slag_encoder::cells::CellLimits;
 use slag_encoder::encode::{self, EncodeSettings, EncodeSummary, Engines};
 use slag_encoder::progress::Progress;
-use slag_encoder::publish::serve::{self, Access, Limits};
 use slag_encoder::query;
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
@@ -42,14 +42,11 @@ pub struct DemoOptions {
     pub out: PathBuf,
     pub seed: u64,
     pub session: SessionOptions,
-    /// The robot's program.
-    pub edge: PathBuf,
     pub created_unix_secs: u64,
 }
 
 pub struct Demo {
     pub report: DemoReport,
-    edge: PathBuf,
     cache: PathBuf,
 }
 
@@ -82,16 +79,6 @@ struct EdgeReply {
     reason: Option<serde_json::Value>,
 }
 
-#[derive(Deserialize)]
-struct FetchReply {
-    downloaded: Tally,
-}
-
-#[derive(Deserialize)]
-struct Tally {
-    bytes: u64,
-}
-
 impl DemoReport {
     pub fn all_right(&self) -> bool {
         self.questions.iter().all(|q| q.right)
@@ -108,50 +95,45 @@ impl Demo {
     /// Serves the shards and the robot's queries until it is stopped.
     pub fn keep(&self) -> Result<()> {
         let store = self.cache.with_file_name("store");
-        let mut shards =
-            Command::new(self.edge.with_file_name(format!("slag-encoder{}", std::env::consts::EXE_SUFFIX)));
+        let mut shards = Command::new(sibling("slag-encoder")?);
         let mut shards =
             shards.arg("serve").arg("--store").arg(store).spawn().context("cannot serve the store")?;
         println!("try: curl 'http://127.0.0.1:7734/query?text=chair'");
         if let Some(link) = self.report.link() {
             println!("see: {link}");
         }
-        let status = Command::new(&self.edge).arg("serve").arg("--cache").arg(&self.cache).status();
+        let edge = sibling("slag-edge")?;
+        let status = Command::new(&edge).arg("serve").arg("--cache").arg(&self.cache).status();
         // It may have ended already: ctrl-c reaches all processes of the terminal.
         let _ = shards.kill();
         let _ = shards.wait();
-        status.with_context(|| format!("cannot start {}", self.edge.display()))?;
+        status.with_context(|| format!("cannot start {}", edge.display()))?;
         Ok(())
     }
 }
 
-pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
-    if !options.edge.is_file() {
-        return Err(anyhow!(
-            "{} does not exist; build it with: cargo build --release --bin slag-edge",
-            options.edge.display()
-        ));
-    }
+pub fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
+    // Before any work.
+    let edge = sibling("slag-edge")?;
     clear(&options.out)?;
     let (store, cache) = (options.out.join("store"), options.out.join("cache"));
     let mut scene = Scene::new(&KINDS, options.seed, N_VIEWS);
     let models = ModelDir::embedded()?;
-    let encoding = || encode(options, &mut scene, &store, &models, (progress, cancel));
-    let encode = tokio::task::block_in_place(encoding)?;
+    let encode = encode(options, &mut scene, &store, &models, (progress, cancel))?;
     let camera_in_world = scene.views[ROBOT_VIEW].camera_from_world.inverse().translation;
     let robot_in_world = DVec3::new(camera_in_world.x, camera_in_world.y, 0.0);
     let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
-    let downloaded_bytes = fetch(options, store, &cache, &at).await?;
+    let radius = RADIUS_M.to_string();
+    let fetched = fetch(&store, &cache, &["--at", &at, "--radius", &radius])?;
+    let downloaded_bytes = fetched["downloaded"]["bytes"].as_u64().context("fetch: no downloaded bytes")?;
     // The robot is offline from here on.
-    let questions = ask(options, &cache, &scene, (robot_in_world, &at))?;
+    let questions = ask(&edge, &cache, &scene, (robot_in_world, &at))?;
     let mut encoder = models.text_encoder(&options.session)?;
-    let pictures =
-        tokio::task::block_in_place(|| draw(options, &scene, &questions, &mut *encoder, robot_in_world))
-            .context("pictures")?;
+    let pictures = draw(options, &scene, &questions, &mut *encoder, robot_in_world).context("pictures")?;
     let about_model = models.about().to_owned();
     let report = DemoReport { pictures, encode, downloaded_bytes, about_model, questions };
     fs_err::write(options.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
-    Ok(Demo { report, edge: options.edge.clone(), cache })
+    Ok(Demo { report, cache })
 }
 
 fn encode(
@@ -175,32 +157,9 @@ fn encode(
     encode::encode(&settings, &engines, progress, cancel).context("encode")
 }
 
-/// Serves the store while the robot fetches what is around it; returns the bytes that it downloads.
-async fn fetch(options: &DemoOptions, store: PathBuf, cache: &Path, at: &str) -> Result<u64> {
-    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
-    let (listens, listening) = tokio::sync::oneshot::channel();
-    let serving = tokio::spawn(async move {
-        // A channel fails only if its other end is dropped: the demo has failed and reports why.
-        let on_listening = |url| drop(listens.send(url));
-        let stopped = async { drop(stopped.await) };
-        let address = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
-        serve::serve(&store, address, Limits::default(), Access::default(), None, on_listening, stopped).await
-    });
-    let Ok(url) = listening.await else {
-        serving.await.context("serve")?.context("serve")?;
-        return Err(anyhow!("serve: ended before it listened on a port"));
-    };
-    let radius = RADIUS_M.to_string();
-    let fetch = ["fetch", "--trust-first", "--from", &url, "--at", at, "--radius", &radius];
-    let fetched: FetchReply = edge(options, cache, &fetch).context("fetch")?;
-    let _ = stop.send(());
-    serving.await.context("serve")?.context("serve")?;
-    Ok(fetched.downloaded.bytes)
-}
-
 /// Asks the robot, and compares its answers with the truth. `at`: the robot's position as a flag.
 fn ask(
-    options: &DemoOptions,
+    edge: &Path,
     cache: &Path,
     scene: &Scene,
     (robot_in_world, at): (DVec3, &str),
@@ -208,8 +167,9 @@ fn ask(
     let mut questions = Vec::new();
     for asked in questions::questions(&scene.objects, robot_in_world, RADIUS_M) {
         let start = Instant::now();
-        let reply: EdgeReply =
-            edge(options, cache, &["query", &asked.text, "--near", at]).context("query")?;
+        let mut query = Command::new(edge);
+        query.args(["query", &asked.text, "--near", at, "--json", "--quiet", "--cache"]).arg(cache);
+        let reply: EdgeReply = serde_json::from_value(json_of(&mut query)?).context("query")?;
         let process_ms = start.elapsed().as_secs_f64() * 1e3;
         let answer = reply.answers.into_iter().next();
         let right = match &answer {
@@ -263,25 +223,6 @@ fn clear(out: &Path) -> Result<()> {
     // Before any work, so that an interrupted demo can be started again.
     fs_err::write(out.join(MARKER), "{}")?;
     Ok(())
-}
-
-/// Runs the robot's program on its cache and parses its output.
-fn edge<T: for<'a> Deserialize<'a>>(options: &DemoOptions, cache: &Path, args: &[&str]) -> Result<T> {
-    let mut command = Command::new(&options.edge);
-    command
-        .args(args)
-        .arg("--cache")
-        .arg(cache)
-        .args(["--json", "--quiet"])
-        .stdin(Stdio::null())
-        .stderr(Stdio::inherit());
-    let output = tokio::task::block_in_place(|| command.output())
-        .with_context(|| format!("cannot start {}", options.edge.display()))?;
-    let text = String::from_utf8_lossy(&output.stdout);
-    if !output.status.success() {
-        return Err(anyhow!("slag-edge {}: {}", args.join(" "), text.trim()));
-    }
-    serde_json::from_str(&text).with_context(|| format!("slag-edge {}: {}", args.join(" "), text.trim()))
 }
 
 impl fmt::Display for DemoReport {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 use slag_common::manifest::Calibration;
@@ -70,9 +70,6 @@ impl fmt::Display for EvalKind {
 /// How a store is judged.
 #[derive(Clone, Debug, Default, Args)]
 pub(crate) struct JudgeSettings {
-    /// Categories to query [default: all].
-    #[arg(long, value_name = "A,B", value_delimiter = ',')]
-    pub(crate) words: Vec<String>,
     /// Scores this profile's shards, as a robot does [default: the field in full precision].
     #[arg(long, value_name = "NAME")]
     pub(crate) profile: Option<Profile>,
@@ -242,27 +239,18 @@ impl Asker<'_> {
     }
 
     fn classes(&mut self, truth: &Truth) -> Result<Vec<Class>> {
-        let all = truth.categories();
-        let asked = &self.settings.words;
-        let is_asked = |word: &String| asked.is_empty() || asked.contains(word);
         let mut classes = Vec::new();
-        for (word, ids) in all.iter().filter(|(word, _)| is_asked(word)) {
-            if let Some((cosines, of_objects)) = self.score(word)? {
-                classes.push(Class { word: word.clone(), ids: ids.clone(), cosines, of_objects });
+        for (word, ids) in truth.categories() {
+            if let Some((cosines, of_objects)) = self.score(&word)? {
+                classes.push(Class { word, ids, cosines, of_objects });
             }
         }
         match self.unknown.first_key_value() {
             _ if !classes.is_empty() => Ok(classes),
             Some((word, error)) => {
-                bail!("the encoder knows none of {} words ({word}: {error}); give others", self.unknown.len())
+                bail!("the encoder knows none of {} words ({word}: {error})", self.unknown.len())
             }
-            None => {
-                let words: Vec<&str> = all.iter().map(|(word, _)| word.as_str()).collect();
-                Err(anyhow!(
-                    "none of the words is a category of the labels; the categories are: {}",
-                    words.join(", ")
-                ))
-            }
+            None => bail!("the labels name no things"),
         }
     }
 

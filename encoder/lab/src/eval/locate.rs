@@ -8,7 +8,6 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use clap::builder::RangedU64ValueParser;
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -46,19 +45,9 @@ pub(crate) struct LocateArgs {
     /// Folders of scenes: a splat, poses, photos, and optionally test/transforms.json.
     #[arg(long = "scene", value_name = "DIR", num_args = 1.., required = true)]
     scenes: Vec<PathBuf>,
-    /// Decides by landmarks alone, as a robot does whose cells do not tell how their Gaussians look.
-    #[arg(long)]
-    unverified: bool,
     /// Changes each query.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
-    /// The map has only photos of these places in the order of names, from A to before B; the others are queries
-    /// [default: all].
-    #[arg(long, value_names = ["A", "B"], num_args = 2)]
-    map_views: Option<Vec<usize>>,
-    /// Of each four photos in the order of names, the one that is a query: 0 to 3.
-    #[arg(long, value_name = "N", default_value_t = HELD_OUT - 1, value_parser = RangedU64ValueParser::<usize>::new().range(0..HELD_OUT as u64))]
-    fold: usize,
     /// Tells each query that was not found where it is.
     #[arg(long)]
     list: bool,
@@ -147,9 +136,8 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
     for (at, scene) in scenes.iter().enumerate() {
         let loaded = CpuRasterizer.load(&scene.gaussians)?;
         let renderer = SceneRenderer(loaded.as_ref());
-        let renderer = (!args.unverified).then_some(&renderer as &(dyn Renderer + Sync));
         let attempt = |of: usize, view: &View| -> Result<Try> {
-            Ok(attempt(scene, &query(view, args.change, drawn[of].as_deref())?, renderer))
+            Ok(attempt(scene, &query(view, args.change, drawn[of].as_deref())?, &renderer))
         };
         let mut tries = Vec::new();
         for view in &scene.queries {
@@ -182,8 +170,8 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
 fn prepare(files: &SceneFiles, args: &LocateArgs) -> Result<Located> {
     let gaussians = splat::read(&files.splat, &ReadOptions { with_sh_rest: true })?;
     let views = poses::read(&files.poses, files.images.as_deref())?.views;
-    let range = args.map_views.as_ref().map_or(0..views.len(), |range| range[0]..range[1].min(views.len()));
-    let is_query = |at: usize| at % HELD_OUT == args.fold || !range.contains(&at);
+    // The last of each.
+    let is_query = |at: usize| at % HELD_OUT == HELD_OUT - 1;
     let start = Instant::now();
     let loaded = CpuRasterizer.load(&gaussians)?;
     let mapping = views.iter().enumerate().filter(|(at, _)| !is_query(*at));
@@ -262,11 +250,11 @@ fn query(view: &View, change: Change, drawn: Option<&dyn LoadedScene>) -> Result
     Ok(Query { grey, intrinsics, camera_from_world })
 }
 
-fn attempt(scene: &Located, query: &Query, renderer: Option<&(dyn Renderer + Sync)>) -> Try {
+fn attempt(scene: &Located, query: &Query, renderer: &dyn Renderer) -> Try {
     let photo =
         Photo { grey: &query.grey, intrinsics: &query.intrinsics, gravity_in_camera: None, prior: None };
     let start = Instant::now();
-    let outcome = locate(&scene.map, &photo, renderer.map(|renderer| renderer as &dyn Renderer));
+    let outcome = locate(&scene.map, &photo, Some(renderer));
     let secs = start.elapsed().as_secs_f64();
     let found = match outcome {
         Outcome::Found(found) => {

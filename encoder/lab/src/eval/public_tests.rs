@@ -14,18 +14,21 @@ use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 use super::lerf::{self, LerfLabels};
 use super::scannet::{self, Scan, ScanReport, ScannetReport, ScannetSettings};
 use slag_encoder::cells::CellLimits;
-use slag_encoder::codebook::CodebookSettings;
-use slag_encoder::encode::{self, CellSettings, EncodeSettings, Engines, Masks};
+use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, RasterView, Rasterizer, pinhole};
-use slag_encoder::shard::ShardSettings;
 use slag_encoder::store::StoreReader;
 
 /// Gaussians across and down, 0.1 m apart, 2 m in front of the camera.
 const COLUMNS: usize = 24;
 const ROWS: usize = 16;
 const PHOTO_PX: [u32; 2] = [320, 240];
+
+/// Returns the places of the Gaussians, row by row.
+fn on_wall() -> impl Iterator<Item = (f64, f64)> {
+    (0..COLUMNS * ROWS).map(|i| ((i % COLUMNS) as f64 * 0.1 - 1.15, (i / COLUMNS) as f64 * 0.1 - 0.75))
+}
 
 struct Wall {
     dir: tempfile::TempDir,
@@ -36,16 +39,11 @@ struct Wall {
 impl Wall {
     fn new() -> Self {
         let dir = tempfile::tempdir().expect("a folder");
-        let mut gaussians = Gaussians::default();
-        for i in 0..COLUMNS * ROWS {
-            let (x, y) = ((i % COLUMNS) as f64 * 0.1 - 1.15, (i / COLUMNS) as f64 * 0.1 - 0.75);
-            gaussians.means_in_world.push(DVec3::new(x, y, 2.0));
-            gaussians.scales.push([0.05, 0.05, 0.002]);
-            gaussians.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-            gaussians.opacities.push(0.99);
-            let rgb = if x < 0.0 { [0.85, 0.08, 0.06] } else { [0.06, 0.1, 0.85] };
-            gaussians.sh_dc.push(rgb.map(|c: f32| (c - 0.5) / SH_C0));
-        }
+        let mut gaussians = Gaussians::balls(on_wall().map(|(x, y)| DVec3::new(x, y, 2.0)).collect(), 0.05);
+        gaussians.scales.fill([0.05, 0.05, 0.002]);
+        gaussians.opacities.fill(0.99);
+        let rgb = |x: f64| if x < 0.0 { [0.85, 0.08, 0.06] } else { [0.06, 0.1, 0.85] };
+        gaussians.sh_dc = on_wall().map(|(x, _)| rgb(x).map(|c: f32| (c - 0.5) / SH_C0)).collect();
         let scene = dir.path().join("scene.ply");
         splat::ply::write(&scene, &gaussians).expect("writes");
         let mut frames = Vec::new();
@@ -81,19 +79,9 @@ impl Wall {
         settings.view.masks = Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() };
         settings.view.min_mask_px = 10;
         settings.aggregation = Aggregation::PLAIN;
-        settings.cells = CellSettings {
-            limits: CellLimits::by_count(4096),
-            shards: ShardSettings {
-                profiles: vec![Profile::Compact],
-                codebook: CodebookSettings::default(),
-                input_indices: false,
-                compact_appearance: false,
-            },
-            objects: false,
-            occupancy: None,
-            photo_poses: false,
-            landmarks: false,
-        };
+        settings.cells.limits = CellLimits::by_count(4096);
+        settings.cells.shards.profiles = vec![Profile::Compact];
+        settings.cells.objects = false;
         settings.run.threads = 1;
         settings.run.memory_bytes = 1 << 28;
         settings.run.strict = true;
@@ -225,10 +213,7 @@ fn wrong_lerf_labels_are_named() {
 
 /// Vertices just in front of the wall: left half `wall`, right half `floor`; five far away; two of no class.
 fn vertices() -> Vec<([f64; 3], u16)> {
-    let on_wall = (0..COLUMNS * ROWS).map(|i| {
-        let (x, y) = ((i % COLUMNS) as f64 * 0.1 - 1.15, (i / COLUMNS) as f64 * 0.1 - 0.75);
-        ([x + 0.01, y, 1.98], if x < 0.0 { 1 } else { 2 })
-    });
+    let on_wall = on_wall().map(|(x, y)| ([x + 0.01, y, 1.98], if x < 0.0 { 1 } else { 2 }));
     let far = (0..5).map(|i| ([f64::from(i), 0.0, 9.0], 1));
     on_wall.chain(far).chain([([0.0, 0.0, 2.0], 0), ([0.0, 0.0, 2.0], 38)]).collect()
 }

@@ -162,19 +162,19 @@ fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Xorshift) ->
         return None;
     }
     for _ in 0..20 {
-        let thing = &solids.things()[*random.pick(&things)];
+        let thing = &solids.things[*random.pick(&things)];
         let field_of_view_rad = random.between(40.0, 75.0).to_radians();
         // The thing fills between a third of the picture's width and all of it.
         let fills = random.between(0.35, 1.1);
-        let distance_m = thing.radius_m() / (field_of_view_rad / 2.0 * fills).sin();
+        let distance_m = thing.radius_m / (field_of_view_rad / 2.0 * fills).sin();
         let azimuth = random.between(0.0, std::f64::consts::TAU);
         let elevation = random.between(-5.0, 50.0).to_radians();
         let away =
             DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
-        let position = thing.centre() + away * distance_m;
+        let position = thing.centre + away * distance_m;
         if position.z > 0.15 && layout.is_walkable(position) {
-            let aside = DVec3::from([0; 3].map(|_| random.signed())) * 0.25 * thing.radius_m();
-            let camera_from_world = looking(position, thing.centre() + aside - position);
+            let aside = DVec3::from([0; 3].map(|_| random.signed())) * 0.25 * thing.radius_m;
+            let camera_from_world = looking(position, thing.centre + aside - position);
             return Some(RasterView {
                 camera_from_world,
                 intrinsics: pinhole([PHOTO_PX; 2], field_of_view_rad),

@@ -36,8 +36,9 @@ impl Light {
 #[derive(Clone, Debug)]
 pub struct Thing {
     pieces: Vec<Piece>,
-    centre: DVec3,
-    radius_m: f64,
+    pub centre: DVec3,
+    /// Radius of the sphere around the centre that holds all of it.
+    pub radius_m: f64,
 }
 
 #[derive(Clone, Debug)]
@@ -52,7 +53,7 @@ struct Piece {
 /// All solids of a scene, and its light.
 #[derive(Clone, Debug)]
 pub struct Solids {
-    things: Vec<Thing>,
+    pub things: Vec<Thing>,
     light: Light,
     ambient: f64,
     tint: [f64; 3],
@@ -99,15 +100,6 @@ impl Thing {
         Self { pieces, centre, radius_m }
     }
 
-    pub fn centre(&self) -> DVec3 {
-        self.centre
-    }
-
-    /// Returns the radius of the sphere around the centre that holds all of it.
-    pub fn radius_m(&self) -> f64 {
-        self.radius_m
-    }
-
     /// Returns points on its surface about `spacing_m` apart, each with its piece.
     fn surfels(&self, spacing_m: f64) -> impl Iterator<Item = (&Piece, Surfel)> {
         self.pieces.iter().flat_map(move |piece| piece.part.surfels(spacing_m).map(move |s| (piece, s)))
@@ -139,10 +131,6 @@ impl Solids {
     /// Lights things; `ambient` is the share of ambient light, `tint` the colour of the light.
     pub fn new(things: Vec<Thing>, light: Light, ambient: f64, tint: [f64; 3]) -> Self {
         Self { things, light, ambient, tint }
-    }
-
-    pub fn things(&self) -> &[Thing] {
-        &self.things
     }
 
     /// Returns the diffuse colour at a point of a surface, and whether the light reaches it.

@@ -78,8 +78,7 @@ impl Scene {
             let next_id = &mut next_ids[usize::from(!placed.shell)];
             let id = *next_id;
             *next_id += 1;
-            let spacing_m =
-                (solids.things()[i].radius_m() * SPACING_OF_RADIUS).clamp(SPACING_M[0], SPACING_M[1]);
+            let spacing_m = (solids.things[i].radius_m * SPACING_OF_RADIUS).clamp(SPACING_M[0], SPACING_M[1]);
             let spread = (spacing_m * SPREAD) as f32;
             let covering = solids.covering(i, spacing_m);
             for (surfel, rgb) in &covering {

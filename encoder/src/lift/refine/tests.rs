@@ -24,15 +24,12 @@ fn random(seed: u64) -> f64 {
 
 /// Three patches of 30 Gaussians, far apart and each of a colour.
 fn gaussians() -> Gaussians {
-    let mut scene = Gaussians::default();
-    for i in 0..N {
-        let at = DVec3::new((i / 30 * 10) as f64 + (i % 6) as f64 * 0.1, (i % 30 / 6) as f64 * 0.1, 0.0);
-        scene.means_in_world.push(at);
-        scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        scene.scales.push([0.1, 0.1, 0.01]);
-        scene.opacities.push(0.9);
-        scene.sh_dc.push([(i / 30) as f32; 3]);
-    }
+    let at =
+        |i: usize| DVec3::new((i / 30 * 10) as f64 + (i % 6) as f64 * 0.1, (i % 30 / 6) as f64 * 0.1, 0.0);
+    let mut scene = Gaussians::balls((0..N).map(at).collect(), 0.1);
+    scene.scales.fill([0.1, 0.1, 0.01]);
+    scene.opacities.fill(0.9);
+    scene.sh_dc = (0..N).map(|i| [(i / 30) as f32; 3]).collect();
     scene
 }
 

@@ -75,16 +75,11 @@ fn threads_do_not_show() {
 /// Twelve Gaussians of the ground's colour and direction stay a thing of their own, though superpoints have twenty.
 #[test]
 fn what_stands_on_the_ground_is_no_part_of_it() {
-    let mut scene = Gaussians::default();
     let ground = (0..10_000).map(|i| [f64::from(i % 100) * 0.02, f64::from(i / 100) * 0.02, 0.0]);
     let cone = (0..12).map(|i| [1.0 + f64::from(i % 4) * 0.02, 1.0 + f64::from(i / 4) * 0.02, 0.06]);
-    for position in ground.chain(cone) {
-        scene.means_in_world.push(position.into());
-        scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        scene.scales.push([0.01, 0.01, 0.001]);
-        scene.opacities.push(0.9);
-        scene.sh_dc.push([0.0; 3]);
-    }
+    let mut scene = Gaussians::balls(ground.chain(cone).map(Into::into).collect(), 0.01);
+    scene.scales.fill([0.01, 0.01, 0.001]);
+    scene.opacities.fill(0.9);
     let standing = Standing::find(&scene, &[]);
     let found = Superpoints::new(&scene, &standing, &SuperpointSettings::default());
     let cone = found.of_gaussian[10_000];

@@ -61,14 +61,9 @@ fn voxels_are_occupied_as_defined() {
 /// voxels are not.
 #[test]
 fn background_is_left_out() {
-    let mut scene = Gaussians::default();
-    for (k, scales) in [[1.0, 1.0, 0.02], [0.3, 0.25, 0.3], [4.4, 4.4, 0.02]].into_iter().enumerate() {
-        scene.means_in_world.push(DVec3::X * 100.0 * k as f64);
-        scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        scene.scales.push(scales);
-        scene.opacities.push(0.9);
-        scene.sh_dc.push([0.0; 3]);
-    }
+    let mut scene = Gaussians::balls((0..3).map(|k| DVec3::X * 100.0 * f64::from(k)).collect(), 0.0);
+    scene.scales = vec![[1.0, 1.0, 0.02], [0.3, 0.25, 0.3], [4.4, 4.4, 0.02]];
+    scene.opacities.fill(0.9);
     let found = occupied(&scene, &[0, 1, 2], Lattice { voxel: 0.05 });
     assert_eq!(found.n_background, 2);
     assert!(!found.blocks.is_empty() && found.blocks.iter().all(|([x, ..], _)| x.abs() < 20));
@@ -96,15 +91,11 @@ fn the_largest_gaussians_are_background() {
 fn places_at_the_ends_of_the_lattice_are_the_same() {
     let mut random = Random::new(8);
     let lattice = Lattice { voxel: 0.0625 };
-    let mut scene = Gaussians::default();
-    for _ in 0..60 {
-        // On a grid of 2^-12, which doubles hold at the ends of the lattice, too.
-        scene.means_in_world.push(DVec3::from([0; 3].map(|_| random.below(1 << 14) as f64 / 4096.0 - 2.0)));
-        scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        scene.scales.push([0.2, 0.1, 0.01]);
-        scene.opacities.push(0.9);
-        scene.sh_dc.push([0.0; 3]);
-    }
+    // On a grid of 2^-12, which doubles hold at the ends of the lattice, too.
+    let mut mean = || DVec3::from([0; 3].map(|_| random.below(1 << 14) as f64 / 4096.0 - 2.0));
+    let mut scene = Gaussians::balls((0..60).map(|_| mean()).collect(), 0.0);
+    scene.scales.fill([0.2, 0.1, 0.01]);
+    scene.opacities.fill(0.9);
     let usable: Vec<u32> = (0..scene.len() as u32).collect();
     let near = occupied(&scene, &usable, lattice);
     assert!(near.blocks.len() > 20 && near.n_background == 0);
@@ -137,14 +128,13 @@ fn a_thin_surface_has_no_holes() {
         let middle = DVec3::from([0; 3].map(|_| random.between(-5.0, 5.0)));
         let rotation = DQuat::from_rotation_arc(DVec3::Z, normal);
         let n = (0.8 / spacing) as i32;
-        let mut scene = Gaussians::default();
-        for (i, j) in (-n..=n).flat_map(|i| (-n..=n).map(move |j| (i, j))) {
-            scene.means_in_world.push(middle + u * (f64::from(i) * spacing) + v * (f64::from(j) * spacing));
-            scene.rotations_wxyz.push([rotation.w, rotation.x, rotation.y, rotation.z].map(|q| q as f32));
-            scene.scales.push([(0.62 * spacing) as f32, (0.62 * spacing) as f32, 0.002]);
-            scene.opacities.push(0.97);
-            scene.sh_dc.push([0.0; 3]);
-        }
+        let places = (-n..=n).flat_map(|i| (-n..=n).map(move |j| (f64::from(i), f64::from(j))));
+        let means = places.map(|(i, j)| middle + u * (i * spacing) + v * (j * spacing)).collect();
+        let mut scene = Gaussians::balls(means, 0.0);
+        let rotation = [rotation.w, rotation.x, rotation.y, rotation.z].map(|q| q as f32);
+        scene.rotations_wxyz.fill(rotation);
+        scene.scales.fill([(0.62 * spacing) as f32, (0.62 * spacing) as f32, 0.002]);
+        scene.opacities.fill(0.97);
         let usable: Vec<u32> = (0..scene.len() as u32).collect();
         let found: BTreeMap<BlockAt, u64> = occupied(&scene, &usable, lattice).blocks.into_iter().collect();
         let is_occupied = |voxel: [i32; 3]| {

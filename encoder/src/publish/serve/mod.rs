@@ -9,55 +9,31 @@ mod problem;
 mod router;
 mod state;
 
-use std::path::Path;
-
 use slag_service::listen::{Listen, ListenError, bind};
 use slag_service::listener;
 use slag_service::tls::Tls;
 
-use crate::store::StoreError;
 pub use router::bounded;
-pub(crate) use router::{router, router_with};
+pub(crate) use router::router;
 pub use slag_service::access::Access;
 pub(crate) use slag_service::access::AccessSettings;
 pub use state::Limits;
 
-#[derive(Debug, thiserror::Error)]
-pub enum ServeError {
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    #[error(transparent)]
-    Listen(#[from] ListenError),
-}
-
-/// Serves a store until `shutdown` completes, then lets answers in progress finish within the drain deadline.
+/// Serves until `shutdown` completes, then lets answers in progress finish within the drain deadline.
 ///
 /// `on_listening` gets the address to connect to, `http://IP:PORT` (`https` with TLS) or `unix:PATH`: the system
 /// chooses the port if `listen` has port 0.
 ///
 /// # Errors
-/// [`ServeError`]; a store without a published scene is one.
+/// Fails if the address cannot be listened on.
 pub async fn serve(
-    dir: &Path,
-    listen: impl Into<Listen>,
-    limits: Limits,
-    access: Access,
-    tls: Option<Tls>,
-    on_listening: impl FnOnce(String),
-    shutdown: impl Future<Output = ()>,
-) -> Result<(), ServeError> {
-    serve_router(router(dir, limits, access)?, listen, limits, tls, on_listening, shutdown).await
-}
-
-pub(crate) async fn serve_router(
     router: axum::Router,
-    listen: impl Into<Listen>,
+    listen: Listen,
     limits: Limits,
     tls: Option<Tls>,
     on_listening: impl FnOnce(String),
     shutdown: impl Future<Output = ()>,
-) -> Result<(), ServeError> {
-    let listen = listen.into();
+) -> Result<(), ListenError> {
     let listener = bind(&listen).await?.with_tls(tls);
     on_listening(listener.url().map_err(|cause| ListenError { address: listen, cause })?);
     if let Err(cut_off) = listener::serve(router, listener, limits.connections, shutdown).await {

@@ -41,18 +41,8 @@ const STORE: [(u16, &str); 1] = [(500, "The service failed.")];
 /// No request here needs a body; a few bytes of a careless client do no harm.
 const REQUEST_BODY_BYTES: usize = 1024;
 
-/// Returns the service of a store, without a listener.
-pub(crate) fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, StoreError> {
-    router_with(dir, limits, access, Router::new())
-}
-
-/// As [`router`], with a page's routes beside the store's.
-pub(crate) fn router_with(
-    dir: &Path,
-    limits: Limits,
-    access: Access,
-    page: Router,
-) -> Result<Router, StoreError> {
+/// Returns the service of a store with a page's routes beside, without a listener.
+pub(crate) fn router(dir: &Path, limits: Limits, access: Access, page: Router) -> Result<Router, StoreError> {
     let service = Arc::new(Service::open(dir, &limits)?);
     let responses = Arc::clone(&service.responses);
     let (router, _) = described();

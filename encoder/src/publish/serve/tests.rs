@@ -16,7 +16,7 @@ use tower::ServiceExt;
 
 use super::*;
 use crate::store::tests::{manifest, manifest_of_boxes};
-use crate::store::{Extras, Store, StoreReader};
+use crate::store::{Extras, Store, StoreError, StoreReader};
 
 /// A store with generations 1 (shards 0 and 1) and 2 (shards 1 and 2), and the shards' bytes.
 struct Fixture {
@@ -60,7 +60,11 @@ impl Fixture {
     }
 
     fn router(&self) -> Router {
-        router(self.dir.path(), Limits::default(), Access::default()).expect("published")
+        self.router_within(Limits::default()).expect("published")
+    }
+
+    fn router_within(&self, limits: Limits) -> Result<Router, StoreError> {
+        router(self.dir.path(), limits, Access::default(), Router::new())
     }
 }
 
@@ -349,10 +353,7 @@ async fn new_manifest_is_noticed_and_a_damaged_one_is_not_served() {
     fs_err::write(&path, b"damaged otherwise").expect("writable");
     assert_eq!(generation(&router).await, 3);
     assert_eq!(counted("slag_store_reload_failures_total ").await, 2, "a changed file is read again");
-    assert!(
-        super::router(fixture.dir.path(), Limits::default(), Access::default()).is_err(),
-        "but nothing starts from it"
-    );
+    assert!(fixture.router_within(Limits::default()).is_err(), "but nothing starts from it");
     fs_err::write(&path, good).expect("writable");
     assert_eq!(generation(&router).await, 3);
     assert_eq!(counted("slag_store_reloads_total ").await, 2, "it is put in place when it opens again");
@@ -392,7 +393,7 @@ async fn overload_and_timeout_are_problems() {
 async fn downloads_are_counted_until_they_end() {
     let fixture = fixture();
     let limits = Limits { n_downloads: 1, ..Limits::default() };
-    let router = router(fixture.dir.path(), limits, Access::default()).expect("published");
+    let router = fixture.router_within(limits).expect("published");
     let path = format!("/v1/objects/{}", fixture.shards[1].0);
     let unread = router.clone().oneshot(request(&path, &[])).await.expect("infallible");
     assert_eq!(unread.status(), StatusCode::OK);
@@ -406,20 +407,19 @@ async fn downloads_are_counted_until_they_end() {
 struct Running {
     address: SocketAddr,
     stop: tokio::sync::oneshot::Sender<()>,
-    ended: tokio::task::JoinHandle<Result<(), ServeError>>,
+    ended: tokio::task::JoinHandle<Result<(), ListenError>>,
 }
 
-async fn start(dir: &Path, limits: Limits) -> Running {
+async fn start(router: Router) -> Running {
     let (stop, stopped) = tokio::sync::oneshot::channel();
     let (told, listening) = tokio::sync::oneshot::channel();
-    let dir = dir.to_owned();
     let ended = tokio::spawn(async move {
         let any_port = SocketAddr::from(([127, 0, 0, 1], 0));
         let shutdown = async move {
             let _ = stopped.await;
         };
         let told = |url: String| told.send(url).expect("awaited");
-        serve(&dir, any_port, limits, Access::default(), None, told, shutdown).await
+        serve(router, any_port.into(), Limits::default(), None, told, shutdown).await
     });
     let url = listening.await.expect("listens");
     let address = url.strip_prefix("http://").and_then(|address| address.parse().ok()).expect("an address");
@@ -438,7 +438,7 @@ async fn over_tcp_a_download_outlives_the_stop() {
     let big: Vec<u8> = (0..8_000_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
     let (hash, len_bytes) = fixture.store.put_bytes(&big).expect("room");
     fixture.store.publish(&manifest(3, &[(hash, len_bytes)]), &Extras::new()).expect("publishes");
-    let running = start(fixture.dir.path(), Limits::default()).await;
+    let running = start(fixture.router()).await;
     let text = format!("GET /v1/objects/{hash} HTTP/1.1\r\nHost: localhost\r\nRange: bytes=5-\r\n\r\n");
     let mut stream = connect(running.address, &text).await;
     let mut received = vec![0; 1000];
@@ -454,14 +454,11 @@ async fn over_tcp_a_download_outlives_the_stop() {
     assert!(tokio::net::TcpStream::connect(running.address).await.is_err(), "no longer listening");
 }
 
-#[tokio::test]
-async fn nothing_published_is_an_error_at_the_start() {
+#[test]
+fn nothing_published_is_an_error_at_the_start() {
     let dir = tempfile::tempdir().expect("temporary folder");
-    let any_port = SocketAddr::from(([127, 0, 0, 1], 0));
-    let limits = Limits::default();
-    let ended =
-        serve(dir.path(), any_port, limits, Access::default(), None, |_| (), std::future::pending()).await;
-    assert!(matches!(ended, Err(ServeError::Store(StoreError::NotPublished { .. }))));
+    let started = router(dir.path(), Limits::default(), Access::default(), Router::new());
+    assert!(matches!(started, Err(StoreError::NotPublished { .. })));
 }
 
 #[tokio::test]

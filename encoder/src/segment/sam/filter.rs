@@ -37,7 +37,7 @@ impl Filters<'_> {
             .filter(|&(_, (_, &predicted_iou))| predicted_iou > least_iou || least_iou == 0.0)
             .filter_map(|(at, (logits, predicted_iou))| {
                 let cut = upsampler.cut(logits, stability_offset, [crop.x0, crop.y0])?;
-                let keeps = cut.stability >= stability && !self.is_cut_by(crop, cut.mask.box_px());
+                let keeps = cut.stability >= stability && !self.is_cut_by(crop, cut.mask.box_px);
                 let (mask, stability) = (cut.mask, cut.stability);
                 let candidate =
                     Candidate { mask, predicted_iou: *predicted_iou, stability, level: level_of(at), crop };
@@ -123,7 +123,7 @@ pub(super) fn is_finite(decoded: &Decoded) -> bool {
 }
 
 fn by_boxes(candidates: Vec<Candidate>, scores: Vec<f64>, most_iou: f64) -> Vec<Candidate> {
-    suppress(candidates, scores, |a, b| box_iou(a.mask.box_px(), b.mask.box_px()) > most_iou)
+    suppress(candidates, scores, |a, b| box_iou(a.mask.box_px, b.mask.box_px) > most_iou)
 }
 
 /// Non-maximum suppression: in descending order of scores (equal ones in their order), keeps candidates that are

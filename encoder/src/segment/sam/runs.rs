@@ -16,8 +16,8 @@ pub(super) struct Run {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct RunMask {
     runs: Vec<Run>,
-    box_px: BoxPx,
-    area_px: u32,
+    pub(super) box_px: BoxPx,
+    pub(super) area_px: u32,
 }
 
 impl RunMask {
@@ -29,10 +29,6 @@ impl RunMask {
         let box_px = BoxPx { x0, y0: first.y, x1, y1: last.y + 1 };
         let area_px = runs.iter().map(|run| run.x1 - run.x0).sum();
         Some(Self { runs, box_px, area_px })
-    }
-
-    pub(super) fn box_px(&self) -> BoxPx {
-        self.box_px
     }
 
     pub(super) fn len_bytes(&self) -> u64 {
@@ -48,10 +44,6 @@ impl RunMask {
             inside[start + (run.x0 - x0) as usize..start + (run.x1 - x0) as usize].fill(true);
         }
         Mask { box_px: self.box_px, inside, area_px: self.area_px, level }
-    }
-
-    pub(super) fn area_px(&self) -> u32 {
-        self.area_px
     }
 
     pub(super) fn iou(&self, other: &Self) -> f64 {

@@ -23,8 +23,8 @@ pub(super) fn keep(mut candidates: Vec<Candidate>, filter: &ScoreFilter) -> Vec<
         for i in 0..j {
             let [better, worse] = [i, j].map(|k| &candidates[k].mask);
             let both_px = better.intersection_px(worse) as f64;
-            let [of_better, of_worse] = [better, worse].map(|mask| both_px / f64::from(mask.area_px()));
-            let union_px = f64::from(better.area_px()) + f64::from(worse.area_px()) - both_px;
+            let [of_better, of_worse] = [better, worse].map(|mask| both_px / f64::from(mask.area_px));
+            let union_px = f64::from(better.area_px) + f64::from(worse.area_px) - both_px;
             let is_contained = |share: f64, of_other: f64| {
                 share >= CONTAINED_SHARE && of_other < LARGE_SHARE && share * of_other < filter.max_contained
             };

@@ -29,7 +29,7 @@ pub(crate) struct TradeoffArgs {
     /// Labelled scene: a folder that `generate scene` wrote; may be repeated.
     #[arg(long, visible_alias = "truth", value_name = "DIR", required = true, num_args = 1..)]
     scene: Vec<PathBuf>,
-    /// Folder for figures and plots; points measured there before are not measured again.
+    /// Folder for figures; points measured there before are not measured again.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// What to measure: `full`; `quick`, a small grid with the scenes' own masks (ten minutes on two cores);

@@ -1,4 +1,4 @@
-//! Table and plots of a measured grid, and the front that `slag-encoder encode --front` reads.
+//! Table of a measured grid, and the front that `slag-encoder encode --front` reads.
 
 use std::fmt;
 use std::path::Path;
@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use slag_encoder::encode::front::{Front, FrontSetting};
 
 use super::grid::Point;
-use crate::bench::plot::{self, PlotPoint};
 use crate::harness::Machine;
 use crate::table::{Table, figure};
 
@@ -45,52 +44,10 @@ pub(crate) struct TradeoffReport {
     pub(crate) left_out: Vec<String>,
 }
 
-/// A cost or an accuracy, for one axis of a plot.
-struct Measure<T> {
-    /// Part of the plots' file names.
-    file: &'static str,
-    axis: &'static str,
-    of: fn(&Figures) -> T,
-}
+type Cost = fn(&Figures) -> f64;
 
-const COSTS: [Measure<f64>; 2] = [
-    Measure { file: "seconds", axis: "seconds of the encode", of: |f| f.seconds },
-    Measure { file: "bytes", axis: "bytes per Gaussian", of: |f| f.bytes_per_gaussian },
-];
-
-/// Which word wins at a Gaussian, and which Gaussians come first for a word, as the paper and as a search judge.
-const ACCURACIES: [Measure<Option<f64>>; 2] = [
-    Measure { file: "", axis: "multi-class mIoU", of: |f| Some(f.miou) },
-    Measure { file: "-ap", axis: "mean average precision", of: |f| f.map },
-];
-
-/// A point's figures, averaged over scenes.
-struct Mean<'a> {
-    point: &'a Point,
-    cost: f64,
-    accuracy: f64,
-}
-
-/// Returns the mean of each point that all of these scenes have, in the order of the first scene.
-fn means<'a>(
-    figures: &'a [Figures],
-    scenes: &[&str],
-    cost: impl Fn(&Figures) -> f64,
-    accuracy: impl Fn(&Figures) -> Option<f64>,
-) -> Vec<Mean<'a>> {
-    let n = scenes.len();
-    let mean = |values: &[f64]| values.iter().sum::<f64>() / n as f64;
-    let of_point = |of_first: &'a Figures| {
-        let point = &of_first.point;
-        let of_point: Vec<&Figures> =
-            figures.iter().filter(|f| f.point == *point && scenes.contains(&f.scene.as_str())).collect();
-        let costs: Vec<f64> = of_point.iter().map(|f| cost(f)).collect();
-        let accuracies: Vec<f64> = of_point.iter().filter_map(|f| accuracy(f)).collect();
-        let is_whole = costs.len() == n && accuracies.len() == n;
-        is_whole.then(|| Mean { point, cost: mean(&costs), accuracy: mean(&accuracies) })
-    };
-    figures.iter().filter(|f| Some(&f.scene.as_str()) == scenes.first()).filter_map(of_point).collect()
-}
+/// Seconds of the encode, bytes a Gaussian.
+const COSTS: [Cost; 2] = [|f| f.seconds, |f| f.bytes_per_gaussian];
 
 /// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate,
 /// and differs.
@@ -100,17 +57,11 @@ pub(super) fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
 }
 
 impl TradeoffReport {
-    /// Writes `tradeoff.json`, `tradeoff.md`, `front.json`, and the plots of the scenes' mean, one a cost and
-    /// accuracy.
+    /// Writes `tradeoff.json`, `tradeoff.md` and `front.json`.
     pub(super) fn write(&self, out: &Path) -> Result<()> {
         fs_err::write(out.join("tradeoff.json"), serde_json::to_vec_pretty(self)?)?;
         fs_err::write(out.join("tradeoff.md"), self.to_string())?;
         fs_err::write(out.join("front.json"), serde_json::to_vec_pretty(&self.front())?)?;
-        for (cost, accuracy) in COSTS.iter().flat_map(|cost| ACCURACIES.iter().map(move |a| (cost, a))) {
-            if let Some(svg) = self.svg(cost, accuracy) {
-                fs_err::write(out.join(format!("{}{}.svg", cost.file, accuracy.file)), svg)?;
-            }
-        }
         Ok(())
     }
 
@@ -120,34 +71,40 @@ impl TradeoffReport {
         scenes
     }
 
+    /// Returns the figures of each point that all scenes have, in the order of the first scene.
+    fn of_points(&self) -> Vec<Vec<&Figures>> {
+        let scenes = self.scenes();
+        let of_point = |first: &Figures| self.figures.iter().filter(|f| f.point == first.point).collect();
+        let of_first = self.figures.iter().filter(|f| Some(&f.scene.as_str()) == scenes.first());
+        of_first.map(of_point).filter(|of_point: &Vec<&Figures>| of_point.len() == scenes.len()).collect()
+    }
+
     /// Returns the settings that no other beats in seconds or bytes, on the mean of the scenes; only those that a
     /// user can give on any scene: without placeholders, and flags of the machine.
     fn front(&self) -> Front {
-        let scenes = self.scenes();
         let of_views = |f: &Figures| f.views_seconds + f.coverage_seconds;
-        let of = |cost: &dyn Fn(&Figures) -> f64| means(&self.figures, &scenes, cost, |f| Some(f.miou));
-        let seconds = of(&|f| f.seconds);
-        let per_view = of(&|f| of_views(f) / f.n_photos.max(1) as f64);
-        let rest = of(&|f| (f.seconds - of_views(f)).max(0.0) / (f.n_gaussians.max(1) as f64 / 1e6));
-        let bytes = of(&|f| f.bytes_per_gaussian);
         let mut settings: Vec<(f64, FrontSetting)> = Vec::new();
-        for (((seconds, view), rest), bytes) in seconds.iter().zip(per_view).zip(rest).zip(bytes) {
-            let point = seconds.point;
+        for of_point in self.of_points() {
+            let point = &of_point[0].point;
             let flags = [point.views.as_str(), point.lift.as_str()].join(" ");
             let is_of_machine = ["{", "--threads", "--device", "--every"].iter().any(|f| flags.contains(f));
             if is_of_machine {
                 continue;
             }
+            let mean = |of: &dyn Fn(&Figures) -> f64| {
+                of_point.iter().map(|f| of(f)).sum::<f64>() / of_point.len() as f64
+            };
+            let millions = |f: &Figures| f.n_gaussians.max(1) as f64 / 1e6;
             let setting = FrontSetting {
                 name: format!("{} / {}", point.axis, point.name),
                 flags: flags.trim().to_owned(),
                 profile: point.profile,
-                seconds_per_view: view.cost,
-                seconds_per_million_gaussians: rest.cost,
-                bytes_per_gaussian: bytes.cost,
-                miou: seconds.accuracy,
+                seconds_per_view: mean(&|f| of_views(f) / f.n_photos.max(1) as f64),
+                seconds_per_million_gaussians: mean(&|f| (f.seconds - of_views(f)).max(0.0) / millions(f)),
+                bytes_per_gaussian: mean(&|f| f.bytes_per_gaussian),
+                miou: mean(&|f| f.miou),
             };
-            settings.push((seconds.cost, setting));
+            settings.push((mean(&|f| f.seconds), setting));
         }
         let of_seconds: Vec<(f64, f64)> = settings.iter().map(|(s, f)| (*s, f.miou)).collect();
         let of_bytes: Vec<(f64, f64)> =
@@ -157,26 +114,9 @@ impl TradeoffReport {
         Front {
             machine: self.machine.to_string(),
             measured_with: self.figures.first().map_or(String::new(), |f| f.made_by.clone()),
-            n_scenes: scenes.len(),
+            n_scenes: self.scenes().len(),
             settings: kept.collect(),
         }
-    }
-
-    /// Draws an accuracy against a cost, means over scenes; `None` without a point that all scenes have.
-    fn svg(&self, cost: &Measure<f64>, accuracy: &Measure<Option<f64>>) -> Option<String> {
-        let scenes = self.scenes();
-        let means = means(&self.figures, &scenes, cost.of, accuracy.of);
-        let all: Vec<(f64, f64)> = means.iter().map(|mean| (mean.cost, mean.accuracy)).collect();
-        let point = |(mean, is_on_front): (&Mean<'_>, bool)| PlotPoint {
-            name: format!("{} / {}", mean.point.axis, mean.point.name),
-            cost: mean.cost,
-            accuracy: mean.accuracy,
-            is_on_front,
-        };
-        let points: Vec<PlotPoint> = means.iter().zip(pareto(&all)).map(point).collect();
-        let Machine { cpu, n_threads, .. } = &self.machine;
-        let title = format!("{}: {cpu}, {n_threads} threads", scenes.join(", "));
-        (!points.is_empty()).then(|| plot::svg(&title, [cost.axis, accuracy.axis], &points))
     }
 }
 
@@ -189,9 +129,8 @@ impl fmt::Display for TradeoffReport {
         let mut table = Table::new(columns);
         for scene in self.scenes() {
             let of_scene: Vec<&Figures> = self.figures.iter().filter(|f| f.scene == scene).collect();
-            let fronts = COSTS.each_ref().map(|cost| {
-                pareto(&of_scene.iter().map(|f| ((cost.of)(f), f.miou)).collect::<Vec<(f64, f64)>>())
-            });
+            let fronts = COSTS
+                .map(|cost| pareto(&of_scene.iter().map(|f| (cost(f), f.miou)).collect::<Vec<(f64, f64)>>()));
             for (number, p) in of_scene.into_iter().enumerate() {
                 let marks = ["s", "b"].into_iter().zip(&fronts).filter(|(_, front)| front[number]);
                 table.row([

@@ -21,7 +21,7 @@ use slag_encoder::objects::NONE;
 use slag_encoder::progress::Progress;
 use slag_encoder::query::PublishedObjects;
 use slag_encoder::store::StoreReader;
-use truth::{MIN_SHOWN, SENSOR_HEIGHT_M, Truth, goal_request};
+use truth::{MIN_SHOWN, RADIUS_M, SENSOR_HEIGHT_M, Truth, goal_request};
 
 use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
@@ -50,12 +50,6 @@ pub(crate) struct GoalArgs {
     /// Photos of each scene.
     #[arg(long, value_name = "N", default_value_t = 96, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     n_views: u32,
-    /// Where they are taken.
-    #[arg(long, value_enum, default_value = "everywhere")]
-    walk: Walk,
-    /// Radius of the robot.
-    #[arg(long, value_name = "M", default_value_t = 0.3)]
-    radius_m: f64,
     /// Goes the whole road instead: from photos that no map has seen to what words name, with the encoder's own
     /// masks.
     #[arg(long)]
@@ -77,17 +71,17 @@ pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport
         kinds: &args.kind,
         seeds: &args.seeds,
         n_views: args.n_views,
-        walk: args.walk,
+        walk: Walk::Everywhere,
         encode_flags,
     };
     let scenes = scenes.judge(progress, |kind, seed, dir| {
         let layout = Layout::new(&[kind], seed, &|_, _| true);
-        let views = layout.photos(args.walk, args.n_views);
+        let views = layout.photos(Walk::Everywhere, args.n_views);
         let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
-        let truth = Truth::new(&layout, args.radius_m, cameras)?;
+        let truth = Truth::new(&layout, cameras)?;
         let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
         match args.from_photos {
-            true => road.add(&dir.join("scene"), &layout, &truth, &service, args.radius_m),
+            true => road.add(&dir.join("scene"), &layout, &truth, &service),
             false => judge(args, dir, &layout, &truth, &service, &mut places),
         }
     })?;
@@ -106,7 +100,7 @@ fn judge(
 ) -> Result<()> {
     report.voxels.add(compare_voxels(layout, &dir.join("store"))?);
     let labels = labels(&dir.join("scene"), &dir.join("store"))?;
-    let start = truth.start();
+    let start = truth.start;
     for (index, placed) in layout.placed.iter().enumerate().filter(|(_, placed)| !placed.shell) {
         let Some(label) = labels.get(index).filter(|label| label.n_pixels >= MIN_PIXELS) else { continue };
         let is_reachable = truth.is_reachable(index);
@@ -114,7 +108,7 @@ fn judge(
             None => Verdict::NoObject,
             Some(id) => {
                 let asked = Instant::now();
-                let reply = service.get(&goal_request(&format!("id={id}"), start, args.radius_m))?;
+                let reply = service.get(&goal_request(&format!("id={id}"), start))?;
                 report.millis.push(asked.elapsed().as_secs_f64() * 1e3);
                 verdict(truth, index, &reply)?
             }
@@ -124,7 +118,7 @@ fn judge(
             let id = label.object.as_deref().unwrap_or("no object");
             tracing::warn!("{}: {noun} {id} (reachable: {is_reachable}): {verdict:?}", dir.display());
         }
-        report.count(args.radius_m, is_reachable, &verdict);
+        report.count(is_reachable, &verdict);
     }
     Ok(())
 }
@@ -236,11 +230,11 @@ struct Places {
 }
 
 impl Places {
-    fn count(&mut self, radius_m: f64, is_reachable: bool, verdict: &Verdict) {
+    fn count(&mut self, is_reachable: bool, verdict: &Verdict) {
         if let Verdict::Pose { clearance_m, is_reached, height_error_m, .. } = verdict {
             self.n_poses += 1;
             self.n_cut_off += usize::from(!is_reached);
-            self.n_too_close += usize::from(*clearance_m < radius_m - TOLERANCE_M);
+            self.n_too_close += usize::from(*clearance_m < RADIUS_M - TOLERANCE_M);
             self.max_height_error_m = self.max_height_error_m.max(*height_error_m);
         }
         if !is_reachable {

@@ -39,7 +39,6 @@ impl Road {
         layout: &Layout,
         truth: &Truth<'_>,
         service: &Service,
-        radius_m: f64,
     ) -> Result<()> {
         let things = || (0..layout.placed.len()).filter(|at| !layout.placed[*at].shell);
         let noun = |at: usize| NOUNS[layout.placed[at].noun].name.as_str();
@@ -56,7 +55,7 @@ impl Road {
             for word in &reachable {
                 self.n_runs += 1;
                 let what = format!("text={}", word.replace(' ', "%20"));
-                let reply = service.get(&goal_request(&what, found.translation, radius_m))?;
+                let reply = service.get(&goal_request(&what, found.translation))?;
                 let Some(goal) = reply["goals"].get(0) else { continue };
                 let goal_in_scene: DVec3 = serde_json::from_value(goal["position_in_world"].clone())?;
                 let goal_in_odom = odom_from_scene_as_found.transform_point3(goal_in_scene);

@@ -10,6 +10,8 @@ use slag_math::distance_transform::squared_distances;
 use crate::generate::compose::{Layout, looking, pinhole};
 use crate::generate::render::Solids;
 
+/// Radius of the robot.
+pub(super) const RADIUS_M: f64 = 0.3;
 /// Largest horizontal distance to the thing.
 const REACH_M: f64 = 0.8;
 pub(super) const SENSOR_HEIGHT_M: f64 = 0.4;
@@ -29,9 +31,9 @@ const FIELD_OF_VIEW_RAD: f64 = 110.0 * PI / 180.0;
 const MIN_SHOWN_PX: u32 = 12;
 
 /// Returns the path that asks for places to stand near a thing, for a robot on the floor. `what`: `id=` or `text=`.
-pub(super) fn goal_request(what: &str, at: DVec3, radius_m: f64) -> String {
+pub(super) fn goal_request(what: &str, at: DVec3) -> String {
     format!(
-        "/v1/goal?{what}&near={},{},0&radius_m={radius_m}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
+        "/v1/goal?{what}&near={},{},0&radius_m={RADIUS_M}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
         at.x, at.y
     )
 }
@@ -44,16 +46,12 @@ pub(super) struct Truth<'a> {
     /// Distance of each cell to what the robot must not touch.
     squared: Vec<u32>,
     is_reached: Vec<bool>,
-    start: DVec3,
+    pub(super) start: DVec3,
 }
 
 impl<'a> Truth<'a> {
     /// Makes the true map of a robot that starts below the first camera with room for it.
-    pub(super) fn new(
-        layout: &'a Layout,
-        radius_m: f64,
-        cameras: impl Iterator<Item = DVec3>,
-    ) -> Result<Self> {
+    pub(super) fn new(layout: &'a Layout, cameras: impl Iterator<Item = DVec3>) -> Result<Self> {
         let shell = || layout.placed.iter().filter(|placed| placed.shell);
         let low = shell().fold(DVec2::INFINITY, |low, placed| low.min(placed.bounds.min.truncate()));
         let high = shell().fold(DVec2::NEG_INFINITY, |high, placed| high.max(placed.bounds.max.truncate()));
@@ -82,7 +80,7 @@ impl<'a> Truth<'a> {
             }
         }
         let squared = squared_distances(&is_obstacle, width);
-        let least = (radius_m / CELL_M).powi(2);
+        let least = (RADIUS_M / CELL_M).powi(2);
         let is_safe = |cell: usize| f64::from(squared[cell]) >= least;
         let mut starts = cameras.filter_map(|at| Some((cell_of(at).filter(|cell| is_safe(*cell))?, at)));
         let (first, at) =
@@ -100,10 +98,6 @@ impl<'a> Truth<'a> {
         }
         let start = at.with_z(0.0);
         Ok(Self { layout, solids: layout.solids(), origin, width, squared, is_reached, start })
-    }
-
-    pub(super) fn start(&self) -> DVec3 {
-        self.start
     }
 
     /// Returns the clearance of a place, and whether the robot reaches it.
@@ -141,7 +135,7 @@ impl<'a> Truth<'a> {
 
     /// Returns the share of a thing's outline that a sensor sees, of what it would see without the other things.
     pub(super) fn shown(&self, thing: usize, sensor: DVec3) -> f64 {
-        let towards = self.solids.things()[thing].centre() - sensor;
+        let towards = self.solids.things[thing].centre - sensor;
         let level = towards.with_z(0.0).length().max(0.05);
         // A camera that looks straight up has no right.
         let heading = towards.with_z(towards.z.clamp(-10.0 * level, 10.0 * level));

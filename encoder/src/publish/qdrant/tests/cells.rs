@@ -151,7 +151,7 @@ async fn foreign_cells_are_refused_before_anything_is_written() {
     assert_eq!(collection, NAMES[2]);
     assert_eq!(names(&server), [NAMES[2]]);
     let mut held = Held::new(vectors());
-    held.vectors().size += 1;
+    held.vectors.size += 1;
     server.with(|state| state.collections.insert(NAMES[2].into(), held));
     let refused = fixture.push(&cells(&url)).await.expect_err("other vectors");
     assert!(matches!(refused, PushError::Collection { .. }), "{refused}");

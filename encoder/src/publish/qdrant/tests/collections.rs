@@ -11,66 +11,6 @@ fn done() -> Response<CollectionOperationResponse> {
     Response::new(CollectionOperationResponse { result: true, ..Default::default() })
 }
 
-/// Copies the fields that a difference has.
-macro_rules! merge {
-    ($into:expr, $from:expr, $($field:ident)*) => {
-        $(if $from.$field.is_some() {
-            $into.$field = $from.$field;
-        })*
-    };
-}
-
-fn merge_hnsw(into: &mut Option<HnswConfigDiff>, from: Option<HnswConfigDiff>) {
-    let Some(from) = from else { return };
-    #[expect(deprecated, reason = "older servers know no other field")]
-    {
-        let into = into.get_or_insert_default();
-        merge!(into, from, m ef_construct on_disk);
-    }
-}
-
-fn merge_quantization(into: &mut Option<QuantizationConfig>, from: Option<QuantizationConfigDiff>) {
-    use quantization_config::Quantization;
-    use quantization_config_diff::Quantization as Diff;
-    let quantization = match from.and_then(|from| from.quantization) {
-        None => return,
-        Some(Diff::Disabled(_)) => {
-            *into = None;
-            return;
-        }
-        Some(Diff::Scalar(scalar)) => Quantization::Scalar(scalar),
-        Some(Diff::Product(product)) => Quantization::Product(product),
-        Some(Diff::Binary(binary)) => Quantization::Binary(binary),
-        Some(Diff::Turboquant(turbo)) => Quantization::Turboquant(turbo),
-    };
-    *into = Some(QuantizationConfig { quantization: Some(quantization) });
-}
-
-/// Changes a collection as the comments of the client's messages say.
-fn update(held: &mut Held, request: UpdateCollection) -> Result<(), Status> {
-    merge_hnsw(&mut held.config.hnsw_config, request.hnsw_config);
-    merge_quantization(&mut held.config.quantization_config, request.quantization_config);
-    match request.vectors_config.map(|vectors| vectors.config) {
-        None => {}
-        Some(Some(vectors_config_diff::Config::Params(diff))) => {
-            let vectors = held.vectors();
-            #[expect(deprecated, reason = "older servers know no other field")]
-            {
-                merge!(vectors, diff, on_disk);
-            }
-        }
-        Some(_) => return Err(Status::unimplemented("only one unnamed vector")),
-    }
-    if let Some(diff) = request.params {
-        let params = held.config.params.get_or_insert_default();
-        #[expect(deprecated, reason = "older servers know no other field")]
-        if let Some(on_disk) = diff.on_disk_payload {
-            params.on_disk_payload = on_disk;
-        }
-    }
-    Ok(())
-}
-
 service!(Collections {
     async fn collection_exists(&self, request: Request<CollectionExistsRequest>) -> Result<Response<CollectionExistsResponse>, Status> {
         let name = self.admit(request)?.collection_name;
@@ -86,14 +26,7 @@ service!(Collections {
             let Some(vectors_config::Config::Params(vectors)) = config else {
                 return Err(Status::unimplemented("only one unnamed vector"));
             };
-            let mut held = Held::new(vectors);
-            held.config.hnsw_config = request.hnsw_config;
-            held.config.quantization_config = request.quantization_config;
-            #[expect(deprecated, reason = "older servers know no other field")]
-            if let (Some(params), Some(on_disk)) = (&mut held.config.params, request.on_disk_payload) {
-                params.on_disk_payload = on_disk;
-            }
-            match state.collections.insert(request.collection_name, held) {
+            match state.collections.insert(request.collection_name, Held::new(vectors)) {
                 None => Ok(done()),
                 Some(_) => Err(Status::already_exists("exists")),
             }
@@ -102,7 +35,10 @@ service!(Collections {
 
     async fn get(&self, request: Request<GetCollectionInfoRequest>) -> Result<Response<GetCollectionInfoResponse>, Status> {
         let name = self.admit(request)?.collection_name;
-        let Held { config, indexed, .. } = self.with(|state| state.held(&name).cloned())?;
+        let Held { vectors, indexed, .. } = self.with(|state| state.held(&name).cloned())?;
+        let vectors_config = Some(VectorsConfig { config: Some(vectors_config::Config::Params(vectors)) });
+        let params = Some(CollectionParams { vectors_config, ..Default::default() });
+        let config = CollectionConfig { params, ..Default::default() };
         let payload_schema = indexed.into_iter().map(|field| (field, PayloadSchemaInfo::default())).collect();
         let result = Some(CollectionInfo { config: Some(config), payload_schema, ..Default::default() });
         Ok(Response::new(GetCollectionInfoResponse { result, ..Default::default() }))
@@ -118,8 +54,8 @@ service!(Collections {
     async fn update(&self, request: Request<UpdateCollection>) -> Result<Response<CollectionOperationResponse>, Status> {
         let request = self.admit(request)?;
         self.with(|state| {
-            state.updated.push(request.clone());
-            update(state.held(&request.collection_name)?, request)?;
+            state.held(&request.collection_name)?;
+            state.updated.push(request);
             Ok(done())
         })
     }

@@ -10,10 +10,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use half::f16;
-use qdrant_client::Qdrant;
-use qdrant_client::qdrant::{
-    Distance, SearchPointsBuilder, VectorParamsBuilder, point_id::PointIdOptions, value::Kind,
-};
+use qdrant_client::qdrant::{Distance, VectorParamsBuilder, value::Kind};
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::ShardRecord;
 use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
@@ -207,7 +204,7 @@ fn options(url: &str) -> PushOptions {
 }
 
 #[tokio::test]
-async fn every_point_arrives_and_search_equals_brute_force() {
+async fn every_point_arrives() {
     let fixture = fixture();
     let (server, url) = Server::start(Some("k3y")).await;
     let options = PushOptions { api_key: Some("k3y".into()), ..options(&url) };
@@ -229,30 +226,6 @@ async fn every_point_arrives_and_search_equals_brute_force() {
         server.with(|state| state.collections["yard"].indexed.clone()),
         ["scene", "generation", "location"]
     );
-
-    let client = Qdrant::from_url(&url).api_key("k3y").skip_compatibility_check().build().expect("a client");
-    let mut random = Random::new(99);
-    for _ in 0..5 {
-        let query: Vec<f32> = (0..DIM).map(|_| random.signed()).collect();
-        let search = SearchPointsBuilder::new("yard", query.clone(), 12);
-        let found = client.search_points(search).await.expect("answers").result;
-        // Oracle: cosines in float64 of the embeddings that the shards were written from.
-        let norm = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
-        let query: Vec<f64> = query.iter().copied().map(f64::from).collect();
-        let mut scores: Vec<(f64, u64)> = Vec::new();
-        for (id, (_, embedding, _)) in &fixture.truth {
-            let embedding: Vec<f64> = embedding.iter().map(|v| v.to_f64()).collect();
-            let dot: f64 = embedding.iter().zip(&query).map(|(a, b)| a * b).sum();
-            scores.push((dot / (norm(&embedding) * norm(&query)), *id));
-        }
-        scores.sort_by(|a, b| b.0.total_cmp(&a.0));
-        assert_eq!(found.len(), 12);
-        for (point, (score, id)) in found.iter().zip(scores) {
-            let found_id = point.id.as_ref().and_then(|id| id.point_id_options.clone());
-            assert_eq!(found_id, Some(PointIdOptions::Num(id)));
-            assert!((f64::from(point.score) - score).abs() < 1e-6);
-        }
-    }
 }
 
 /// The client repeats a request once by itself, so three failures in a row need a repetition of ours.

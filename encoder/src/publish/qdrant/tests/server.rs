@@ -1,4 +1,4 @@
-//! A small Qdrant: the generated gRPC services over points in memory, with exact cosine search.
+//! A small Qdrant: the generated gRPC services over points in memory.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex};
@@ -22,8 +22,7 @@ pub(super) struct Stored {
 
 #[derive(Clone, Default)]
 pub(super) struct Held {
-    /// As created and updated.
-    pub(super) config: CollectionConfig,
+    pub(super) vectors: VectorParams,
     pub(super) indexed: Vec<String>,
     pub(super) points: BTreeMap<u64, Stored>,
     pub(super) snapshots: Vec<SnapshotDescription>,
@@ -31,17 +30,7 @@ pub(super) struct Held {
 
 impl Held {
     pub(super) fn new(vectors: VectorParams) -> Self {
-        let vectors_config = Some(VectorsConfig { config: Some(vectors_config::Config::Params(vectors)) });
-        let params = Some(CollectionParams { vectors_config, ..Default::default() });
-        Self { config: CollectionConfig { params, ..Default::default() }, ..Self::default() }
-    }
-
-    pub(super) fn vectors(&mut self) -> &mut VectorParams {
-        let config = self.config.params.as_mut().and_then(|params| params.vectors_config.as_mut());
-        match config.and_then(|config| config.config.as_mut()) {
-            Some(vectors_config::Config::Params(vectors)) => vectors,
-            other => panic!("no unnamed vectors: {other:?}"),
-        }
+        Self { vectors, ..Self::default() }
     }
 }
 
@@ -113,7 +102,7 @@ impl Server {
         let mut state = self.state.lock().expect("no test panics within");
         let points: Vec<(u64, Stored)> = request.points.into_iter().map(stored).collect::<Result<_, _>>()?;
         let first = points.first().ok_or_else(|| Status::invalid_argument("no points"))?.0;
-        let dim = state.held(&request.collection_name)?.vectors().size;
+        let dim = state.held(&request.collection_name)?.vectors.size;
         if points.iter().any(|(_, point)| point.vector.len() as u64 != dim) {
             return Err(Status::invalid_argument("wrong dimension"));
         }
@@ -183,11 +172,6 @@ fn passes(payload: &HashMap<String, Value>, filter: &Filter) -> Result<bool, Sta
     Ok(true)
 }
 
-fn cosine(a: &[f32], b: &[f32]) -> f64 {
-    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum::<f64>();
-    dot(a, b) / (dot(a, a) * dot(b, b)).sqrt()
-}
-
 /// Implements a service by the functions given and refuses the others.
 macro_rules! service {
     ($service:ident { $($given:item)* } refused { $($name:ident: $request:ty => $response:ty;)* }) => {
@@ -252,24 +236,9 @@ service!(Points {
             Ok(self.done())
         })
     }
-
-    async fn search(&self, request: Request<SearchPoints>) -> Result<Response<SearchResponse>, Status> {
-        let request = self.admit(request)?;
-        self.with(|state| {
-            let score = |(id, point): (&u64, &Stored)| ScoredPoint {
-                id: Some((*id).into()),
-                score: cosine(&point.vector, &request.vector) as f32,
-                payload: point.payload.clone(),
-                ..Default::default()
-            };
-            let mut result: Vec<ScoredPoint> = state.held(&request.collection_name)?.points.iter().map(score).collect();
-            result.sort_by(|a, b| b.score.total_cmp(&a.score));
-            result.truncate(request.limit as usize);
-            Ok(Response::new(SearchResponse { result, ..Default::default() }))
-        })
-    }
 } refused {
     get: GetPoints => GetResponse;
+    search: SearchPoints => SearchResponse;
     update_vectors: UpdatePointVectors => PointsOperationResponse;
     delete_vectors: DeletePointVectors => PointsOperationResponse;
     set_payload: SetPayloadPoints => PointsOperationResponse;

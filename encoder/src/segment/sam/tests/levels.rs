@@ -38,5 +38,5 @@ fn kept_levels(settings: SamSettings) -> Vec<(u8, u32)> {
     let upsampler = Upsampler::new(&letterbox, decoded.logits_px);
     let lists = filters.lists(filters.candidates(&decoded, &upsampler, crop));
     let kept = lists.into_iter().flat_map(|list| filters.unique_in_image(filters.unique_in_crop(list), 1));
-    kept.map(|candidate| (candidate.level, candidate.mask.area_px())).collect()
+    kept.map(|candidate| (candidate.level, candidate.mask.area_px)).collect()
 }
