@@ -73,10 +73,7 @@ fn an_old_state_is_refused_even_if_the_new_one_never_arrived() {
     let trial = Trial::new(of(2, &[FIRST], 2));
     assert!(matches!(trial.refuses(of(1, &[FIRST], 1)), TufError::Rollback { seen: 2, offered: 1, .. }));
     trial.server.publish(of(7, &[FIRST], 7));
-    trial.server.faults(|seen| match seen.path.contains("objects") {
-        true => Fault::Status(404),
-        false => Fault::None,
-    });
+    trial.server.fault_at("objects", Fault::Status(404));
     assert!(matches!(trial.robot.fetch(), Err(FetchError::Download { .. })));
     trial.server.faults(|_| Fault::None);
     assert!(matches!(trial.refuses(of(6, &[FIRST], 6)), TufError::Rollback { seen: 7, offered: 6, .. }));
@@ -95,11 +92,7 @@ fn files_of_different_states_are_not_mixed() {
         assert!(matches!(error, TufError::Content { .. }), "{name}: {error}");
     }
     trial.server.publish(new.clone());
-    let instead = other.listed.clone();
-    trial.server.faults(move |seen| match seen.path.contains("/targets/") {
-        true => Fault::Instead(instead.clone()),
-        false => Fault::None,
-    });
+    trial.server.fault_at("/targets/", Fault::Instead(other.listed));
     assert!(matches!(trial.robot.fetch(), Err(FetchError::Tuf(TufError::Content { .. }))));
     trial.server.faults(|_| Fault::None);
     trial.accepts(new);

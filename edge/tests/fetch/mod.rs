@@ -94,6 +94,13 @@ impl Robot {
         Self::new(EdgeCache::with_files(dir.join("cache"), files), from)
     }
 
+    /// Moves it to a place, with room for the cells of a scene that are needed there.
+    fn go(&mut self, x: f64, radius: f64, scene: &Published, cell_ids: std::ops::Range<u32>) {
+        self.request.at = Some(at(x));
+        self.request.radius = radius;
+        self.request.max_bytes = Some(scene.bytes(cell_ids));
+    }
+
     fn fetch(&self) -> Result<FetchReport, FetchError> {
         self.fetch_watched(&(), &AtomicBool::new(false))
     }
