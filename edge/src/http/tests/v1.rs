@@ -1,6 +1,6 @@
 //! Version 1 of the API: one shape of reply, areas, pages, relations, the things on board, events.
 
-use axum::body::Bytes;
+use futures_util::StreamExt;
 use slag_common::manifest::Calibration;
 use slag_common::occupancy::BuiltOccupancy;
 
@@ -384,13 +384,8 @@ async fn events_tell_of_generations_until_the_service_stops() {
     let service = Service::new(Some(&room()), settings);
     let response = soon(service.send("GET", "/v1/events")).await;
     assert_eq!(response.headers()["content-type"], "text/event-stream");
-    let mut body = response.into_body();
-    let mut next = async || -> Option<Bytes> {
-        let frame = std::future::poll_fn(|context| {
-            hyper::body::Body::poll_frame(std::pin::Pin::new(&mut body), context)
-        });
-        soon(frame).await.map(|frame| frame.expect("no error").into_data().expect("data"))
-    };
+    let mut events = response.into_body().into_data_stream();
+    let mut next = async || soon(events.next()).await.map(|event| event.expect("no error"));
     let first = next().await.expect("an event");
     let text = String::from_utf8_lossy(&first);
     assert!(text.starts_with("event: generation\ndata: {") && text.contains("\"generation\":1"), "{text}");
