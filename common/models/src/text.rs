@@ -210,7 +210,7 @@ impl TextEncoder for OnnxTextEncoder {
     }
 
     fn placement(&self) -> Option<&Placement> {
-        Some(self.model.placement())
+        Some(&self.model.placement)
     }
 }
 

@@ -117,7 +117,8 @@ pub struct ListenError {
 #[derive(Debug)]
 pub struct Listener {
     socket: Socket,
-    tls: Option<Tls>,
+    /// Makes TLS connections out of the accepted ones.
+    pub(crate) tls: Option<Tls>,
 }
 
 #[derive(Debug)]
@@ -172,11 +173,6 @@ impl Listener {
     pub fn with_tls(mut self, tls: Option<Tls>) -> Self {
         self.tls = tls;
         self
-    }
-
-    /// Returns what makes TLS connections out of the accepted ones.
-    pub(crate) fn tls(&self) -> Option<Tls> {
-        self.tls.clone()
     }
 
     /// Returns the address to connect to: `http://IP:PORT`, with TLS `https://IP:PORT`, or `unix:PATH`.

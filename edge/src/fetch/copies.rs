@@ -5,7 +5,7 @@
 //! are the same.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use slag_common::{Hash32, tuf};
 
@@ -46,17 +46,13 @@ enum Copy {
 /// The two copies, in a folder of their own.
 #[derive(Clone, Debug)]
 pub struct Copies {
-    dir: PathBuf,
+    pub dir: PathBuf,
 }
 
 impl Copies {
     /// Names the copies, without reading or creating anything.
     pub fn new(dir: PathBuf) -> Self {
         Self { dir }
-    }
-
-    pub fn dir(&self) -> &Path {
-        &self.dir
     }
 
     pub fn paths(&self) -> [PathBuf; 2] {
