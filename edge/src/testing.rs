@@ -223,10 +223,6 @@ impl Axes {
 }
 
 impl TextEncoder for Axes {
-    fn name(&self) -> &str {
-        "axes"
-    }
-
     fn dim(&self) -> usize {
         self.dim
     }

@@ -218,7 +218,7 @@ impl ModelDir {
             }
             TextDescription::Phrases(text) => {
                 let (phrases, vectors) = (files.on_disk(&text.file)?, files.on_disk(&text.vectors)?);
-                Box::new(PhraseEncoder::open(name, dim, &phrases, (&vectors, &text.tensor), centre)?)
+                Box::new(PhraseEncoder::open(dim, &phrases, (&vectors, &text.tensor), centre)?)
             }
         })
     }

@@ -174,10 +174,6 @@ impl OnnxTextEncoder {
 }
 
 impl TextEncoder for OnnxTextEncoder {
-    fn name(&self) -> &str {
-        &self.name
-    }
-
     fn dim(&self) -> usize {
         self.dim
     }

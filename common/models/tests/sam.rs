@@ -81,25 +81,6 @@ fn masks_and_scores_equal_the_recorded_ones() {
 
 #[needs_shared]
 #[test]
-fn a_batch_of_prompts_gives_what_each_gives_alone() {
-    let (golden, sam) = open();
-    let embedding = recorded_embedding(&golden, &sam);
-    let points: Vec<[f32; 2]> = (0..5).map(|i| [100.0 + 170.0 * i as f32, 620.0 - 90.0 * i as f32]).collect();
-    let together = sam.decode(&embedding, 5, &points, &[1; 5]).expect("it runs");
-    for (k, point) in points.iter().enumerate() {
-        let alone = sam.decode(&embedding, 1, &[*point], &[1]).expect("it runs");
-        let n = alone.logits.len();
-        let logits = &together.logits[k * n..(k + 1) * n];
-        let difference = max_difference(logits, 256, 1, &alone.logits);
-        assert!(difference < 1e-5, "prompt {k}: {difference}");
-        assert!(
-            max_difference(&together.predicted_ious[3 * k..3 * k + 3], 3, 1, &alone.predicted_ious) < 1e-5
-        );
-    }
-}
-
-#[needs_shared]
-#[test]
 fn wrong_descriptions_and_files_are_named() {
     let (models, options) = (shared("models"), options());
     let description =

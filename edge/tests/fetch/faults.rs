@@ -41,10 +41,6 @@ fn n_trials() -> u64 {
 struct FirstAxis;
 
 impl TextEncoder for FirstAxis {
-    fn name(&self) -> &str {
-        "e"
-    }
-
     fn dim(&self) -> usize {
         DIM as usize
     }
