@@ -109,7 +109,7 @@ pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
 }
 
 pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
-    let failed = Failure::of("models");
+    let failed = |error| Failure::Failed("models", error);
     let models = model_commands::open(args.models.as_deref(), &variable);
     let options = session_options(&args.how).map_err(|e| failed(e.into()))?;
     Ok((models.map_err(|e| failed(e.into()))?, options))

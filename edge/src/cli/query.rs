@@ -98,7 +98,10 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
     if let Some(path) = &args.ply {
         write_ply(&reply, path)?;
     }
-    if args.json { write_json(reply) } else { print_reply(&reply) }
+    match args.json {
+        true => write_json(reply),
+        false => reply.answers().try_for_each(|answers| print_answers(&reply, answers)),
+    }
 }
 
 fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
@@ -118,11 +121,7 @@ fn write_json(reply: Reply) -> Result<(), Failure> {
     Ok(writeln!(out)?)
 }
 
-/// Prints a reply's answers as tables, and notes about them on stderr.
-fn print_reply(reply: &Reply) -> Result<(), Failure> {
-    reply.answers().try_for_each(|answers| print_answers(reply, answers))
-}
-
+/// Prints answers as a table, and notes about them on stderr.
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     for (word, asked) in &answers.asked_as {
         note(format_args!("{word}: asked as {asked}"));
