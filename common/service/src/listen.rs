@@ -259,18 +259,17 @@ mod tests {
     #[cfg(unix)]
     #[tokio::test]
     async fn a_dead_socket_is_replaced_and_a_living_one_is_not() {
-        let dir = std::env::temp_dir().join(format!("slag-listen-{}", std::process::id()));
-        std::fs::create_dir_all(&dir).expect("a folder");
-        let listen = Listen::Unix(dir.join("s"));
-        drop(std::os::unix::net::UnixListener::bind(dir.join("s")).expect("binds"));
+        let dir = tempfile::tempdir().expect("a folder");
+        let socket = dir.path().join("s");
+        let listen = Listen::Unix(socket.clone());
+        drop(std::os::unix::net::UnixListener::bind(&socket).expect("binds"));
         let living = bind(&listen).await.expect("replaces what nobody listens on");
         let refused = bind(&listen).await.expect_err("in use").to_string();
         assert!(refused.contains("/s") && refused.contains("choose another"), "{refused}");
         drop(living);
-        assert!(!dir.join("s").exists());
-        std::fs::write(dir.join("s"), b"a file of somebody").expect("writes");
+        assert!(!socket.exists());
+        std::fs::write(&socket, b"a file of somebody").expect("writes");
         bind(&listen).await.expect_err("not a socket");
-        assert!(dir.join("s").exists());
-        std::fs::remove_dir_all(dir).expect("removed");
+        assert!(socket.exists());
     }
 }

@@ -90,11 +90,6 @@ fn located(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer,
         error => Failure::Failed("photo", anyhow::anyhow!("{}: {error}", photo.display())),
     };
     let bytes = files::read_short(photo, MAX_PHOTO_BYTES as u64)?;
-    if bytes.len() > MAX_PHOTO_BYTES {
-        let error =
-            anyhow::anyhow!("{}: longer than {MAX_PHOTO_BYTES} bytes; make it smaller", photo.display());
-        return Err(Failure::Failed("photo", error));
-    }
     PhotoFile::open(&bytes)
         .and_then(|opened| answer(snapshot, opened, camera, &Budget::default()))
         .map_err(of_photo)
