@@ -7,7 +7,6 @@ use fs_err::File;
 
 /// Opens a file to read. A pipe is refused: it keeps its reader waiting until somebody writes, perhaps for ever.
 pub fn open(path: &Path) -> io::Result<File> {
-    #[cfg(unix)]
     if std::os::unix::fs::FileTypeExt::is_fifo(&fs_err::metadata(path)?.file_type()) {
         let text = format!("{} is a pipe; write what comes out of it into a file", path.display());
         return Err(io::Error::new(io::ErrorKind::InvalidInput, text));
@@ -60,7 +59,7 @@ pub fn stand_in(start: &[u8]) -> Option<(&'static str, &'static str)> {
     }
 }
 
-#[cfg(all(test, unix))]
+#[cfg(test)]
 mod tests {
     use super::*;
 

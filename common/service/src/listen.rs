@@ -7,9 +7,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::TcpListener;
-#[cfg(unix)]
-use tokio::net::UnixListener;
+use tokio::net::{TcpListener, UnixListener};
 
 use crate::tls::{Tls, TlsError, TlsFiles};
 
@@ -21,7 +19,6 @@ const UNIX: &str = "unix:";
 /// does not return while the service is silent.
 pub async fn answers(url: &str) -> bool {
     let asked = match (url.strip_prefix(UNIX), url.split_once("://")) {
-        #[cfg(unix)]
         (Some(path), _) => match tokio::net::UnixStream::connect(path).await {
             Ok(stream) => ask_for_health(stream).await,
             Err(error) => Err(error),
@@ -89,7 +86,6 @@ impl FromStr for Listen {
     fn from_str(text: &str) -> Result<Self, String> {
         match text.strip_prefix(UNIX) {
             Some("") => Err("a path after unix:".to_owned()),
-            Some(_) if cfg!(not(unix)) => Err("IP:PORT; this system has no Unix sockets".to_owned()),
             Some(path) => Ok(Self::Unix(path.into())),
             None => text.parse().map(Self::Tcp).map_err(|_| "IP:PORT or unix:PATH".to_owned()),
         }
@@ -124,7 +120,6 @@ pub struct Listener {
 #[derive(Debug)]
 enum Socket {
     Tcp(TcpListener),
-    #[cfg(unix)]
     Unix(UnixListener, PathBuf),
 }
 
@@ -150,7 +145,6 @@ pub async fn bind(listen: &Listen) -> Result<Listener, ListenError> {
     Ok(Listener { socket, tls: None })
 }
 
-#[cfg(unix)]
 async fn bind_unix(path: &std::path::Path) -> io::Result<Socket> {
     use std::os::unix::fs::{FileTypeExt, PermissionsExt};
 
@@ -161,11 +155,6 @@ async fn bind_unix(path: &std::path::Path) -> io::Result<Socket> {
     let socket = UnixListener::bind(path)?;
     std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o660))?;
     Ok(Socket::Unix(socket, path.to_owned()))
-}
-
-#[cfg(not(unix))]
-async fn bind_unix(_: &std::path::Path) -> io::Result<Socket> {
-    Err(io::ErrorKind::Unsupported.into())
 }
 
 impl Listener {
@@ -182,7 +171,6 @@ impl Listener {
                 let scheme = if self.tls.is_some() { "https" } else { "http" };
                 Ok(format!("{scheme}://{}", socket.local_addr()?))
             }
-            #[cfg(unix)]
             Socket::Unix(_, path) => Ok(format!("{UNIX}{}", path.display())),
         }
     }
@@ -198,14 +186,12 @@ impl Listener {
                 }
                 Ok((Box::new(stream), Some(peer.ip())))
             }
-            #[cfg(unix)]
             Socket::Unix(socket, _) => Ok((Box::new(socket.accept().await?.0), None)),
         }
     }
 }
 
 /// The path of a Unix socket outlives the socket unless it is removed.
-#[cfg(unix)]
 impl Drop for Listener {
     fn drop(&mut self) {
         if let Socket::Unix(_, path) = &self.socket
@@ -256,7 +242,6 @@ mod tests {
         assert!(!answers(&url).await, "nobody listens");
     }
 
-    #[cfg(unix)]
     #[tokio::test]
     async fn a_dead_socket_is_replaced_and_a_living_one_is_not() {
         let dir = tempfile::tempdir().expect("a folder");

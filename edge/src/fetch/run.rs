@@ -307,7 +307,7 @@ impl Switched<'_> {
 
 /// Refuses a download for which there is no space, before it begins. `other_bytes`: what is written besides.
 fn check_space(cache: &EdgeCache, download: &[Object], other_bytes: u64) -> Result<(), FetchError> {
-    let Some(free_bytes) = cache.files().free_bytes(cache.dir())? else { return Ok(()) };
+    let free_bytes = cache.files().free_bytes(cache.dir())?;
     let missing_bytes = |Object { hash, len_bytes }: &Object| {
         let staged = cache.files().stat(&part_path(cache, *hash)).ok().flatten();
         len_bytes.saturating_sub(staged.map_or(0, |stat| stat.len_bytes))

@@ -105,7 +105,6 @@ async fn bodies_are_whole_json_and_short() {
     }
 }
 
-#[cfg(unix)]
 #[tokio::test]
 async fn unix_sockets_are_served() {
     let dir = tempfile::tempdir().expect("a folder");
