@@ -9,6 +9,7 @@ use std::path::PathBuf;
 
 use slag_common::{Hash32, tuf};
 
+use super::staging::put_through;
 use crate::store::files::{Files, is_bad_medium};
 
 /// A longer copy is damaged. It holds the longest metadata that a client keeps, with its quotes escaped.
@@ -137,11 +138,7 @@ impl Copies {
 
     fn write_one(&self, files: &dyn Files, index: usize, sequence: u64, content: &[u8]) -> io::Result<()> {
         // Renamed into place, so that a power cut leaves no half of the first copy ever written.
-        let aside = self.dir.join("new");
-        files.write_from(&aside, 0, &copy_of(sequence, content))?;
-        files.sync(&aside)?;
-        files.rename(&aside, &self.path(index))?;
-        files.sync_dir(&self.dir)
+        put_through(files, &self.dir.join("new"), &copy_of(sequence, content), &self.path(index))
     }
 }
 

@@ -6,11 +6,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
+use slag_common::manifest::ObjectRecord;
 
 use super::error::FetchError;
-use super::plan::{Held, Object};
+use super::plan::Held;
 use crate::store::EdgeCache;
-use crate::store::files::is_bad_medium;
+use crate::store::files::{Files, is_bad_medium};
 
 pub fn staging(cache: &EdgeCache) -> PathBuf {
     cache.dir().join("staging")
@@ -32,7 +33,7 @@ pub fn remove(cache: &EdgeCache, path: &Path) -> io::Result<()> {
 }
 
 /// Empties `staging/` except for partial downloads still wanted.
-pub fn clear_staging(cache: &EdgeCache, wanted: &[Object]) -> Result<(), FetchError> {
+pub fn clear_staging(cache: &EdgeCache, wanted: &[ObjectRecord]) -> Result<(), FetchError> {
     let wanted: BTreeSet<PathBuf> = wanted.iter().map(|object| part_path(cache, object.hash)).collect();
     for name in cache.files().list(&staging(cache))? {
         let path = staging(cache).join(name);
@@ -55,12 +56,15 @@ pub fn clear_manifests(cache: &EdgeCache, needed: &BTreeSet<Hash32>) -> Result<(
 
 /// Replaces a small file durably: its path always holds the old or the new content, whole.
 pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchError> {
-    let files = cache.files();
-    let aside = staging(cache).join("put");
-    files.write_from(&aside, 0, bytes)?;
-    files.sync(&aside)?;
-    files.rename(&aside, path)?;
-    Ok(files.sync_dir(path.parent().unwrap_or(cache.dir()))?)
+    Ok(put_through(cache.files(), &staging(cache).join("put"), bytes, path)?)
+}
+
+/// The same, by way of a file aside.
+pub fn put_through(files: &dyn Files, aside: &Path, bytes: &[u8], path: &Path) -> io::Result<()> {
+    files.write_from(aside, 0, bytes)?;
+    files.sync(aside)?;
+    files.rename(aside, path)?;
+    path.parent().map_or(Ok(()), |dir| files.sync_dir(dir))
 }
 
 /// A longer file is damaged; a shard takes about 80 bytes.

@@ -23,6 +23,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use slag_common::Hash32;
+use slag_common::retry::Backoff;
 use slag_edge::fetch::{
     AddedRoot, Environment, FetchError, FetchReport, FetchRequest, FirstRoot, NetworkLimits, Position,
     Progress, add_root, fetch,
@@ -47,8 +48,7 @@ impl Robot {
     fn new(cache: EdgeCache, from: &str) -> Self {
         let limits = NetworkLimits {
             attempts: 3,
-            first_backoff: Duration::from_millis(1),
-            longest_backoff: Duration::from_millis(4),
+            backoff: Backoff { first: Duration::from_millis(1), longest: Duration::from_millis(4) },
             read_timeout: Duration::from_secs(5),
             chunk_bytes: 512,
             progress_bytes: 512,
