@@ -11,7 +11,6 @@ use anyhow::{Context, Result};
 use serde_json::json;
 
 pub use args::Args;
-use file::File;
 use messages::Stamp;
 
 /// Asks a robot and writes its answers; returns the number of messages. A robot that refuses leaves no file.
@@ -48,10 +47,6 @@ pub fn record(args: &Args) -> Result<usize> {
         let ground = ground.context("the robot's ground has other cells than it says")?;
         messages.push(("/slag/ground".to_owned(), file::GROUND, ground));
     }
-    let mut file = File::create(&args.out, time_ns)?;
-    for (topic, schema, message) in &messages {
-        file.write(topic, *schema, message)?;
-    }
-    file.finish().with_context(|| args.out.display().to_string())?;
+    file::write(&args.out, time_ns, &messages)?;
     Ok(messages.len())
 }

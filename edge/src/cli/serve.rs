@@ -249,7 +249,7 @@ mod tests {
 const PULSES_PER_TIMEOUT: u32 = 3;
 
 fn tell(news: NotifyState<'_>) {
-    if let Err(error) = sd_notify::notify(&[news]) {
+    if let Err(error) = sd_notify::notify(std::slice::from_ref(&news)) {
         tracing::warn!("systemd was not told {news:?}: {error}");
     }
 }
