@@ -9,8 +9,7 @@ use std::path::PathBuf;
 
 use slag_common::{Hash32, tuf};
 
-use super::staging::put_through;
-use crate::store::files::{Files, is_bad_medium};
+use crate::store::files::{Files, is_bad_medium, put_through};
 
 /// A longer copy is damaged. It holds the longest metadata that a client keeps, with its quotes escaped.
 pub const MAX_COPY_BYTES: u64 =

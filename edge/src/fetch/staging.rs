@@ -11,7 +11,7 @@ use slag_common::manifest::ObjectRecord;
 use super::error::FetchError;
 use super::plan::Held;
 use crate::store::EdgeCache;
-use crate::store::files::{Files, is_bad_medium};
+use crate::store::files::{is_bad_medium, put_through};
 
 pub fn staging(cache: &EdgeCache) -> PathBuf {
     cache.dir().join("staging")
@@ -57,14 +57,6 @@ pub fn clear_manifests(cache: &EdgeCache, needed: &BTreeSet<Hash32>) -> Result<(
 /// Replaces a small file durably: its path always holds the old or the new content, whole.
 pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchError> {
     Ok(put_through(cache.files(), &staging(cache).join("put"), bytes, path)?)
-}
-
-/// The same, by way of a file aside.
-pub fn put_through(files: &dyn Files, aside: &Path, bytes: &[u8], path: &Path) -> io::Result<()> {
-    files.write_from(aside, 0, bytes)?;
-    files.sync(aside)?;
-    files.rename(aside, path)?;
-    path.parent().map_or(Ok(()), |dir| files.sync_dir(dir))
 }
 
 /// A longer file is damaged; a shard takes about 80 bytes.

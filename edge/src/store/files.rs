@@ -79,6 +79,14 @@ pub trait Files: Send + Sync {
     fn free_bytes(&self, dir: &Path) -> io::Result<u64>;
 }
 
+/// Replaces a small file durably by way of one aside: its path always holds the old or the new content, whole.
+pub fn put_through(files: &dyn Files, aside: &Path, bytes: &[u8], path: &Path) -> io::Result<()> {
+    files.write_from(aside, 0, bytes)?;
+    files.sync(aside)?;
+    files.rename(aside, path)?;
+    path.parent().map_or(Ok(()), |dir| files.sync_dir(dir))
+}
+
 #[derive(Clone, Copy, Debug, Default)]
 pub struct DiskFiles;
 
