@@ -223,28 +223,6 @@ fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
     Ok(access)
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_cache_that_others_may_write_is_warned_of() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let cache = EdgeCache::open(dir.path());
-        let shards = dir.path().join("shards");
-        fs_err::create_dir(&shards).expect("made");
-        let with_mode = |path: &PathBuf, mode: u32| {
-            fs_err::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
-            open_to_everybody(&cache)
-        };
-        assert_eq!(with_mode(&shards, 0o775), None);
-        assert_eq!(with_mode(&shards, 0o777), Some(shards.clone()));
-        assert_eq!(with_mode(&shards, 0o755), None);
-        let root = dir.path().to_owned();
-        assert_eq!(with_mode(&root, 0o1777), Some(root.join("")));
-    }
-}
-
 /// Pulses in the time after which systemd takes a silent service for dead; it advises two.
 const PULSES_PER_TIMEOUT: u32 = 3;
 
@@ -268,5 +246,27 @@ async fn pulse<A: Future<Output = bool>>(is_alive: impl Fn() -> A) {
             _ => tracing::error!("the service does not answer itself; its supervisor may end it"),
         }
         tokio::time::sleep(pulse).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cache_that_others_may_write_is_warned_of() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let cache = EdgeCache::open(dir.path());
+        let shards = dir.path().join("shards");
+        fs_err::create_dir(&shards).expect("made");
+        let with_mode = |path: &PathBuf, mode: u32| {
+            fs_err::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
+            open_to_everybody(&cache)
+        };
+        assert_eq!(with_mode(&shards, 0o775), None);
+        assert_eq!(with_mode(&shards, 0o777), Some(shards.clone()));
+        assert_eq!(with_mode(&shards, 0o755), None);
+        let root = dir.path().to_owned();
+        assert_eq!(with_mode(&root, 0o1777), Some(root.join("")));
     }
 }
