@@ -11,6 +11,8 @@ use crate::text::TextService;
 use anyhow::anyhow;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
+use serde::de::DeserializeOwned;
+use serde::de::value::{Error, StrDeserializer};
 use slag_common::byte_size::{ByteSize, ByteSizeError};
 use slag_common::shard::Profile;
 use slag_models::commands::{self as model_commands, MODELS_HELP, RunArgs};
@@ -120,6 +122,11 @@ pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     let exe = std::env::current_exe().unwrap_or_default();
     let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
     how.session_options(&model_commands::runtime_folders(&exe), n_cores.min(MAX_MODEL_THREADS))
+}
+
+/// Reads a value by its name in JSON.
+pub(super) fn named<T: DeserializeOwned>(text: &str) -> Result<T, Error> {
+    T::deserialize(StrDeserializer::new(text))
 }
 
 pub fn variable(name: &str) -> Option<OsString> {

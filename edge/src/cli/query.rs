@@ -13,7 +13,7 @@ use glam::DVec3;
 use slag_common::frames::Aabb;
 use slag_common::note;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
 
@@ -47,7 +47,7 @@ pub struct QueryArgs {
     pub threshold: Option<f32>,
     /// Kind of answers: objects, clusters or gaussians [default: objects, and clusters for what no object
     /// answers].
-    #[arg(long)]
+    #[arg(long, value_parser = named::<AnswerKind>)]
     pub kind: Option<AnswerKind>,
     /// Edge of the voxels used for clustering, world units [default: 0.25 m, or the scene's].
     #[arg(long)]

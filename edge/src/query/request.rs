@@ -5,8 +5,6 @@ use std::str::FromStr;
 
 use glam::DVec3;
 use schemars::JsonSchema;
-use serde::de::IntoDeserializer;
-use serde::de::value::Error;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 
@@ -48,14 +46,6 @@ pub enum AnswerKind {
 impl fmt::Display for AnswerKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.serialize(f)
-    }
-}
-
-impl FromStr for AnswerKind {
-    type Err = Error;
-
-    fn from_str(text: &str) -> Result<Self, Error> {
-        Self::deserialize(text.into_deserializer())
     }
 }
 
