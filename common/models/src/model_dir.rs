@@ -226,7 +226,7 @@ impl ModelDir {
 
 fn hashed(description: &Description, root: &Path) -> Result<Description, DescriptionError> {
     let mut hashed = description.clone();
-    for (_, file) in hashed.files_mut() {
+    for file in hashed.files_mut() {
         file.for_each_part(|part| {
             part.sha256 = Some(crate::description::Sha256(sha256_of(root, part)?));
             Ok::<_, DescriptionError>(())
