@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::fetch::{FetchRequest, Position};
+use crate::fetch::{FetchRequest, Position, fetch};
 use crate::query::parse_point;
 use anyhow::anyhow;
 use clap::Args;
@@ -14,7 +14,7 @@ use slag_service::stop::on_stop;
 use super::args::{CacheArgs, DownloadArgs};
 use super::failure::Failure;
 use super::follow::{FollowArgs, watch};
-use super::network::{failure, fetch_once};
+use super::network::{environment, failure};
 use super::output::print_json;
 use super::progress::{Bar, bad_cells, print_report};
 
@@ -68,7 +68,7 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     if args.watch {
         return watch(&cache, &request, ca.as_deref(), settings, &cancel, &bar, args.json);
     }
-    let result = fetch_once(&cache, &request, ca.as_deref(), &cancel, &bar);
+    let result = fetch(&cache, &request, &environment(ca.as_deref(), &cancel, &bar));
     bar.finish();
     match result {
         Ok(report) => {
