@@ -1,8 +1,6 @@
 //! Manifests as bytes.
 
-use glam::DVec3;
-
-use super::records::{CellRecord, MAX_BYTES, MAX_TEXT_FILES, Manifest, VERSION};
+use super::records::{MAX_BYTES, MAX_TEXT_FILES, Manifest, VERSION};
 use crate::frames::Aabb;
 use crate::shard::MAX_DIM;
 
@@ -19,11 +17,6 @@ pub enum ManifestError {
 }
 
 impl Manifest {
-    /// Returns the cells with a box within a radius of a point. Not from a tree: a manifest has 100,000 cells at most.
-    pub fn cells_within(&self, centre_in_world: DVec3, radius: f64) -> impl Iterator<Item = &CellRecord> {
-        self.cells.iter().filter(move |cell| cell.bounds.distance_to(centre_in_world) <= radius)
-    }
-
     pub fn to_bytes(&self) -> Vec<u8> {
         serde_json::to_vec(self).expect("a manifest has no map with other keys than strings")
     }

@@ -4,11 +4,13 @@
 //! spaces. It is a target of the store's metadata ([`crate::tuf`]), which says whose it is and whether it is the
 //! newest.
 
+mod index;
 mod json;
 mod records;
 #[cfg(test)]
 mod tests;
 
+pub use index::CellIndex;
 pub use json::ManifestError;
 pub use records::{
     Calibration, CellRecord, EncoderRecord, MAX_BYTES, MAX_TEXT_FILES, Manifest, ObjectRecord, ShardRecord,

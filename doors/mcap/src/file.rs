@@ -1,7 +1,7 @@
 //! The file: a channel for each topic, one message each, with its schema.
 
 use std::collections::BTreeMap;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Seek, Write};
 use std::path::Path;
 
 use anyhow::Result;
@@ -9,19 +9,34 @@ use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 use serde_json::{Value, json};
 
-/// Writes messages to a file, each to a channel of its own. `time_ns`: time of all, nanoseconds since 1970.
-pub fn write(path: &Path, time_ns: u64, messages: &[(String, Schema, Value)]) -> Result<()> {
-    let options =
-        WriteOptions::new().compression(None).library(concat!("slag-mcap ", env!("CARGO_PKG_VERSION")));
-    let mut writer = Writer::with_options(BufWriter::new(fs_err::File::create(path)?), options)?;
-    for (topic, (name, schema), message) in messages {
-        let schema = writer.add_schema(name, "jsonschema", schema().to_string().as_bytes())?;
-        let channel_id = writer.add_channel(schema, topic, "json", &BTreeMap::new())?;
-        let header = MessageHeader { channel_id, sequence: 0, log_time: time_ns, publish_time: time_ns };
-        writer.write_to_known_channel(&header, message.to_string().as_bytes())?;
+pub struct File<W: Write + Seek> {
+    writer: Writer<W>,
+    time_ns: u64,
+}
+
+impl File<BufWriter<fs_err::File>> {
+    /// Creates a file. `time_ns`: time of all its messages, nanoseconds since 1970.
+    pub fn create(path: &Path, time_ns: u64) -> Result<Self> {
+        let options =
+            WriteOptions::new().compression(None).library(concat!("slag-mcap ", env!("CARGO_PKG_VERSION")));
+        let writer = Writer::with_options(BufWriter::new(fs_err::File::create(path)?), options)?;
+        Ok(Self { writer, time_ns })
     }
-    writer.finish()?;
-    Ok(writer.into_inner().flush()?)
+}
+
+impl<W: Write + Seek> File<W> {
+    pub fn write(&mut self, topic: &str, (name, schema): Schema, message: &Value) -> Result<()> {
+        let schema = self.writer.add_schema(name, "jsonschema", schema().to_string().as_bytes())?;
+        let channel_id = self.writer.add_channel(schema, topic, "json", &BTreeMap::new())?;
+        let header =
+            MessageHeader { channel_id, sequence: 0, log_time: self.time_ns, publish_time: self.time_ns };
+        Ok(self.writer.write_to_known_channel(&header, message.to_string().as_bytes())?)
+    }
+
+    pub fn finish(mut self) -> Result<()> {
+        self.writer.finish()?;
+        Ok(self.writer.into_inner().flush()?)
+    }
 }
 
 /// A schema's name and text.

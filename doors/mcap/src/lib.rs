@@ -11,6 +11,7 @@ use anyhow::{Context, Result};
 use serde_json::json;
 
 pub use args::Args;
+use file::File;
 use messages::Stamp;
 
 /// Asks a robot and writes its answers; returns the number of messages. A robot that refuses leaves no file.
@@ -47,6 +48,10 @@ pub fn record(args: &Args) -> Result<usize> {
         let ground = ground.context("the robot's ground has other cells than it says")?;
         messages.push(("/slag/ground".to_owned(), file::GROUND, ground));
     }
-    file::write(&args.out, time_ns, &messages)?;
+    let mut file = File::create(&args.out, time_ns)?;
+    for (topic, schema, message) in &messages {
+        file.write(topic, *schema, message)?;
+    }
+    file.finish().with_context(|| args.out.display().to_string())?;
     Ok(messages.len())
 }

@@ -58,11 +58,11 @@ impl Robot {
     }
 
     pub fn place(&self) -> Result<MapStatus, RobotError> {
-        self.get("/v1/map", &[])
+        self.get("/v1/map")
     }
 
     pub fn objects(&self, parameters: &[(&str, String)]) -> Result<ObjectPage, RobotError> {
-        self.get("/v1/objects", parameters)
+        self.get_with("/v1/objects", parameters)
     }
 
     /// Returns the number of things on board, or of those in a ball.
@@ -75,15 +75,15 @@ impl Robot {
     }
 
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<GoalReply, RobotError> {
-        self.get("/v1/goal", parameters)
+        self.get_with("/v1/goal", parameters)
     }
 
     pub fn changes(&self, parameters: &[(&str, String)]) -> Result<ChangesReply, RobotError> {
-        self.get("/v1/changes", parameters)
+        self.get_with("/v1/changes", parameters)
     }
 
     pub fn floor(&self, parameters: &[(&str, String)]) -> Result<Floor, RobotError> {
-        self.get("/v1/floor", parameters)
+        self.get_with("/v1/floor", parameters)
     }
 
     pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<locate::Answer, RobotError> {
@@ -99,7 +99,15 @@ impl Robot {
         self.post::<Value>("/position", position).map(drop)
     }
 
-    fn get<T: DeserializeOwned>(&self, path: &str, parameters: &[(&str, String)]) -> Result<T, RobotError> {
+    fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, RobotError> {
+        self.read(path, self.agent.get(self.address(path)).call())
+    }
+
+    fn get_with<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        parameters: &[(&str, String)],
+    ) -> Result<T, RobotError> {
         let pairs = || parameters.iter().map(|(name, value)| (*name, value.as_str()));
         check_texts(pairs().filter_map(|(name, value)| (name == "text").then_some(value)))?;
         self.read(path, self.agent.get(self.address(path)).query_pairs(pairs()).call())

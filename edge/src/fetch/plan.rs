@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 use slag_common::Hash32;
-use slag_common::manifest::{CellRecord, Manifest, ObjectRecord, TextModelRecord};
+use slag_common::manifest::{CellIndex, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::Profile;
 
 use super::position::PlanError;
@@ -52,8 +52,8 @@ impl Plan {
             let (name, expected) = ("radius", "zero or more, and finite");
             return Err(PlanError::Number { name, value: radius, expected });
         }
-        let cells = cells_of(manifest.cells_within(centre_in_world, radius), profile)?;
-        if cells.is_empty() {
+        let positions = CellIndex::new(&manifest.cells).within(centre_in_world, radius);
+        if positions.is_empty() {
             let distances = manifest.cells.iter().map(|cell| cell.bounds.distance_to(centre_in_world));
             let nearest = distances.fold(f64::INFINITY, f64::min);
             return Err(PlanError::NoCells {
@@ -63,6 +63,7 @@ impl Plan {
                 nearest,
             });
         }
+        let cells = cells_at(manifest, profile, &positions)?;
         let needs = objects(&cells, manifest)?;
         let needed: BTreeSet<Hash32> = needs.iter().map(|object| object.hash).collect();
         let needed_bytes = needs.iter().fold(0u64, |sum, object| sum.saturating_add(object.len_bytes));
@@ -99,18 +100,22 @@ impl Plan {
     }
 }
 
-/// Returns cells with their shards of a profile.
-fn cells_of<'a>(
-    cells: impl Iterator<Item = &'a CellRecord>,
+/// Returns the cells at the given indices of a manifest with their shards of a profile.
+fn cells_at(
+    manifest: &Manifest,
     profile: Profile,
+    positions: &[usize],
 ) -> Result<Vec<CurrentCell>, PlanError> {
-    let listed = cells.map(|cell| match cell.shards.get(&profile) {
-        Some(shard) => {
-            Ok(CurrentCell { cell_id: cell.cell_id, hash: shard.hash, len_bytes: shard.len_bytes })
-        }
-        None => {
-            let names: Vec<&str> = cell.shards.keys().map(|profile| profile.name()).collect();
-            Err(PlanError::NoProfile { cell_id: cell.cell_id, profile, available: names.join(", ") })
+    let listed = positions.iter().map(|position| {
+        let cell = &manifest.cells[*position];
+        match cell.shards.get(&profile) {
+            Some(shard) => {
+                Ok(CurrentCell { cell_id: cell.cell_id, hash: shard.hash, len_bytes: shard.len_bytes })
+            }
+            None => {
+                let names: Vec<&str> = cell.shards.keys().map(|profile| profile.name()).collect();
+                Err(PlanError::NoProfile { cell_id: cell.cell_id, profile, available: names.join(", ") })
+            }
         }
     });
     listed.collect()

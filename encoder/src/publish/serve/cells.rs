@@ -107,7 +107,8 @@ pub(super) async fn cells(
     let search = move |snapshot: &Snapshot| {
         let manifest = snapshot.world();
         let (centre, radius) = query.ball_in_world(manifest)?;
-        let cells = manifest.cells_within(centre, radius).map(|cell| CellAnswer {
+        let near = snapshot.index.within(centre, radius).into_iter().map(|i| &manifest.cells[i]);
+        let cells = near.map(|cell| CellAnswer {
             cell_id: cell.cell_id,
             bounds: cell.bounds,
             n_gaussians: cell.n_gaussians,
