@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use clap::CommandFactory;
-use slag_tests::root;
+use slag_tests::{files_below, root, sources, words};
 use syn::visit::{self, Visit};
 
 const MAX_WORDS: usize = 22_000;
@@ -23,30 +23,14 @@ fn documents() -> Vec<(PathBuf, String)> {
         .chain(["clients/python/README.md", "common/models/embedded/CARD.md"])
         .map(PathBuf::from)
         .collect();
-    let pages = files(&root().join("docs"), "md");
-    paths.extend(pages.iter().map(|page| page.strip_prefix(root()).expect("in the project").to_owned()));
+    let pages = files_below(&root().join("docs")).into_iter();
+    let pages = pages.filter(|page| page.extension().is_some_and(|of| of == "md"));
+    paths.extend(pages.map(|page| page.strip_prefix(root()).expect("in the project").to_owned()));
     assert!(paths.len() > 15, "only {paths:?}");
     paths
         .into_iter()
         .map(|path| (path.clone(), fs_err::read_to_string(root().join(path)).expect("a document")))
         .collect()
-}
-
-/// Returns the files below a folder with an extension, without build folders.
-fn files(folder: &Path, extension: &str) -> Vec<PathBuf> {
-    let mut found = Vec::new();
-    for entry in fs_err::read_dir(folder).expect("a folder") {
-        let path = entry.expect("an entry").path();
-        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-        match path.is_dir() {
-            true if ["target", "node_modules", "dist"].contains(&name) || name.starts_with('.') => {}
-            true => found.extend(files(&path, extension)),
-            false if path.extension().is_some_and(|found| found == extension) => found.push(path),
-            false => {}
-        }
-    }
-    found.sort();
-    found
 }
 
 fn check(faults: impl Fn(&Path, &str) -> Vec<String>) {
@@ -161,18 +145,10 @@ fn commands(text: &str) -> Vec<Vec<String>> {
         }
     }
     let parts = lines.iter().flat_map(|line| line.split([';', '|', '&', '>']));
-    let words = parts.map(|part| {
-        // Words in quotes are one word.
-        let quoted = part.split('"').enumerate().flat_map(|(i, piece)| match i % 2 {
-            1 => vec![piece.to_owned()],
-            _ => piece.split_whitespace().map(str::to_owned).collect(),
-        });
-        quoted.collect::<Vec<_>>()
-    });
-    words
-        .map(|words| {
-            words.into_iter().skip_while(|word| word == "sudo" || word == "-u" || word == "slag").collect()
-        })
+    let before = ["sudo", "-u", "slag"];
+    let commands =
+        parts.map(|part| words(part).into_iter().skip_while(|word| before.contains(&&**word)).collect());
+    commands
         .filter(|words: &Vec<String>| words.first().is_some_and(|program| program.starts_with("slag-")))
         .collect()
 }
@@ -208,7 +184,7 @@ fn flags<'a>(words: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
 #[test]
 fn flags_that_the_documents_name_exist() {
     let mut known = Flags::default();
-    for file in files(&root(), "rs") {
+    for file in sources("rs") {
         let text = fs_err::read_to_string(&file).expect("a source file");
         if text.contains("#[arg(") {
             let parsed = syn::parse_file(&text);
@@ -273,7 +249,7 @@ fn has_command(program: &clap::Command, words: &[&str]) -> bool {
 /// Collects the functions of all Rust files: `function` and `file::function`.
 fn functions() -> BTreeSet<String> {
     let mut found = BTreeSet::new();
-    for path in files(&root(), "rs") {
+    for path in sources("rs") {
         let text = fs_err::read_to_string(&path).expect("a source file");
         let module = path.file_stem().and_then(|stem| stem.to_str()).expect("a name");
         for line in text.lines() {

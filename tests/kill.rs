@@ -52,7 +52,6 @@ fn programs_go_on_when_nobody_reads_what_they_say() {
 }
 
 /// Under `nohup` an encode outlives its terminal; without, it stops as at ctrl-c.
-#[cfg(unix)]
 #[test]
 fn a_hangup_that_is_ignored_stops_nothing() {
     let dir = tempfile::tempdir().expect("a temporary folder");

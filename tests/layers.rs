@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use slag_tests::root;
+use slag_tests::{root, sources};
 use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
@@ -355,25 +355,13 @@ fn files_form_no_circle() {
 /// No source file is too long to read at once; generated tables do not count.
 #[test]
 fn no_file_is_over_700_lines() {
-    let mut open: Vec<PathBuf> = ["common", "encoder", "edge", "doors", "packaging", "tests", "fuzz"]
-        .map(|folder| root().join(folder))
-        .into();
+    let files = [sources("rs"), sources("wgsl")].concat();
+    assert!(files.len() > 500, "{}", files.len());
     let mut long = Vec::new();
-    while let Some(folder) = open.pop() {
-        for entry in fs_err::read_dir(&folder).expect("a folder") {
-            let path = entry.expect("an entry").path();
-            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            if path.is_dir() && name != "target" && name != "node_modules" {
-                open.push(path);
-            } else if path.extension().is_some_and(|e| e == "rs" || e == "wgsl") {
-                let n_lines = fs_err::read_to_string(&path).expect("text").lines().count();
-                if n_lines > 700 {
-                    long.push(format!(
-                        "{}: {n_lines} lines",
-                        path.strip_prefix(root()).unwrap_or(&path).display()
-                    ));
-                }
-            }
+    for path in files {
+        let n_lines = fs_err::read_to_string(&path).expect("text").lines().count();
+        if n_lines > 700 {
+            long.push(format!("{}: {n_lines} lines", path.strip_prefix(root()).unwrap_or(&path).display()));
         }
     }
     assert!(long.is_empty(), "split these:\n{}", long.join("\n"));

@@ -16,8 +16,7 @@ fn manual() -> tempfile::TempDir {
     out
 }
 
-/// Returns a text with single spaces.
-fn words(text: &str) -> String {
+fn with_single_spaces(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
@@ -53,7 +52,7 @@ fn flags(help: &str) -> Vec<(String, String)> {
         // Defaults and the like stand elsewhere in a page.
         let end =
             [" [default:", " [env:", " [possible", " [alias"].iter().filter_map(|mark| help.find(mark)).min();
-        *help = words(&help[..end.unwrap_or(help.len())]);
+        *help = with_single_spaces(&help[..end.unwrap_or(help.len())]);
     }
     flags
 }
@@ -80,7 +79,7 @@ fn page(path: &Path) -> String {
         .output()
         .expect("man runs (Debian: man-db)");
     assert!(shown.status.success() && shown.stderr.is_empty(), "{}: {shown:?}", path.display());
-    words(&String::from_utf8(shown.stdout).expect("text"))
+    with_single_spaces(&String::from_utf8(shown.stdout).expect("text"))
 }
 
 /// Compares the pages of a command and those below it; returns how many there are, and how many flags they have.
@@ -148,16 +147,9 @@ fn examples_of_help_parse() {
             let lines: Vec<&str> = examples.lines().skip(1).collect();
             assert!(lines.is_empty() || lines.len() == 3, "{}: {examples}", below.get_name());
             for line in lines {
-                // What is between quotes is one word.
-                let parts = line.split('"').enumerate();
-                let words: Vec<&str> = parts
-                    .flat_map(
-                        |(at, part)| if at % 2 == 1 { vec![part] } else { part.split_whitespace().collect() },
-                    )
-                    .collect();
+                let words = slag_tests::words(line);
                 assert_eq!(words[0], name);
-                let words =
-                    words.into_iter().map(|word| if word == "HEX" { "0".repeat(64) } else { word.into() });
+                let words = words.into_iter().map(|word| if word == "HEX" { "0".repeat(64) } else { word });
                 if let Err(error) = command.clone().try_get_matches_from(words) {
                     panic!("{line}: {error}");
                 }

@@ -1,7 +1,7 @@
 //! A store that rots: another encode writes its files anew, from the views that are kept, and its catalogue from
 //! the files.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use slag_tests::*;
@@ -81,14 +81,7 @@ fn a_field(store: &Path) -> String {
     hash.expect("a hash").to_owned()
 }
 
-fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    for entry in fs_err::read_dir(folder).expect("there") {
-        let path = entry.expect("readable").path();
-        match path.is_dir() {
-            true => found.extend(files(&path)),
-            false => drop(found.insert(path.clone(), fs_err::read(&path).expect("readable"))),
-        }
-    }
-    found
+fn files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let read = |path: PathBuf| (path.clone(), fs_err::read(path).expect("readable"));
+    files_below(folder).into_iter().map(read).collect()
 }

@@ -156,7 +156,6 @@ fn odd_views_are_counted_not_fatal() {
 }
 
 /// Ctrl-C ends an encode with code 130 and a state that the next one resumes, to the same shards as without.
-#[cfg(unix)]
 #[test]
 fn an_interrupted_encode_resumes() {
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -129,7 +129,7 @@ fn photos_are_added_and_withdrawn() {
     let first = poses_of("first.json", &[0, 2, 3, 5, 6, 7]);
     let second = poses_of("second.json", &[1, 4, 8, 9]);
     // The masks of the second flight do not exist yet.
-    let later: Vec<_> = files(&masks)
+    let later: Vec<_> = files_below(&masks)
         .into_iter()
         .filter(|path| [1, 4, 8, 9].iter().any(|i| path.file_stem() == Path::new(&name(*i)).file_stem()))
         .collect();
@@ -193,9 +193,4 @@ fn photos_are_added_and_withdrawn() {
     assert_eq!(lost["n_views"], 10);
     assert!(lost["reason"].as_str().expect("text").contains("no view is taken"), "{lost}");
     assert_eq!(summary()["lost_views"], Value::Null);
-}
-
-fn files(folder: &Path) -> Vec<std::path::PathBuf> {
-    let entries = fs_err::read_dir(folder).expect("reads").map(|entry| entry.expect("reads").path());
-    entries.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
 }

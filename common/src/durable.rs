@@ -75,7 +75,6 @@ fn in_place(error: io::Error) -> io::Result<Option<File>> {
 pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Result<()> {
     let mut options = fs_err::OpenOptions::new();
     options.write(true).create_new(true);
-    #[cfg(unix)]
     if matches!(access, Access::Private) {
         use fs_err::os::unix::fs::OpenOptionsExt;
         options.mode(0o600);
@@ -100,8 +99,7 @@ pub fn move_into_place(part: &Path, path: &Path) -> io::Result<()> {
 pub fn sync_folder(path: &Path) -> io::Result<()> {
     // The folder of a name alone is the empty path, which cannot be opened.
     let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
-    // Other systems cannot open a folder to sync it; their file systems order renames.
-    if cfg!(unix) { File::open(path)?.sync_all() } else { Ok(()) }
+    File::open(path)?.sync_all()
 }
 
 #[cfg(test)]

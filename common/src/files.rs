@@ -7,7 +7,6 @@ use fs_err::File;
 
 /// Opens a file to read. A pipe is refused: it keeps its reader waiting until somebody writes, perhaps for ever.
 pub fn open(path: &Path) -> io::Result<File> {
-    #[cfg(unix)]
     if std::os::unix::fs::FileTypeExt::is_fifo(&fs_err::metadata(path)?.file_type()) {
         let text = format!("{} is a pipe; write what comes out of it into a file", path.display());
         return Err(io::Error::new(io::ErrorKind::InvalidInput, text));
@@ -15,13 +14,18 @@ pub fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Reads a file of at most `max_bytes`; of a longer one, a byte more than that. What a shell puts in a file's place,
+/// Reads a file of at most `max_bytes`; a longer one is refused. What a shell puts in a file's place,
 /// `--token-file <(pass show robot)`, is read, too: it has no name, but a writer.
 pub fn read_short(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let has_name = std::fs::canonicalize(path).is_ok();
     let file = if has_name { open(path)? } else { File::open(path)? };
     let mut bytes = Vec::new();
     file.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > max_bytes {
+        let text =
+            format!("{} is longer than {max_bytes} bytes, the most that is read of it", path.display());
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, text));
+    }
     Ok(bytes)
 }
 
@@ -55,7 +59,7 @@ pub fn stand_in(start: &[u8]) -> Option<(&'static str, &'static str)> {
     }
 }
 
-#[cfg(all(test, unix))]
+#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -67,6 +71,8 @@ mod tests {
         assert!(open(&pipe).expect_err("is refused").to_string().contains("is a pipe"));
         assert!(read_short(&pipe, 9).expect_err("is refused").to_string().contains("is a pipe"));
         assert!(open(Path::new("/dev/null")).is_ok());
+        let endless = read_short(Path::new("/dev/zero"), 9).expect_err("is refused").to_string();
+        assert!(endless.contains("longer than 9 bytes"), "{endless}");
     }
 
     #[test]

@@ -169,7 +169,7 @@ mod tests {
         let download = fetch.download;
         assert_eq!((download.radius, download.profile, download.max_bytes), (20.0, Profile::Exact, Some(7)));
         let Command::Fetch(fetch) = command("slag-edge fetch --at-geo -46.8,-92") else { panic!("fetch") };
-        assert_eq!(fetch.at_geo, Some((-46.8, -92.0, None)));
+        assert_eq!(fetch.at_geo, "-46.8,-92".parse().ok());
         assert_eq!((fetch.download.radius, fetch.download.profile), (50.0, Profile::Compact));
         let Command::Serve(serve) = command("slag-edge serve") else { panic!("serve") };
         assert_eq!(serve.listen.to_string(), "127.0.0.1:7734");

@@ -58,7 +58,17 @@ pub struct TestObject {
     pub n_gaussians: u32,
 }
 
+/// How the scores of test objects scatter.
+pub(crate) const CALIBRATION: Calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
+
 impl BuiltShard {
+    /// Rewrites the shard with additions.
+    pub(crate) fn with(&self, additions: Additions<'_>) -> Self {
+        let mut bytes = Vec::new();
+        self.view().write_with(&mut bytes, additions).expect("writes to memory");
+        Self::read(&bytes, self.embeddings.clone())
+    }
+
     /// Rewrites the shard with objects: boxes around the origin, photos named by their ids.
     pub(crate) fn with_objects(&self, objects: &[TestObject], calibration: Calibration) -> Self {
         self.with_objects_and_places(objects, calibration, None)
@@ -223,10 +233,6 @@ impl Axes {
 }
 
 impl TextEncoder for Axes {
-    fn name(&self) -> &str {
-        "axes"
-    }
-
     fn dim(&self) -> usize {
         self.dim
     }

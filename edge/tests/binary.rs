@@ -59,7 +59,7 @@ fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
 }
 
 /// Serves a scene of one shard for as long as the tests run; returns the store's address.
-fn store(listed: Vec<u8>, shard: Vec<u8>) -> String {
+fn store((listed, shard): (Vec<u8>, Vec<u8>)) -> String {
     let manifest = Manifest::parse(&listed).expect("valid");
     let metadata = one_key_repository(&generate_key(), 3, manifest::TARGET, &listed);
     let objects = BTreeMap::from([(Hash32::of(&shard), shard)]);
@@ -68,9 +68,9 @@ fn store(listed: Vec<u8>, shard: Vec<u8>) -> String {
 }
 
 /// Returns a cache with a scene of one shard on board.
-fn fetched((listed, shard): (Vec<u8>, Vec<u8>)) -> tempfile::TempDir {
+fn fetched(scene: (Vec<u8>, Vec<u8>)) -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
+    let from = store(scene);
     assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
     dir
 }
@@ -123,8 +123,7 @@ fn get(url: &str) -> (u16, Value) {
 
 #[test]
 fn a_robot_fetches_asks_and_serves() {
-    let (listed, shard) = red_and_blue();
-    let from = store(listed, shard);
+    let from = store(red_and_blue());
     let dir = tempfile::tempdir().expect("a folder");
     let cache = dir.path().join("cache");
 
@@ -231,9 +230,8 @@ fn nobody_reads_and_nobody_complains() {
 /// skipped.
 #[test]
 fn a_robot_is_followed_along_stdin() {
-    let (listed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
+    let from = store(red_and_blue());
     let watch = |text: &str| {
         let args = [
             "fetch",
@@ -273,9 +271,8 @@ fn a_robot_is_followed_along_stdin() {
 /// The service fetches around the positions posted to it and answers from the result.
 #[test]
 fn a_robot_is_followed_by_its_service() {
-    let (listed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
-    let from = store(listed, shard);
+    let from = store(red_and_blue());
     let (serving, url) = serve(dir.path(), &["--trust-first", "--follow", &from, "--radius", "20"]);
     assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
     let posted = ureq::post(format!("{url}/position")).content_type("application/json");
@@ -308,7 +305,7 @@ fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
     let (listed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
     let path = dir.path().join("shards").join(Hash32::of(&shard).to_string());
-    let from = store(listed, shard);
+    let from = store((listed, shard));
     let fetch = ["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--json"];
     assert_eq!(run(dir.path(), &fetch).0, Some(0));
     let (mut serving, url) = serve(dir.path(), &[]);
@@ -331,7 +328,7 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
     let disk = slag_test_support::LoopDisk::new(dir.path());
     let (listed, shard) = painted(&[[5000; 3]; 4000], 2000);
     let path = disk.path().join("shards").join(Hash32::of(&shard).to_string());
-    let from = store(listed, shard);
+    let from = store((listed, shard));
     let fetch = ["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--json"];
     assert_eq!(run(disk.path(), &fetch).0, Some(0));
     disk.break_block(&path, 15);

@@ -332,7 +332,7 @@ pub fn phrases(data: &[u8]) -> bool {
         let (text, tensors) = (folder.join("phrases.txt"), folder.join("x.safetensors"));
         fs_err::write(&text, phrases).expect("the file is written");
         fs_err::write(&tensors, vectors).expect("the file is written");
-        let opened = slag_models::phrases::PhraseEncoder::open("x", 3, &text, (&tensors, "vectors"), None);
+        let opened = slag_models::phrases::PhraseEncoder::open(3, &text, (&tensors, "vectors"), None);
         opened.is_ok_and(|mut encoder| {
             let vector = encoder.encode("chair").unwrap_or_default();
             assert!(vector.iter().all(|v| v.is_finite()));

@@ -26,10 +26,6 @@ const MAX_ANSWER_BYTES: u64 = 1 << 20;
 struct Letters;
 
 impl TextEncoder for Letters {
-    fn name(&self) -> &str {
-        "letters"
-    }
-
     fn dim(&self) -> usize {
         3
     }

@@ -75,7 +75,7 @@ fn run_with_faults(seed: u64) -> Faults {
     let mut random = Random::new(seed);
     let (fleet, server) = Fleet::new(free_port());
     let flags = ["--ack-wait", "1", "--max-deliver", "100"];
-    let networks = [0, 1].map(|_| Network::to(server.port(), random.bits()));
+    let networks = [0, 1].map(|_| Network::to(server.port, random.bits()));
     let start = |which: usize| fleet.worker_over(&networks[which], &flags);
     let mut server = Some(server);
     let mut coordinator = fleet.coordinator(&flags);

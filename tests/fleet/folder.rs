@@ -2,41 +2,21 @@
 
 use std::process::Command;
 
-use super::conformance::{Kind, conforms};
+use super::conformance::conforms;
 use super::support::*;
 use slag_tests::*;
-
-/// A folder as bucket, and shares.
-struct Shares {
-    scene: Scene,
-    bucket: String,
-}
-
-impl Kind for Shares {
-    fn scene(&self) -> &Scene {
-        &self.scene
-    }
-
-    fn coordinator(&self, store: &str) -> Command {
-        let mut command = self.scene.encode(store);
-        command.args(["--blobs", &self.bucket]);
-        command
-    }
-
-    fn worker(&self, number: usize) -> Command {
-        with_share(worker(&self.bucket), number)
-    }
-
-    fn n_views(&self) -> usize {
-        n_objects(&self.scene.path("bucket/views"))
-    }
-}
 
 #[test]
 fn a_folder_and_shares_conform() {
     let scene = Scene::new();
     let bucket = text(&scene.path("bucket")).to_owned();
-    conforms(&Shares { scene, bucket });
+    let coordinator = |store: &str| {
+        let mut command = scene.encode(store);
+        command.args(["--blobs", &bucket]);
+        command
+    };
+    let n_views = || n_objects(&scene.path("bucket/views"));
+    conforms(&scene, coordinator, |number| with_share(worker(&bucket), number), n_views);
 }
 
 /// Folders for photos in work go with their workers, or when the next one begins; workers of other models and

@@ -2,14 +2,14 @@
 
 use std::process::Command;
 
-use super::conformance::{Kind, conforms};
+use super::conformance::conforms;
 use super::network::Network;
 use super::support::*;
 use slag_tests::*;
 
 pub struct Server {
     running: Running,
-    port: u16,
+    pub port: u16,
 }
 
 impl Server {
@@ -17,10 +17,6 @@ impl Server {
         let (at, folder) = (port.to_string(), scene.path("nats"));
         let args = ["--jetstream", "--addr", "127.0.0.1", "--port", &at, "--store_dir", text(&folder)];
         Self { running: start_server("nats-server", port, &args), port }
-    }
-
-    pub fn port(&self) -> u16 {
-        self.port
     }
 }
 
@@ -42,23 +38,30 @@ impl Fleet {
         (Self { scene, bucket, port }, server)
     }
 
+    fn coordinator_of(&self, store: &str, flags: &[&str]) -> Command {
+        let mut command = self.scene.encode(store);
+        command.args(["--blobs", &self.bucket, "--fleet", &url(self.port)]).args(flags);
+        command
+    }
+
     /// Starts the coordinator; `flags` are for it and the workers alike.
     pub fn coordinator(&self, flags: &[&str]) -> Running {
-        let mut command = self.scene.encode("store");
-        Running::start(command.args(["--blobs", &self.bucket, "--fleet", &url(self.port)]).args(flags))
+        Running::start(&mut self.coordinator_of("store", flags))
     }
 
     pub fn worker(&self, flags: &[&str]) -> Running {
-        self.worker_at(self.port, flags)
+        Running::start(&mut self.worker_at(self.port, flags))
     }
 
     /// Starts a worker that reaches the server over a network.
     pub fn worker_over(&self, network: &Network, flags: &[&str]) -> Running {
-        self.worker_at(network.port(), flags)
+        Running::start(&mut self.worker_at(network.port, flags))
     }
 
-    fn worker_at(&self, port: u16, flags: &[&str]) -> Running {
-        Running::start(worker(&self.bucket).args(["--fleet", &url(port), "--threads", "1"]).args(flags))
+    fn worker_at(&self, port: u16, flags: &[&str]) -> Command {
+        let mut command = worker(&self.bucket);
+        command.args(["--fleet", &url(port), "--threads", "1"]).args(flags);
+        command
     }
 
     /// Kills the server and starts it again: with its files, or with nothing.
@@ -76,32 +79,12 @@ impl Fleet {
     }
 }
 
-impl Kind for Fleet {
-    fn scene(&self) -> &Scene {
-        &self.scene
-    }
-
-    fn coordinator(&self, store: &str) -> Command {
-        let mut command = self.scene.encode(store);
-        command.args(["--blobs", &self.bucket, "--fleet", &url(self.port), "--ack-wait", "1"]);
-        command
-    }
-
-    fn worker(&self, _number: usize) -> Command {
-        let mut command = worker(&self.bucket);
-        command.args(["--fleet", &url(self.port), "--threads", "1", "--ack-wait", "1"]);
-        command
-    }
-
-    fn n_views(&self) -> usize {
-        self.n_views_done()
-    }
-}
-
 #[test]
 fn a_folder_and_a_queue_conform() {
     let (fleet, _server) = Fleet::new(free_port());
-    conforms(&fleet);
+    let flags = ["--ack-wait", "1"];
+    let coordinator = |store: &str| fleet.coordinator_of(store, &flags);
+    conforms(&fleet.scene, coordinator, |_| fleet.worker_at(fleet.port, &flags), || fleet.n_views_done());
 }
 
 /// One worker is killed, one stands still for longer than the queue waits for it and goes on; the server is killed

@@ -25,7 +25,7 @@ pub struct Weather {
 
 /// A network of its own between a port of this machine and another.
 pub struct Network {
-    port: u16,
+    pub port: u16,
     weather: Arc<Mutex<Weather>>,
 }
 
@@ -51,10 +51,6 @@ impl Network {
             }
         });
         Self { port, weather }
-    }
-
-    pub fn port(&self) -> u16 {
-        self.port
     }
 
     pub fn set(&self, weather: Weather) {

@@ -7,7 +7,7 @@ use hyper_util::server::conn::auto::Builder;
 use s3s::auth::SimpleAuth;
 use s3s::service::S3ServiceBuilder;
 
-use super::conformance::{Kind, conforms};
+use super::conformance::conforms;
 use super::support::*;
 
 const KEY: &str = "robot";
@@ -66,50 +66,25 @@ impl Drop for S3s {
     }
 }
 
-/// A bucket of S3, and shares.
-struct Shares {
-    scene: Scene,
-    s3: S3s,
-}
-
-impl Shares {
-    fn coordinator_at(&self, bucket: &str, store: &str) -> Command {
-        let mut command = self.s3.known_to(self.scene.encode(store));
-        command.args(["--blobs", bucket]);
-        command
-    }
-}
-
-impl Kind for Shares {
-    fn scene(&self) -> &Scene {
-        &self.scene
-    }
-
-    fn coordinator(&self, store: &str) -> Command {
-        self.coordinator_at("s3://scenes/room", store)
-    }
-
-    fn worker(&self, number: usize) -> Command {
-        with_share(self.s3.known_to(worker("s3://scenes/room")), number)
-    }
-
-    fn n_views(&self) -> usize {
-        self.s3.n_objects("room/views/")
-    }
-}
-
 /// A coordinator is fenced by a second one; puts of the bucket decide. Another fleet in the same bucket conforms.
 #[test]
 fn a_bucket_of_s3_fences_and_conforms() {
-    let shares = Shares { scene: Scene::new(), s3: S3s::start() };
-    let first = Running::start(&mut shares.coordinator_at("s3://scenes/fence", "first"));
-    wait_until("a plan", || shares.s3.n_objects("fence/jobs/00000001/plan.json") == 1);
-    let second = Running::start(&mut shares.coordinator_at("s3://scenes/fence", "second"));
+    let (scene, s3) = (Scene::new(), S3s::start());
+    let coordinator = |bucket: &str, store: &str| {
+        let mut command = s3.known_to(scene.encode(store));
+        command.args(["--blobs", bucket]);
+        command
+    };
+    let first = Running::start(&mut coordinator("s3://scenes/fence", "first"));
+    wait_until("a plan", || s3.n_objects("fence/jobs/00000001/plan.json") == 1);
+    let second = Running::start(&mut coordinator("s3://scenes/fence", "second"));
     let fenced = first.output();
     let errors = String::from_utf8_lossy(&[fenced.stdout, fenced.stderr].concat()).into_owned();
     assert_eq!(fenced.status.code(), Some(1), "{errors}");
-    let is_published = shares.scene.path("first/manifest").exists();
+    let is_published = scene.path("first/manifest").exists();
     assert!(errors.contains("superseded") && !is_published, "{errors}");
     drop(second);
-    conforms(&shares);
+    let share = |number: usize| with_share(s3.known_to(worker("s3://scenes/room")), number);
+    let n_views = || s3.n_objects("room/views/");
+    conforms(&scene, |store| coordinator("s3://scenes/room", store), share, n_views);
 }

@@ -18,6 +18,9 @@ pub use made::{encoded, encoded_into, generated, made};
 pub use python::{judge, python_with};
 pub use site::{ROOM, SITE, Site};
 
+/// Folders with source files.
+const OURS: [&str; 7] = ["common", "encoder", "edge", "doors", "packaging", "tests", "fuzz"];
+
 pub fn root() -> PathBuf {
     slag_test_support::workspace_root()
 }
@@ -136,6 +139,33 @@ pub fn copy_dir(from: &Path, to: &Path) {
     }
 }
 
+/// Returns all files below a folder, in order of their paths.
+pub fn files_below(folder: &Path) -> Vec<PathBuf> {
+    let mut paths: Vec<PathBuf> =
+        fs_err::read_dir(folder).expect("a folder").map(|entry| entry.expect("readable").path()).collect();
+    paths.sort();
+    paths.into_iter().flat_map(|path| if path.is_dir() { files_below(&path) } else { vec![path] }).collect()
+}
+
+/// Returns the files of the project's own folders with an extension, without those that are built or installed.
+pub fn sources(extension: &str) -> Vec<PathBuf> {
+    let is_made =
+        |path: &Path| ["target", "node_modules", "dist"].map(Path::new).iter().any(|of| path.ends_with(of));
+    let mut found = Vec::new();
+    let mut waiting: Vec<PathBuf> = OURS.iter().map(|folder| root().join(folder)).collect();
+    while let Some(path) = waiting.pop() {
+        if !path.is_dir() {
+            found.extend(Some(path).filter(|path| path.extension().is_some_and(|of| of == extension)));
+        } else if !is_made(&path) {
+            waiting.extend(
+                fs_err::read_dir(path).expect("a folder").map(|entry| entry.expect("readable").path()),
+            );
+        }
+    }
+    found.sort();
+    found
+}
+
 /// A service, stopped when dropped.
 pub struct Service {
     child: Child,
@@ -187,6 +217,16 @@ impl Drop for Service {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// Returns the words of a command line; what is between quotes is one word.
+pub fn words(line: &str) -> Vec<String> {
+    let parts = line.split('"').enumerate();
+    let words = parts.flat_map(|(at, part)| match at % 2 {
+        1 => vec![part],
+        _ => part.split_whitespace().collect(),
+    });
+    words.map(str::to_owned).collect()
 }
 
 pub fn text(path: &Path) -> &str {

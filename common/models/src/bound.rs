@@ -74,7 +74,7 @@ impl Model {
         inputs: &[(&str, &DynTensor)],
         outputs: &[(&str, Place)],
     ) -> ort::Result<Vec<DynTensor>> {
-        let session = self.session_mut();
+        let session = &mut self.session;
         // A new binding each time: a bound output is otherwise overwritten by the next run, while its reader has
         // it.
         let mut binding = session.create_binding()?;

@@ -93,10 +93,6 @@ fn known() -> Vec<String> {
 pub struct ColourShape;
 
 impl TextEncoder for ColourShape {
-    fn name(&self) -> &str {
-        NAME
-    }
-
     fn dim(&self) -> usize {
         DIM
     }

@@ -270,17 +270,13 @@ impl Description {
         files
     }
 
-    pub(crate) fn files_mut(&mut self) -> Vec<(&'static str, &mut FileRef)> {
-        let mut files = vec![("image.model", &mut self.image.file)];
+    pub(crate) fn files_mut(&mut self) -> Vec<&mut FileRef> {
+        let mut files = vec![&mut self.image.file];
         match &mut self.text {
-            TextDescription::Onnx(text) => {
-                files.extend([("text.model", &mut text.file), ("text.tokenizer", &mut text.tokenizer)]);
-            }
-            TextDescription::Phrases(text) => {
-                files.extend([("text.phrases", &mut text.file), ("text.vectors", &mut text.vectors)]);
-            }
+            TextDescription::Onnx(text) => files.extend([&mut text.file, &mut text.tokenizer]),
+            TextDescription::Phrases(text) => files.extend([&mut text.file, &mut text.vectors]),
         }
-        files.extend(self.text_centre.iter_mut().map(|centre| ("text.centre", &mut centre.file)));
+        files.extend(self.text_centre.iter_mut().map(|centre| &mut centre.file));
         files
     }
 

@@ -19,9 +19,8 @@ const NAP: Duration = Duration::from_millis(50);
 pub struct NetworkLimits {
     /// Failures in a row, without progress, before a download is given up.
     pub attempts: u32,
-    /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
-    pub first_backoff: Duration,
-    pub longest_backoff: Duration,
+    /// Waits after failures, scaled by 0.5..1.5.
+    pub backoff: Backoff,
     /// Longest `Retry-After` accepted; it is added to the backoff.
     pub longest_retry_after: Duration,
     /// Timeout for name resolution and for connecting, each.
@@ -42,8 +41,7 @@ impl Default for NetworkLimits {
     fn default() -> Self {
         Self {
             attempts: 6,
-            first_backoff: Duration::from_millis(500),
-            longest_backoff: Duration::from_secs(30),
+            backoff: Backoff { first: Duration::from_millis(500), longest: Duration::from_secs(30) },
             longest_retry_after: Duration::from_secs(120),
             connect_timeout: Duration::from_secs(10),
             read_timeout: Duration::from_secs(20),
@@ -450,8 +448,7 @@ impl<'a> Client<'a> {
         mut attempt: impl FnMut() -> Result<T, Stop>,
     ) -> Result<T, DownloadError> {
         let limits = &self.limits;
-        let backoff = Backoff { first: limits.first_backoff, longest: limits.longest_backoff };
-        let mut retries = Retries::new(limits.attempts, backoff);
+        let mut retries = Retries::new(limits.attempts, limits.backoff);
         loop {
             self.check_cancelled()?;
             let (failure, made_progress) = match attempt() {
@@ -491,9 +488,6 @@ impl<'a> Client<'a> {
 pub fn tls(ca: Option<&Path>) -> Result<TlsConfig, String> {
     let Some(path) = ca else { return Ok(TlsConfig::default()) };
     let pem = files::read_short(path, MAX_CA_BYTES).map_err(|e| e.to_string())?;
-    if pem.len() as u64 > MAX_CA_BYTES {
-        return Err(format!("longer than {MAX_CA_BYTES} bytes"));
-    }
     let mut authorities = Vec::new();
     for item in parse_pem(&pem) {
         if let PemItem::Certificate(certificate) = item.map_err(|e| e.to_string())? {

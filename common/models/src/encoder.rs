@@ -39,8 +39,6 @@ pub trait ImageEncoder: Send {
 
 /// Turns words into unit vectors of the image encoder's space.
 pub trait TextEncoder: Send {
-    fn name(&self) -> &str;
-
     fn dim(&self) -> usize;
 
     /// Encodes `text`: `[dim]`, a unit vector, centred if the description asks for it.

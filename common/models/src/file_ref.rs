@@ -82,16 +82,12 @@ impl TryFrom<String> for Sha256 {
 pub struct ModelFile {
     /// Its path; for messages only if it is embedded.
     pub path: PathBuf,
-    embedded: Option<&'static [u8]>,
+    pub(crate) embedded: Option<&'static [u8]>,
 }
 
 impl ModelFile {
     pub(crate) fn embedded(path: &Path, bytes: &'static [u8]) -> Self {
         Self { path: Path::new("(embedded)").join(path), embedded: Some(bytes) }
-    }
-
-    pub(crate) fn embedded_bytes(&self) -> Option<&'static [u8]> {
-        self.embedded
     }
 
     pub fn reader(&self) -> io::Result<Box<dyn Read>> {

@@ -75,7 +75,7 @@ impl OnnxImageEncoder {
         options: &SessionOptions,
     ) -> Result<Self, ModelError> {
         let mut model = Model::open(file, options)?;
-        let memory = model.take_memory();
+        let memory = model.memory.take();
         let preprocess = description.preprocess();
         let size = i64::from(preprocess.size_px());
         let (f32, input) = (TensorElementType::Float32, description.input.as_str());
@@ -276,7 +276,7 @@ impl ImageEncoder for OnnxImageEncoder {
     }
 
     fn placement(&self) -> Option<&Placement> {
-        Some(self.model.placement())
+        Some(&self.model.placement)
     }
 }
 

@@ -46,7 +46,7 @@ impl Levels {
         let model = Model::open(&ModelFile::embedded(Path::new(name), bytes), options)?;
         let size = i64::from(preprocess.size_px());
         let shape = [batch as i64, 3, size, size];
-        let squares = memory.bytes(model.session(), &shape).map_err(|cause| model.run_error(cause))?;
+        let squares = memory.bytes(&model.session, &shape).map_err(|cause| model.run_error(cause))?;
         let of_channels = |values: [f32; 3]| match is_f16 {
             true => model.owned(vec![3, 1, 1], values.map(f16::from_f32).to_vec()),
             false => model.owned(vec![3, 1, 1], values.to_vec()),
@@ -64,7 +64,7 @@ impl Levels {
         memory: &DeviceMemory,
         squares: impl Iterator<Item = std::borrow::Cow<'a, RgbImage>>,
     ) -> Result<DynTensor, SessionError> {
-        let failed = |cause| SessionError::Run { path: self.model.path().to_owned(), cause };
+        let failed = |cause| SessionError::Run { path: self.model.path.clone(), cause };
         let (places, square_bytes) = (bytes_mut(&mut self.squares).map_err(failed)?, self.square_bytes);
         let squares: Vec<_> = squares.collect();
         let n_of_thread = squares.len().div_ceil(N_THREADS).max(1);

@@ -218,7 +218,7 @@ impl ModelDir {
             }
             TextDescription::Phrases(text) => {
                 let (phrases, vectors) = (files.on_disk(&text.file)?, files.on_disk(&text.vectors)?);
-                Box::new(PhraseEncoder::open(name, dim, &phrases, (&vectors, &text.tensor), centre)?)
+                Box::new(PhraseEncoder::open(dim, &phrases, (&vectors, &text.tensor), centre)?)
             }
         })
     }
@@ -226,7 +226,7 @@ impl ModelDir {
 
 fn hashed(description: &Description, root: &Path) -> Result<Description, DescriptionError> {
     let mut hashed = description.clone();
-    for (_, file) in hashed.files_mut() {
+    for file in hashed.files_mut() {
         file.for_each_part(|part| {
             part.sha256 = Some(crate::description::Sha256(sha256_of(root, part)?));
             Ok::<_, DescriptionError>(())

@@ -16,7 +16,6 @@ const LONGEST_COMPARED: usize = 100;
 
 #[derive(Debug)]
 pub struct PhraseEncoder {
-    name: String,
     dim: usize,
     phrases: Vec<String>,
     index_of_key: HashMap<String, usize>,
@@ -30,7 +29,6 @@ impl PhraseEncoder {
     ///
     /// If two lines are the same phrase, the first one counts.
     pub fn open(
-        name: &str,
         dim: usize,
         phrases: &Path,
         (vectors, tensor): (&Path, &str),
@@ -60,7 +58,7 @@ impl PhraseEncoder {
             }
         }
         let known = Arc::new(KnownPhrases::new(index_of_key.keys().cloned(), true));
-        Ok(Self { name: name.to_owned(), dim, phrases: lines, index_of_key, known, vectors })
+        Ok(Self { dim, phrases: lines, index_of_key, known, vectors })
     }
 
     /// Returns the index of a phrase, which may be in the plural.
@@ -102,10 +100,6 @@ impl PhraseEncoder {
 }
 
 impl TextEncoder for PhraseEncoder {
-    fn name(&self) -> &str {
-        &self.name
-    }
-
     fn dim(&self) -> usize {
         self.dim
     }

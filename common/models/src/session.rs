@@ -66,7 +66,7 @@ pub(crate) struct Tensor {
 /// An input or output: its name, and for tensors element type and shape; -1 is any size.
 pub(crate) type Declared = (String, Option<(TensorElementType, Vec<i64>)>);
 
-fn declared(outlets: &[Outlet]) -> Vec<Declared> {
+pub(crate) fn declared(outlets: &[Outlet]) -> Vec<Declared> {
     let tensor = |outlet: &Outlet| match outlet.dtype() {
         ValueType::Tensor { ty, shape, .. } => Some((*ty, shape.to_vec())),
         _ => None,
@@ -74,18 +74,18 @@ fn declared(outlets: &[Outlet]) -> Vec<Declared> {
     outlets.iter().map(|outlet| (outlet.name().to_owned(), tensor(outlet))).collect()
 }
 
-fn listed(outlets: &[Outlet]) -> String {
-    let listed = outlets.iter().map(|outlet| format!("{} {}", outlet.name(), type_of(outlet)));
-    listed.collect::<Vec<_>>().join(", ")
+/// Names inputs or outputs with their types.
+pub(crate) fn listed(outlets: &[Outlet]) -> Vec<String> {
+    outlets.iter().map(|outlet| format!("{} {}", outlet.name(), type_of(outlet))).collect()
 }
 
 #[derive(Debug)]
 pub(crate) struct Model {
-    path: PathBuf,
-    session: Session,
-    placement: Placement,
+    pub(crate) path: PathBuf,
+    pub(crate) session: Session,
+    pub(crate) placement: Placement,
     /// The memory of the GPU that runs the model; `None` where tensors cannot be bound to it.
-    memory: Option<DeviceMemory>,
+    pub(crate) memory: Option<DeviceMemory>,
 }
 
 pub(crate) struct Slot {
@@ -109,7 +109,7 @@ impl Model {
     ) -> Result<Self, SessionError> {
         let path = &*file.path;
         // Checked before the library is loaded, so that a missing model is reported as such.
-        if file.embedded_bytes().is_none() {
+        if file.embedded.is_none() {
             fs_err::metadata(path).map_err(|cause| SessionError::Read { cause })?;
         }
         let environment = environment(&options.runtime)?;
@@ -184,7 +184,7 @@ impl Model {
                 .register(builder, options.gpu)
                 .map_err(|cause| SessionError::Provider { provider, cause })?;
         }
-        let committed = match file.embedded_bytes() {
+        let committed = match file.embedded {
             Some(bytes) => builder.commit_from_memory(bytes),
             None => builder.commit_from_file(&file.path),
         };
@@ -196,27 +196,6 @@ impl Model {
             (Some(&provider), _) => SessionError::Provider { provider, cause },
         })?;
         Ok((session, listener.placement()))
-    }
-
-    pub(crate) fn placement(&self) -> &Placement {
-        &self.placement
-    }
-
-    /// Takes the memory to bind tensors to, if the model runs on a GPU that allows it.
-    pub(crate) fn take_memory(&mut self) -> Option<DeviceMemory> {
-        self.memory.take()
-    }
-
-    pub(crate) fn path(&self) -> &Path {
-        &self.path
-    }
-
-    pub(crate) fn session(&self) -> &Session {
-        &self.session
-    }
-
-    pub(crate) fn session_mut(&mut self) -> &mut Session {
-        &mut self.session
     }
 
     pub(crate) fn run_error(&self, cause: ort::Error) -> SessionError {
@@ -248,8 +227,7 @@ impl Model {
         self.expect("input", self.session.inputs(), name.into(), element, shape)
     }
 
-    /// Returns output `name` (`None`: the only one that fits) if it gives `element`, with f16 accepted for f32,
-    /// and `shape`, where -1 is any size.
+    /// The same of an output.
     pub(crate) fn expect_output<'a>(
         &self,
         name: impl Into<Option<&'a str>>,
@@ -296,7 +274,7 @@ impl Model {
                 _ => Err(SessionError::Unnamed {
                     path,
                     role,
-                    found: outlets.iter().map(|o| format!("{} {}", o.name(), type_of(o))).collect(),
+                    found: listed(outlets),
                     expected: format!("{element} {expected:?}"),
                 }),
             };
@@ -337,22 +315,6 @@ impl Model {
             found,
             expected: format!("{element} {expected:?}"),
         }
-    }
-
-    pub(crate) fn inputs(&self) -> Vec<Declared> {
-        declared(self.session.inputs())
-    }
-
-    pub(crate) fn outputs(&self) -> Vec<Declared> {
-        declared(self.session.outputs())
-    }
-
-    pub(crate) fn listed_inputs(&self) -> String {
-        listed(self.session.inputs())
-    }
-
-    pub(crate) fn listed_outputs(&self) -> String {
-        listed(self.session.outputs())
     }
 
     pub(crate) fn layout_error(&self, found: String, expected: String) -> SessionError {

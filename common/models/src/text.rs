@@ -174,10 +174,6 @@ impl OnnxTextEncoder {
 }
 
 impl TextEncoder for OnnxTextEncoder {
-    fn name(&self) -> &str {
-        &self.name
-    }
-
     fn dim(&self) -> usize {
         self.dim
     }
@@ -210,7 +206,7 @@ impl TextEncoder for OnnxTextEncoder {
     }
 
     fn placement(&self) -> Option<&Placement> {
-        Some(self.model.placement())
+        Some(&self.model.placement)
     }
 }
 

@@ -1,13 +1,13 @@
 //! Wrong descriptions and files: one clear message each, no panic.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use crate::common::{model_dir, needs_shared, options, shared};
+use crate::common::{link_models, model_dir, needs_shared, options, shared, unhashed};
 use slag_models::{EncoderId, ModelDir, SessionOptions};
 use tempfile::TempDir;
 
-/// A copy of the description `name` with replacements, its files linked beside it as `models`.
-fn changed(name: &str, models: &Path, replacements: &[(&str, &str)]) -> TempDir {
+/// A copy of the description `name` with replacements, without its files.
+fn changed(name: &str, replacements: &[(&str, &str)]) -> TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     let mut text = fs_err::read_to_string(model_dir(name).join("model.toml")).expect("it is readable");
     for (from, to) in [("../../../../shared/models", "models")].iter().chain(replacements) {
@@ -15,10 +15,13 @@ fn changed(name: &str, models: &Path, replacements: &[(&str, &str)]) -> TempDir 
         text = text.replace(from, to);
     }
     fs_err::write(folder.path().join("model.toml"), text).expect("it is writable");
-    if models.is_dir() {
-        std::os::unix::fs::symlink(models.canonicalize().expect("it exists"), folder.path().join("models"))
-            .expect("a link");
-    }
+    folder
+}
+
+/// The same, with its files beside it as `models`.
+fn changed_with_files(name: &str, replacements: &[(&str, &str)]) -> TempDir {
+    let folder = changed(name, replacements);
+    link_models(folder.path());
     folder
 }
 
@@ -34,7 +37,6 @@ fn failure(folder: &Path, options: &SessionOptions) -> String {
 
 #[test]
 fn wrong_descriptions_are_named_by_field_or_line() {
-    let no_models = PathBuf::from("absent");
     let no_runtime = SessionOptions::new("no-such-library.so".into());
     let hash = "sha256 = \"7651536597622dcf6d1e2f9ab46450187797180727d08ccc1ee903e1eed44469\"";
     for (from, to, expected) in [
@@ -56,7 +58,7 @@ fn wrong_descriptions_are_named_by_field_or_line() {
         (&format!(", {hash}"), "", "records no sha256"),
         ("[text]", "[text", "line"),
     ] {
-        let folder = changed("conse", &no_models, &[(from, to)]);
+        let folder = changed("conse", &[(from, to)]);
         let message = failure(folder.path(), &no_runtime);
         assert!(message.contains(expected), "{to}: {message}");
         assert!(message.contains("model.toml"), "{to}: {message}");
@@ -64,7 +66,7 @@ fn wrong_descriptions_are_named_by_field_or_line() {
     let message = failure(Path::new("no-such-folder"), &no_runtime);
     assert!(message.contains("no-such-folder/model.toml"), "{message}");
     // Files are opened with the encoder.
-    let folder = changed("conse", &no_models, &[]);
+    let folder = changed("conse", &[]);
     let message = failure(folder.path(), &no_runtime);
     assert!(message.contains("conse_mnv2_int8.onnx") && message.contains("put the file there"), "{message}");
 }
@@ -72,7 +74,7 @@ fn wrong_descriptions_are_named_by_field_or_line() {
 #[needs_shared]
 #[test]
 fn files_that_do_not_fit_their_description_are_refused() {
-    let (models, options) = (shared("models"), options());
+    let options = options();
     let vision = ", sha256 = \"e0bca5c7dd0e39ddb0137356acde890cf58930766dccd276ae8242a868f39ae4\"";
     let text = ", sha256 = \"1965ec622a100a1beebea6db591985d88f12e057f9772fc83dc8c4c8cd6e5ef0\"";
     for (replacements, expected) in [
@@ -97,7 +99,7 @@ fn files_that_do_not_fit_their_description_are_refused() {
         (&[("end_token_id = 49407", "end_token_id = 2")], "the model's end token is 2"),
         (&[("clip_tiny/text_model.onnx", "clip_tiny/absent.onnx")], "absent.onnx"),
     ] {
-        let folder = changed("clip_tiny", &models, replacements);
+        let folder = changed_with_files("clip_tiny", replacements);
         let message = failure(folder.path(), &options);
         assert!(message.contains(expected), "{replacements:?}: {message}");
     }
@@ -105,7 +107,7 @@ fn files_that_do_not_fit_their_description_are_refused() {
         (&[("tensor = \"vectors\"", "tensor = \"v\"")][..], "no tensor \"v\", it has mean, vectors"),
         (&[("tensor = \"vectors\"", "tensor = \"mean\"")], "is F32 [512], expected F16 or F32 [1612, 512]"),
     ] {
-        let folder = changed("conse", &models, replacements);
+        let folder = changed_with_files("conse", replacements);
         let message = failure(folder.path(), &options);
         assert!(message.contains(expected), "{replacements:?}: {message}");
     }
@@ -116,11 +118,7 @@ fn files_that_do_not_fit_their_description_are_refused() {
 fn a_tokenizer_of_another_vocabulary_is_refused() {
     let (models, options) = (shared("models"), options());
     let hash = ", sha256 = \"e77528f5a52e0f4b4f98e1b3b4c13453f7762f2e38ec23c9ed352278a65de0a4\"";
-    let folder = changed(
-        "clip_tiny",
-        Path::new("absent"),
-        &[(hash, ""), ("clip_tokenizer/tokenizer.json", "tokenizer.json")],
-    );
+    let folder = changed("clip_tiny", &[(hash, ""), ("clip_tokenizer/tokenizer.json", "tokenizer.json")]);
     fs_err::create_dir(folder.path().join("models")).expect("it is writable");
     std::os::unix::fs::symlink(
         models.join("clip_tiny").canonicalize().expect("it exists"),
@@ -158,14 +156,9 @@ fn cut_files_are_refused() {
     ] {
         let bytes = fs_err::read(models.join(path)).expect("it is readable");
         let text = fs_err::read_to_string(model_dir(name).join("model.toml")).expect("it is readable");
-        // The description without hashes, which would reveal every change.
-        let mut unhashed = String::new();
-        for line in text.replace("../../../../shared/models", ".").lines() {
-            unhashed += line.split(", sha256").next().expect("one part at least");
-            unhashed += if line.contains(", sha256") { " }\n" } else { "\n" };
-        }
+        let description = unhashed(&text.replace("../../../../shared/models", "."));
         let folder = tempfile::tempdir().expect("a folder");
-        fs_err::write(folder.path().join("model.toml"), unhashed).expect("it is writable");
+        fs_err::write(folder.path().join("model.toml"), description).expect("it is writable");
         for sub in ["clip_tiny", "clip_text", "clip_tokenizer", "image_encoder"] {
             fs_err::create_dir(folder.path().join(sub)).expect("it is writable");
             for entry in fs_err::read_dir(models.join(sub)).expect("it is readable") {
@@ -202,11 +195,11 @@ fn the_encoder_id_needs_no_files() {
 #[test]
 fn a_hash_that_is_left_out_is_computed_from_the_file() {
     let full = ModelDir::open(&model_dir("conse")).expect("no file is needed");
-    let (id, models) = (full.encoder_id(), shared("models"));
+    let id = full.encoder_id();
     // Without a recorded hash, it is computed from the file.
     let hash = ", sha256 = \"0799d6716c84b2a15511cf1b267a0fb6ee91c8ca5b2155680b1b46770b798952\"";
-    let folder = changed("conse", &models, &[(hash, "")]);
+    let folder = changed_with_files("conse", &[(hash, "")]);
     assert_eq!(ModelDir::open(folder.path()).expect("it opens").encoder_id(), id);
-    let folder = changed("conse", &models, &[("0799d6716c84", "0799d6716c85")]);
+    let folder = changed_with_files("conse", &[("0799d6716c84", "0799d6716c85")]);
     assert_ne!(ModelDir::open(folder.path()).expect("it opens").encoder_id().hash(), id.hash());
 }

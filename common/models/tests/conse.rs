@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::common::{array, max_difference, model_dir, needs_shared, options, shared, unit};
+use crate::common::{array, assert_recorded, max_difference, model_dir, needs_shared, options, shared, unit};
 use ::image::{RgbImage, imageops};
 use half::f16;
 use safetensors::SafeTensors;
@@ -29,11 +29,8 @@ fn image_vectors_equal_the_recorded_ones_in_any_batch() {
         .iter()
         .flat_map(|image| encoder.encode(&[Crop::whole(image.clone())]).expect("it encodes"))
         .collect();
-    for (k, (found, expected)) in alone.chunks_exact(512).zip(expected.chunks_exact(512)).enumerate() {
-        let difference = max_difference(found, &unit(expected));
-        // Recorded with ONNX Runtime 1.19; its 8-bit kernels round like ours.
-        assert!(difference < 1e-5, "image {k}: {difference}");
-    }
+    // Recorded with ONNX Runtime 1.19; its 8-bit kernels round like ours.
+    assert_recorded(&alone, &expected, 512, 1e-5);
     // 20 crops: one whole batch and one part.
     let crops: Vec<Crop> = (0..20).map(|i| Crop::whole(images[i % 3].clone())).collect();
     let together = encoder.encode(&crops).expect("it encodes");

@@ -1,7 +1,7 @@
 //! Vectors of patches against tensors recorded with PyTorch (`tests/models/dense_tiny/export.py`), and texts
 //! without an end token.
 
-use crate::common::{array, image, made, max_difference, model_dir, options, unit};
+use crate::common::{array, assert_recorded, image, made, max_difference, model_dir, options, unit};
 use slag_models::{Crop, ModelDir};
 
 #[test]
@@ -15,10 +15,7 @@ fn patches_and_crops_equal_the_recorded_ones() {
     let vectors = encoder.encode_patches(&photo).expect("it runs").expect("it has patches");
     let (shape, recorded) = array::<f32>(&golden, "patch_embeddings");
     assert_eq!((shape, vectors.len()), (vec![16, 16], 16 * 16));
-    for (k, (found, expected)) in vectors.chunks_exact(16).zip(recorded.chunks_exact(16)).enumerate() {
-        let difference = max_difference(found, &unit(expected));
-        assert!(difference < 1e-5, "patch {k}: {difference}");
-    }
+    assert_recorded(&vectors, &recorded, 16, 1e-5);
     // Neighbouring patches differ, so their order matters.
     assert!(max_difference(&vectors[..16], &unit(&recorded[16..32])) > 0.01);
     let (_, recorded) = array::<f32>(&golden, "image_embeds");

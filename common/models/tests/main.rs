@@ -7,7 +7,6 @@ mod common;
 mod conse;
 mod dense;
 mod encoders;
-mod full_size;
 mod hub;
 mod sam;
 mod sam2;

@@ -2,22 +2,11 @@
 
 use std::path::Path;
 
-use crate::common::{array, image, model_dir, needs_shared, options, shared};
+use crate::common::{
+    array, image, link_models, max_difference_of_planes as max_difference, model_dir, needs_shared, options,
+    shared, unhashed,
+};
 use slag_models::sam::{Embedding, Letterbox, Sam};
-
-/// The largest difference between `found`, `[planes][rows][columns]` from which every `step`th row and column is
-/// taken, and the recorded `expected`.
-fn max_difference(found: &[f32], columns: usize, step: usize, expected: &[f32]) -> f64 {
-    let rows = found.chunks_exact(columns).enumerate();
-    // Planes have a multiple of `step` rows.
-    let taken = rows.filter(|(row, _)| row % step == 0).flat_map(|(_, row)| row.iter().step_by(step));
-    let pairs: Vec<_> = taken.zip(expected).collect();
-    assert_eq!(pairs.len(), expected.len());
-    let differences = pairs.iter().map(|(found, expected)| f64::from(**found - **expected).abs());
-    let largest = differences.fold(0.0, f64::max);
-    println!("{} values: {largest:.1e}", pairs.len());
-    largest
-}
 
 fn open() -> (std::path::PathBuf, Sam) {
     let (golden, options) = (shared("models/sam_tiny/golden.npz"), options());
@@ -92,25 +81,6 @@ fn masks_and_scores_equal_the_recorded_ones() {
 
 #[needs_shared]
 #[test]
-fn a_batch_of_prompts_gives_what_each_gives_alone() {
-    let (golden, sam) = open();
-    let embedding = recorded_embedding(&golden, &sam);
-    let points: Vec<[f32; 2]> = (0..5).map(|i| [100.0 + 170.0 * i as f32, 620.0 - 90.0 * i as f32]).collect();
-    let together = sam.decode(&embedding, 5, &points, &[1; 5]).expect("it runs");
-    for (k, point) in points.iter().enumerate() {
-        let alone = sam.decode(&embedding, 1, &[*point], &[1]).expect("it runs");
-        let n = alone.logits.len();
-        let logits = &together.logits[k * n..(k + 1) * n];
-        let difference = max_difference(logits, 256, 1, &alone.logits);
-        assert!(difference < 1e-5, "prompt {k}: {difference}");
-        assert!(
-            max_difference(&together.predicted_ious[3 * k..3 * k + 3], 3, 1, &alone.predicted_ious) < 1e-5
-        );
-    }
-}
-
-#[needs_shared]
-#[test]
 fn wrong_descriptions_and_files_are_named() {
     let (models, options) = (shared("models"), options());
     let description =
@@ -118,19 +88,13 @@ fn wrong_descriptions_and_files_are_named() {
     let (encoder, decoder) = ("vision_encoder.onnx", "prompt_encoder_mask_decoder.onnx");
     let message = |replacements: &[(&str, &str)], hashes: bool| {
         let folder = tempfile::tempdir().expect("a folder");
-        std::os::unix::fs::symlink(models.canonicalize().expect("it exists"), folder.path().join("models"))
-            .expect("a link");
+        link_models(folder.path());
         let cut = fs_err::read(models.join("sam_tiny").join(decoder)).expect("it is readable");
         fs_err::write(folder.path().join("cut.onnx"), &cut[..cut.len() / 2]).expect("it is writable");
         let mut text =
             description.replace("../../../../shared/models", ".").replace("sam_tiny/", "models/sam_tiny/");
         if !hashes {
-            text = text
-                .lines()
-                .map(|line| line.split(", sha256").next().unwrap_or(line))
-                .collect::<Vec<_>>()
-                .join("\n");
-            text = text.replace(".onnx\"", ".onnx\" }");
+            text = unhashed(&text);
         }
         for (from, to) in replacements {
             assert!(text.contains(from), "{from:?} is not in the description");

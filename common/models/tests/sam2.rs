@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::common::{array, image, model_dir, options};
+use crate::common::{array, image, max_difference_of_planes as max_difference, model_dir, options};
 use slag_models::sam::{Letterbox, Sam};
 
 fn golden() -> PathBuf {
@@ -12,16 +12,6 @@ fn golden() -> PathBuf {
 
 fn open() -> Sam {
     Sam::open(&model_dir("sam2_tiny"), &options()).expect("it opens")
-}
-
-/// The largest difference between every `step`th row and column of `found`, `[planes][rows][columns]`, and the
-/// recorded `expected`.
-fn max_difference(found: &[f32], columns: usize, step: usize, expected: &[f32]) -> f64 {
-    let rows = found.chunks_exact(columns).enumerate();
-    let taken = rows.filter(|(row, _)| row % step == 0).flat_map(|(_, row)| row.iter().step_by(step));
-    let pairs: Vec<_> = taken.zip(expected).collect();
-    assert_eq!(pairs.len(), expected.len());
-    pairs.iter().map(|(found, expected)| f64::from(**found - **expected).abs()).fold(0.0, f64::max)
 }
 
 #[test]

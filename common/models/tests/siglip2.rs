@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use crate::common::{array, image, max_difference, model_dir, options, unit};
+use crate::common::{array, assert_recorded, image, max_difference, model_dir, options, unit};
 use slag_models::{
     Crop, ModelDir,
     preprocess::{Filter, Preprocess, Resize},
@@ -65,12 +65,7 @@ fn image_vectors_equal_the_recorded_ones() {
     let mut encoder = pulled(folder.path(), |as_it_is| as_it_is).image_encoder(&options()).expect("it loads");
     let crops: Vec<Crop> = (0..3).map(|k| Crop::whole(image(&golden, &format!("image_{k}")))).collect();
     let found = encoder.encode(&crops).expect("it encodes");
-    let (_, expected) = array::<f32>(&golden, "image_embeds");
-    assert_eq!(found.len(), expected.len());
-    for (k, (found, expected)) in found.chunks_exact(DIM).zip(expected.chunks_exact(DIM)).enumerate() {
-        let difference = max_difference(found, &unit(expected));
-        assert!(difference < 2e-6, "image {k}: {difference}");
-    }
+    assert_recorded(&found, &array::<f32>(&golden, "image_embeds").1, DIM, 2e-6);
 }
 
 /// Ids up to the end; the rest of the recorded 64 is padding.

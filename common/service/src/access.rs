@@ -260,9 +260,6 @@ fn read_token(path: &Path) -> Result<String, AccessError> {
     let bytes =
         files::read_short(path, MAX_TOKEN_BYTES).map_err(|cause| AccessError::Unreadable { cause })?;
     let refused = |found: String| Err(AccessError::Token { path: path.to_owned(), found });
-    if bytes.len() as u64 > MAX_TOKEN_BYTES {
-        return refused(format!("more than {MAX_TOKEN_BYTES} bytes"));
-    }
     let text = String::from_utf8_lossy(&bytes);
     let token = text.trim();
     if token.len() < MIN_TOKEN_CHARS {

@@ -7,9 +7,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::TcpListener;
-#[cfg(unix)]
-use tokio::net::UnixListener;
+use tokio::net::{TcpListener, UnixListener};
 
 use crate::tls::{Tls, TlsError, TlsFiles};
 
@@ -21,7 +19,6 @@ const UNIX: &str = "unix:";
 /// does not return while the service is silent.
 pub async fn answers(url: &str) -> bool {
     let asked = match (url.strip_prefix(UNIX), url.split_once("://")) {
-        #[cfg(unix)]
         (Some(path), _) => match tokio::net::UnixStream::connect(path).await {
             Ok(stream) => ask_for_health(stream).await,
             Err(error) => Err(error),
@@ -89,7 +86,6 @@ impl FromStr for Listen {
     fn from_str(text: &str) -> Result<Self, String> {
         match text.strip_prefix(UNIX) {
             Some("") => Err("a path after unix:".to_owned()),
-            Some(_) if cfg!(not(unix)) => Err("IP:PORT; this system has no Unix sockets".to_owned()),
             Some(path) => Ok(Self::Unix(path.into())),
             None => text.parse().map(Self::Tcp).map_err(|_| "IP:PORT or unix:PATH".to_owned()),
         }
@@ -117,13 +113,13 @@ pub struct ListenError {
 #[derive(Debug)]
 pub struct Listener {
     socket: Socket,
-    tls: Option<Tls>,
+    /// Makes TLS connections out of the accepted ones.
+    pub(crate) tls: Option<Tls>,
 }
 
 #[derive(Debug)]
 enum Socket {
     Tcp(TcpListener),
-    #[cfg(unix)]
     Unix(UnixListener, PathBuf),
 }
 
@@ -149,7 +145,6 @@ pub async fn bind(listen: &Listen) -> Result<Listener, ListenError> {
     Ok(Listener { socket, tls: None })
 }
 
-#[cfg(unix)]
 async fn bind_unix(path: &std::path::Path) -> io::Result<Socket> {
     use std::os::unix::fs::{FileTypeExt, PermissionsExt};
 
@@ -162,21 +157,11 @@ async fn bind_unix(path: &std::path::Path) -> io::Result<Socket> {
     Ok(Socket::Unix(socket, path.to_owned()))
 }
 
-#[cfg(not(unix))]
-async fn bind_unix(_: &std::path::Path) -> io::Result<Socket> {
-    Err(io::ErrorKind::Unsupported.into())
-}
-
 impl Listener {
     #[must_use]
     pub fn with_tls(mut self, tls: Option<Tls>) -> Self {
         self.tls = tls;
         self
-    }
-
-    /// Returns what makes TLS connections out of the accepted ones.
-    pub(crate) fn tls(&self) -> Option<Tls> {
-        self.tls.clone()
     }
 
     /// Returns the address to connect to: `http://IP:PORT`, with TLS `https://IP:PORT`, or `unix:PATH`.
@@ -186,7 +171,6 @@ impl Listener {
                 let scheme = if self.tls.is_some() { "https" } else { "http" };
                 Ok(format!("{scheme}://{}", socket.local_addr()?))
             }
-            #[cfg(unix)]
             Socket::Unix(_, path) => Ok(format!("{UNIX}{}", path.display())),
         }
     }
@@ -202,14 +186,12 @@ impl Listener {
                 }
                 Ok((Box::new(stream), Some(peer.ip())))
             }
-            #[cfg(unix)]
             Socket::Unix(socket, _) => Ok((Box::new(socket.accept().await?.0), None)),
         }
     }
 }
 
 /// The path of a Unix socket outlives the socket unless it is removed.
-#[cfg(unix)]
 impl Drop for Listener {
     fn drop(&mut self) {
         if let Socket::Unix(_, path) = &self.socket
@@ -260,21 +242,19 @@ mod tests {
         assert!(!answers(&url).await, "nobody listens");
     }
 
-    #[cfg(unix)]
     #[tokio::test]
     async fn a_dead_socket_is_replaced_and_a_living_one_is_not() {
-        let dir = std::env::temp_dir().join(format!("slag-listen-{}", std::process::id()));
-        std::fs::create_dir_all(&dir).expect("a folder");
-        let listen = Listen::Unix(dir.join("s"));
-        drop(std::os::unix::net::UnixListener::bind(dir.join("s")).expect("binds"));
+        let dir = tempfile::tempdir().expect("a folder");
+        let socket = dir.path().join("s");
+        let listen = Listen::Unix(socket.clone());
+        drop(std::os::unix::net::UnixListener::bind(&socket).expect("binds"));
         let living = bind(&listen).await.expect("replaces what nobody listens on");
         let refused = bind(&listen).await.expect_err("in use").to_string();
         assert!(refused.contains("/s") && refused.contains("choose another"), "{refused}");
         drop(living);
-        assert!(!dir.join("s").exists());
-        std::fs::write(dir.join("s"), b"a file of somebody").expect("writes");
+        assert!(!socket.exists());
+        std::fs::write(&socket, b"a file of somebody").expect("writes");
         bind(&listen).await.expect_err("not a socket");
-        assert!(dir.join("s").exists());
-        std::fs::remove_dir_all(dir).expect("removed");
+        assert!(socket.exists());
     }
 }

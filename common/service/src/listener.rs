@@ -85,7 +85,7 @@ pub async fn serve(
     stop: impl Future<Output = ()>,
 ) -> Result<(), CutOff> {
     let listener = listener.into();
-    let tls = listener.tls();
+    let tls = listener.tls.clone();
     let permits = Permits::new(limits.n_connections, limits.n_per_peer, limits.n_reserved);
     let graceful = GracefulShutdown::new();
     let mut stop = std::pin::pin!(stop);

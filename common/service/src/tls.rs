@@ -132,9 +132,6 @@ fn read_pem<T>(
 ) -> Result<T, TlsError> {
     let file = |cause: String| TlsError::File { path: path.to_owned(), expected, cause };
     let bytes = files::read_short(path, MAX_BYTES).map_err(|e| file(e.to_string()))?;
-    if bytes.len() as u64 > MAX_BYTES {
-        return Err(file(format!("longer than {MAX_BYTES} bytes")));
-    }
     parse(&bytes).map_err(|e| match e {
         pem::Error::NoItemsFound => file("none is there".to_owned()),
         e => file(e.to_string()),

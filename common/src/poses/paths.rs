@@ -37,13 +37,7 @@ impl PhotoFinder {
     }
 
     fn find_as_written(&mut self, path: &str) -> Option<(PathBuf, String)> {
-        let parts: Vec<&str> = Path::new(path)
-            .components()
-            .filter_map(|part| match part {
-                Component::Normal(part) => part.to_str(),
-                _ => None,
-            })
-            .collect();
+        let parts = parts_of(path);
         let endings = || (0..parts.len()).map(|start| parts[start..].join("/"));
         let exact = endings().find(|ending| self.dir.join(ending).is_file());
         let found = exact.map(|ending| (self.dir.join(&ending), ending));
@@ -80,6 +74,15 @@ impl PhotoFinder {
         let first = moved.first()?;
         Some(format!("{} photos have other names than the poses say, such as {first}", moved.len()))
     }
+}
+
+/// Returns the folders and the name of a path, without its root and its dots.
+pub(super) fn parts_of(path: &str) -> Vec<&str> {
+    let part = |part| match part {
+        Component::Normal(part) => part.to_str(),
+        _ => None,
+    };
+    Path::new(path).components().filter_map(part).collect()
 }
 
 /// Returns the text with `%20` and the like as the characters that they stand for; `None` without any.

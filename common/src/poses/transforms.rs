@@ -4,14 +4,14 @@
 //! records an earlier change of the world frame; it is not undone, so the world frame is that of the file's poses.
 
 use std::f64::consts::PI;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DVec3};
 use serde::Deserialize;
 
 use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
-use super::paths::{PhotoFinder, parent};
+use super::paths::{PhotoFinder, parent, parts_of};
 use super::view_set::{AppliedTransform, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::files;
@@ -196,13 +196,7 @@ fn names_of(file_paths: &[String]) -> Vec<Option<String>> {
     let split: Vec<(Vec<&str>, usize)> = file_paths
         .iter()
         .map(|path| {
-            let parts: Vec<&str> = Path::new(path)
-                .components()
-                .filter_map(|part| match part {
-                    Component::Normal(part) => part.to_str(),
-                    _ => None,
-                })
-                .collect();
+            let parts = parts_of(path);
             let folders = &parts[..parts.len().saturating_sub(1)];
             let images_at = folders.iter().position(|part| is_image_folder(part));
             (parts, images_at.map_or(0, |at| at + 1))

@@ -11,6 +11,8 @@ use crate::text::TextService;
 use anyhow::anyhow;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
+use serde::de::DeserializeOwned;
+use serde::de::value::{Error, StrDeserializer};
 use slag_common::byte_size::{ByteSize, ByteSizeError};
 use slag_common::shard::Profile;
 use slag_models::commands::{self as model_commands, MODELS_HELP, RunArgs};
@@ -109,7 +111,7 @@ pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
 }
 
 pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
-    let failed = Failure::of("models");
+    let failed = |error| Failure::Failed("models", error);
     let models = model_commands::open(args.models.as_deref(), &variable);
     let options = session_options(&args.how).map_err(|e| failed(e.into()))?;
     Ok((models.map_err(|e| failed(e.into()))?, options))
@@ -120,6 +122,11 @@ pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     let exe = std::env::current_exe().unwrap_or_default();
     let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
     how.session_options(&model_commands::runtime_folders(&exe), n_cores.min(MAX_MODEL_THREADS))
+}
+
+/// Reads a value by its name in JSON.
+pub(super) fn named<T: DeserializeOwned>(text: &str) -> Result<T, Error> {
+    T::deserialize(StrDeserializer::new(text))
 }
 
 pub fn variable(name: &str) -> Option<OsString> {

@@ -78,9 +78,6 @@ fn read(
         read => read.map_err(|cause| ConfigError::Unreadable { cause })?,
     };
     let wrong = |what: String| ConfigError::Wrong { place: path.display().to_string(), what };
-    if bytes.len() as u64 > MAX_FILE_BYTES {
-        return Err(wrong(format!("longer than {MAX_FILE_BYTES} bytes, expected a few lines of flags")));
-    }
     let text =
         String::from_utf8(bytes).map_err(|_| wrong("not text in UTF-8; save it as such".to_owned()))?;
     let table = text.parse::<Table>().map_err(|e| wrong(e.to_string().trim_end().to_owned()))?;

@@ -96,8 +96,7 @@ fn disk(cache: &EdgeCache) -> Finding {
     let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(dir);
     match cache.files().free_bytes(there) {
         Err(error) => Finding::new("disk", Verdict::Missing, format!("{error}; give another --cache")),
-        Ok(None) => Finding::new("disk", Verdict::Ok, dir.display().to_string()),
-        Ok(Some(free)) => {
+        Ok(free) => {
             let verdict = if free < LITTLE_BYTES { Verdict::Note } else { Verdict::Ok };
             Finding::new("disk", verdict, format!("{} free for {}", ByteSize(free), dir.display()))
         }

@@ -40,10 +40,6 @@ pub enum Failure {
 }
 
 impl Failure {
-    pub fn of(kind: &'static str) -> impl Fn(anyhow::Error) -> Self {
-        move |error| Self::Failed(kind, error)
-    }
-
     pub fn text(&self) -> String {
         match self {
             Self::BrokenPipe => String::new(),

@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::fetch::{FetchRequest, Position};
+use crate::fetch::{FetchRequest, Position, fetch};
 use crate::query::parse_point;
 use anyhow::anyhow;
 use clap::Args;
@@ -14,7 +14,7 @@ use slag_service::stop::on_stop;
 use super::args::{CacheArgs, DownloadArgs};
 use super::failure::Failure;
 use super::follow::{FollowArgs, watch};
-use super::network::{failure, fetch_once};
+use super::network::{environment, failure};
 use super::output::print_json;
 use super::progress::{Bar, bad_cells, print_report};
 
@@ -34,7 +34,7 @@ pub struct FetchArgs {
     pub at: Option<DVec3>,
     /// Position of the robot: WGS 84 degrees, and metres.
     #[arg(long, value_name = "LAT,LON[,HEIGHT]", value_parser = parse_geographic, allow_hyphen_values = true, conflicts_with = "at")]
-    pub at_geo: Option<(f64, f64, Option<f64>)>,
+    pub at_geo: Option<Position>,
     /// Change the robot's scene: accept this scene only, from now on. Without it, a store that offers another
     /// scene than the first one fetched is refused.
     #[arg(long, value_name = "NAME")]
@@ -55,13 +55,7 @@ pub struct FetchArgs {
 }
 
 pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
-    let at = match (args.at, args.at_geo) {
-        (Some(at), _) => Some(Position::World(at)),
-        (None, Some((latitude_deg, longitude_deg, height_m))) => {
-            Some(Position::Geographic { latitude_deg, longitude_deg, height_m })
-        }
-        (None, None) => None,
-    };
+    let at = args.at.map(Position::World).or(args.at_geo);
     let settings = args.follow.settings(args.download.radius)?;
     let ca = args.download.ca.clone();
     let request = FetchRequest { scene: args.scene, ..args.download.request(args.from, at) };
@@ -74,7 +68,7 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     if args.watch {
         return watch(&cache, &request, ca.as_deref(), settings, &cancel, &bar, args.json);
     }
-    let result = fetch_once(&cache, &request, ca.as_deref(), &cancel, &bar);
+    let result = fetch(&cache, &request, &environment(ca.as_deref(), &cancel, &bar));
     bar.finish();
     match result {
         Ok(report) => {
@@ -88,14 +82,8 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     }
 }
 
-fn parse_geographic(text: &str) -> Result<(f64, f64, Option<f64>), String> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
-    let in_range = |lat: f64, lon: f64| lat.abs() <= 90.0 && lon.abs() <= 180.0;
-    match numbers.as_deref() {
-        Some([lat, lon]) if in_range(*lat, *lon) => Ok((*lat, *lon, None)),
-        Some([lat, lon, height]) if in_range(*lat, *lon) && height.is_finite() => {
-            Ok((*lat, *lon, Some(*height)))
-        }
-        _ => Err("degrees LAT,LON within ±90 and ±180, optionally a height in metres".into()),
-    }
+fn parse_geographic(text: &str) -> Result<Position, &'static str> {
+    let position =
+        text.parse::<Position>().ok().filter(|position| matches!(position, Position::Geographic { .. }));
+    position.ok_or("degrees LAT,LON within ±90 and ±180, optionally a height in metres")
 }

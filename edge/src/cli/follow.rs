@@ -7,14 +7,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use crate::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
-use crate::fetch::{FetchRequest, last_position};
+use crate::fetch::{FetchRequest, fetch, last_position};
 use crate::http::{App, RESTARTS, keep_following};
 use crate::store::EdgeCache;
 use anyhow::anyhow;
 use clap::Args;
 
 use super::failure::Failure;
-use super::network::{failure, fetch_once, random};
+use super::network::{environment, failure, random};
 use super::output::print_json;
 use super::progress::{Bar, print_line};
 
@@ -82,7 +82,7 @@ pub fn watch(
         settings,
         &following,
         FollowEnvironment {
-            fetch: &mut |request| fetch_once(cache, request, ca, cancel, bar),
+            fetch: &mut |request| fetch(cache, request, &environment(ca, cancel, bar)),
             report: &mut |outcome| {
                 bar.finish();
                 let result = match outcome {
@@ -126,7 +126,7 @@ pub fn follow_in_background(
     std::thread::Builder::new().name("follow".into()).spawn(move || {
         let followed = keep_following(&following, RESTARTS, &stop, || {
             let environment = FollowEnvironment {
-                fetch: &mut |request| fetch_once(&cache, request, ca.as_deref(), &stop, &()),
+                fetch: &mut |request| fetch(&cache, request, &environment(ca.as_deref(), &stop, &())),
                 report: &mut |outcome| match outcome {
                     Ok(report) => {
                         // Served before it is said.

@@ -6,13 +6,11 @@ use std::time::Duration;
 
 use clap::Args;
 use glam::DVec3;
-use serde::de::value::{Error, StrDeserializer};
-use serde::de::{DeserializeOwned, IntoDeserializer};
 use slag_api::objects::{Name, ObjectOnBoard, ObjectPage};
 use slag_common::frames::Aabb;
 use slag_common::note;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, parse_radius, parse_reach};
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named, parse_radius, parse_reach};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
 use crate::query::{ListFormat, ObjectFilter, ObjectOrder, parse_box, parse_point};
@@ -62,11 +60,6 @@ pub struct ListArgs {
     pub cache: CacheArgs,
     #[command(flatten)]
     pub models: ModelArgs,
-}
-
-fn named<T: DeserializeOwned>(text: &str) -> Result<T, Error> {
-    let value: StrDeserializer<'_, Error> = text.into_deserializer();
-    T::deserialize(value)
 }
 
 pub fn run(args: ListArgs) -> Result<(), Failure> {

@@ -8,11 +8,11 @@ use slag_common::files;
 use slag_locate::Prior;
 
 use crate::locate::{Answer, Camera, LocateError, MAX_PHOTO_BYTES, PhotoFile, Pose, Verification, answer};
-use crate::query::parse_point;
+use crate::query::{numbers, parse_point};
 use crate::score::Budget;
 use crate::store::Snapshot;
 
-use super::args::CacheArgs;
+use super::args::{CacheArgs, parse_reach};
 use super::failure::{Failure, store_failure};
 use super::output::{print_json, print_pairs};
 
@@ -40,7 +40,7 @@ pub struct LocateArgs {
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, requires = "sigma", allow_hyphen_values = true)]
     pub near: Option<DVec3>,
     /// Standard deviation of --near, world units: poses beyond three of it are refused.
-    #[arg(long, value_name = "UNITS", value_parser = parse_sigma, requires = "near")]
+    #[arg(long, value_name = "UNITS", value_parser = parse_reach, requires = "near")]
     pub sigma: Option<f64>,
     #[command(flatten)]
     pub cache: CacheArgs,
@@ -55,13 +55,7 @@ fn parse_focal(text: &str) -> Result<f64, String> {
 }
 
 fn parse_centre(text: &str) -> Result<[f64; 2], String> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
-    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| "expected pixels X,Y".into())
-}
-
-fn parse_sigma(text: &str) -> Result<f64, String> {
-    let sigma = text.parse().ok().filter(|sigma: &f64| *sigma > 0.0 && sigma.is_finite());
-    sigma.ok_or_else(|| "expected world units, more than 0".into())
+    numbers(text).and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| "expected pixels X,Y".into())
 }
 
 pub fn run(args: LocateArgs) -> Result<(), Failure> {
@@ -90,11 +84,6 @@ fn located(snapshot: &Snapshot, photo: &Path, camera: &Camera) -> Result<Answer,
         error => Failure::Failed("photo", anyhow::anyhow!("{}: {error}", photo.display())),
     };
     let bytes = files::read_short(photo, MAX_PHOTO_BYTES as u64)?;
-    if bytes.len() > MAX_PHOTO_BYTES {
-        let error =
-            anyhow::anyhow!("{}: longer than {MAX_PHOTO_BYTES} bytes; make it smaller", photo.display());
-        return Err(Failure::Failed("photo", error));
-    }
     PhotoFile::open(&bytes)
         .and_then(|opened| answer(snapshot, opened, camera, &Budget::default()))
         .map_err(of_photo)

@@ -4,20 +4,9 @@ use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use crate::fetch::{self, Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Progress};
-use crate::store::EdgeCache;
+use crate::fetch::{Environment, FetchError, NetworkLimits, Progress};
 
 use super::failure::Failure;
-
-pub fn fetch_once(
-    cache: &EdgeCache,
-    request: &FetchRequest,
-    ca: Option<&Path>,
-    cancel: &AtomicBool,
-    progress: &dyn Progress,
-) -> Result<FetchReport, FetchError> {
-    fetch::fetch(cache, request, &environment(ca, cancel, progress))
-}
 
 /// Returns the real surroundings.
 pub fn environment<'a>(

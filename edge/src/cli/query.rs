@@ -13,7 +13,7 @@ use glam::DVec3;
 use slag_common::frames::Aabb;
 use slag_common::{durable, files, note};
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
 
@@ -47,7 +47,7 @@ pub struct QueryArgs {
     pub threshold: Option<f32>,
     /// Kind of answers: objects, clusters or gaussians [default: objects, and clusters for what no object
     /// answers].
-    #[arg(long)]
+    #[arg(long, value_parser = named::<AnswerKind>)]
     pub kind: Option<AnswerKind>,
     /// Edge of the voxels used for clustering, world units [default: 0.25 m, or the scene's].
     #[arg(long)]
@@ -99,7 +99,10 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
     if let Some(path) = &args.ply {
         write_ply(&reply, path)?;
     }
-    if args.json { write_json(reply) } else { print_reply(&reply) }
+    match args.json {
+        true => write_json(reply),
+        false => reply.answers().try_for_each(|answers| print_answers(&reply, answers)),
+    }
 }
 
 fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
@@ -115,11 +118,7 @@ fn write_json(reply: Reply) -> Result<(), Failure> {
     Ok(writeln!(out)?)
 }
 
-/// Prints a reply's answers as tables, and notes about them on stderr.
-fn print_reply(reply: &Reply) -> Result<(), Failure> {
-    reply.answers().try_for_each(|answers| print_answers(reply, answers))
-}
-
+/// Prints answers as a table, and notes about them on stderr.
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     for (word, asked) in &answers.asked_as {
         note(format_args!("{word}: asked as {asked}"));

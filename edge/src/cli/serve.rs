@@ -1,6 +1,7 @@
 //! `serve`.
 
 use std::io::{self, Write};
+use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use clap::Args;
+use sd_notify::NotifyState;
 use slag_service::access::{Access, AccessSettings};
 use slag_service::listen::{Listen, answers, bind};
 use slag_service::stop::stop_signal;
@@ -132,11 +134,11 @@ async fn serve(
         None => None,
     };
     let scrub = scrub_in_background(&app, args.scrub_secs)?;
-    tell(News::Ready);
+    tell(NotifyState::Ready);
     tokio::spawn(async move { pulse(|| answers(&url)).await });
     let stop = async {
         stop.await;
-        tell(News::Stopping);
+        tell(NotifyState::Stopping);
     };
     let served = http::serve(app, listener, stop).await;
     // A fetch in progress need not be awaited: the next one resumes it.
@@ -178,20 +180,11 @@ fn tls(args: &mut ServeArgs) -> Result<Option<Tls>, Failure> {
 /// Returns a folder of the cache that every user of the machine may write to: what is on board is opened by its
 /// hashes, and signatures are checked by fetches alone.
 fn open_to_everybody(cache: &EdgeCache) -> Option<PathBuf> {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        let folders = ["", "manifests", "shards", "trust"].map(|name| cache.dir().join(name));
-        let is_open = |path: &PathBuf| {
-            fs_err::metadata(path).is_ok_and(|metadata| metadata.permissions().mode() & 0o002 != 0)
-        };
-        folders.into_iter().find(is_open)
-    }
-    #[cfg(not(unix))]
-    {
-        let _ = cache;
-        None
-    }
+    let folders = ["", "manifests", "shards", "trust"].map(|name| cache.dir().join(name));
+    let is_open = |path: &PathBuf| {
+        fs_err::metadata(path).is_ok_and(|metadata| metadata.permissions().mode() & 0o002 != 0)
+    };
+    folders.into_iter().find(is_open)
 }
 
 fn parse_query_bytes(text: &str) -> Result<u64, String> {
@@ -230,10 +223,34 @@ fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
     Ok(access)
 }
 
-#[cfg(all(test, unix))]
-mod tests {
-    use std::os::unix::fs::PermissionsExt;
+/// Pulses in the time after which systemd takes a silent service for dead; it advises two.
+const PULSES_PER_TIMEOUT: u32 = 3;
 
+fn tell(news: NotifyState<'_>) {
+    if let Err(error) = sd_notify::notify(&[news]) {
+        tracing::warn!("systemd was not told {news:?}: {error}");
+    }
+}
+
+/// Keeps reporting that the service is alive, as long as `is_alive` says so in time; returns at once if nobody
+/// expects it.
+async fn pulse<A: Future<Output = bool>>(is_alive: impl Fn() -> A) {
+    let timeout = sd_notify::watchdog_enabled();
+    let Some(pulse) = timeout.map(|timeout| timeout / PULSES_PER_TIMEOUT).filter(|pulse| !pulse.is_zero())
+    else {
+        return;
+    };
+    loop {
+        match tokio::time::timeout(pulse, is_alive()).await {
+            Ok(true) => tell(NotifyState::Watchdog),
+            _ => tracing::error!("the service does not answer itself; its supervisor may end it"),
+        }
+        tokio::time::sleep(pulse).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
     use super::*;
 
     #[test]
@@ -251,54 +268,5 @@ mod tests {
         assert_eq!(with_mode(&shards, 0o755), None);
         let root = dir.path().to_owned();
         assert_eq!(with_mode(&root, 0o1777), Some(root.join("")));
-    }
-}
-
-/// Pulses in the time after which systemd takes a silent service for dead; it advises two.
-const PULSES_PER_TIMEOUT: u32 = 3;
-
-#[derive(Clone, Copy, Debug)]
-enum News {
-    Ready,
-    Alive,
-    Stopping,
-}
-
-#[cfg(unix)]
-fn tell(news: News) {
-    use sd_notify::NotifyState;
-
-    let state = match news {
-        News::Ready => NotifyState::Ready,
-        News::Alive => NotifyState::Watchdog,
-        News::Stopping => NotifyState::Stopping,
-    };
-    if let Err(error) = sd_notify::notify(&[state]) {
-        tracing::warn!("systemd was not told {news:?}: {error}");
-    }
-}
-
-#[cfg(not(unix))]
-fn tell(_: News) {}
-
-/// Keeps reporting that the service is alive, as long as `is_alive` says so in time; returns at once if nobody
-/// expects it.
-async fn pulse<A: Future<Output = bool>>(is_alive: impl Fn() -> A) {
-    let timeout: Option<Duration> = match () {
-        #[cfg(unix)]
-        () => sd_notify::watchdog_enabled(),
-        #[cfg(not(unix))]
-        () => None,
-    };
-    let Some(pulse) = timeout.map(|timeout| timeout / PULSES_PER_TIMEOUT).filter(|pulse| !pulse.is_zero())
-    else {
-        return;
-    };
-    loop {
-        match tokio::time::timeout(pulse, is_alive()).await {
-            Ok(true) => tell(News::Alive),
-            _ => tracing::error!("the service does not answer itself; its supervisor may end it"),
-        }
-        tokio::time::sleep(pulse).await;
     }
 }

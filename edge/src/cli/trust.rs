@@ -4,7 +4,6 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use crate::fetch::{AddedRoot, FirstRoot, accepted, add_root};
-use anyhow::anyhow;
 use clap::{ArgGroup, Args, Subcommand};
 use slag_common::files;
 use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
@@ -84,7 +83,7 @@ pub fn run(command: TrustCommand) -> Result<(), Failure> {
 fn add(args: AddArgs) -> Result<(), Failure> {
     let from = args.from.unwrap_or_default();
     let root = match (args.root, args.sha256) {
-        (Some(path), _) => FirstRoot::Bytes(read_root(&path)?),
+        (Some(path), _) => FirstRoot::Bytes(files::read_short(&path, MAX_ROOT_BYTES)?),
         (None, Some(sha256)) => FirstRoot::Sha256 { from, sha256 },
         (None, None) => FirstRoot::Any { from },
     };
@@ -116,17 +115,6 @@ fn show(args: ShowArgs) -> Result<(), Failure> {
         ("refreshed", time(accepted.signed_unix_secs)),
         ("expires", time(accepted.expires_unix_secs)),
     ])
-}
-
-fn read_root(path: &std::path::Path) -> Result<Vec<u8>, Failure> {
-    let bytes = files::read_short(path, MAX_ROOT_BYTES)?;
-    match bytes.len() as u64 > MAX_ROOT_BYTES {
-        true => Err(Failure::Usage(anyhow!(
-            "{}: longer than {MAX_ROOT_BYTES} bytes; expected a root such as metadata/1.root.json of a store",
-            path.display()
-        ))),
-        false => Ok(bytes),
-    }
 }
 
 fn parse_sha256(text: &str) -> Result<String, String> {

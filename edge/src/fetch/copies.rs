@@ -5,11 +5,11 @@
 //! are the same.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use slag_common::{Hash32, tuf};
 
-use crate::store::files::{Files, is_bad_medium};
+use crate::store::files::{Files, is_bad_medium, put_through};
 
 /// A longer copy is damaged. It holds the longest metadata that a client keeps, with its quotes escaped.
 pub const MAX_COPY_BYTES: u64 =
@@ -46,17 +46,13 @@ enum Copy {
 /// The two copies, in a folder of their own.
 #[derive(Clone, Debug)]
 pub struct Copies {
-    dir: PathBuf,
+    pub dir: PathBuf,
 }
 
 impl Copies {
     /// Names the copies, without reading or creating anything.
     pub fn new(dir: PathBuf) -> Self {
         Self { dir }
-    }
-
-    pub fn dir(&self) -> &Path {
-        &self.dir
     }
 
     pub fn paths(&self) -> [PathBuf; 2] {
@@ -141,11 +137,7 @@ impl Copies {
 
     fn write_one(&self, files: &dyn Files, index: usize, sequence: u64, content: &[u8]) -> io::Result<()> {
         // Renamed into place, so that a power cut leaves no half of the first copy ever written.
-        let aside = self.dir.join("new");
-        files.write_from(&aside, 0, &copy_of(sequence, content))?;
-        files.sync(&aside)?;
-        files.rename(&aside, &self.path(index))?;
-        files.sync_dir(&self.dir)
+        put_through(files, &self.dir.join("new"), &copy_of(sequence, content), &self.path(index))
     }
 }
 

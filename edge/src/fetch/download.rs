@@ -15,7 +15,7 @@ use crate::store::files::Files;
 
 pub(super) struct Client<'a> {
     http: download::Client<'a>,
-    base: String,
+    pub base: String,
 }
 
 impl Watch for Environment<'_> {
@@ -64,10 +64,6 @@ impl<'a> Client<'a> {
         let agent = concat!("slag-edge/", env!("CARGO_PKG_VERSION"));
         let http = download::Client::new(limits, tls, None, agent, environment);
         Ok(Self { http, base: from.trim_end_matches('/').to_owned() })
-    }
-
-    pub fn base(&self) -> &str {
-        &self.base
     }
 
     /// Returns the bytes left by earlier fetches, and the number of attempts beyond the first.

@@ -34,9 +34,8 @@ pub struct FollowSettings {
     pub min_interval: Duration,
     /// Interval at which a resting robot looks for a new generation; absent: never.
     pub refresh: Option<Duration>,
-    /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
-    pub first_backoff: Duration,
-    pub longest_backoff: Duration,
+    /// Waits after failures, scaled by 0.5..1.5.
+    pub backoff: Backoff,
 }
 
 impl Default for FollowSettings {
@@ -46,8 +45,7 @@ impl Default for FollowSettings {
             margin: DEFAULT_RADIUS / 4.0,
             min_interval: Duration::from_secs(2),
             refresh: Some(Duration::from_secs(300)),
-            first_backoff: Duration::from_secs(2),
-            longest_backoff: Duration::from_secs(60),
+            backoff: Backoff { first: Duration::from_secs(2), longest: Duration::from_secs(60) },
         }
     }
 }
@@ -122,8 +120,7 @@ impl Follower {
     pub fn failed(&mut self, began: Duration, now: Duration, random: f64) {
         self.attempted = Some(began);
         self.n_failures = self.n_failures.saturating_add(1);
-        let backoff = Backoff { first: self.settings.first_backoff, longest: self.settings.longest_backoff };
-        let pause = backoff.after(self.n_failures).mul_f64(0.5 + random.clamp(0.0, 1.0));
+        let pause = self.settings.backoff.after(self.n_failures).mul_f64(0.5 + random.clamp(0.0, 1.0));
         self.retry_at = now.saturating_add(pause);
     }
 }
@@ -361,8 +358,7 @@ mod tests {
             margin: 8.0,
             min_interval: Duration::from_secs(2),
             refresh: Some(Duration::from_secs(100)),
-            first_backoff: Duration::from_secs(4),
-            longest_backoff: Duration::from_secs(20),
+            backoff: Backoff { first: secs(4), longest: secs(20) },
         }
     }
 

@@ -28,7 +28,7 @@ mod staging;
 mod trust;
 
 pub use error::FetchError;
-pub use plan::{Held, Object, Plan, Wanted};
+pub use plan::{Held, Plan, Wanted};
 pub use position::{NotAPosition, PlanError, Position, Spoken};
 pub use records::{Accepted, LastFetch, Records, RecordsError, accepted, last_position};
 pub use request::{Environment, FetchReport, FetchRequest, Progress, Tally};

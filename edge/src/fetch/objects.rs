@@ -7,14 +7,13 @@ use std::sync::PoisonError;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use slag_common::Hash32;
-use slag_common::manifest::{Manifest, TextModelRecord};
+use slag_common::manifest::{Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::Profile;
 use slag_models::download::DownloadFailure;
 
 use super::download::Client;
 use super::error::FetchError;
 use super::offer::Offer;
-use super::plan::Object;
 use super::staging::part_path;
 use crate::store::files::is_bad_medium;
 use crate::store::{self, CellFault, CurrentCell, EdgeCache, StoreError};
@@ -99,7 +98,7 @@ pub fn download_all(
     cache: &EdgeCache,
     client: &Client<'_>,
     check: &Check<'_>,
-    objects: &[Object],
+    objects: &[ObjectRecord],
     parallel: usize,
 ) -> Result<Downloaded, FetchError> {
     let next = AtomicUsize::new(0);
@@ -147,7 +146,7 @@ fn download_one(
     cache: &EdgeCache,
     client: &Client<'_>,
     check: &Check<'_>,
-    Object { hash, len_bytes }: Object,
+    ObjectRecord { hash, len_bytes }: ObjectRecord,
 ) -> Result<(), FetchError> {
     let part = part_path(cache, hash);
     client.object(cache.files(), hash, len_bytes, &part)?;

@@ -37,7 +37,7 @@ impl Offer {
         now_unix_secs: u64,
         on_board: Option<&Self>,
     ) -> Result<Self, FetchError> {
-        let no_trust = || FetchError::NoTrust { from: client.base().to_owned() };
+        let no_trust = || FetchError::NoTrust { from: client.base.clone() };
         let mut kept = records.kept().ok_or_else(no_trust)?.clone();
         let mut source = StoreMetadata { client, failure: None };
         let trusted = refresh(&mut kept, &mut source, now_unix_secs);

@@ -28,19 +28,11 @@ pub struct Wanted {
     pub max_bytes: Option<u64>,
 }
 
-/// A content-addressed file that a generation needs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Object {
-    /// BLAKE3 of the content.
-    pub hash: Hash32,
-    pub len_bytes: u64,
-}
-
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Plan {
     /// The cells within the radius, by id, ascending.
     pub cells: Vec<CurrentCell>,
-    pub download: Vec<Object>,
+    pub download: Vec<ObjectRecord>,
     /// Needed objects on board.
     pub keep: BTreeSet<Hash32>,
     /// Objects on board that are not needed but fit the budget, most recently used first.
@@ -131,19 +123,15 @@ fn cells_at(
 
 /// Returns the objects that must be on board before these cells become current: their shards, and the text model
 /// that the scene carries.
-fn objects(cells: &[CurrentCell], manifest: &Manifest) -> Result<Vec<Object>, PlanError> {
+fn objects(cells: &[CurrentCell], manifest: &Manifest) -> Result<Vec<ObjectRecord>, PlanError> {
     let mut seen = BTreeSet::new();
     let object = |cell: &CurrentCell| match seen.insert(cell.hash) {
-        true => Ok(Object { hash: cell.hash, len_bytes: cell.len_bytes }),
+        true => Ok(ObjectRecord { hash: cell.hash, len_bytes: cell.len_bytes }),
         false => Err(PlanError::Conflict { cell_id: cell.cell_id, hash: cell.hash }),
     };
-    let mut objects: Vec<Object> = cells.iter().map(object).collect::<Result<_, _>>()?;
+    let mut objects: Vec<ObjectRecord> = cells.iter().map(object).collect::<Result<_, _>>()?;
     let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
-    objects.extend(
-        text_model
-            .filter(|object| seen.insert(object.hash))
-            .map(|ObjectRecord { hash, len_bytes }| Object { hash, len_bytes }),
-    );
+    objects.extend(text_model.filter(|object| seen.insert(object.hash)));
     Ok(objects)
 }
 

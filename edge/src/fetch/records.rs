@@ -81,7 +81,7 @@ impl Records {
         let busy = || RecordsError::Busy { path: cache.dir().to_owned() };
         let lock = Lock::take(cache.dir())?.ok_or_else(busy)?;
         let copies = copies_of(cache);
-        cache.files().create_dir(copies.dir())?;
+        cache.files().create_dir(&copies.dir)?;
         let (mut version, record, damage) = match read(cache, &copies)? {
             Read::Nothing => (None, Record::default(), None),
             Read::Record(version, record) => (Some(version), *record, None),
@@ -92,7 +92,7 @@ impl Records {
             if !version.is_twice {
                 tracing::warn!(
                     "{}: one copy is damaged or outdated; it is written anew",
-                    copies.dir().display()
+                    copies.dir.display()
                 );
             }
             // The whole copy is enough for now; a full disk must not keep a robot from fetching.
@@ -105,7 +105,7 @@ impl Records {
 
     pub fn damage(&self) -> Option<RecordsError> {
         let what = self.damage.clone()?;
-        Some(RecordsError::Damaged { path: self.copies.dir().to_owned(), what })
+        Some(RecordsError::Damaged { path: self.copies.dir.clone(), what })
     }
 
     pub fn last(&self) -> Option<&LastFetch> {

@@ -5,6 +5,7 @@ use std::io;
 use std::time::Instant;
 
 use slag_common::Hash32;
+use slag_common::manifest::ObjectRecord;
 use slag_common::tuf::Kept;
 
 use super::download::Client;
@@ -12,7 +13,7 @@ use super::error::FetchError;
 use super::generation::{Before, assemble};
 use super::objects::{Check, Downloaded, download_all};
 use super::offer::Offer;
-use super::plan::{Held, Object, Plan, Wanted};
+use super::plan::{Held, Plan, Wanted};
 use super::records::{LastFetch, Records, RecordsError};
 use super::request::{Environment, FetchReport, FetchRequest, Tally, TextModelTally};
 use super::staging::{Usage, clear_manifests, clear_staging, part_path, put, remove, staging};
@@ -270,11 +271,11 @@ impl Switched<'_> {
         let text: BTreeSet<Hash32> = offer.text_model().collect();
         let of_held =
             |hashes: &BTreeSet<Hash32>| Tally::of(hashes.difference(&text).map(|hash| held[hash].len_bytes));
-        let new_bytes = |object: &Object| downloaded.good.contains(&object.hash).then_some(object.len_bytes);
+        let new_bytes =
+            |object: &ObjectRecord| downloaded.good.contains(&object.hash).then_some(object.len_bytes);
         let shards = plan.download.iter().filter(|object| !text.contains(&object.hash));
         let text_model = offer.manifest.encoder.text_model.as_ref().map(|model| {
-            let objects = model.objects().map(|of| Object { hash: of.hash, len_bytes: of.len_bytes });
-            let (all, new) = objects.fold((0, 0), |(all, new), object| {
+            let (all, new) = model.objects().fold((0, 0), |(all, new), object| {
                 (all + object.len_bytes, new + new_bytes(&object).unwrap_or(0))
             });
             TextModelTally { bytes: all, downloaded_bytes: new }
@@ -306,9 +307,9 @@ impl Switched<'_> {
 }
 
 /// Refuses a download for which there is no space, before it begins. `other_bytes`: what is written besides.
-fn check_space(cache: &EdgeCache, download: &[Object], other_bytes: u64) -> Result<(), FetchError> {
-    let Some(free_bytes) = cache.files().free_bytes(cache.dir())? else { return Ok(()) };
-    let missing_bytes = |Object { hash, len_bytes }: &Object| {
+fn check_space(cache: &EdgeCache, download: &[ObjectRecord], other_bytes: u64) -> Result<(), FetchError> {
+    let free_bytes = cache.files().free_bytes(cache.dir())?;
+    let missing_bytes = |ObjectRecord { hash, len_bytes }: &ObjectRecord| {
         let staged = cache.files().stat(&part_path(cache, *hash)).ok().flatten();
         len_bytes.saturating_sub(staged.map_or(0, |stat| stat.len_bytes))
     };

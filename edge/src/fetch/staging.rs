@@ -6,11 +6,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
+use slag_common::manifest::ObjectRecord;
 
 use super::error::FetchError;
-use super::plan::{Held, Object};
+use super::plan::Held;
 use crate::store::EdgeCache;
-use crate::store::files::is_bad_medium;
+use crate::store::files::{is_bad_medium, put_through};
 
 pub fn staging(cache: &EdgeCache) -> PathBuf {
     cache.dir().join("staging")
@@ -32,7 +33,7 @@ pub fn remove(cache: &EdgeCache, path: &Path) -> io::Result<()> {
 }
 
 /// Empties `staging/` except for partial downloads still wanted.
-pub fn clear_staging(cache: &EdgeCache, wanted: &[Object]) -> Result<(), FetchError> {
+pub fn clear_staging(cache: &EdgeCache, wanted: &[ObjectRecord]) -> Result<(), FetchError> {
     let wanted: BTreeSet<PathBuf> = wanted.iter().map(|object| part_path(cache, object.hash)).collect();
     for name in cache.files().list(&staging(cache))? {
         let path = staging(cache).join(name);
@@ -58,19 +59,15 @@ const MAX_BAD_NAMES: u32 = 4;
 
 /// Replaces a small file durably: its path always holds the old or the new content, whole.
 pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchError> {
-    let files = cache.files();
     let mut n = 0;
-    let aside = loop {
+    loop {
         let aside = staging(cache).join(format!("put{n}"));
-        match files.write_from(&aside, 0, bytes).and_then(|()| files.sync(&aside)) {
-            Ok(()) => break aside,
+        match put_through(cache.files(), &aside, bytes, path) {
             // The name stays taken where its inode cannot be read.
             Err(e) if is_bad_medium(&e) && n < MAX_BAD_NAMES => n += 1,
-            Err(e) => return Err(e.into()),
+            other => return Ok(other?),
         }
-    };
-    files.rename(&aside, path)?;
-    Ok(files.sync_dir(path.parent().unwrap_or(cache.dir()))?)
+    }
 }
 
 /// A longer file is damaged; a shard takes about 80 bytes.

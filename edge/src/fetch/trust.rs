@@ -86,5 +86,5 @@ fn find_root(client: &Client<'_>, sha256: &str) -> Result<Vec<u8>, FetchError> {
             return Ok(bytes);
         }
     }
-    Err(FetchError::NoSuchRoot { from: client.base().to_owned(), sha256 })
+    Err(FetchError::NoSuchRoot { from: client.base.clone(), sha256 })
 }

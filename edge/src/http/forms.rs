@@ -8,7 +8,7 @@ use slag_common::frames::Aabb;
 use slag_common::objects::parse_public_id;
 
 use crate::query::{
-    Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, parse_box,
+    Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, numbers, parse_box,
     parse_point,
 };
 use crate::score::{MAX_COORDINATE, MAX_CORNERS};
@@ -58,10 +58,6 @@ texts! {
 /// Returns the form of `least` to `most` values with commas between them.
 fn several(value: &str, least: usize, most: usize) -> String {
     format!("^{value}(,{value}){{{},{}}}$", least - 1, most - 1)
-}
-
-fn numbers(text: &str) -> Option<Vec<f64>> {
-    text.split(',').map(|number| number.trim().parse().ok()).collect()
 }
 
 fn xy(text: &str) -> Result<[f64; 2], &'static str> {

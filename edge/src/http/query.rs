@@ -1,10 +1,8 @@
 //! `GET /query`, `GET` and `POST /v1/query`: short answers whole, long ones piece by piece.
 
 use std::io;
-use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
 use axum::Json;
@@ -12,12 +10,12 @@ use axum::body::{Body, Bytes};
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, Uri, header};
 use axum::response::Response;
-use hyper::body::Frame;
+use futures_util::stream::try_unfold;
 use schemars::SchemaGenerator;
 use slag_service::params::Params;
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Binary, Described, Reply};
-use tokio::sync::mpsc::{Receiver, Sender, channel};
+use tokio::sync::mpsc::{Sender, channel};
 
 use super::app::App;
 use super::ask::{AskParams, ShortParams};
@@ -98,13 +96,19 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
     let body = match rest {
         None => Body::from(first),
         Some((pieces, budget)) => {
-            let (sender, receiver) = channel(PIECES_AHEAD);
+            let (sender, receiver) = channel::<Option<Bytes>>(PIECES_AHEAD);
             let deadline = app.settings.stream_timeout;
             tokio::spawn(async move {
                 let _held = budget;
                 send_all(first, pieces, sender, deadline).await;
             });
-            Body::new(Pieces { receiver, is_complete: false })
+            // A cut-off answer must not look complete.
+            Body::from_stream(try_unfold(receiver, |mut pieces| async move {
+                match pieces.recv().await {
+                    Some(piece) => Ok(piece.map(|piece| (piece, pieces))),
+                    None => Err(io::Error::new(io::ErrorKind::TimedOut, "the answer was cut off")),
+                }
+            }))
         }
     };
     let mut response = Response::new(body);
@@ -132,24 +136,19 @@ impl Described for Formats {
     }
 }
 
-enum Message {
-    Piece(Bytes),
-    End,
-}
-
-/// Sends the pieces, each made off the async threads once the client took those before.
+/// Sends the pieces and then `None`; each is made off the async threads once the client took those before.
 ///
 /// It gives up at the deadline: a slow or silent client does not hold the answers for longer.
 async fn send_all(
     first: Vec<u8>,
     pieces: impl Iterator<Item = io::Result<Vec<u8>>> + Send + 'static,
-    to: Sender<Message>,
+    to: Sender<Option<Bytes>>,
     deadline: Duration,
 ) {
     let sending = async {
         let (mut piece, mut pieces) = (Some(Ok(first)), pieces);
         while let Some(Ok(bytes)) = piece {
-            if to.send(Message::Piece(bytes.into())).await.is_err() {
+            if to.send(Some(bytes.into())).await.is_err() {
                 tracing::debug!("a client left before its answer ended");
                 return;
             }
@@ -162,41 +161,10 @@ async fn send_all(
         match piece {
             Some(Err(error)) => tracing::error!("an answer broke off: {error}"),
             // Nothing is lost if the client is gone.
-            _ => drop(to.send(Message::End).await),
+            _ => drop(to.send(None).await),
         }
     };
     if tokio::time::timeout(deadline, sending).await.is_err() {
         tracing::warn!("an answer was cut off: its client took more than {} s", deadline.as_secs_f64());
-    }
-}
-
-/// A body that ends complete or with an error: a cut-off answer must not look complete.
-struct Pieces {
-    receiver: Receiver<Message>,
-    is_complete: bool,
-}
-
-impl hyper::body::Body for Pieces {
-    type Data = Bytes;
-    type Error = io::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, io::Error>>> {
-        if self.is_complete {
-            return Poll::Ready(None);
-        }
-        Poll::Ready(match ready!(self.receiver.poll_recv(context)) {
-            Some(Message::Piece(bytes)) => Some(Ok(Frame::data(bytes))),
-            Some(Message::End) => {
-                self.is_complete = true;
-                None
-            }
-            None => {
-                self.is_complete = true;
-                Some(Err(io::Error::new(io::ErrorKind::TimedOut, "the answer was cut off")))
-            }
-        })
     }
 }

@@ -58,11 +58,11 @@ impl Engine {
 mod tests {
     use std::sync::atomic::Ordering;
 
-    use slag_common::manifest::Calibration;
-
     use super::*;
     use crate::store::EdgeCache;
-    use crate::testing::{Gate, Member, TestObject, TestShard, axes_service, open_gate, write_cache};
+    use crate::testing::{
+        CALIBRATION, Gate, Member, TestObject, TestShard, axes_service, open_gate, write_cache,
+    };
 
     /// While the text model answers a question there are no names; then each word was encoded once, for all asked.
     #[test]
@@ -75,8 +75,7 @@ mod tests {
             runs: std::iter::once(0..9).collect(),
             n_gaussians: 9,
         };
-        let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-        let shard = TestShard::new(vec![members]).build(false).with_objects(&[object], calibration);
+        let shard = TestShard::new(vec![members]).build(false).with_objects(&[object], CALIBRATION);
         write_cache(dir.path(), &[shard], 1);
         let gate = Gate::default();
         let (text, n_encoded) = axes_service(3, Arc::clone(&gate));

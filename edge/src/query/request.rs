@@ -5,8 +5,6 @@ use std::str::FromStr;
 
 use glam::DVec3;
 use schemars::JsonSchema;
-use serde::de::IntoDeserializer;
-use serde::de::value::Error;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 
@@ -48,14 +46,6 @@ pub enum AnswerKind {
 impl fmt::Display for AnswerKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.serialize(f)
-    }
-}
-
-impl FromStr for AnswerKind {
-    type Err = Error;
-
-    fn from_str(text: &str) -> Result<Self, Error> {
-        Self::deserialize(text.into_deserializer())
     }
 }
 
@@ -105,10 +95,14 @@ impl FromStr for Negatives {
     }
 }
 
+/// Reads numbers with commas between them.
+pub fn numbers(text: &str) -> Option<Vec<f64>> {
+    text.split(',').map(|number| number.trim().parse().ok()).collect()
+}
+
 /// Parses `X0,Y0,Z0,X1,Y1,Z1`: two opposite corners of a box.
 pub fn parse_box(text: &str) -> Result<Aabb, String> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
-    match numbers.as_deref() {
+    match numbers(text).as_deref() {
         Some([a, b, c, d, e, f]) if [a, b, c, d, e, f].iter().all(|v| v.abs() <= MAX_COORDINATE) => {
             let (one, other) = (DVec3::new(*a, *b, *c), DVec3::new(*d, *e, *f));
             Ok(Aabb { min: one.min(other), max: one.max(other) })
@@ -119,8 +113,7 @@ pub fn parse_box(text: &str) -> Result<Aabb, String> {
 
 /// Parses `X,Y,Z`.
 pub fn parse_point(text: &str) -> Result<DVec3, String> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
-    match numbers.as_deref() {
+    match numbers(text).as_deref() {
         Some([x, y, z]) if [x, y, z].iter().all(|v| v.abs() <= MAX_COORDINATE) => Ok(DVec3::new(*x, *y, *z)),
         _ => Err(format!("three numbers X,Y,Z within ±{MAX_COORDINATE:e}")),
     }

@@ -137,12 +137,10 @@ fn of_vector(
 mod tests {
     use std::collections::BTreeMap;
 
-    use slag_common::manifest::Calibration;
-
     use super::*;
     use crate::score::tests::{random_question, views};
     use crate::testing::coded::CodedShard;
-    use crate::testing::{BuiltShard, TestObject};
+    use crate::testing::{BuiltShard, CALIBRATION, TestObject};
     use glam::DVec3;
     use slag_math::random::Random;
 
@@ -170,7 +168,7 @@ mod tests {
             runs: std::iter::once(at..at + 1).collect(),
             n_gaussians: 2,
         });
-        shard.with_objects(&objects.collect::<Vec<_>>(), Calibration { score_mean: 0.0, score_spread: 0.1 })
+        shard.with_objects(&objects.collect::<Vec<_>>(), CALIBRATION)
     }
 
     /// Oracle: the format's definition in float64, in the first shard that has the object. The bound holds

@@ -2,6 +2,7 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Seek, SeekFrom, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -26,10 +27,9 @@ pub fn is_bad_medium(e: &io::Error) -> bool {
 fn at(path: &Path) -> impl Fn(io::Error) -> io::Error {
     // What file systems and block devices answer with. Linux: EIO, ENXIO, EBADE, ENODATA, ENOLINK, EBADMSG,
     // EILSEQ, ETIMEDOUT, EUCLEAN (a broken inode), EREMOTEIO.
-    let codes: &[i32] = match (cfg!(target_os = "linux"), cfg!(unix)) {
-        (true, _) => &[5, 6, 52, 61, 67, 74, 84, 110, 117, 121],
-        (false, true) => &[5],
-        (false, false) => &[],
+    let codes: &[i32] = match cfg!(target_os = "linux") {
+        true => &[5, 6, 52, 61, 67, 74, 84, 110, 117, 121],
+        false => &[5],
     };
     move |source| match source.raw_os_error().is_some_and(|code| codes.contains(&code)) {
         true => bad_medium(path, source),
@@ -47,7 +47,7 @@ pub struct Stat {
     pub len_bytes: u64,
     /// Time of the last change, if the file system records it.
     pub modified: Option<SystemTime>,
-    /// Inode number; 0 if there is none.
+    /// Inode number.
     pub inode: u64,
 }
 
@@ -75,9 +75,16 @@ pub trait Files: Send + Sync {
     fn map(&self, path: &Path) -> io::Result<FileBytes>;
     /// Returns a file's metadata; `None` if it does not exist.
     fn stat(&self, path: &Path) -> io::Result<Option<Stat>>;
-    /// Returns the free space of the file system that holds a folder, as far as this user may use it; `None` if
-    /// the system does not say.
-    fn free_bytes(&self, dir: &Path) -> io::Result<Option<u64>>;
+    /// Returns the free space of the file system that holds a folder, as far as this user may use it.
+    fn free_bytes(&self, dir: &Path) -> io::Result<u64>;
+}
+
+/// Replaces a small file durably by way of one aside: its path always holds the old or the new content, whole.
+pub fn put_through(files: &dyn Files, aside: &Path, bytes: &[u8], path: &Path) -> io::Result<()> {
+    files.write_from(aside, 0, bytes)?;
+    files.sync(aside)?;
+    files.rename(aside, path)?;
+    path.parent().map_or(Ok(()), |dir| files.sync_dir(dir))
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -158,21 +165,12 @@ impl Files for DiskFiles {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
             other => other.map_err(at(path))?,
         };
-        #[cfg(unix)]
-        let inode = std::os::unix::fs::MetadataExt::ino(&metadata);
-        #[cfg(not(unix))]
-        let inode = 0;
+        let inode = metadata.ino();
         Ok(Some(Stat { len_bytes: metadata.len(), modified: metadata.modified().ok(), inode }))
     }
 
-    #[cfg(unix)]
-    fn free_bytes(&self, dir: &Path) -> io::Result<Option<u64>> {
+    fn free_bytes(&self, dir: &Path) -> io::Result<u64> {
         let stat = rustix::fs::statvfs(dir).map_err(|e| at(dir)(e.into()))?;
-        Ok(Some(stat.f_bavail.saturating_mul(stat.f_frsize)))
-    }
-
-    #[cfg(not(unix))]
-    fn free_bytes(&self, _dir: &Path) -> io::Result<Option<u64>> {
-        Ok(None)
+        Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
     }
 }

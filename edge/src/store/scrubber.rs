@@ -29,7 +29,7 @@ impl Scrubber {
     /// the shard meanwhile: a sector that cannot be read is an error of `read`, but ends a program that reads it
     /// through a map.
     pub fn step(&mut self, cache: &EdgeCache, snapshot: &Snapshot) -> Option<Scrubbed> {
-        let hashes = || snapshot.shards.iter().map(|shard| (shard.hash(snapshot.current.profile), shard));
+        let hashes = || snapshot.shards.iter().map(|shard| (shard.hash(), shard));
         let n_before = self.read.len();
         if n_before > snapshot.shards.len() {
             let on_board: BTreeMap<_, _> = hashes().collect();

@@ -32,8 +32,8 @@ impl OpenShard {
         self.layout.additions(&self.bytes)
     }
 
-    pub fn hash(&self, profile: Profile) -> Option<Hash32> {
-        self.cell.shards.get(&profile).map(|shard| shard.hash)
+    pub fn hash(&self) -> Option<Hash32> {
+        self.cell.shards.get(&self.profile).map(|shard| shard.hash)
     }
 
     pub fn len_bytes(&self) -> u64 {
@@ -50,7 +50,7 @@ impl OpenShard {
     ) -> bool {
         let header = self.view().header;
         let is_listed = cell_of(manifest, at.cell_id) == Some(&self.cell) && self.profile == profile;
-        let is_named = self.cell.shards.get(&profile).is_some_and(|shard| shard.hash == at.hash);
+        let is_named = self.hash() == Some(at.hash);
         let is_readable = (header.dim, header.encoder_id) == (manifest.encoder.dim, manifest.encoder.id.0);
         // Storage without times cannot show that a file was replaced.
         let is_unchanged = self.stat.is_some_and(|stat| stat.modified.is_some())

@@ -11,7 +11,7 @@ use slag_edge::store::{Snapshot, StoreError};
 use super::scene::Published;
 use super::server::Server;
 use super::sim::SimFiles;
-use super::{Robot, assert_holds, at};
+use super::{Robot, assert_holds};
 use slag_math::random::Random;
 use slag_test_support::trials;
 
@@ -52,9 +52,7 @@ impl Trial {
     /// Moves to cells 1..5 (and frees cell 0) under the new generation.
     fn fetch(&self, files: &Arc<SimFiles>, parallel: usize) -> (Robot, Result<FetchReport, FetchError>) {
         let mut robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
-        robot.request.at = Some(at(30.0));
-        robot.request.radius = 15.0;
-        robot.request.max_bytes = Some(self.new.bytes(1..5));
+        robot.go(30.0, 15.0, &self.new, 1..5);
         robot.request.parallel = parallel;
         robot.limits.attempts = 20;
         let result = robot.fetch();

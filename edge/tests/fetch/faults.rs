@@ -17,11 +17,11 @@ use slag_edge::store::{BadCell, EdgeCache};
 use slag_edge::text::{EncoderInfo, TextService};
 use slag_models::{InferenceError, TextEncoder};
 
+use super::Robot;
 use super::crash::rot_one_copy;
 use super::scene::{DIM, ENCODER, FIRST, Published, RootKeys};
 use super::server::{Fault, Seen, Server};
 use super::sim::SimFiles;
-use super::{Robot, at};
 use slag_math::random::Random;
 use slag_test_support::trials;
 
@@ -41,10 +41,6 @@ fn n_trials() -> u64 {
 struct FirstAxis;
 
 impl TextEncoder for FirstAxis {
-    fn name(&self) -> &str {
-        "e"
-    }
-
     fn dim(&self) -> usize {
         DIM as usize
     }
@@ -147,9 +143,7 @@ impl Stage {
     /// The robot moves from cells 0..3 to cells 1..5, and cell 0 must be freed.
     fn robot(&self, files: &Arc<SimFiles>) -> Robot {
         let mut robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
-        robot.request.at = Some(at(30.0));
-        robot.request.radius = 15.0;
-        robot.request.max_bytes = Some(self.new.bytes(1..5));
+        robot.go(30.0, 15.0, &self.new, 1..5);
         robot
     }
 

@@ -4,6 +4,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use glam::DVec3;
+use slag_common::retry::Backoff;
 use slag_common::shard::Profile;
 use slag_common::tuf::TufError;
 use slag_edge::fetch::follow::{Decision, FollowEnvironment, FollowSettings, Follower, Following, follow};
@@ -100,8 +101,7 @@ fn following_survives_the_loss_of_the_network() {
         radius: 4.0,
         margin: 4.0,
         min_interval: Duration::from_millis(1),
-        first_backoff: Duration::from_millis(5),
-        longest_backoff: Duration::from_millis(20),
+        backoff: Backoff { first: Duration::from_millis(5), longest: Duration::from_millis(20) },
         refresh: None,
     };
     let place = |x: f64| Position::World(DVec3::new(x, 0.0, 105.0));
@@ -170,8 +170,7 @@ fn a_follower_waits_for_trust_and_not_for_time() {
     let pause = Duration::from_secs(3600);
     let settings = FollowSettings {
         min_interval: Duration::ZERO,
-        first_backoff: pause,
-        longest_backoff: pause,
+        backoff: Backoff { first: pause, longest: pause },
         ..FollowSettings::default()
     };
     let following = Following::default();

@@ -12,7 +12,7 @@ use super::faults::text_service;
 use super::scene::{Published, TestThing};
 use super::server::Server;
 use super::sim::SimFiles;
-use super::{Robot, at, cells};
+use super::{Robot, cells};
 
 fn thing(id: u64, x: f64, axis: usize) -> TestThing {
     TestThing { cell_id: (x / 10.0) as u32, id, x, axis }
@@ -63,9 +63,7 @@ fn changes_are_told_where_both_generations_are_known() {
     robot.fetch().expect("works");
     assert_changed(&robot, "after the fetch");
     // It leaves; what it knew of both generations is still compared, what it knows of one alone is not.
-    robot.request.at = Some(at(55.0));
-    robot.request.radius = 14.0;
-    robot.request.max_bytes = Some(after().bytes(4..7));
+    robot.go(55.0, 14.0, &after(), 4..7);
     robot.fetch().expect("works");
     let on_board = cells(&robot.snapshot());
     assert_eq!(on_board, [4, 5, 6], "the cells left behind are gone");
@@ -98,9 +96,7 @@ fn changes_are_told_where_both_generations_are_known() {
 fn what_is_left_behind_has_not_gone() {
     let (server, mut robot) = Robot::fetched(before());
     server.publish(after());
-    robot.request.at = Some(at(55.0));
-    robot.request.radius = 14.0;
-    robot.request.max_bytes = Some(after().bytes(4..7));
+    robot.go(55.0, 14.0, &after(), 4..7);
     robot.fetch().expect("works");
     let reply = changes(&robot, None).expect("a reply");
     assert_eq!(ids(&reply), (vec![], vec![], vec![]), "{reply:?}");

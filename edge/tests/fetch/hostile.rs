@@ -10,16 +10,8 @@ use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, PlanError, Pro
 use slag_edge::store::{BadCell, CellFault, Snapshot, StoreError};
 
 use super::scene::{ENCODER, FIRST, Published, ShardSpec, shard};
-use super::server::{Fault, Seen, Server};
+use super::server::{Fault, Server};
 use super::{Robot, assert_holds, cells};
-
-fn objects(fault: Fault) -> impl FnMut(&Seen) -> Fault + Send + 'static {
-    move |seen| if seen.path.contains("objects") { fault.clone() } else { Fault::None }
-}
-
-fn targets(fault: Fault) -> impl FnMut(&Seen) -> Fault + Send + 'static {
-    move |seen| if seen.path.contains("/targets/") { fault.clone() } else { Fault::None }
-}
 
 #[derive(Default)]
 struct Count(AtomicU64);
@@ -37,7 +29,7 @@ fn other_content_under_a_hash_is_refused() {
     let (server, robot) = Robot::started(scene.clone());
     let instead = other.objects[&other.hash(0, Profile::Compact)].clone();
     assert_eq!(instead.len() as u64, scene.bytes(0..1));
-    server.faults(objects(Fault::Instead(instead)));
+    server.fault_at("objects", Fault::Instead(instead));
     let error = robot.fetch().expect_err("refused");
     assert!(matches!(error, FetchError::Download { failure: DownloadFailure::Hash { .. }, .. }), "{error}");
     assert!(robot.shards().is_empty() && robot.staged().is_empty());
@@ -51,17 +43,14 @@ fn endless_bodies_are_cut_off() {
     let scene = Published::new(1, &[0; 1], 50);
     let (server, mut robot) = Robot::started(scene.clone());
     // The right content, followed by more: only the manifest's length is read.
-    server.faults(objects(Fault::Endless));
+    server.fault_at("objects", Fault::Endless);
     let count = Count::default();
     robot.fetch_watched(&count, &AtomicBool::new(false)).expect("the content is right");
     assert_eq!(count.0.load(Ordering::Relaxed), scene.bytes(0..1));
     robot.limits.chunk_bytes = 1 << 16;
     server.publish(Published::new(2, &[0; 1], 50));
-    type Faults = Box<dyn FnMut(&Seen) -> Fault + Send>;
-    let cases: [(Faults, &str); 2] =
-        [(Box::new(|_| Fault::Endless), "timestamp.json"), (Box::new(targets(Fault::Endless)), "manifest")];
-    for (faults, expected) in cases {
-        server.faults(faults);
+    for (part, expected) in [("", "timestamp.json"), ("/targets/", "manifest")] {
+        server.fault_at(part, Fault::Endless);
         let error = robot.fetch().expect_err("refused");
         let is_expected =
             matches!(&error, FetchError::Tuf(TufError::TooLong { what, .. }) if what.ends_with(expected));
@@ -104,7 +93,7 @@ fn lasting_faults_are_given_up_and_told() {
     ];
     for (fault, expected_attempts, is_expected) in cases {
         let (server, robot) = Robot::started(scene.clone());
-        server.faults(objects(fault.clone()));
+        server.fault_at("objects", fault.clone());
         let count = Count::default();
         match robot.fetch_watched(&count, &AtomicBool::new(false)).expect_err("lasting") {
             FetchError::Download { attempts, failure, .. } => {
@@ -125,18 +114,14 @@ fn lasting_faults_are_given_up_and_told() {
 fn signed_nonsense_is_refused() {
     let scene = Published::new(1, &[0; 2], 50);
     let fetched = |published: Published| {
-        let dir = tempfile::tempdir().expect("temporary folder");
-        let server = Server::start(published);
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let (_server, robot) = Robot::started(published);
         let error = robot.fetch().expect_err("refused");
         assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
         error
     };
     // Of one cell: the other is good.
     let without_a_cell = |published: Published, bad_id: u32| {
-        let dir = tempfile::tempdir().expect("temporary folder");
-        let server = Server::start(published);
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let (_server, robot) = Robot::started(published);
         let bad = BadCell { cell_id: bad_id, fault: CellFault::Invalid, old: None };
         assert_eq!(robot.fetch().expect("the other cell").bad_cells, [bad]);
         let on_board = cells(&robot.snapshot());
@@ -172,10 +157,7 @@ fn signed_nonsense_is_refused() {
     assert!(matches!(error, FetchError::NoSpace { needed_bytes: u64::MAX, .. }), "{error}");
 
     // Kept shards are checked against the new manifest too.
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let server = Server::start(scene.clone());
-    let robot = Robot::on_disk(dir.path(), &server.url());
-    robot.fetch().expect("works");
+    let (server, robot) = Robot::fetched(scene.clone());
     server.publish(scene.clone().edited(|manifest| {
         (manifest.generation, manifest.encoder.id) = (2, Hash32([5; 32]));
     }));
@@ -218,12 +200,9 @@ fn a_manifest_of_a_gigabyte_is_refused_unread() {
     let (server, robot) = Robot::fetched(scene.clone());
     server.publish(Published::new(2, &[1; 1], 50));
     server.take_seen();
-    type Faults = Box<dyn FnMut(&Seen) -> Fault + Send>;
     // The first request, for another root, finds none.
-    let cases: [(Faults, usize); 2] =
-        [(Box::new(|_| Fault::Length(1 << 30)), 2), (Box::new(targets(Fault::Length(1 << 30))), 5)];
-    for (faults, n_requests) in cases {
-        server.faults(faults);
+    for (part, n_requests) in [("", 2), ("/targets/", 5)] {
+        server.fault_at(part, Fault::Length(1 << 30));
         let error = robot.fetch().expect_err("refused");
         assert!(matches!(error, FetchError::Tuf(TufError::TooLong { .. })), "{error}");
         assert_eq!(server.take_seen().len(), n_requests, "no second attempt");

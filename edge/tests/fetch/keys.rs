@@ -3,7 +3,7 @@
 use slag_common::tuf::TufError;
 use slag_edge::fetch::{FetchError, FetchReport};
 
-use super::scene::{FIRST, NOW, Published, RootKeys, metadata};
+use super::scene::{FIRST, NOW, Published, RootKeys};
 use super::server::{Fault, Server};
 use super::{Robot, assert_holds};
 
@@ -73,10 +73,7 @@ fn an_old_state_is_refused_even_if_the_new_one_never_arrived() {
     let trial = Trial::new(of(2, &[FIRST], 2));
     assert!(matches!(trial.refuses(of(1, &[FIRST], 1)), TufError::Rollback { seen: 2, offered: 1, .. }));
     trial.server.publish(of(7, &[FIRST], 7));
-    trial.server.faults(|seen| match seen.path.contains("objects") {
-        true => Fault::Status(404),
-        false => Fault::None,
-    });
+    trial.server.fault_at("objects", Fault::Status(404));
     assert!(matches!(trial.robot.fetch(), Err(FetchError::Download { .. })));
     trial.server.faults(|_| Fault::None);
     assert!(matches!(trial.refuses(of(6, &[FIRST], 6)), TufError::Rollback { seen: 7, offered: 6, .. }));
@@ -95,38 +92,15 @@ fn files_of_different_states_are_not_mixed() {
         assert!(matches!(error, TufError::Content { .. }), "{name}: {error}");
     }
     trial.server.publish(new.clone());
-    let instead = other.listed.clone();
-    trial.server.faults(move |seen| match seen.path.contains("/targets/") {
-        true => Fault::Instead(instead.clone()),
-        false => Fault::None,
-    });
+    trial.server.fault_at("/targets/", Fault::Instead(other.listed));
     assert!(matches!(trial.robot.fetch(), Err(FetchError::Tuf(TufError::Content { .. }))));
     trial.server.faults(|_| Fault::None);
     trial.accepts(new);
 }
 
-/// A network that repeats the last state for ever is noticed when the timestamp expires; what is on board answers
-/// on. A clock that is behind does not help: the newest time that was signed counts.
-#[test]
-fn a_frozen_store_is_noticed() {
-    let expiring = |at: u64, version: u64| {
-        let published = of(version, &[FIRST], version);
-        let metadata = metadata(&[FIRST], version, at, &published.listed);
-        Published { metadata, ..published }
-    };
-    let mut trial = Trial::new(of(1, &[FIRST], 1));
-    trial.robot.now_unix_secs = NOW + 999;
-    trial.accepts(of(1, &[FIRST], 1));
-    trial.robot.now_unix_secs = NOW + 1000;
-    assert!(matches!(trial.refuses(of(1, &[FIRST], 1)), TufError::Expired { .. }));
-    // Timestamps here are signed at NOW - 1000.
-    trial.robot.now_unix_secs = 0;
-    assert!(matches!(trial.refuses(expiring(NOW - 1000, 2)), TufError::Expired { .. }));
-    trial.accepts(expiring(NOW - 999, 2));
-}
-
-/// Time is the later of the clock and the newest signed time. A clock that is ahead stops fetches while it is
-/// ahead, and leaves nothing behind; at 1970, what the newest signed time allows is taken.
+/// Time is the later of the clock and the newest signed time, so that a frozen store is noticed when its timestamp
+/// expires; what is on board answers on. A clock that is ahead stops fetches while it is ahead, and leaves nothing
+/// behind; at 1970, what the newest signed time allows is taken.
 #[test]
 fn a_clock_that_is_wrong_costs_no_more_than_fetches() {
     let mut trial = Trial::new(of(1, &[FIRST], 1));

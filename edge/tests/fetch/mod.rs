@@ -23,6 +23,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use slag_common::Hash32;
+use slag_common::retry::Backoff;
 use slag_edge::fetch::{
     AddedRoot, Environment, FetchError, FetchReport, FetchRequest, FirstRoot, NetworkLimits, Position,
     Progress, add_root, fetch,
@@ -47,8 +48,7 @@ impl Robot {
     fn new(cache: EdgeCache, from: &str) -> Self {
         let limits = NetworkLimits {
             attempts: 3,
-            first_backoff: Duration::from_millis(1),
-            longest_backoff: Duration::from_millis(4),
+            backoff: Backoff { first: Duration::from_millis(1), longest: Duration::from_millis(4) },
             read_timeout: Duration::from_secs(5),
             chunk_bytes: 512,
             progress_bytes: 512,
@@ -92,6 +92,13 @@ impl Robot {
 
     fn on_sim(dir: &Path, files: Arc<SimFiles>, from: &str) -> Self {
         Self::new(EdgeCache::with_files(dir.join("cache"), files), from)
+    }
+
+    /// Moves it to a place, with room for the cells of a scene that are needed there.
+    fn go(&mut self, x: f64, radius: f64, scene: &Published, cell_ids: std::ops::Range<u32>) {
+        self.request.at = Some(at(x));
+        self.request.radius = radius;
+        self.request.max_bytes = Some(scene.bytes(cell_ids));
     }
 
     fn fetch(&self) -> Result<FetchReport, FetchError> {

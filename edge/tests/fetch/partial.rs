@@ -7,7 +7,7 @@ use slag_edge::store::{BadCell, CellFault, Snapshot};
 
 use super::Robot;
 use super::scene::Published;
-use super::server::{Fault, Seen, Server};
+use super::server::{Fault, Seen};
 
 /// Misbehaves for the compact shards of these cells.
 fn at_cells(
@@ -52,9 +52,7 @@ fn a_bad_cell_costs_that_cell_only() {
         (Fault::Corrupt(900), CellFault::Damaged),
         (longer, CellFault::Damaged),
     ] {
-        let dir = tempfile::tempdir().expect("temporary folder");
-        let server = Server::start(first.clone());
-        let mut robot = Robot::on_disk(dir.path(), &server.url());
+        let (server, mut robot) = Robot::started(first.clone());
 
         // Nothing older is on board: the others answer.
         server.faults(at_cells(&first, &[1], &fault));

@@ -174,7 +174,7 @@ impl Published {
 }
 
 /// Returns metadata files by name. Roots are each signed by the one before, too. `expires`: of the timestamp.
-pub fn metadata(roots: &[RootKeys], version: u64, expires: u64, target: &[u8]) -> BTreeMap<String, Vec<u8>> {
+fn metadata(roots: &[RootKeys], version: u64, expires: u64, target: &[u8]) -> BTreeMap<String, Vec<u8>> {
     let lasting = NOW + 1_000_000;
     let mut files = BTreeMap::new();
     for (at, keys) in roots.iter().enumerate() {

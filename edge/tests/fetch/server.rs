@@ -100,6 +100,11 @@ impl Server {
         *self.shared.chooser.lock().expect("sound") = Box::new(chooser);
     }
 
+    /// Answers requests whose path contains `part` with this fault, and the others rightly.
+    pub fn fault_at(&self, part: &'static str, fault: Fault) {
+        self.faults(move |seen| if seen.path.contains(part) { fault.clone() } else { Fault::None });
+    }
+
     /// Returns the requests since the last call.
     pub fn take_seen(&self) -> Vec<Seen> {
         std::mem::take(&mut self.shared.seen.lock().expect("sound"))

@@ -323,10 +323,10 @@ impl Files for SimFiles {
         })
     }
 
-    fn free_bytes(&self, _dir: &Path) -> io::Result<Option<u64>> {
+    fn free_bytes(&self, _dir: &Path) -> io::Result<u64> {
         self.look(|state| {
             let capacity = state.capacity_bytes.filter(|_| !state.hides_free_space);
-            Ok(capacity.map(|capacity| capacity.saturating_sub(state.used_bytes())))
+            Ok(capacity.map_or(u64::MAX, |capacity| capacity.saturating_sub(state.used_bytes())))
         })
     }
 }

@@ -9,7 +9,7 @@ use slag_edge::fetch::{FetchError, FetchRequest, PlanError, Progress, Records, R
 use slag_edge::store::{EdgeCache, Snapshot, StoreError};
 
 use super::scene::{ENCODER, Published};
-use super::server::{Fault, Server};
+use super::server::Fault;
 use super::{Robot, assert_holds, at};
 
 #[test]
@@ -43,9 +43,7 @@ fn the_second_fetch_brings_only_the_difference() {
     // A new generation changes cell 1, and the robot moves: cells 1..=3 (x = 25) are needed, cell 0 is not.
     let second = Published::new(2, &[0, 7, 0, 0, 0, 0, 0, 0], 100);
     server.publish(second.clone());
-    robot.request.at = Some(at(25.0));
-    robot.request.radius = 14.0;
-    robot.request.max_bytes = Some(second.bytes(1..4));
+    robot.go(25.0, 14.0, &second, 1..4);
     let report = robot.fetch().expect("works");
     let objects = server.take_objects();
     let expected = [1, 3].map(|id| format!("/v1/objects/{}", second.hash(id, Profile::Compact)));
@@ -86,7 +84,7 @@ fn an_interrupted_download_goes_on_where_it_ended() {
     robot.limits.attempts = 1;
     let len = scene.bytes(0..1) as usize;
     let cut = len * 2 / 3;
-    server.faults(move |seen| if seen.path.contains("objects") { Fault::Cut(cut) } else { Fault::None });
+    server.fault_at("objects", Fault::Cut(cut));
     assert!(matches!(robot.fetch(), Err(FetchError::Download { .. })));
     assert_eq!(robot.staged().len(), 1);
     server.take_seen();
@@ -142,10 +140,8 @@ fn passing_faults_are_overcome() {
 #[test]
 fn resuming_never_mixes_contents() {
     for fault in [Fault::None, Fault::IgnoreRange, Fault::ShiftedRange(1), Fault::Status(416)] {
-        let dir = tempfile::tempdir().expect("temporary folder");
         let scene = Published::new(1, &[0; 3], 300);
-        let server = Server::start(scene.clone());
-        let mut robot = Robot::on_disk(dir.path(), &server.url());
+        let (server, mut robot) = Robot::started(scene.clone());
         robot.request.radius = 2.0;
         let staging = robot.cache.dir().join("staging");
         fs_err::create_dir_all(&staging).expect("made");
@@ -188,10 +184,7 @@ fn a_root_that_is_not_there_may_be_refused() {
     for status in [403, 404, 410] {
         let scene = Published::new(1, &[0; 1], 10);
         let (server, robot) = Robot::started(scene.clone());
-        server.faults(move |seen| match seen.path.ends_with("/2.root.json") {
-            true => Fault::Status(status),
-            false => Fault::None,
-        });
+        server.fault_at("/2.root.json", Fault::Status(status));
         robot.fetch().unwrap_or_else(|e| panic!("{status}: {e}"));
         assert!(server.take_seen().iter().any(|seen| seen.path.ends_with("/2.root.json")));
         assert_holds(&robot.snapshot(), &scene, 0..1);
@@ -238,24 +231,11 @@ fn one_fetch_at_a_time() {
     robot.fetch().expect("free again");
 }
 
+/// A manifest of other content, and a pointer that is not JSON; damaged shards are in `rot`.
 #[test]
 fn damage_on_board_is_found_and_healed() {
     let scene = Published::new(1, &[0; 3], 100);
-    let (server, robot) = Robot::fetched(scene.clone());
-    let victim = scene.hash(1, Profile::Compact);
-    let path = robot.cache.shard_path(victim);
-    let mut bytes = fs_err::read(&path).expect("there");
-    bytes[600] ^= 1;
-    fs_err::write(&path, &bytes).expect("written");
-    assert_eq!(robot.snapshot().bad_cells.len(), 1, "a reader finds it");
-    server.take_seen();
-    assert_eq!(robot.fetch().expect("heals").downloaded.n_shards, 1);
-    assert_eq!(server.take_objects().len(), 1);
-    assert_holds(&robot.snapshot(), &scene, 0..3);
-
-    // A missing shard; a missing manifest; a pointer that is not JSON.
-    fs_err::remove_file(&path).expect("there");
-    robot.fetch().expect("heals");
+    let (_server, robot) = Robot::fetched(scene.clone());
     fs_err::write(robot.cache.manifest_path(Hash32::of(&scene.listed)), b"x").expect("written");
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Hash { .. })));
     fs_err::write(robot.cache.current_path(), b"{").expect("written");
@@ -286,10 +266,8 @@ fn a_shard_that_the_manifest_does_not_describe_is_refused() {
 /// Readers that keep opening snapshots while fetches replace them always get a whole one.
 #[test]
 fn readers_get_a_whole_generation_during_fetches() {
-    let dir = tempfile::tempdir().expect("temporary folder");
     let scene = Published::new(1, &[0; 8], 50);
-    let server = Server::start(scene.clone());
-    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    let (_server, mut robot) = Robot::started(scene.clone());
     robot.request.radius = 2.0;
     robot.request.max_bytes = Some(scene.bytes(0..1));
     robot.fetch().expect("works");

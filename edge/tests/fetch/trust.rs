@@ -168,10 +168,7 @@ fn a_robot_without_records_asks_for_a_root() {
 /// A store is trusted for one scene: another one could bring an older map without a word.
 #[test]
 fn another_scene_of_the_same_root_is_refused() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let server = Server::start(of(2, &[FIRST]));
-    let robot = Robot::on_disk(dir.path(), &server.url());
-    robot.fetch().expect("works");
+    let (server, robot) = Robot::fetched(of(2, &[FIRST]));
     let barn = |version| {
         Published::new(1, &[4; 3], 20)
             .edited(|manifest| manifest.scene = "barn".into())

@@ -4,6 +4,7 @@ use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use slag_common::retry::Backoff;
 use ureq::http::{HeaderName, Method, Response, StatusCode};
 use ureq::tls::TlsConfig;
 
@@ -59,8 +60,7 @@ pub(super) fn client(options: &HubOptions) -> Result<Client<'static>, DownloadFa
     let proxy = options.proxy.as_deref().map(ureq::Proxy::new).transpose()?;
     let limits = NetworkLimits {
         attempts: MAX_ATTEMPTS,
-        first_backoff: options.first_backoff,
-        longest_backoff: Duration::MAX,
+        backoff: Backoff { first: options.first_backoff, longest: Duration::MAX },
         connect_timeout: options.timeout,
         read_timeout: options.timeout,
         progress_bytes: 1,

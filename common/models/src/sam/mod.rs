@@ -131,7 +131,7 @@ impl Sam {
             decoder = Model::open_sized(&decoder_file, options, Some((&dimension, n as i64)))?;
             prompts_per_call = Some(n);
         }
-        let memory = encoder.take_memory().zip(decoder.take_memory()).map(|(memory, _)| memory);
+        let memory = encoder.memory.take().zip(decoder.memory.take()).map(|(memory, _)| memory);
         Ok(Self {
             id: format!("{id} {:?} {:?} {size_px} px", sam.mean, sam.std),
             size_px,

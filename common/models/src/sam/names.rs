@@ -2,7 +2,7 @@
 
 use ort::value::TensorElementType::{Float32, Int64};
 
-use crate::session::{Declared, Model, SessionError, shapes_fit};
+use crate::session::{Declared, Model, SessionError, declared, listed, shapes_fit};
 
 /// Masks that SAM proposes for a prompt: subpart, part and whole, in that order.
 pub const MASKS_PER_PROMPT: usize = 3;
@@ -47,7 +47,7 @@ impl Inputs {
     /// Sorts the decoder's inputs; `offered`: the encoder's outputs.
     fn sort(decoder: &Model, offered: &[Declared]) -> Self {
         let mut inputs = Self::default();
-        for (name, tensor) in decoder.inputs() {
+        for (name, tensor) in declared(decoder.session.inputs()) {
             let given = offered.iter().find(|(output, _)| *output == name);
             match (given, tensor) {
                 (Some((output, Some((Float32, shape)))), Some((Float32, _))) => {
@@ -80,17 +80,17 @@ impl Inputs {
 impl Names {
     /// Matches the inputs and outputs of the two files.
     pub(super) fn discover(encoder: &Model, decoder: &Model, size_px: i64) -> Result<Self, SessionError> {
-        let pixels = match &encoder.inputs()[..] {
+        let pixels = match &declared(encoder.session.inputs())[..] {
             [(name, Some((Float32, shape)))] if matches!(shape[..], [_, 3 | -1, _, _]) => name.clone(),
             _ => {
                 let expected = format!("an image encoder's only one, f32 [-1, 3, {size_px}, {size_px}]");
-                let found = format!("its inputs are {}", encoder.listed_inputs());
+                let found = format!("its inputs are {}", listed(encoder.session.inputs()).join(", "));
                 return Err(encoder.layout_error(found, expected));
             }
         };
         encoder.expect_input(pixels.as_str(), Float32, &[-1, 3, size_px, size_px])?;
 
-        let offered = encoder.outputs();
+        let offered = declared(encoder.session.outputs());
         let inputs = Inputs::sort(decoder, &offered);
         let ([points], [labels], [] | [_], [_, ..], []) = (
             &inputs.points[..],
@@ -105,7 +105,10 @@ impl Names {
                  f32 [-1, -1, 4] or none, and no others (no earlier masks)",
                 names.join(", ")
             );
-            return Err(decoder.layout_error(format!("its inputs are {}", decoder.listed_inputs()), expected));
+            return Err(decoder.layout_error(
+                format!("its inputs are {}", listed(decoder.session.inputs()).join(", ")),
+                expected,
+            ));
         };
         let n_masks = MASKS_PER_PROMPT as i64;
         Ok(Self {
@@ -124,7 +127,7 @@ impl Names {
 
 /// Returns the decoder's f32 output of shape `expected`: the one called `name`, else the first that fits.
 fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, SessionError> {
-    let outputs = decoder.outputs();
+    let outputs = declared(decoder.session.outputs());
     let fits =
         |declared: &&Declared| matches!(&declared.1, Some((Float32, shape)) if shapes_fit(shape, expected));
     let named = outputs.iter().filter(fits).find(|(found, _)| found == name);
@@ -132,7 +135,7 @@ fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, Sessi
     let by_shape = || outputs.iter().find(|declared| expected.last() != Some(&1) && fits(declared));
     let found = named.or_else(by_shape);
     found.map(|(name, _)| name.clone()).ok_or_else(|| {
-        let found = format!("its outputs are {}", decoder.listed_outputs());
+        let found = format!("its outputs are {}", listed(decoder.session.outputs()).join(", "));
         decoder.layout_error(found, format!("one of them f32 {expected:?}"))
     })
 }

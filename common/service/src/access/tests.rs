@@ -15,22 +15,14 @@ fn access(
     token: Option<&str>,
 ) -> Result<Access, AccessError> {
     let owned = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect();
-    let file = std::env::temp_dir().join(format!(
-        "slag-token-{}-{:?}",
-        std::process::id(),
-        std::thread::current().id()
-    ));
+    let dir = tempfile::tempdir().expect("a folder");
+    let file = dir.path().join("slag-token");
     if let Some(token) = token {
         std::fs::write(&file, token).expect("writes");
     }
-    let settings = AccessSettings {
-        hosts: owned(hosts),
-        origins: owned(origins),
-        token_file: token.map(|_| file.clone()),
-    };
-    let access = Access::new(&listen.parse().expect("an address"), settings);
-    let _ = std::fs::remove_file(file);
-    access
+    let settings =
+        AccessSettings { hosts: owned(hosts), origins: owned(origins), token_file: token.map(|_| file) };
+    Access::new(&listen.parse().expect("an address"), settings)
 }
 
 fn status(access: &Access, method: Method, headers: &[(&str, &str)]) -> u16 {

@@ -57,31 +57,17 @@ impl Authority {
     }
 }
 
-/// Files in a folder of their own, removed at the end.
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(name: &str) -> (Self, TlsFiles) {
-        let dir = std::env::temp_dir().join(format!("slag-tls-{name}-{}", std::process::id()));
-        std::fs::create_dir_all(&dir).expect("made");
-        let files = TlsFiles { cert: dir.join("cert.pem"), key: dir.join("key.pem") };
-        (Self(dir), files)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
-
-fn any_port() -> Listen {
-    "127.0.0.1:0".parse().expect("an address")
+/// A folder, and the files of a certificate there.
+fn folder() -> (tempfile::TempDir, TlsFiles) {
+    let dir = tempfile::tempdir().expect("a folder");
+    let [cert, key] = ["cert.pem", "key.pem"].map(|name| dir.path().join(name));
+    (dir, TlsFiles { cert, key })
 }
 
 /// Serves with a certificate; returns the address.
 async fn start(files: &TlsFiles, limits: ConnectionLimits) -> String {
-    let listener = bind(&any_port()).await.expect("binds");
+    let any_port: Listen = "127.0.0.1:0".parse().expect("an address");
+    let listener = bind(&any_port).await.expect("binds");
     let listener = listener.with_tls(Some(Tls::open(files.clone()).expect("a certificate")));
     let url = listener.url().expect("bound");
     // Longer than a record of TLS.
@@ -92,7 +78,7 @@ async fn start(files: &TlsFiles, limits: ConnectionLimits) -> String {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_renewed_certificate_is_used_and_half_a_renewal_is_not() {
-    let (_folder, files) = Folder::new("renewed");
+    let (_folder, files) = folder();
     let (authority, other) = (Authority::new("one"), Authority::new("other"));
     authority.issue("localhost", &files);
     let address = start(&files, ConnectionLimits::default()).await;
@@ -125,7 +111,7 @@ async fn a_renewed_certificate_is_used_and_half_a_renewal_is_not() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn plain_and_silent_clients_are_let_go() {
-    let (_folder, files) = Folder::new("silent");
+    let (_folder, files) = folder();
     let authority = Authority::new("one");
     authority.issue("localhost", &files);
     let limits = ConnectionLimits { head_timeout: Duration::from_millis(300), ..ConnectionLimits::default() };
@@ -145,7 +131,7 @@ async fn plain_and_silent_clients_are_let_go() {
 
 #[test]
 fn files_without_a_pair_are_named() {
-    let (_folder, files) = Folder::new("named");
+    let (_folder, files) = folder();
     let refused = |files: &TlsFiles| Tls::open(files.clone()).expect_err("no pair").to_string();
     assert!(refused(&files).contains("cert.pem: ") && refused(&files).contains("expected a certificate"));
     let authority = Authority::new("one");

@@ -3,7 +3,7 @@
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Float64Type, UInt32Type};
 use arrow_ipc::reader::StreamReader;
-use hyper::body::Body as _;
+use futures_util::TryStreamExt;
 use serde_json::json;
 
 use super::*;
@@ -22,14 +22,8 @@ fn many() -> [BuiltShard; 2] {
 }
 
 async fn pieces(response: Response) -> Result<Vec<Vec<u8>>, axum::Error> {
-    let mut body = response.into_body();
-    let mut pieces = Vec::new();
-    while let Some(frame) =
-        soon(std::future::poll_fn(|context| std::pin::Pin::new(&mut body).poll_frame(context))).await
-    {
-        pieces.push(frame?.into_data().expect("data").to_vec());
-    }
-    Ok(pieces)
+    let body = response.into_body().into_data_stream();
+    soon(body.map_ok(|piece| piece.to_vec()).try_collect()).await
 }
 
 /// A long answer comes in short pieces: JSON of 60,000 Gaussians in pieces of 64 KiB.

@@ -1,13 +1,13 @@
 //! What changed between generations: `GET /v1/changes`.
 
 use slag_common::frames::{GeoReference, Geographic};
-use slag_common::manifest::{Calibration, Manifest};
+use slag_common::manifest::Manifest;
 
 use super::openapi::{check, description};
 use super::*;
 use crate::query::MAX_TEXTS;
 use crate::store::{BadCell, CellFault, OldShard, Snapshot, history};
-use crate::testing::{TestObject, manifest_of, write_manifest};
+use crate::testing::{CALIBRATION, TestObject, manifest_of, write_manifest};
 
 /// 20 Gaussians at x = 3, and objects at x = their ids, each along the axis of its id modulo 3. Other things are of
 /// another splat.
@@ -22,8 +22,7 @@ fn with_things(shard: &BuiltShard, ids: &[u64], vector: impl Fn(u64) -> Vec<f32>
         runs: std::iter::once(2 * at..2 * at + 2).collect(),
         n_gaussians: 40,
     });
-    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-    shard.with_objects(&objects.collect::<Vec<_>>(), calibration)
+    shard.with_objects(&objects.collect::<Vec<_>>(), CALIBRATION)
 }
 
 /// 20 Gaussians of axis 0 in a cell of 656 units from x on, elsewhere for other things.
@@ -229,10 +228,7 @@ async fn a_fetched_generation_is_found_by_asking_for_changes() {
     write_cache(service.dir.path(), &shards(&[6, 10]), 2);
     let mut attempts = service.app.reload_attempts();
     service.get("/v1/changes").await;
-    tokio::time::timeout(Duration::from_secs(20), attempts.changed())
-        .await
-        .expect("in time")
-        .expect("is told");
+    soon(attempts.changed()).await.expect("is told");
     let (_, _, body) = service.get("/v1/changes").await;
     assert_eq!((&body["to"]["generation"], ids(&body, "appeared")), (&json!(2), vec!["o000000000000000a"]));
 }

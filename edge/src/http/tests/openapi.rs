@@ -2,14 +2,13 @@
 
 use std::collections::BTreeSet;
 
-use slag_common::manifest::Calibration;
 use slag_service::openapi::document;
 use slag_service::routes::Route;
 
 use super::problem::Members;
 use super::router::{ABOUT, described};
 use super::*;
-use crate::testing::TestObject;
+use crate::testing::{CALIBRATION, TestObject};
 
 pub(super) fn description() -> Value {
     let (_, table) = described();
@@ -208,8 +207,7 @@ async fn every_answer_is_as_described() {
     }
     // Objects come first where there are any.
     let object = TestObject { id: 5, vectors: vec![1.0, 0.0, 0.0], runs: vec![2..8, 8..14], n_gaussians: 40 };
-    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-    let service = Service::new(Some(&[exact[0].with_objects(&[object], calibration)]), Settings::default());
+    let service = Service::new(Some(&[exact[0].with_objects(&[object], CALIBRATION)]), Settings::default());
     for (query, kind, n) in
         [("text=0", "objects", 1), ("text=1", "objects", 0), ("text=0&kind=clusters", "clusters", 1)]
     {

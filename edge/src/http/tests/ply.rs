@@ -2,10 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use slag_common::manifest::Calibration;
-
 use super::*;
-use crate::testing::TestObject;
+use crate::testing::{CALIBRATION, TestObject};
 
 /// Two things, 20 m apart. Each lies in two cells: in one every Gaussian matches, in the other every second.
 fn two_things(has_packed_indices: bool) -> [BuiltShard; 2] {
@@ -122,8 +120,7 @@ async fn objects_have_their_own_gaussians() {
     let [first, _] = two_things(true);
     let object =
         TestObject { id: 5, vectors: vec![1.0, 0.0, 0.0], runs: vec![2..8, 14..20], n_gaussians: 40 };
-    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-    let service = Service::new(Some(&[first.with_objects(&[object], calibration)]), Settings::default());
+    let service = Service::new(Some(&[first.with_objects(&[object], CALIBRATION)]), Settings::default());
     let (_, points) = get_points(&service, "text=0&threshold=0.5").await;
     let indices: Vec<f64> = points.iter().map(|point| point["index"]).collect();
     let expected: Vec<f64> = (2..8).chain(14..20).map(f64::from).collect();

@@ -1,12 +1,11 @@
 //! Version 1 of the API: one shape of reply, areas, pages, relations, the things on board, events.
 
-use axum::body::Bytes;
-use slag_common::manifest::Calibration;
+use futures_util::StreamExt;
 use slag_common::occupancy::BuiltOccupancy;
 
 use super::*;
 use crate::query::map_status;
-use crate::testing::TestObject;
+use crate::testing::{CALIBRATION, TestObject};
 
 /// Gaussians on a lattice between two corners, in steps of 0.01.
 fn lattice(from: [u16; 3], to: [u16; 3], n: [u16; 3], axis: usize) -> Vec<Member> {
@@ -47,8 +46,7 @@ pub(super) fn room_with(places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
         n_gaussians: ends[at + 1] - ends[at],
     };
     let objects = [object(1, 0, 0), object(2, 0, 1), object(3, 1, 2)];
-    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-    [shard.with_objects_and_places(&objects, calibration, places)]
+    [shard.with_objects_and_places(&objects, CALIBRATION, places)]
 }
 
 async fn post(service: &Service, body: &Value) -> Answered {
@@ -203,8 +201,7 @@ fn room_in_pieces() -> [BuiltShard; 1] {
         }
         end += n;
     }
-    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-    [TestShard::new(members).build(false).with_objects_and_places(&objects, calibration, None)]
+    [TestShard::new(members).build(false).with_objects(&objects, CALIBRATION)]
 }
 
 /// What no object answers, clusters do, in phrases as in plain questions; pieces that touch are counted once.
@@ -384,13 +381,8 @@ async fn events_tell_of_generations_until_the_service_stops() {
     let service = Service::new(Some(&room()), settings);
     let response = soon(service.send("GET", "/v1/events")).await;
     assert_eq!(response.headers()["content-type"], "text/event-stream");
-    let mut body = response.into_body();
-    let mut next = async || -> Option<Bytes> {
-        let frame = std::future::poll_fn(|context| {
-            hyper::body::Body::poll_frame(std::pin::Pin::new(&mut body), context)
-        });
-        soon(frame).await.map(|frame| frame.expect("no error").into_data().expect("data"))
-    };
+    let mut events = response.into_body().into_data_stream();
+    let mut next = async || soon(events.next()).await.map(|event| event.expect("no error"));
     let first = next().await.expect("an event");
     let text = String::from_utf8_lossy(&first);
     assert!(text.starts_with("event: generation\ndata: {") && text.contains("\"generation\":1"), "{text}");

@@ -5,9 +5,8 @@ use std::path::PathBuf;
 use glam::DAffine3;
 use half::f16;
 use slag_common::appearance::AppearanceColumns;
-use slag_common::container::AlignedBytes;
 use slag_common::photo_poses::BuiltPhotoPoses;
-use slag_common::shard::{Additions, ShardLayout};
+use slag_common::shard::Additions;
 use slag_common::{Gaussians, View, pinhole};
 
 use super::*;
@@ -97,12 +96,7 @@ async fn appearances_on_board_are_handed_on() {
         ..Gaussians::balls(vec![DVec3::ZERO; 25], 0.0)
     };
     let columns = AppearanceColumns::of(&scene, &(0..25).collect::<Vec<u32>>());
-    let mut bytes = Vec::new();
-    let additions = Additions { appearance: Some(columns.view()), ..Additions::default() };
-    near.view().write_with(&mut bytes, additions).expect("writes to memory");
-    let bytes = AlignedBytes::copy_of(&bytes);
-    let layout = ShardLayout::check(&bytes).expect("a valid shard");
-    let dressed = BuiltShard { layout, bytes, embeddings: near.embeddings.clone() };
+    let dressed = near.with(Additions { appearance: Some(columns.view()), ..Additions::default() });
     let service = Service::new(Some(&[dressed]), Settings::default());
     let (_, gaussians) = bytes_of(&service, "/v1/view/cells/1").await;
     assert_eq!(u32_at(&gaussians, 24), 1);
@@ -184,12 +178,7 @@ async fn photo_poses_on_board_are_handed_on() {
     };
     let mut photos = BuiltPhotoPoses::default();
     photos.push(DVec3::new(x, 0.0, z), &view);
-    let mut bytes = Vec::new();
-    let additions = Additions { photo_poses: photos.view(), ..Additions::default() };
-    near.view().write_with(&mut bytes, additions).expect("writes to memory");
-    let bytes = AlignedBytes::copy_of(&bytes);
-    let layout = ShardLayout::check(&bytes).expect("a valid shard");
-    let shard = BuiltShard { layout, bytes, embeddings: near.embeddings.clone() };
+    let shard = near.with(Additions { photo_poses: photos.view(), ..Additions::default() });
     let service = Service::new(Some(&[shard]), Settings::default());
     let (_, _, described) = service.get("/v1/view").await;
     let [photo] = &described["views"].as_array().expect("photos")[..] else { panic!("one: {described}") };

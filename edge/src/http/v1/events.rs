@@ -1,20 +1,18 @@
 //! `GET /v1/events`: server-sent events (WHATWG HTML, 9.2), so that a client need not poll.
 
-use std::io;
-use std::pin::Pin;
+use std::convert::Infallible;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use axum::extract::State;
 use axum::http::{HeaderValue, header};
-use hyper::body::Frame;
+use futures_util::stream::unfold;
 use schemars::SchemaGenerator;
 use serde_json::{Value, json};
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Described, Reply};
-use tokio::sync::mpsc::{Receiver, channel};
+use tokio::sync::mpsc::channel;
 
 use crate::fetch::follow::FollowStatus;
 use crate::http::app::App;
@@ -69,7 +67,12 @@ pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> 
         (header::CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE)),
         (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
     ];
-    Ok(As::new((headers, Body::new(Events(receiver)))))
+    // It ends when the service stops.
+    let events = unfold(receiver, |mut events| async move {
+        let event = events.recv().await?;
+        Some((Ok::<_, Infallible>(event), events))
+    });
+    Ok(As::new((headers, Body::from_stream(events))))
 }
 
 #[derive(Default)]
@@ -110,23 +113,10 @@ fn push(text: &mut String, name: &str, data: &Value) {
     text.push_str(&format!("event: {name}\ndata: {data}\n\n"));
 }
 
-/// A body of events, which ends when the service stops.
-pub struct Events(Receiver<Bytes>);
+pub struct Events;
 
 impl Described for Events {
     fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
         vec![Reply::ok(MEDIA_TYPE, schemas.subschema_for::<String>())]
-    }
-}
-
-impl hyper::body::Body for Events {
-    type Data = Bytes;
-    type Error = io::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, io::Error>>> {
-        self.0.poll_recv(context).map(|event| event.map(|event| Ok(Frame::data(event))))
     }
 }

@@ -45,8 +45,7 @@ pub struct CellParams {
 
 pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, Problem> {
     app.within_limits(None, |app, budget| {
-        let posted = app.following.as_ref().and_then(|following| following.status().position);
-        let described = app.engine.view(|snapshot| posted?.in_world(&snapshot.manifest).ok(), budget);
+        let described = app.engine.view(|snapshot| app.last_position(&snapshot.manifest), budget);
         described.map(Json).map_err(query_problem)
     })
     .await

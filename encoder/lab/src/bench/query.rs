@@ -289,7 +289,7 @@ pub(crate) fn time_texts(args: &TextArgs) -> Result<TextReport> {
     }
     Ok(TextReport {
         machine: Machine::here(),
-        model: encoder.name().to_owned(),
+        model: models.encoder_id().name.clone(),
         runs_on: encoder.placement().map(ToString::to_string),
         model_threads: session.intra_op_threads,
         texts,

@@ -110,10 +110,6 @@ fn camera() -> Intrinsics {
 struct Renamed(Box<dyn TextEncoder>, BTreeMap<&'static str, &'static str>);
 
 impl TextEncoder for Renamed {
-    fn name(&self) -> &str {
-        self.0.name()
-    }
-
     fn dim(&self) -> usize {
         self.0.dim()
     }
