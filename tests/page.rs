@@ -1,5 +1,6 @@
 //! What the page is sent, by both programs, against the scores that the command line prints.
 
+use serde_json::json;
 use slag_tests::*;
 
 /// A message of scores: for each cell its id and the scores of its Gaussians; `None` where no view shows one.
@@ -148,6 +149,9 @@ fn the_store_finds_what_the_robot_finds() {
         let (_, same) = of_store.iter().find(|(other, _)| other == id).expect("the store has it, too");
         assert!((same - score).abs() < 0.02, "{id}: {same} {score}");
     }
+    let store = site.cache().with_file_name("store");
+    let mut query = encoder(&["query", "--store", text(&store), "--models", "colours", "red", "--limit", "100"]);
+    assert_eq!(places(&json!({ "answers": run_json(&mut query)["things"] })), of_store, "the command line's, too");
 }
 
 /// Both programs suggest the names of things: those of the robot's list, and its other words without a thing.

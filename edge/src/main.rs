@@ -4,9 +4,11 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use slag_edge::cli;
+use slag_models::restart::{NO_TELEMETRY, restart_with};
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
+    restart_with(&[NO_TELEMETRY]);
     let cli = match cli::parse() {
         Ok(cli) => cli,
         Err(exit) => return exit.into(),

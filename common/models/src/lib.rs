@@ -9,7 +9,8 @@
 //!
 //! [`hub`] pulls public models; [`commands`] is its command line, shared by both programs.
 //!
-//! Nothing here prints, reads the environment or starts threads, except the prompt of [`commands::ask`].
+//! Nothing here prints, reads the environment or starts threads, except [`restart`] and the prompt of
+//! [`commands::ask`].
 
 mod bound;
 pub mod boundaries;
@@ -34,6 +35,7 @@ pub mod phrases;
 mod placement;
 pub mod preprocess;
 mod provider;
+pub mod restart;
 pub mod sam;
 pub mod session;
 mod synonyms;

@@ -2,7 +2,7 @@
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
-use slag_robot::api::goal::{Goal, GoalMiss, GoalReply};
+use slag_robot::api::goal::{Goal, GoalMiss, GoalReply, NoGoal, TargetThing};
 use slag_robot::xyz;
 
 /// A thing to go to, and the robot that goes.
@@ -14,6 +14,8 @@ pub struct Going {
     pub what: String,
     /// Where the robot is, [x, y, z] in the world frame. Absent: where the robot itself says it is.
     pub near: Option<[f64; 3]>,
+    /// Where it looks, radians from the world's x axis towards y. For "left of me" and the like.
+    pub heading_rad: Option<f64>,
     /// Radius of the robot, metres, seen from above; 0.3 if absent.
     #[schemars(range(min = 0.05, max = 2.0))]
     pub radius_m: Option<f64>,
@@ -40,6 +42,20 @@ pub struct Stands {
     /// Why there is none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub none: Option<GoalMiss>,
+    /// Things that match better than `thing` and have no place to stand, best first.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schemars(default)]
+    pub passed_over: Vec<PassedOver>,
+}
+
+/// A thing without a place to stand.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct PassedOver {
+    /// The thing.
+    #[serde(flatten)]
+    pub thing: Target,
+    /// Why there is no place.
+    pub why: NoGoal,
 }
 
 /// The thing that the places are near.
@@ -77,6 +93,7 @@ impl Going {
         let number = |name, value: Option<f64>| value.map(|value| (name, value.to_string()));
         let near = self.near.map(|near| ("near", xyz(near)));
         let robot = [
+            number("heading_rad", self.heading_rad),
             number("radius_m", self.radius_m),
             number("reach_m", self.reach_m),
             number("sensor_height_m", self.sensor_height_m),
@@ -96,12 +113,14 @@ impl From<GoalReply> for Stands {
             way_m: goal.path_m,
             lat_lon_deg: goal.geographic.map(|place| [place.latitude_deg, place.longitude_deg]),
         };
+        let target =
+            |of: TargetThing| Target { id: of.id, position_in_world: of.position_in_world.to_array() };
+        let missed = goals.missed.into_iter();
         Self {
             scene: goals.scene,
             generation: goals.generation,
-            thing: goals
-                .thing
-                .map(|of| Target { id: of.id, position_in_world: of.position_in_world.to_array() }),
+            passed_over: missed.map(|of| PassedOver { thing: target(of.thing), why: of.none }).collect(),
+            thing: goals.thing.map(target),
             places: goals.goals.into_iter().map(stand).collect(),
             none: goals.none,
         }

@@ -156,9 +156,9 @@ async def check(client, robot, word):
     return len(found["things"])
 
 
-async def check_pictures(client, store):
-    """The service of the store answers what a robot with balanced shards does."""
-    for thing in (await client.call_tool("list", {"limit": 3})).structured_content["things"]:
+async def check_pictures(client, robot, store):
+    """The service of the store has the pictures that a robot with balanced shards has."""
+    for thing in get(f"{robot}/v1/objects?limit=3")["objects"]:
         with urllib.request.urlopen(f"{store}/v1/objects/{thing['id']}/thumbnail", timeout=20) as reply:
             truth = reply.read()
         [shown] = (await client.call_tool("picture", {"id": thing["id"]})).content
@@ -196,7 +196,7 @@ async def main(program, robot, word, store, url):
     check_strangers(url)
     said.append(f"http: {n} things")
     async with Client(StdioServerParameters(command=program, args=["--robot", store])) as client:
-        await check_pictures(client, store)
+        await check_pictures(client, robot, store)
     # A robot that does not answer is an error of the call; the door stays open.
     async with Client(StdioServerParameters(command=program, args=["--robot", "http://127.0.0.1:9"])) as client:
         refused = await client.call_tool("find", {"what": word})

@@ -8,7 +8,7 @@ use crate::query::parse_point;
 use crate::score::Budget;
 use clap::Args;
 use glam::DVec3;
-use slag_api::goal::{Goal, GoalReply};
+use slag_api::goal::{Goal, GoalReply, MissedThing, NoGoal};
 use slag_common::objects::parse_public_id;
 use slag_common::{durable, files};
 
@@ -30,6 +30,9 @@ pub struct GoalArgs {
     /// Where the robot is, world frame [default: the middle of the area on board].
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     pub near: Option<DVec3>,
+    /// Where it looks, for things such as "chair left of me": radians from the world's x axis towards y.
+    #[arg(long, value_name = "RAD", allow_negative_numbers = true)]
+    pub heading_rad: Option<f64>,
     #[command(flatten)]
     pub robot: Robot,
     #[command(flatten)]
@@ -52,7 +55,8 @@ pub struct GoalArgs {
 pub fn run(args: GoalArgs) -> Result<(), Failure> {
     let target =
         parse_public_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
-    let request = GoalRequest { target, near: args.near, robot: args.robot, stand: args.stand };
+    let GoalArgs { near, heading_rad, robot, stand, .. } = args;
+    let request = GoalRequest { target, near, heading_rad, robot, stand };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
     args.map.iter().try_for_each(|path| files::check_writable(path))?;
     args.threads.apply()?;
@@ -79,6 +83,18 @@ fn failure(error: GoalError) -> Failure {
 
 fn lines(reply: &GoalReply) -> String {
     let mut text = String::new();
+    if reply.thing.is_some() {
+        for MissedThing { thing, none } in &reply.missed {
+            let [x, y, z] = thing.position_in_world.to_array();
+            let why = match none {
+                NoGoal::NoSuchThing => "is not on board",
+                NoGoal::Unreachable => "no way leads there",
+                NoGoal::UnknownGround => "the ground around it is not known",
+                NoGoal::NotVisible => "it is not seen from any place to stand",
+            };
+            text += &format!("{} at {x:.2}, {y:.2}, {z:.2} matches better, but {why}\n", thing.id);
+        }
+    }
     if let Some(thing) = &reply.thing {
         let [x, y, z] = thing.position_in_world.to_array();
         text.push_str(&format!("{} at {x:.2}, {y:.2}, {z:.2}\n", thing.id));

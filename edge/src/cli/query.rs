@@ -33,6 +33,9 @@ pub struct QueryArgs {
     /// Position of the asker, world frame: answers carry their distance from it, and nearer ones rank higher.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     pub near: Option<DVec3>,
+    /// Where the asker looks, for questions such as "chair left of me": radians from the world's x axis towards y.
+    #[arg(long, value_name = "RAD", requires = "near", allow_negative_numbers = true)]
+    pub heading_rad: Option<f64>,
     /// Search only within this distance of --near, world units.
     #[arg(long, requires = "near")]
     pub radius: Option<f64>,
@@ -82,6 +85,7 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
         limit: args.limit,
         threshold: args.threshold,
         near: args.near,
+        heading_rad: args.heading_rad,
         region: Region { ball, bounds: args.bounds, polygon: None },
         kind: args.kind,
         voxel: args.voxel,

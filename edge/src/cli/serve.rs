@@ -227,7 +227,7 @@ fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
 const PULSES_PER_TIMEOUT: u32 = 3;
 
 fn tell(news: NotifyState<'_>) {
-    if let Err(error) = sd_notify::notify(&[news]) {
+    if let Err(error) = sd_notify::notify(std::slice::from_ref(&news)) {
         tracing::warn!("systemd was not told {news:?}: {error}");
     }
 }

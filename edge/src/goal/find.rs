@@ -117,7 +117,8 @@ fn things(
     let near = Some(Point::World(near.to_array()));
     // Clusters have no id to go to.
     let kind = Some(AnswerKind::Objects);
-    let ask = Ask { texts: vec![text.clone()], near, kind, limit: Some(MAX_THINGS), ..Ask::default() };
+    let (texts, heading_rad) = (vec![text.clone()], request.heading_rad);
+    let ask = Ask { texts, near, heading_rad, kind, limit: Some(MAX_THINGS), ..Ask::default() };
     let found = engine.ask_on(on_board, ask, budget)?;
     let thing = |answer: &crate::query::ClusterAnswer| {
         let thing = TargetThing {

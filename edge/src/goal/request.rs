@@ -114,6 +114,8 @@ pub struct GoalRequest {
     pub target: GoalTarget,
     /// Where the robot is, world frame; the centre of the area on board if absent.
     pub near: Option<DVec3>,
+    /// Where it looks, radians from the world's x axis towards y, for texts that depend on it.
+    pub heading_rad: Option<f64>,
     pub robot: Robot,
     pub stand: Stand,
 }
@@ -121,7 +123,7 @@ pub struct GoalRequest {
 impl GoalRequest {
     /// Asks for places to stand near a thing, for the robot that flags and parameters describe by default.
     pub fn new(target: GoalTarget) -> Self {
-        Self { target, near: None, robot: ROBOT, stand: STAND }
+        Self { target, near: None, heading_rad: None, robot: ROBOT, stand: STAND }
     }
 
     /// Checks every limit that does not depend on the scene.

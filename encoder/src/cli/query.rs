@@ -1,11 +1,11 @@
-//! `query`: scores of every Gaussian against a text, and the Gaussians that match it.
+//! `query`: the things and the Gaussians that match a text.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
 use slag_common::{Gaussians, durable, files, npy};
@@ -14,6 +14,7 @@ use slag_models::words_to_find;
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
 use crate::query::{self, Hit};
 use crate::store::StoreReader;
+use crate::view::Things;
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder query --store STORE \"fire extinguisher\"\n\
@@ -31,7 +32,7 @@ pub struct QueryArgs {
     pub models: ModelArgs,
     /// Text to look for.
     pub text: String,
-    /// Gaussians to print, best first.
+    /// Things to print, best first, or Gaussians where no thing matches.
     #[arg(long, default_value_t = 10)]
     pub limit: u32,
     /// Least cosine of a match, -1 to 1 [default: the encoder's].
@@ -80,18 +81,43 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     }
     let n_matching = matching.len();
     let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
+    let things = Things::open(&reader)?;
+    let least = args.threshold.unwrap_or_else(|| things.threshold(manifest, false));
+    let things = things.matching(manifest, &[vector], least, args.limit as usize);
     let mut lines = asked_as.as_ref().map_or(String::new(), |asked| format!("{words}: asked as {asked}\n"));
-    lines += &format!("{n_matching} of {n_scored} Gaussians reach {threshold}\n");
-    for hit in &hits {
-        let p = hit.position_in_world;
-        lines +=
-            &format!("{:.4}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z);
+    lines.extend(things.iter().map(of_thing));
+    lines += &format!("{n_matching} of {n_scored} Gaussians reach {threshold:.3}\n");
+    if things.is_empty() {
+        lines.extend(hits.iter().filter(|hit| hit.cosine >= threshold).map(of_hit));
+        if let (0, Some(best)) = (n_matching, hits.first()) {
+            lines +=
+                &format!("the best: {}--threshold {:.2} shows such\n", of_hit(best), best.cosine - 0.005);
+        }
     }
     let value = json!({
         "text": args.text, "asked_as": asked_as, "threshold": threshold, "n_matching": n_matching, "n_scored": n_scored, "best": hits,
+        "things": things,
     });
     print(json, &value, lines)?;
     Ok(Exit::Done)
+}
+
+/// `thing`: an answer as the page reads it.
+fn of_thing(thing: &Value) -> String {
+    let number = |at: &Value| at.as_f64().unwrap_or_default();
+    let place: Vec<String> =
+        (0..3).map(|axis| format!("{:.2}", number(&thing["position_in_world"][axis]))).collect();
+    let edge =
+        |axis: usize| number(&thing["box_max_in_world"][axis]) - number(&thing["box_min_in_world"][axis]);
+    let size = [0, 1, 2].map(edge).map(|edge| format!("{edge:.2}")).join(" x ");
+    let (score, id) = (number(&thing["score"]), thing["id"].as_str().unwrap_or_default());
+    let photo = thing["evidence"]["photo"].as_str().unwrap_or_default();
+    format!("{score:.3}  {id}  at {}, {size}, in {photo}\n", place.join(" "))
+}
+
+fn of_hit(hit: &Hit) -> String {
+    let p = hit.position_in_world;
+    format!("{:.3}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z)
 }
 
 /// Reads a splat and checks that it is the store's.

@@ -8,8 +8,9 @@ use slag_common::manifest::{Calibration, CellRecord, Manifest};
 use slag_common::objects::{ObjectRecord, public_id};
 use slag_models::names::{Confidence, Naming, Spread};
 
-use super::shards::combined;
-use crate::store::StoredShard;
+use super::error::ViewError;
+use super::shards::{combined, smallest_shard};
+use crate::store::{StoreReader, StoredShard};
 
 /// Spreads above the mean from which a score is an answer, as on robots.
 const SPREADS_ABOVE_MEAN: f32 = 3.0;
@@ -27,13 +28,24 @@ struct ThingsHere {
 
 /// The things of a generation: each is scored in the first shard that has it.
 #[derive(Default)]
-pub(super) struct Things {
+pub(crate) struct Things {
     shards: Vec<ThingsHere>,
     calibration: Option<Calibration>,
     ids: BTreeSet<u64>,
 }
 
 impl Things {
+    /// Finds the things of a published store.
+    pub(crate) fn open(reader: &StoreReader) -> Result<Self, ViewError> {
+        let mut things = Self::default();
+        for cell in &reader.manifest().cells {
+            if let Some(shard) = smallest_shard(reader, cell)? {
+                things.add(cell, shard);
+            }
+        }
+        Ok(things)
+    }
+
     /// Adds the objects of the next cell's smallest shard.
     pub(super) fn add(&mut self, cell: &CellRecord, shard: StoredShard) {
         let Some(objects) = shard.objects() else { return };
@@ -57,7 +69,7 @@ impl Things {
     }
 
     /// Returns the score from which a thing answers a question with negatives, or one without.
-    fn threshold(&self, manifest: &Manifest, has_negatives: bool) -> f32 {
+    pub(crate) fn threshold(&self, manifest: &Manifest, has_negatives: bool) -> f32 {
         let encoder = &manifest.encoder;
         match self.calibration.filter(|_| encoder.calibration.is_some()) {
             _ if has_negatives => RELEVANCY_THRESHOLD,
@@ -100,6 +112,30 @@ impl Things {
         limit: usize,
     ) -> Value {
         let threshold = self.threshold(manifest, vectors.len() > 1);
+        let answers = self.matching(manifest, vectors, threshold, limit);
+        let none = answers.is_empty().then(|| {
+            let (kind, detail) = match self.shards.is_empty() {
+                true => {
+                    ("no-objects", "The store has no objects; the Gaussians that match are lit.".to_owned())
+                }
+                false => ("below-threshold", format!("No object reaches {threshold:.3}.")),
+            };
+            json!({ "kind": kind, "detail": detail, "thing": text })
+        });
+        json!({ "results": [{
+            "question": { "text": text }, "understood": null, "kind": "objects", "threshold": threshold,
+            "none": none, "answers": answers,
+        }] })
+    }
+
+    /// Returns the things that reach a score, best first.
+    pub(crate) fn matching(
+        &self,
+        manifest: &Manifest,
+        vectors: &[Vec<f32>],
+        threshold: f32,
+        limit: usize,
+    ) -> Vec<Value> {
         let mut found: Vec<Found> = Vec::new();
         for ThingsHere { shard, numbers, have_thumbnails } in &self.shards {
             let Some(objects) = shard.objects() else { continue };
@@ -115,21 +151,7 @@ impl Things {
         }
         found.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.record.id.cmp(&b.record.id)));
         found.truncate(limit);
-        let answers = found.iter().zip(1..).map(|(found, rank)| answer(manifest, rank, found));
-        let answers: Vec<Value> = answers.collect();
-        let none = answers.is_empty().then(|| {
-            let (kind, detail) = match self.shards.is_empty() {
-                true => {
-                    ("no-objects", "The store has no objects; the Gaussians that match are lit.".to_owned())
-                }
-                false => ("below-threshold", format!("No object reaches {threshold:.3}.")),
-            };
-            json!({ "kind": kind, "detail": detail, "thing": text })
-        });
-        json!({ "results": [{
-            "question": { "text": text }, "understood": null, "kind": "objects", "threshold": threshold,
-            "none": none, "answers": answers,
-        }] })
+        found.iter().zip(1..).map(|(found, rank)| answer(manifest, rank, found)).collect()
     }
 }
 

@@ -76,6 +76,17 @@ async fn poses_or_reasons_are_given() {
     let (_, _, none) = service.get("/v1/goal?text=2&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &none);
     assert_eq!(none["none"]["kind"], "no-such-thing", "{none:#}");
+    // Which side is left depends on where the robot looks.
+    let of_side = "/v1/goal?text=0+left+of+me&near=2,3,0&step_m=0.15";
+    assert_refused(&service.get(of_side).await, "heading_rad", "nothing");
+    let mut kinds = Vec::new();
+    for heading_rad in [0.0, std::f64::consts::FRAC_PI_2, std::f64::consts::PI, -std::f64::consts::FRAC_PI_2] {
+        let (status, _, body) = service.get(&format!("{of_side}&heading_rad={heading_rad}")).await;
+        assert_eq!(status, 200, "{body:#}");
+        kinds.push(body["none"]["kind"].as_str().unwrap_or("found").to_owned());
+    }
+    assert!(kinds.iter().any(|kind| kind == "no-such-thing"), "{kinds:?}");
+    assert!(kinds.iter().any(|kind| kind != "no-such-thing"), "{kinds:?}");
     // A robot beyond the known ground.
     let (_, _, away) = service.get("/v1/goal?text=0&near=20,3,0&step_m=0.15").await;
     assert_eq!(away["none"]["kind"], "unknown-ground", "{away:#}");

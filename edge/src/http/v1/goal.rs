@@ -29,6 +29,9 @@ pub struct TargetParams {
     /// The same by its id, instead of text.
     #[schemars(example = &"o0123456789abcdef")]
     id: Option<ObjectIdText>,
+    /// Where the robot looks, radians from the world's x axis towards y, for texts such as "chair left of me".
+    #[schemars(example = 0.0)]
+    heading_rad: Option<f64>,
 }
 
 #[derive(Deserialize, JsonSchema)]
@@ -52,7 +55,7 @@ pub async fn goal(
         (Some(_), Some(_)) => return Err(RequestError::new("id", "text as well", "one of the two").into()),
         _ => return Err(RequestError::new("text", "nothing", "the thing to go to, or its id as id").into()),
     };
-    let request = GoalRequest { target, near: None, robot, stand };
+    let request = GoalRequest { target, near: None, heading_rad: of.heading_rad, robot, stand };
     answer(&app, place, request, |app, on_board, request, budget| {
         goal::find(&app.engine, on_board, request, budget)
     })
