@@ -150,8 +150,13 @@ fn the_store_finds_what_the_robot_finds() {
         assert!((same - score).abs() < 0.02, "{id}: {same} {score}");
     }
     let store = site.cache().with_file_name("store");
-    let mut query = encoder(&["query", "--store", text(&store), "--models", "colours", "red", "--limit", "100"]);
-    assert_eq!(places(&json!({ "answers": run_json(&mut query)["things"] })), of_store, "the command line's, too");
+    let mut query =
+        encoder(&["query", "--store", text(&store), "--models", "colours", "red", "--limit", "100"]);
+    assert_eq!(
+        places(&json!({ "answers": run_json(&mut query)["things"] })),
+        of_store,
+        "the command line's, too"
+    );
 }
 
 /// Both programs suggest the names of things: those of the robot's list, and its other words without a thing.

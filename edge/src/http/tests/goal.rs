@@ -80,7 +80,8 @@ async fn poses_or_reasons_are_given() {
     let of_side = "/v1/goal?text=0+left+of+me&near=2,3,0&step_m=0.15";
     assert_refused(&service.get(of_side).await, "heading_rad", "nothing");
     let mut kinds = Vec::new();
-    for heading_rad in [0.0, std::f64::consts::FRAC_PI_2, std::f64::consts::PI, -std::f64::consts::FRAC_PI_2] {
+    for heading_rad in [0.0, std::f64::consts::FRAC_PI_2, std::f64::consts::PI, -std::f64::consts::FRAC_PI_2]
+    {
         let (status, _, body) = service.get(&format!("{of_side}&heading_rad={heading_rad}")).await;
         assert_eq!(status, 200, "{body:#}");
         kinds.push(body["none"]["kind"].as_str().unwrap_or("found").to_owned());
