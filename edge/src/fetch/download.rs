@@ -82,7 +82,7 @@ impl<'a> Client<'a> {
             DownloadError::TooLong { max_bytes } => {
                 TufError::TooLong { what: path.to_owned(), max_bytes }.into()
             }
-            e => FetchError::of_download(url, e),
+            e => FetchError::of_download(url, e, 0),
         })
     }
 
@@ -108,7 +108,7 @@ impl<'a> Client<'a> {
         let url = format!("{}/v1/objects/{hash}", self.base);
         let part = StagedObject { files, hash, len_bytes, path };
         let received = self.http.large(&url, &part, Expected::Exactly(len_bytes));
-        received.map_err(|e| FetchError::of_download(url, e))
+        received.map_err(|e| FetchError::of_download(url, e, part.len_bytes().unwrap_or(0)))
     }
 }
 
