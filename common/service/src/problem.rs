@@ -97,7 +97,8 @@ impl Problem {
         self.cause.as_deref()
     }
 
-    /// Returns the problem of an error response that came without one, from a layer or the router.
+    /// Returns the problem of an error response that came without one, from a layer or the router. A service that
+    /// does not list its resources at `/` has its own for paths that it does not know.
     pub(crate) fn of_status(status: StatusCode, method: &str, path: &str) -> Self {
         let shown: String = path.chars().take(80).collect();
         match status {
