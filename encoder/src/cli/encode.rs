@@ -23,8 +23,8 @@ use super::summary::lines;
 use crate::cells::PositionError;
 use crate::encode::front::{Expectation, Front, Target};
 use crate::encode::{
-    DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, InputSettings, MAX_CELL_GAUSSIANS, Masks, ViewsLimit,
-    count_inputs,
+    DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, InputSettings, MAX_CELL_GAUSSIANS, Masks, Restart,
+    ViewsLimit, count_inputs,
 };
 use crate::occupancy::OccupancySettings;
 use crate::progress::Progress;
@@ -160,7 +160,7 @@ pub struct EncodeArgs {
     /// left out and why.
     #[arg(long, value_name = "FILE", help_heading = "Output")]
     report: Option<PathBuf>,
-    /// Drops an unfinished encode of another splat or with other settings in the store.
+    /// Drops the views that the store keeps, of an unfinished encode or of any other: all are made again.
     #[arg(long, help_heading = "Output", hide_short_help = true)]
     restart: bool,
 }
@@ -195,7 +195,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     run.memory_bytes = args.memory.unwrap_or_else(default_memory_bytes);
     run.time_budget = args.time_budget;
     run.strict = input.strict;
-    run.restart = args.restart;
+    run.restart = if args.restart { Restart::Always } else { Restart::Never };
     run.keep_views = args.keep_views || !args.added.is_empty() || !args.dropped.is_empty();
     run.allow_empty = args.allow_empty;
     choices.apply(&mut settings);

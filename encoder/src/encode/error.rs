@@ -56,6 +56,8 @@ pub enum EncodeError {
     Store(#[from] StoreError),
     #[error(transparent)]
     Contributions(#[from] ContributionError),
+    #[error("view {view}: {}: {what}; run the same encode again: this view is made again, the others are kept", path.display())]
+    KeptView { view: String, path: PathBuf, what: String },
     #[error(transparent)]
     Io(#[from] std::io::Error),
     #[error("job records: {0}; start over with --restart")]
