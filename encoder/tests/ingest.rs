@@ -4,6 +4,7 @@ use std::path::Path;
 
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
+use slag_common::photo::PhotoError;
 use slag_common::{Distortion, Intrinsics, View, pinhole, poses};
 use slag_encoder::ingest::{
     GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, load_image, missing_images,
@@ -223,7 +224,7 @@ fn absent_and_damaged_images_are_named() {
     let bytes = fs_err::read(&path).unwrap();
     fs_err::write(&path, &bytes[..bytes.len() / 2]).unwrap();
     assert!(matches!(load_image(&absent), Err(IngestError::Io(e)) if e.to_string().contains("b.png")));
-    assert!(matches!(load_image(&damaged), Err(IngestError::Decode { path, .. }) if path.ends_with("a.png")));
+    assert!(matches!(load_image(&damaged), Err(IngestError::Photo { path, .. }) if path.ends_with("a.png")));
     let views = [damaged, absent.clone()];
     assert_eq!(missing_images(&views), [&absent]);
 
@@ -236,10 +237,10 @@ fn absent_and_damaged_images_are_named() {
     let bytes = fs_err::read(&path).unwrap();
     let middle = bytes.len() / 2;
     fs_err::write(&path, &bytes[..middle]).unwrap();
-    assert!(matches!(load_image(&photo), Err(IngestError::Cut { .. })));
+    assert!(matches!(load_image(&photo), Err(IngestError::Photo { fault: PhotoError::Cut, .. })));
     let zeros = [&bytes[..middle], &[0; 300], &bytes[middle + 300..]].concat();
     fs_err::write(&path, zeros).unwrap();
-    assert!(matches!(load_image(&photo), Err(IngestError::Zeros { .. })));
+    assert!(matches!(load_image(&photo), Err(IngestError::Photo { fault: PhotoError::Zeros, .. })));
     let error = check_memory(&photo, 160 * 120).expect_err("a byte a pixel").to_string();
     assert!(error.contains("c.jpg") && error.contains("160 x 120 px"), "{error}");
     check_memory(&photo, 1 << 20).expect("enough");
@@ -338,7 +339,8 @@ fn turned_and_transparent_photos() {
     assert_eq!(loaded.image.dimensions(), (160, 120));
     assert!(loaded.image.get_pixel(80, 119)[0] > 150 && loaded.image.get_pixel(80, 60)[0] < 60);
     fs_err::write(&path, b"\0\0\0\x24ftypheic\0\0\0\0mif1heic").unwrap();
-    assert!(matches!(load_image(&view(&path, camera)), Err(IngestError::Heif { .. })));
+    let heif = load_image(&view(&path, camera));
+    assert!(matches!(heif, Err(IngestError::Photo { fault: PhotoError::Heif, .. })));
     fs_err::write(&path, b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n").unwrap();
     assert!(load_image(&view(&path, camera)).unwrap_err().to_string().contains("git lfs pull"));
 }
