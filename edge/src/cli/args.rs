@@ -5,7 +5,8 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use crate::fetch::{FetchRequest, Position};
-use crate::query::Engine;
+use crate::query::{Engine, LENGTHS, is_length};
+use crate::score::MAX_COORDINATE;
 use crate::store::EdgeCache;
 use crate::text::TextService;
 use anyhow::anyhow;
@@ -127,14 +128,14 @@ pub fn variable(name: &str) -> Option<OsString> {
 }
 
 pub(super) fn parse_radius(text: &str) -> Result<f64, String> {
-    let radius = text.parse::<f64>().ok().filter(|radius| *radius >= 0.0 && radius.is_finite());
-    radius.ok_or_else(|| "expected world units, 0 or more".to_owned())
+    let radius = text.parse::<f64>().ok().filter(|radius| *radius == 0.0 || is_length(*radius));
+    radius.ok_or_else(|| format!("expected world units, 0 or more, at most {MAX_COORDINATE:e}"))
 }
 
 /// Reads the radius of a search, which finds nothing at 0.
 pub(super) fn parse_reach(text: &str) -> Result<f64, String> {
     let radius = parse_radius(text).ok().filter(|radius| *radius > 0.0);
-    radius.ok_or_else(|| "expected world units, more than 0".to_owned())
+    radius.ok_or_else(|| format!("expected world units, {LENGTHS}"))
 }
 
 /// Reads a number of bytes: 2GB, 2GiB or 2G.

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::fetch::{FetchRequest, Position};
 use crate::query::parse_point;
+use crate::score::MAX_COORDINATE;
 use anyhow::anyhow;
 use clap::Args;
 use glam::DVec3;
@@ -14,7 +15,7 @@ use slag_service::stop::on_stop;
 use super::args::{CacheArgs, DownloadArgs};
 use super::failure::Failure;
 use super::follow::{FollowArgs, watch};
-use super::network::{failure, fetch_once};
+use super::network::{failure, fetch_once, parse_store};
 use super::output::print_json;
 use super::progress::{Bar, bad_cells, print_report};
 
@@ -27,7 +28,7 @@ const EXAMPLES: &str = "Examples:\n\
 #[command(before_help = EXAMPLES)]
 pub struct FetchArgs {
     /// Address of the store [default: that of the last fetch].
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", value_parser = parse_store)]
     pub from: Option<String>,
     /// Position of the robot, world frame [default: that of the last fetch].
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
@@ -62,7 +63,7 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
         }
         (None, None) => None,
     };
-    let settings = args.follow.settings(args.download.radius)?;
+    let settings = args.follow.settings(args.download.radius);
     let ca = args.download.ca.clone();
     let request = FetchRequest { scene: args.scene, ..args.download.request(args.from, at) };
     let cache = args.cache.open()?;
@@ -93,9 +94,9 @@ fn parse_geographic(text: &str) -> Result<(f64, f64, Option<f64>), String> {
     let in_range = |lat: f64, lon: f64| lat.abs() <= 90.0 && lon.abs() <= 180.0;
     match numbers.as_deref() {
         Some([lat, lon]) if in_range(*lat, *lon) => Ok((*lat, *lon, None)),
-        Some([lat, lon, height]) if in_range(*lat, *lon) && height.is_finite() => {
+        Some([lat, lon, height]) if in_range(*lat, *lon) && height.abs() <= MAX_COORDINATE => {
             Ok((*lat, *lon, Some(*height)))
         }
-        _ => Err("degrees LAT,LON within ±90 and ±180, optionally a height in metres".into()),
+        _ => Err("degrees LAT,LON within ±90 and ±180, optionally a height in metres, at most 1e9".into()),
     }
 }
