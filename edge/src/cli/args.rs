@@ -1,7 +1,6 @@
 //! Arguments shared by several commands.
 
 use std::ffi::OsString;
-use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use crate::fetch::{FetchRequest, Position};
@@ -77,16 +76,16 @@ impl DownloadArgs {
 
 #[derive(Debug, Args)]
 pub struct ThreadArgs {
-    /// Threads for answering questions [default: the number of cores].
-    #[arg(long, value_name = "N")]
-    pub threads: Option<NonZeroUsize>,
+    /// Threads for answering questions, at most 256 [default: the number of cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub threads: Option<u32>,
 }
 
 impl ThreadArgs {
     /// Sets the number of threads for answering questions; once per process.
     pub fn apply(&self) -> Result<(), Failure> {
         let Some(n) = self.threads else { return Ok(()) };
-        let built = rayon::ThreadPoolBuilder::new().num_threads(n.get()).build_global();
+        let built = rayon::ThreadPoolBuilder::new().num_threads(n as usize).build_global();
         built.map_err(|e| Failure::Failed("threads", e.into()))
     }
 }
