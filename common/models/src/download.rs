@@ -113,7 +113,10 @@ const TLS_ADVICE: [(&str, &str); 8] = [
         "CaUsedAsEndEntity",
         "the server shows the certificate of an authority: make its own with basicConstraints=critical,CA:FALSE",
     ),
-    ("InvalidContentType", "the server does not speak TLS there: give its address with http://, or its other port"),
+    (
+        "InvalidContentType",
+        "the server does not speak TLS there: give its address with http://, or its other port",
+    ),
     ("NotValidYet", TLS_CLOCK),
     ("not valid yet", TLS_CLOCK),
     ("xpired", TLS_CLOCK),
@@ -623,7 +626,9 @@ mod tests {
         let of_authority = advice("invalid peer certificate: Other(OtherError(CaUsedAsEndEntity))");
         assert!(of_authority.contains("CA:FALSE") && !of_authority.contains("--ca"), "{of_authority}");
         assert!(advice("invalid peer certificate: UnknownIssuer").contains("--ca"));
-        assert!(advice("invalid peer certificate: certificate expired: verification time 1").contains("clock"));
+        assert!(
+            advice("invalid peer certificate: certificate expired: verification time 1").contains("clock")
+        );
         assert_eq!(advice("something new"), "check the server's certificate");
     }
 

@@ -77,9 +77,8 @@ async fn long_photos_are_taken() {
 /// A picture of one colour is short as a file: what it takes is refused before it is read.
 #[tokio::test]
 async fn memory_is_bounded() {
-    let with = |query_bytes: u64| {
-        Service::new(Some(&chair(None)), Settings { query_bytes, ..Settings::default() })
-    };
+    let with =
+        |query_bytes: u64| Service::new(Some(&chair(None)), Settings { query_bytes, ..Settings::default() });
     let service = with(20 << 20);
     let (status, body) = post(&service, "focal_px=500", "image/png", png(4000, 3000)).await;
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body:#}");
