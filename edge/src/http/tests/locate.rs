@@ -42,7 +42,7 @@ async fn photos_are_lost_or_refused() {
         ("focal_px=500&near=1,2,3", "sigma"),
         ("focal_px=500&near=1,2,3&sigma=0", "sigma"),
         ("focal_px=500&sigma=1", "near"),
-        ("focal_px=500&near_lat_lon=46,8&sigma=1", "near"),
+        ("focal_px=500&near_lat_lon=46,8&sigma=1", "near_lat_lon"),
     ] {
         let (status, body) = post(&service, query, "image/jpeg", png(64, 48)).await;
         assert_eq!((status, &body["parameter"]), (StatusCode::BAD_REQUEST, &json!(parameter)), "{query}");
