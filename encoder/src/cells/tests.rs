@@ -68,7 +68,8 @@ fn a_sky_costs_the_chair_no_precision() {
     let (n_near, n_far) = (3_500, 60_000);
     let place = |i: usize| DVec3::new((i % 17) as f64, (i % 19) as f64, (i % 23) as f64) / 30.0;
     let near = (0..n_near).map(place);
-    let means: Vec<DVec3> = near.chain((0..n_far).map(|i| place(i).normalize_or(DVec3::X) * 1000.0)).collect();
+    let means: Vec<DVec3> =
+        near.chain((0..n_far).map(|i| place(i).normalize_or(DVec3::X) * 1000.0)).collect();
     let mut scene = Gaussians::balls(means, 15.0);
     scene.scales[..n_near].fill([0.01; 3]);
     let result = split(&scene, CellLimits::by_count(65_536));
