@@ -246,7 +246,8 @@ fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
 /// Returns the only `Host`; `None` if there is none.
 fn one_host(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
     let refused = |found: &str| {
-        let detail = format!("the request has {found}, expected one Host header: this machine's name or address");
+        let detail =
+            format!("the request has {found}, expected one Host header: this machine's name or address");
         Err(Problem::new(StatusCode::BAD_REQUEST, "bad-host", "Bad host", detail))
     };
     let mut values = headers.get_all(header::HOST).iter();

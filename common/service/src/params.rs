@@ -96,7 +96,8 @@ impl<S: Send + Sync> FromRequestParts<S> for PathText {
         let refused = |rejection: PathRejection| match &rejection {
             PathRejection::FailedToDeserializePathParams(failed) => match failed.kind() {
                 ErrorKind::InvalidUtf8InPathParam { key } => {
-                    RequestError::new(key, parts.uri.path(), "text in UTF-8 where %XX stand for its bytes").into()
+                    RequestError::new(key, parts.uri.path(), "text in UTF-8 where %XX stand for its bytes")
+                        .into()
                 }
                 kind => Problem::internal(kind),
             },

@@ -107,7 +107,8 @@ impl Problem {
 
     /// Calls the part of the request that is refused as the request itself does.
     pub fn rename_parameter(&mut self, name: &str) {
-        if let Some(rest) = self.parameter().and_then(|old| self.detail.strip_prefix(old)?.strip_prefix(": ")) {
+        if let Some(rest) = self.parameter().and_then(|old| self.detail.strip_prefix(old)?.strip_prefix(": "))
+        {
             self.detail = format!("{name}: {rest}");
         }
         self.members.insert(PARAMETER.to_owned(), name.into());

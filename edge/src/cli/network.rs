@@ -66,9 +66,12 @@ mod tests {
         for address in ["http://base:7733", "https://base", "http://[::1]:7733/store/"] {
             assert_eq!(parse_store(address).as_deref(), Ok(address));
         }
-        let flags: [&[&str]; 3] = [&["serve", "--follow"], &["fetch", "--from"], &["trust", "add", "--trust-first"]];
+        let flags: [&[&str]; 3] =
+            [&["serve", "--follow"], &["fetch", "--from"], &["trust", "add", "--trust-first"]];
         for flag in flags {
-            for wrong in ["", "ftp://x", "base:7733", "http://", "http://a@b", "http://a:70000", "http://a/?b"] {
+            for wrong in
+                ["", "ftp://x", "base:7733", "http://", "http://a@b", "http://a:70000", "http://a/?b"]
+            {
                 let line = [&["slag-edge"], flag, &[wrong]].concat();
                 let error = Cli::try_parse_from(&line).expect_err(wrong);
                 assert_eq!(error.exit_code(), Exit::Usage as i32, "{line:?}");

@@ -102,7 +102,9 @@ impl FromStr for Position {
                 Ok(Self::World(DVec3::new(x, y, z)))
             }
             Spoken::Geographic { lat, lon, height }
-                if lat.abs() <= 90.0 && lon.abs() <= 180.0 && height.is_none_or(|height| height.abs() <= MAX_COORDINATE) =>
+                if lat.abs() <= 90.0
+                    && lon.abs() <= 180.0
+                    && height.is_none_or(|height| height.abs() <= MAX_COORDINATE) =>
             {
                 Ok(Self::Geographic { latitude_deg: lat, longitude_deg: lon, height_m: height })
             }

@@ -93,8 +93,11 @@ impl Ask {
         let n = self.texts.len() + self.vectors.len() + self.phrases.len();
         if !(1..=MAX_TEXTS).contains(&n) {
             let expected = format!("1 to {MAX_TEXTS} texts, vectors and phrases together");
-            let counts =
-                [("texts", self.texts.len()), ("vectors", self.vectors.len()), ("phrases", self.phrases.len())];
+            let counts = [
+                ("texts", self.texts.len()),
+                ("vectors", self.vectors.len()),
+                ("phrases", self.phrases.len()),
+            ];
             let most = counts.into_iter().reduce(|most, of| if of.1 > most.1 { of } else { most });
             let member = most.map_or("texts", |(member, _)| member);
             return Err(RequestError::new(member, &format!("{n} questions"), expected));

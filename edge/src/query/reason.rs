@@ -97,7 +97,8 @@ pub fn of_objects(
                 .to_owned(),
         ),
         None if seen_share(scene.shards, place).is_some() => {
-            let advice = if request.kind.is_some() { "; ask with kind=clusters, or search elsewhere" } else { "" };
+            let advice =
+                if request.kind.is_some() { "; ask with kind=clusters, or search elsewhere" } else { "" };
             let detail = format!("there are Gaussians{place}, but none of an object{advice}");
             (ReasonKind::BelowThreshold, detail)
         }

@@ -138,7 +138,11 @@ async fn areas_restrict_what_is_found() {
     let far = json!({"ball": {"centre": [50, 50, 0], "radius": 1.0}});
     let (_, _, body) = post(&service, &json!({"texts": ["0 on the 1"], "region": far})).await;
     assert_eq!(body["results"][0]["none"]["kind"], "not-in-region", "{body}");
-    assert_refused(&service.get("/v1/query?text=0&near_lat_lon=47,8&radius=5").await, "near_lat_lon", "no origin");
+    assert_refused(
+        &service.get("/v1/query?text=0&near_lat_lon=47,8&radius=5").await,
+        "near_lat_lon",
+        "no origin",
+    );
 }
 
 #[tokio::test]
@@ -254,7 +258,10 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({"texts": ["0"], "near": [1e12, 0, 0]}), "near"),
         (json!({"texts": ["0"], "region": {"polygon": [[0, 0], [1, 1]]}}), "polygon"),
         (json!({"texts": ["0"], "region": {"polygon": [[0, 0], [1, 1], [2, 2]]}}), "polygon"),
-        (json!({"texts": ["0"], "region": {"ball": {"centre": {"lat": 1, "lon": 2}, "radius": 1}}}), "centre"),
+        (
+            json!({"texts": ["0"], "region": {"ball": {"centre": {"lat": 1, "lon": 2}, "radius": 1}}}),
+            "centre",
+        ),
         (json!({"texts": ["0"], "region": {"box": {"from": [0, 0, 0], "to": [1e10, 1, 1]}}}), "box"),
         (json!({"texts": ["0"], "region": {"polygon": []}}), "body"),
         (json!({"texts": ["0"], "region": {"box": {"from": [0, 0, 1], "to": [5, 5, 1]}}}), "box"),

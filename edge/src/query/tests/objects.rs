@@ -196,7 +196,10 @@ fn reasons_are_of_the_region() {
     for kind in [objects, None] {
         let low = reason(22.195, 22.6, 1, kind);
         assert_eq!(low.kind, ReasonKind::BelowThreshold, "{}", low.detail);
-        assert!(low.best_score.is_some_and(|score| score < 0.1) && low.detail.contains("in the box"), "{low:?}");
+        assert!(
+            low.best_score.is_some_and(|score| score < 0.1) && low.detail.contains("in the box"),
+            "{low:?}"
+        );
         let of_none = reason(20.5, 20.9, 1, kind);
         assert_eq!(of_none.kind, ReasonKind::BelowThreshold, "{}", of_none.detail);
         // Without objects the nearest miss is of the Gaussians.

@@ -397,7 +397,10 @@ async fn a_page_alone_is_found_from_the_root() {
     let root = get_with(&router, "/", &[]).await;
     assert_eq!((root.status.as_u16(), root.header(header::LOCATION)), (307, "/view"));
     let detail = get_with(&router, "/nowhere", &[]).await.problem(StatusCode::NOT_FOUND);
-    assert!(detail.contains("\"/nowhere\"") && detail.contains("/view") && !detail.contains("GET /"), "{detail}");
+    assert!(
+        detail.contains("\"/nowhere\"") && detail.contains("/view") && !detail.contains("GET /"),
+        "{detail}"
+    );
     let fixture = fixture();
     let router = fixture.router_within(Limits::default()).expect("published");
     assert_eq!(get_with(&router, "/", &[]).await.status, StatusCode::OK);
