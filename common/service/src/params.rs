@@ -93,6 +93,7 @@ impl<S: Send + Sync> FromRequestParts<S> for PathText {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        let read = Path::<String>::from_request_parts(parts, state).await;
         let refused = |rejection: PathRejection| match &rejection {
             PathRejection::FailedToDeserializePathParams(failed) => match failed.kind() {
                 ErrorKind::InvalidUtf8InPathParam { key } => {
@@ -103,7 +104,6 @@ impl<S: Send + Sync> FromRequestParts<S> for PathText {
             },
             other => Problem::internal(other),
         };
-        let read = Path::<String>::from_request_parts(parts, state).await;
         read.map(|Path(text)| Self(text)).map_err(refused)
     }
 }
