@@ -49,7 +49,7 @@ pub fn parse(
     variable: &dyn Fn(&str) -> Option<OsString>,
 ) -> Result<ArgMatches, ConfigError> {
     // Without the checks of what is missing: the file may have it.
-    let first = command.clone().ignore_errors(true).try_get_matches_from(line);
+    let first = switchable(command.clone()).ignore_errors(true).try_get_matches_from(line);
     let Ok(first) = first else { return Ok(command.try_get_matches_from(line)?) };
     let named = first.try_get_one::<OsString>(FILE_FLAG).ok().flatten().map(PathBuf::from);
     let file = read(named, variable)?;
@@ -99,6 +99,20 @@ fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
         ids.extend(explicit(below));
     }
     ids
+}
+
+/// Lets `--trust-first=false` switch off what a file switches on.
+fn switch(arg: Arg) -> Arg {
+    let arg = arg.action(ArgAction::Set).num_args(0..=1).require_equals(true);
+    arg.value_parser(clap::value_parser!(bool)).default_missing_value("true")
+}
+
+/// Lets all flags be switched off, so that what follows one on the line is read.
+fn switchable(command: Command) -> Command {
+    let below: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_owned()).collect();
+    let command = below.iter().fold(command, |command, name| command.mut_subcommand(name, switchable));
+    let is_switch = |arg: &Arg| matches!(arg.get_action(), ArgAction::SetTrue);
+    command.mut_args(|arg| if is_switch(&arg) { switch(arg) } else { arg })
 }
 
 /// Returns the names of the command that is asked for and of those above it.
@@ -216,11 +230,7 @@ impl Settings<'_> {
             // clap keeps names and defaults for as long as the program runs.
             let values: Vec<&'static str> = values.into_iter().map(|value| &*value.leak()).collect();
             command = command.mut_arg(id, |arg| match arg.get_action() {
-                // `--trust-first=false` switches off what a file switches on.
-                ArgAction::SetTrue => (arg.action(ArgAction::Set).num_args(0..=1).require_equals(true))
-                    .value_parser(clap::value_parser!(bool))
-                    .default_missing_value("true")
-                    .default_values(values),
+                ArgAction::SetTrue => switch(arg).default_values(values),
                 _ => arg.default_values(values).required(false),
             });
         }

@@ -95,6 +95,14 @@ fn flags_of_a_file_need_and_exclude_others() {
         ("slag-edge fetch", &[], "radius = 3", "radius", &["3"]),
         ("slag-edge list", &[], "radius = 3", "radius", &[]),
         ("slag-edge list --near 1,2,3 --radius 4", &[], "radius = 3", "radius", &["4"]),
+        // What is switched off on the line hides nothing that follows.
+        (
+            "slag-edge fetch --trust-first=false --at-geo 4,5",
+            &[],
+            "[fetch]\ntrust-first = true\nat = '1,2,3'",
+            "at",
+            &[],
+        ),
         // The environment comes before the file.
         ("slag-edge fetch", &here, "[fetch]\nat = '1,2,3'", "at", &[]),
         ("slag-edge fetch", &here, "[fetch]\nat = '1,2,3'", "at_geo", &["4,5"]),
