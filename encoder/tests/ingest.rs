@@ -7,7 +7,7 @@ use image::{Rgb, RgbImage};
 use slag_common::photo::PhotoError;
 use slag_common::{Distortion, Intrinsics, View, pinhole, poses};
 use slag_encoder::ingest::{
-    GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, load_image, missing_images,
+    GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, drawn_from, load_image, missing_images,
     read_geo_reference,
 };
 use slag_test_support::{needs_shared, shared};
@@ -246,6 +246,17 @@ fn absent_and_damaged_images_are_named() {
     check_memory(&photo, 1 << 20).expect("enough");
 }
 
+/// Drawings are told from photos whatever mark the text begins with.
+#[test]
+fn drawings_are_told_by_a_text_of_windows() {
+    let dir = tempfile::tempdir().unwrap();
+    for mark in ["", "\u{feff}"] {
+        fs_err::write(dir.path().join("transforms.json"), format!(r#"{mark}{{"drawn_from": "a.ply"}}"#))
+            .unwrap();
+        assert_eq!(drawn_from(dir.path()), Some("a.ply".to_owned()), "{mark:?}");
+    }
+}
+
 #[needs_shared]
 #[test]
 fn geo_reference() {
@@ -276,6 +287,9 @@ fn geo_reference() {
     ] {
         assert!(matches!(read(json), Err(GeoError::Json { .. })), "{json}");
     }
+    let utf16: Vec<u8> = "{}".encode_utf16().flat_map(u16::to_le_bytes).collect();
+    fs_err::write(&path, utf16).unwrap();
+    assert!(matches!(read_geo_reference(&path), Err(GeoError::Text { .. })));
     assert!(read("\u{feff}{\"origin\": {\"lat\": 1, \"lon\": 2, \"alt\": 3}}").is_ok(), "a byte order mark");
     let twice = read(r#"{"origin": {"lat": 8, "lat": 47, "lon": 8, "alt": 0}}"#).unwrap_err().to_string();
     assert!(twice.contains("duplicate field `lat`"), "{twice}");
@@ -338,9 +352,11 @@ fn turned_and_transparent_photos() {
     let loaded = load_image(&view(&path, camera)).unwrap();
     assert_eq!(loaded.image.dimensions(), (160, 120));
     assert!(loaded.image.get_pixel(80, 119)[0] > 150 && loaded.image.get_pixel(80, 60)[0] < 60);
-    fs_err::write(&path, b"\0\0\0\x24ftypheic\0\0\0\0mif1heic").unwrap();
-    let heif = load_image(&view(&path, camera));
-    assert!(matches!(heif, Err(IngestError::Photo { fault: PhotoError::Heif, .. })));
+    for brand in ["heic", "heim", "hevc", "msf1"] {
+        fs_err::write(&path, format!("\0\0\0\x24ftyp{brand}\0\0\0\0mif1heic")).unwrap();
+        let heif = load_image(&view(&path, camera));
+        assert!(matches!(heif, Err(IngestError::Photo { fault: PhotoError::Heif, .. })), "{brand}");
+    }
     fs_err::write(&path, b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n").unwrap();
     assert!(load_image(&view(&path, camera)).unwrap_err().to_string().contains("git lfs pull"));
 }

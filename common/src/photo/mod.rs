@@ -13,7 +13,17 @@ use jpeg::Damage;
 /// and a row of pixels. A decoder of JPEG copies the file besides.
 pub const HEAD_BYTES: u64 = 16 << 20;
 /// Bytes 4 to 12 of HEIF files, which phones write.
-const HEIF_BRANDS: [&[u8]; 4] = [b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypavif"];
+const HEIF_BRANDS: [&[u8]; 9] = [
+    b"ftypheic",
+    b"ftypheix",
+    b"ftypheim",
+    b"ftypheis",
+    b"ftyphevc",
+    b"ftyphevx",
+    b"ftypmif1",
+    b"ftypmsf1",
+    b"ftypavif",
+];
 
 #[derive(Debug, thiserror::Error)]
 pub enum PhotoError {

@@ -105,9 +105,9 @@ pub fn drawn_from(poses: &Path) -> Option<String> {
     let inside = poses.join("transforms.json");
     let path = if poses.is_dir() { &inside } else { poses };
     let is_json = path.extension().is_some_and(|extension| extension == "json");
-    let text = is_json.then(|| fs_err::read(path).ok())??;
+    let bytes = is_json.then(|| fs_err::read(path).ok())??;
     // What is malformed is told by the reader of poses.
-    serde_json::from_slice::<Drawn>(&text).ok().map(|drawn| drawn.drawn_from)
+    serde_json::from_str::<Drawn>(files::text_of(&bytes).ok()?).ok().map(|drawn| drawn.drawn_from)
 }
 
 pub(crate) fn hash_file(path: &Path) -> io::Result<Hash32> {
