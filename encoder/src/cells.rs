@@ -24,8 +24,8 @@ const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 /// around a chair. In ordinary cells it is up to 3 times as large.
 const OTHER_SIZE: f32 = 8.0;
 
-/// A Gaussian larger than its cell, and than this many times what 99 % of the cell's Gaussians measure, counts with
-/// the larger of both in the cell's box: a few huge ones would bring every robot every cell.
+/// A Gaussian larger than its cell, and than this many times what 99 % of the cell's Gaussians measure at most, counts
+/// with the latter in the cell's box: a few huge ones would bring every robot every cell.
 const STRAY_EXTENT: f64 = 3.0;
 
 /// Most cells of a scene: its manifest, which lists them, has then a quarter of the bytes that robots take.
@@ -153,7 +153,7 @@ pub struct Cell {
     pub gaussians: Vec<u32>,
     /// Box around the means.
     pub(crate) mean_bounds: Aabb,
-    /// Box around the extents, of strays in size up to [`STRAY_EXTENT`].
+    /// Box around the extents, but see [`STRAY_EXTENT`].
     pub bounds: Aabb,
     /// Where its positions may lie.
     pub grid: PositionGrid,
@@ -306,9 +306,9 @@ fn finish(scene: &Gaussians, part: &[u32], mean_bounds: Aabb, grid: PositionGrid
     let extents: Vec<DVec3> = part.iter().map(|i| extent(scene, *i as usize)).collect();
     let mut largest: Vec<f64> = extents.iter().map(|half| half.max_element()).collect();
     let usual = quantile(&mut largest, 990, Rank::After).unwrap_or(0.0);
-    let most = DVec3::splat((STRAY_EXTENT * usual).max(mean_bounds.size().max_element()));
+    let most = (STRAY_EXTENT * usual).max(mean_bounds.size().max_element());
     for (i, half) in part.iter().zip(extents) {
-        let half = half.min(most);
+        let half = if half.max_element() > most { half.min(DVec3::splat(usual)) } else { half };
         let mean = scene.means_in_world[*i as usize];
         bounds.min = bounds.min.min(mean - half);
         bounds.max = bounds.max.max(mean + half);

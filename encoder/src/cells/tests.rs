@@ -90,7 +90,7 @@ fn a_sky_costs_the_chair_no_precision() {
     assert_eq!(of_small(vec![1.0; 9]), 1.0);
 }
 
-/// A few huge Gaussians count in their cell's box with the cell's width; all others count whole.
+/// A few huge Gaussians count in their cell's box like the largest of the others, which count whole.
 #[test]
 fn huge_gaussians_leave_the_boxes_of_cells_small() {
     let means: Vec<[f64; 3]> = (0..4000).map(|i| [f64::from(i) / 100.0, 0.0, 0.0]).collect();
@@ -102,7 +102,7 @@ fn huge_gaussians_leave_the_boxes_of_cells_small() {
     for (cell, before) in result.cells.iter().zip(&ordinary.cells) {
         assert_eq!((&cell.gaussians, cell.mean_bounds), (&before.gaussians, before.mean_bounds));
         let width = cell.mean_bounds.size().max_element();
-        assert!(cell.bounds.size().max_element() <= 3.0 * width, "{:?}", cell.bounds);
+        assert!(cell.bounds.size().max_element() <= width + 1.3, "{:?}", cell.bounds);
         assert!(before.bounds.size().max_element() > width + 0.5, "their own extents stay");
     }
     // Of a hundred, one is no stray.
