@@ -13,7 +13,6 @@ use slag_common::shard::{HEADER_END_BYTES, ShardHeader};
 
 use super::common::InputArgs;
 use crate::store::StoreReader;
-use crate::store::ceremony::default_root_folder;
 use crate::store::metadata::MetadataReader;
 
 /// Share of the Gaussians that the extent leaves out on each side of each axis: strays lie far away.
@@ -34,7 +33,7 @@ pub(super) fn of_store(store: &Path) -> Result<String> {
 pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
     let reader = StoreReader::open(store)?;
     let manifest = reader.manifest();
-    let root = MetadataReader::new(store).keys_status(&default_root_folder(store))?.root_sha256;
+    let root = MetadataReader::new(store).root_sha256()?;
     let boxes: Vec<(Aabb, f64)> = (manifest.cells.iter())
         .map(|cell| (mean_box(&reader, cell).unwrap_or(cell.bounds), f64::from(cell.n_gaussians)))
         .collect();
