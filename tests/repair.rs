@@ -11,10 +11,13 @@ fn an_encode_heals_a_store_from_kept_views() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let (room, store) = (dir.path().join("room"), dir.path().join("store"));
     run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "4"]));
-    let encode = || {
+    let command = || {
         let mut command = encode_room(&room, &store);
-        let output =
-            command.args(["--models", "colours", "--device", "cpu", "--keep-views"]).output().expect("runs");
+        command.args(["--models", "colours", "--device", "cpu", "--keep-views"]);
+        command
+    };
+    let encode = || {
+        let output = command().output().expect("runs");
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(output.status.success(), "{errors}");
         (serde_json::from_slice::<serde_json::Value>(&output.stdout).expect("JSON"), errors)
@@ -69,6 +72,43 @@ fn an_encode_heals_a_store_from_kept_views() {
     assert!(is_whole, "{verified}");
     assert_eq!(content(&store), before);
     run(&mut encoder(&["query", "blue", "--store", text(&store), "--models", "colours"]));
+
+    // Kept views rot: one is cut, one is gone, and a byte of a third's contributions shows when they are read.
+    let mut kept: Vec<PathBuf> = files(&store.join("job/views")).into_keys().collect();
+    kept.retain(|path| path.extension().is_some_and(|extension| extension == "contributions"));
+    let bytes = fs_err::read(&kept[0]).expect("there");
+    fs_err::write(&kept[0], &bytes[..bytes.len() / 2]).expect("written");
+    fs_err::remove_file(kept[1].with_extension("outlines")).expect("there");
+    let mut bytes = fs_err::read(&kept[2]).expect("there");
+    *bytes.last_mut().expect("some") ^= 1;
+    fs_err::write(&kept[2], bytes).expect("written");
+    let said = refused(&mut command(), "run the same encode again: this view is made again");
+    assert_eq!(said.matches(" is made again: ").count(), 2, "{said}");
+    // So does the manifest.
+    let manifest = fs_err::read(store.join("manifest")).expect("there");
+    fs_err::write(store.join("manifest"), &manifest[..manifest.len() / 2]).expect("written");
+    let (summary, errors) = encode();
+    assert_eq!((&summary["n_views_resumed"], &summary["generation"]), (&3.into(), &3.into()), "{errors}");
+    assert!(errors.contains("it is damaged"), "{errors}");
+    assert!(json("verify").0);
+    assert_eq!(content(&store), before);
+
+    // What robots would refuse is told, and no robot gets it.
+    let targets = store.join("metadata/1.targets.json");
+    let newest = (1..).map(|n| targets.with_file_name(format!("{n}.targets.json")));
+    let newest = newest.take_while(|path| path.exists()).last().expect("signed");
+    fs_err::write(&newest, "{").expect("written");
+    let (is_whole, verified) = json("verify");
+    assert!(!is_whole && verified["bad"][0]["path"] == text(&newest), "{verified}");
+    let out = dir.path().join("out");
+    let export = || encoder(&["store", "export", "--store", text(&store), "--out", text(&out)]);
+    refused(&mut export(), "slag-encoder store refresh");
+    run(&mut encoder(&["store", "refresh", "--store", text(&store)]));
+    assert!(json("verify").0);
+    run(&mut export());
+    // Nothing is listened for where there is nothing to show.
+    let nothing = ["view", "--store", text(&out), "--no-open", "--listen", "127.0.0.1:0"];
+    refused(&mut encoder(&nothing), "nothing has been published here yet");
 }
 
 /// Returns the hash of a published field.

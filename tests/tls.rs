@@ -50,6 +50,16 @@ fn robots_and_stores_speak_tls() {
     refused(&mut fetch(&ca(&authority)), "UnknownIssuer");
     run(&mut fetch(&ca(&other)));
 
+    // A certificate that only an authority may have, and an address without the s.
+    let authoritys = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+    other.issue_as(authoritys, &cert, &key);
+    refused(&mut fetch(&ca(&other)), "basicConstraints=critical,CA:FALSE");
+    let plain = service.url.replace("https://", "http://");
+    refused(
+        &mut edge(&["fetch", "--from", &plain, "--at", "3.5,2.7,0", "--cache", text(&at("cache"))]),
+        "give its address with https://",
+    );
+
     let serve = |flags: &[&str]| {
         let mut command = encoder(&["serve", "--store", text(&store)]);
         String::from_utf8(command.args(flags).output().expect("runs").stderr).expect("text")

@@ -210,6 +210,15 @@ impl Layout {
     }
 }
 
+/// Returns where a section lies by the first bytes of a file, of which nothing is checked.
+pub(crate) fn section_by_start(start: &[u8], magic: [u8; 8], id: u32) -> Option<Range<usize>> {
+    let rows = start.get(PREAMBLE_BYTES..)?.chunks_exact(SECTION_ROW_BYTES);
+    let n_sections = read_u32(start, 12).min(MAX_SECTIONS) as usize;
+    let row = rows.take(n_sections).find(|row| start.starts_with(&magic) && read_u32(row, 0) == id)?;
+    let at = usize::try_from(read_u64(row, 8)).ok()?;
+    Some(at..at.checked_add(usize::try_from(read_u64(row, 16)).ok()?)?)
+}
+
 fn read_u32(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
 }

@@ -33,6 +33,32 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     read_short(path, u64::MAX)
 }
 
+/// What the bytes of a text are instead of UTF-8.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NotUtf8 {
+    #[error(
+        "the text is UTF-16, expected UTF-8; save it as UTF-8, or convert it with iconv -f UTF-16 -t UTF-8"
+    )]
+    Utf16,
+    #[error("the text is not UTF-8; save it with that encoding")]
+    Other,
+}
+
+/// Returns the text of a file, without the byte order mark that editors and shells of Windows begin it with.
+pub fn text_of(bytes: &[u8]) -> Result<&str, NotUtf8> {
+    // Without a mark, every second byte of its first two letters, brackets or spaces is 0.
+    let is_utf16 = match bytes {
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => true,
+        [a, 0, b, 0, ..] | [0, a, 0, b, ..] => *a > 0 && *b > 0,
+        _ => false,
+    };
+    if is_utf16 {
+        return Err(NotUtf8::Utf16);
+    }
+    let text = std::str::from_utf8(bytes).map_err(|_| NotUtf8::Other)?;
+    Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
+}
+
 /// Checks that a result can be written to a file, before the work that makes it.
 pub fn check_writable(path: &Path) -> io::Result<()> {
     match fs_err::metadata(path) {
@@ -96,6 +122,27 @@ mod tests {
         for other in [&b"ply\nformat"[..], b"version 2", b"<svg", b"<", b""] {
             assert_eq!(named(other), None);
         }
+    }
+
+    #[test]
+    fn texts_of_windows_are_read_or_named() {
+        assert_eq!(text_of("\u{feff}[ä]".as_bytes()), Ok("[ä]"));
+        assert_eq!(
+            (text_of(b""), text_of(b"{"), text_of(&[0; 9])),
+            (Ok(""), Ok("{"), Ok("\0".repeat(9).as_str()))
+        );
+        let units = |text: &str| text.encode_utf16().collect::<Vec<u16>>();
+        for text in ["\u{feff}[1]", "[1]"] {
+            let little: Vec<u8> = units(text).into_iter().flat_map(u16::to_le_bytes).collect();
+            let big: Vec<u8> = units(text).into_iter().flat_map(u16::to_be_bytes).collect();
+            assert_eq!(
+                (text_of(&little), text_of(&big)),
+                (Err(NotUtf8::Utf16), Err(NotUtf8::Utf16)),
+                "{text:?}"
+            );
+        }
+        assert_eq!(text_of(b"caf\xe9"), Err(NotUtf8::Other));
+        assert!(NotUtf8::Utf16.to_string().contains("iconv"));
     }
 
     #[test]

@@ -20,6 +20,7 @@ mod named_members;
 pub mod npy;
 pub mod objects;
 pub mod occupancy;
+pub mod photo;
 pub mod photo_poses;
 pub mod poses;
 mod quantise;

@@ -81,20 +81,29 @@ fn a_scene_folder_gives_its_posed_frames() {
 fn damaged_scene_folders_are_named() {
     let dir = scene();
     let path = dir.path();
-    write(path, "pose/7.txt", pose(world_from_camera(7)).replace("0.997551", "nan"));
-    assert!(matches!(problem(path), PoseProblem::NotARotation { deviation, .. } if deviation.is_nan()));
-    write(path, "pose/7.txt", pose(world_from_camera(7)).replace("7.000000", "inf"));
-    assert!(matches!(problem(path), PoseProblem::Expected { expected: "a finite translation", .. }));
-    write(path, "pose/7.txt", "1 0 0 0\n0 1 0 0\n0 0 one 0\n0 0 0 1\n");
-    assert!(matches!(problem(path), PoseProblem::Expected { expected: "a number", .. }));
-    write(path, "pose/7.txt", "1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n");
-    assert!(matches!(problem(path), PoseProblem::Expected { expected: "4 rows of 4 numbers", .. }));
-    write(path, "pose/7.txt", "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n");
-    assert!(matches!(problem(path), PoseProblem::Mirrored { .. }), "a reflection");
-    write(path, "pose/7.txt", " ".repeat(1 << 20));
-    assert!(matches!(problem(path), PoseProblem::TooLarge { bytes: 1_048_576, .. }));
-    write(path, "pose/7.txt", [0xFF; 64]);
-    assert!(matches!(problem(path), PoseProblem::Expected { expected: "UTF-8 text", .. }));
+    // The frame alone is left out, with what is wrong with its pose.
+    let posed = pose(world_from_camera(7));
+    let texts: [(Vec<u8>, &str); 10] = [
+        (posed.replace("0.997551", "nan").into(), "its rotation is off by NaN"),
+        (posed.replace("7.000000", "inf").into(), "a finite translation"),
+        ("0 0 0 0\n".repeat(4).into(), "found \"[0.0, 0.0, 0.0, 0.0]\""),
+        ("1 0 0 0\n0 1 0 0\n0 0 one 0\n0 0 0 1\n".into(), "expected a number, found \"one\""),
+        ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n".into(), "4 rows of 4 numbers"),
+        (Vec::new(), "4 rows of 4 numbers"),
+        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n".into(), "its matrix mirrors"),
+        (" ".repeat(1 << 20).into(), "1048576 bytes"),
+        (vec![0xFF; 64], "not UTF-8"),
+        (posed.encode_utf16().flat_map(u16::to_le_bytes).collect(), "UTF-16"),
+    ];
+    for (text, reason) in &texts {
+        write(path, "pose/7.txt", text);
+        let set = poses::read(path, None).unwrap();
+        let [(name, found)] = &set.damaged[..] else { panic!("{:?}", set.damaged) };
+        assert!(name == "7" && found.contains(reason), "{name}: {found}, expected {reason}");
+        assert_eq!((set.views.len(), set.without_pose.len()), (93, 6));
+    }
+    write(path, "pose/7.txt", format!("\u{feff}{posed}"));
+    assert!(poses::read(path, None).unwrap().damaged.is_empty());
     write(path, "pose/7.txt", LOST);
     // Intrinsics of photos twice as large.
     write(path, "intrinsic/intrinsic_color.txt", INTRINSICS.replace("647.75", "1295.5"));
@@ -112,6 +121,8 @@ fn damaged_scene_folders_are_named() {
         write(path, &format!("pose/{number}.txt"), LOST);
     }
     assert_eq!(problem(path), PoseProblem::NoViews);
+    write(path, "pose/7.txt", "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n");
+    assert!(matches!(problem(path), PoseProblem::Mirrored { .. }), "of all that are not lost");
     fs_err::remove_file(path.join("intrinsic/intrinsic_color.txt")).unwrap();
     let message = poses::read(path, None).unwrap_err().to_string();
     assert!(message.contains("intrinsic_color.txt"), "{message}");
@@ -214,4 +225,6 @@ fn damaged_frames_are_named() {
         message(r#"{"transform": [[2,0,0,0],[0,2,0,0],[0,0,2,0]], "scale": 1}"#).contains("not a rotation")
     );
     assert!(message(&" ".repeat(70_000)).contains("70000 bytes"));
+    fs_err::write(&path, format!("\u{feff}{{\"transform\": {unit}, \"scale\": 2}}")).unwrap();
+    assert!(SplatFrame::read(&path).is_ok(), "a byte order mark");
 }

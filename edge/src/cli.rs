@@ -96,7 +96,16 @@ pub fn parse() -> Result<Cli, Exit> {
     let line: Vec<OsString> = std::env::args_os().collect();
     let parsed = config::parse(help::layered(Cli::command()), &line, &args::variable);
     match parsed.and_then(|matches| Ok(Cli::from_arg_matches(&matches)?)) {
-        Ok(cli) => Ok(cli),
+        Ok(cli) => {
+            let names = std::env::vars_os().filter_map(|(name, _)| name.into_string().ok());
+            for warning in config::unknown_variables(&Cli::command(), names) {
+                if !cli.quiet {
+                    // The log is not open yet; where nobody reads stderr, nobody is told.
+                    let _ = writeln!(io::stderr(), "warning: {}", text::visible(&warning));
+                }
+            }
+            Ok(cli)
+        }
         Err(ConfigError::Line(error)) => error.exit(),
         Err(error) => Err(Failure::Usage(error.into()).report(false)),
     }
@@ -223,6 +232,9 @@ mod tests {
             "slag-edge serve --listen nowhere",
             "slag-edge status --quiet --verbose",
             "slag-edge serve --threads 0",
+            "slag-edge serve --threads 257",
+            "slag-edge query chair --threads 100000",
+            "slag-edge query chair --model-threads 257",
             "slag-edge query chair --provider gpu",
             "slag-edge models",
             "slag-edge models pull",

@@ -3,8 +3,9 @@
 use std::io::Cursor;
 
 use glam::{DMat3, DQuat, DVec3};
-use image::{DynamicImage, ImageDecoder, ImageError, ImageReader};
+use image::{DynamicImage, ImageDecoder};
 pub use slag_api::locate::{Answer, Pose, Verification};
+use slag_common::photo::{self, HEAD_BYTES, PhotoError};
 use slag_common::{Intrinsics, pinhole};
 use slag_locate::{
     CODE_VERSION, Grey, Located, Map, Outcome, Photo, Prior, Renderer, locate, map_bytes, working_bytes,
@@ -20,11 +21,15 @@ pub const MAX_PHOTO_BYTES: usize = 32 << 20;
 /// Largest side of a photo, pixels, and most pixels.
 const MAX_SIDE_PX: u32 = 16_384;
 const MAX_PX: u64 = 50_000_000;
+/// Least length of a direction of gravity, in whatever unit.
+const MIN_GRAVITY: f64 = 1e-6;
 
 #[derive(Debug, thiserror::Error)]
 pub enum LocateError {
-    #[error("no photo: {0}; give a JPEG, PNG or WebP")]
-    Decode(#[from] ImageError),
+    #[error("no photo: {0}")]
+    Photo(#[from] PhotoError),
+    #[error("nothing of the photo is seen: it is transparent; give another copy")]
+    Blank,
     #[error(
         "the photo has {width} x {height} pixels, expected at most {MAX_SIDE_PX} a side and {MAX_PX} in all"
     )]
@@ -54,13 +59,12 @@ pub struct PhotoFile<'a> {
 }
 
 impl<'a> PhotoFile<'a> {
-    /// Reads the head of a JPEG, PNG or WebP.
+    /// Reads the head of a JPEG, PNG or WebP, with at most [`Self::opening_bytes`].
     ///
     /// # Errors
-    /// The bytes are no such picture, or one that is too large.
+    /// The bytes are no such picture, one that lost a piece, or one that is too large.
     pub fn open(bytes: &'a [u8]) -> Result<Self, LocateError> {
-        let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(ImageError::from)?;
-        let decoder: Box<dyn ImageDecoder + 'a> = Box::new(reader.into_decoder()?);
+        let decoder = photo::open(Cursor::new(bytes))?;
         let (width, height) = decoder.dimensions();
         if width.max(height) > MAX_SIDE_PX || u64::from(width) * u64::from(height) > MAX_PX {
             return Err(LocateError::TooLarge { width, height });
@@ -68,7 +72,12 @@ impl<'a> PhotoFile<'a> {
         Ok(Self { decoder })
     }
 
-    /// Returns the bytes that locating it takes at most, besides those of the map.
+    /// Returns the bytes that opening a file takes at most, whatever it says; they are in use until it is located.
+    pub fn opening_bytes(file: &[u8]) -> usize {
+        HEAD_BYTES as usize + file.len()
+    }
+
+    /// Returns the bytes that locating it takes at most, besides those of opening it and of the map.
     pub fn working_bytes(&self) -> usize {
         let (width, height) = self.decoder.dimensions();
         let n_px = width as usize * height as usize;
@@ -78,7 +87,11 @@ impl<'a> PhotoFile<'a> {
     }
 
     fn grey(self) -> Result<Grey, LocateError> {
-        let rgb = DynamicImage::from_decoder(self.decoder)?.into_rgb8();
+        let decoded = DynamicImage::from_decoder(self.decoder).map_err(PhotoError::from)?;
+        let (rgb, opaque) = photo::colours(decoded);
+        if opaque.is_some_and(|opaque| !opaque.contains(&true)) {
+            return Err(LocateError::Blank);
+        }
         Ok(Grey::from_rgb8(rgb.width() as usize, rgb.height() as usize, rgb.as_raw()))
     }
 }
@@ -122,8 +135,11 @@ pub fn answer(
         let found = format!("{centre_x_px},{centre_y_px}");
         return Err(LocateError::Camera { parameter: "centre_px", found, expected });
     }
-    if camera.gravity == Some(DVec3::ZERO) {
-        let (found, expected) = ("0,0,0".into(), "a direction".into());
+    // The squares of very short ones are 0: they would contradict nothing.
+    let is_direction = |gravity: &DVec3| (MIN_GRAVITY..f64::INFINITY).contains(&gravity.length());
+    if let Some(gravity) = camera.gravity.filter(|gravity| !is_direction(gravity)) {
+        let expected = format!("a direction, {MIN_GRAVITY} or longer");
+        let found = gravity.to_array().map(|v| v.to_string()).join(",");
         return Err(LocateError::Camera { parameter: "gravity", found, expected });
     }
     let intrinsics = Intrinsics {

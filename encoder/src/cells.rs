@@ -20,6 +20,14 @@ const EXTENT_SIGMAS: f64 = 3.0;
 /// would become a cell.
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
+/// Where a cell's 10th percentile is this many times that of its 512th Gaussian, it is of other things, as of a sky
+/// around a chair. In ordinary cells it is up to 3 times as large.
+const OTHER_SIZE: f32 = 8.0;
+
+/// A Gaussian larger than its cell, and than this many times what 99 % of the cell's Gaussians measure at most, counts
+/// with the latter in the cell's box: a few huge ones would bring every robot every cell.
+const STRAY_EXTENT: f64 = 3.0;
+
 /// Most cells of a scene: its manifest, which lists them, has then a quarter of the bytes that robots take.
 pub(crate) const MAX_CELLS: usize = 65_536;
 
@@ -32,7 +40,8 @@ pub(crate) const MAX_CELLS_FOR_PRECISION: usize = 4096;
 pub enum PositionError {
     /// World units.
     Within(f64),
-    /// A quarter of the 10th percentile of the largest scales of a cell's Gaussians: the size of its small ones.
+    /// A quarter of the size of a cell's small Gaussians: the 10th percentile of the largest scales or, where that is
+    /// the size of other things, as of a sky, that of the 512th Gaussian.
     OfSize,
 }
 
@@ -47,14 +56,24 @@ impl PositionError {
             return error;
         }
         let largest = |g: &u32| scene.scales[*g as usize].into_iter().fold(0.0, f32::max);
-        let mut sizes: Vec<f32> = part.iter().map(largest).collect();
-        let size = quantile(&mut sizes, 100, Rank::After).map_or(0.0, |size| f64::from(size) / 4.0);
+        let size = f64::from(of_small(part.iter().map(largest).collect())) / 4.0;
         // Never finer than an input in 32 bits is at the place of the nearest Gaussians: strays do not count.
         let farthest = |g: &u32| scene.means_in_world[*g as usize].abs().max_element() as f32;
-        let mut places: Vec<f32> = part.iter().map(farthest).collect();
-        let place = quantile(&mut places, 100, Rank::After).map_or(0.0, f64::from);
+        let place = f64::from(of_small(part.iter().map(farthest).collect()));
         size.max(place * f64::from(f32::EPSILON) / 2.0)
     }
+}
+
+/// Returns the 10th percentile of values, or the 512th of those above 0 where it is far smaller: what is a tenth of a
+/// few thousand Gaussians may be a hundredth of as many of another kind. 0 of none.
+fn of_small(mut values: Vec<f32>) -> f32 {
+    let Some(tenth) = quantile(&mut values, 100, Rank::After) else { return 0.0 };
+    values.retain(|value| *value > 0.0);
+    if values.len() <= MIN_GAUSSIANS_TO_NARROW {
+        return tenth;
+    }
+    let few = *values.select_nth_unstable_by(MIN_GAUSSIANS_TO_NARROW, f32::total_cmp).1;
+    if few * OTHER_SIZE < tenth { few } else { tenth }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -134,7 +153,7 @@ pub struct Cell {
     pub gaussians: Vec<u32>,
     /// Box around the means.
     pub(crate) mean_bounds: Aabb,
-    /// Box around the extents.
+    /// Box around the extents, but see [`STRAY_EXTENT`].
     pub bounds: Aabb,
     /// Where its positions may lie.
     pub grid: PositionGrid,
@@ -284,8 +303,12 @@ fn finish(scene: &Gaussians, part: &[u32], mean_bounds: Aabb, grid: PositionGrid
         part.iter().map(|i| (morton(scene.means_in_world[*i as usize], &mean_bounds), *i)).collect();
     keyed.sort_unstable();
     let mut bounds = mean_bounds;
-    for i in part {
-        let half = extent(scene, *i as usize);
+    let extents: Vec<DVec3> = part.iter().map(|i| extent(scene, *i as usize)).collect();
+    let mut largest: Vec<f64> = extents.iter().map(|half| half.max_element()).collect();
+    let usual = quantile(&mut largest, 990, Rank::After).unwrap_or(0.0);
+    let most = (STRAY_EXTENT * usual).max(mean_bounds.size().max_element());
+    for (i, half) in part.iter().zip(extents) {
+        let half = if half.max_element() > most { half.min(DVec3::splat(usual)) } else { half };
         let mean = scene.means_in_world[*i as usize];
         bounds.min = bounds.min.min(mean - half);
         bounds.max = bounds.max.max(mean + half);

@@ -4,9 +4,10 @@ use std::path::Path;
 
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
+use slag_common::photo::PhotoError;
 use slag_common::{Distortion, Intrinsics, View, pinhole, poses};
 use slag_encoder::ingest::{
-    GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, load_image, missing_images,
+    GeoError, IngestError, RotatedPhotos, Undistorter, check_memory, drawn_from, load_image, missing_images,
     read_geo_reference,
 };
 use slag_test_support::{needs_shared, shared};
@@ -223,7 +224,7 @@ fn absent_and_damaged_images_are_named() {
     let bytes = fs_err::read(&path).unwrap();
     fs_err::write(&path, &bytes[..bytes.len() / 2]).unwrap();
     assert!(matches!(load_image(&absent), Err(IngestError::Io(e)) if e.to_string().contains("b.png")));
-    assert!(matches!(load_image(&damaged), Err(IngestError::Decode { path, .. }) if path.ends_with("a.png")));
+    assert!(matches!(load_image(&damaged), Err(IngestError::Photo { path, .. }) if path.ends_with("a.png")));
     let views = [damaged, absent.clone()];
     assert_eq!(missing_images(&views), [&absent]);
 
@@ -236,13 +237,24 @@ fn absent_and_damaged_images_are_named() {
     let bytes = fs_err::read(&path).unwrap();
     let middle = bytes.len() / 2;
     fs_err::write(&path, &bytes[..middle]).unwrap();
-    assert!(matches!(load_image(&photo), Err(IngestError::Cut { .. })));
+    assert!(matches!(load_image(&photo), Err(IngestError::Photo { fault: PhotoError::Cut, .. })));
     let zeros = [&bytes[..middle], &[0; 300], &bytes[middle + 300..]].concat();
     fs_err::write(&path, zeros).unwrap();
-    assert!(matches!(load_image(&photo), Err(IngestError::Zeros { .. })));
+    assert!(matches!(load_image(&photo), Err(IngestError::Photo { fault: PhotoError::Zeros, .. })));
     let error = check_memory(&photo, 160 * 120).expect_err("a byte a pixel").to_string();
     assert!(error.contains("c.jpg") && error.contains("160 x 120 px"), "{error}");
     check_memory(&photo, 1 << 20).expect("enough");
+}
+
+/// Drawings are told from photos whatever mark the text begins with.
+#[test]
+fn drawings_are_told_by_a_text_of_windows() {
+    let dir = tempfile::tempdir().unwrap();
+    for mark in ["", "\u{feff}"] {
+        fs_err::write(dir.path().join("transforms.json"), format!(r#"{mark}{{"drawn_from": "a.ply"}}"#))
+            .unwrap();
+        assert_eq!(drawn_from(dir.path()), Some("a.ply".to_owned()), "{mark:?}");
+    }
 }
 
 #[needs_shared]
@@ -275,6 +287,9 @@ fn geo_reference() {
     ] {
         assert!(matches!(read(json), Err(GeoError::Json { .. })), "{json}");
     }
+    let utf16: Vec<u8> = "{}".encode_utf16().flat_map(u16::to_le_bytes).collect();
+    fs_err::write(&path, utf16).unwrap();
+    assert!(matches!(read_geo_reference(&path), Err(GeoError::Text { .. })));
     assert!(read("\u{feff}{\"origin\": {\"lat\": 1, \"lon\": 2, \"alt\": 3}}").is_ok(), "a byte order mark");
     let twice = read(r#"{"origin": {"lat": 8, "lat": 47, "lon": 8, "alt": 0}}"#).unwrap_err().to_string();
     assert!(twice.contains("duplicate field `lat`"), "{twice}");
@@ -337,8 +352,11 @@ fn turned_and_transparent_photos() {
     let loaded = load_image(&view(&path, camera)).unwrap();
     assert_eq!(loaded.image.dimensions(), (160, 120));
     assert!(loaded.image.get_pixel(80, 119)[0] > 150 && loaded.image.get_pixel(80, 60)[0] < 60);
-    fs_err::write(&path, b"\0\0\0\x24ftypheic\0\0\0\0mif1heic").unwrap();
-    assert!(matches!(load_image(&view(&path, camera)), Err(IngestError::Heif { .. })));
+    for brand in ["heic", "heim", "hevc", "msf1"] {
+        fs_err::write(&path, format!("\0\0\0\x24ftyp{brand}\0\0\0\0mif1heic")).unwrap();
+        let heif = load_image(&view(&path, camera));
+        assert!(matches!(heif, Err(IngestError::Photo { fault: PhotoError::Heif, .. })), "{brand}");
+    }
     fs_err::write(&path, b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n").unwrap();
     assert!(load_image(&view(&path, camera)).unwrap_err().to_string().contains("git lfs pull"));
 }

@@ -523,6 +523,29 @@ fn masks_are_matched_with_their_photos() {
         fs_err::write(&path, format!(r#"{{"images": [{}], "annotations": []}}"#, images.join(","))).unwrap();
         assert_eq!(check(&path, true).is_ok(), covered, "{names:?}");
     }
+    // Two cameras' photos of one name: an entry without its folder may be either's.
+    let rig = [view("left/0.jpg", 4, 3), view("right/0.jpg", 4, 3)];
+    let of = |file_name: &str| {
+        let text = format!(r#"{{"images": [{{"id": 1, "file_name": "{file_name}"}}], "annotations": []}}"#);
+        fs_err::write(&path, format!("\u{feff}{text}")).unwrap();
+        let given = GivenMasks::open(&path, Vec::new()).unwrap();
+        let found = given.check_views(&rig, false).map_err(|e| e.to_string());
+        (rig.iter().map(|view| given.covers(view)).collect::<Vec<_>>(), found)
+    };
+    let (_, refused) = of("0.jpg");
+    assert!(refused.unwrap_err().contains("may be \"left/0.jpg\" or \"right/0.jpg\""));
+    for name in ["right/0.jpg", r"D:\\masks\\right\\0.jpg"] {
+        let (covered, found) = of(name);
+        assert!(
+            covered == [false, true] && found.unwrap().is_some_and(|text| text.contains("1 of 2")),
+            "{name}"
+        );
+    }
+    let utf16: Vec<u8> = "[]".encode_utf16().flat_map(u16::to_le_bytes).collect();
+    fs_err::write(&path, utf16).unwrap();
+    let refused = GivenMasks::open(&path, Vec::new()).unwrap_err().to_string();
+    assert!(refused.contains("coco.json: the text is UTF-16"), "{refused}");
+
     for ending in ["png", "json"] {
         fs_err::write(dir.path().join("b").with_extension(ending), "").unwrap();
     }

@@ -23,8 +23,14 @@ impl Authority {
     }
 
     pub fn issue(&self, cert: &Path, key: &Path) {
+        self.issue_as(IsCa::NoCa, cert, key);
+    }
+
+    /// Issues a certificate, which may be an authority's.
+    pub fn issue_as(&self, kind: IsCa, cert: &Path, key: &Path) {
         let own = KeyPair::generate().expect("a key");
-        let params = CertificateParams::new(["127.0.0.1".to_owned()]).expect("an address");
+        let mut params = CertificateParams::new(["127.0.0.1".to_owned()]).expect("an address");
+        params.is_ca = kind;
         fs_err::write(key, own.serialize_pem()).expect("written");
         fs_err::write(cert, params.signed_by(&own, &self.issuer).expect("signed").pem()).expect("written");
     }

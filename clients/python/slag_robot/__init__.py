@@ -9,12 +9,15 @@ Needs nothing but the standard library. Every position is in the frame and of th
 
 from __future__ import annotations
 
+import http.client
 import ipaddress
 import json
 import urllib.error
 import urllib.parse
 import urllib.request
 from dataclasses import dataclass, field, is_dataclass, replace
+from datetime import datetime, timezone
+from email.utils import parsedate_to_datetime
 from functools import lru_cache
 from typing import Any, Iterator, Mapping, Optional, Sequence, Union, get_args, get_origin, get_type_hints
 
@@ -30,7 +33,8 @@ Point = Union[Sequence[float], Mapping[str, float]]
 
 
 class SlagError(Exception):
-    """The robot refused a request (RFC 9457). `kind` is stable; `detail` is for people."""
+    """The robot refused a request (RFC 9457), or what came is no answer of a robot. `kind` is stable, and empty where
+    the robot did not say it; `detail` is for people."""
 
     def __init__(self, status: int, problem: Mapping[str, Any]) -> None:
         super().__init__(problem.get("detail", f"HTTP status {status}"))
@@ -116,6 +120,52 @@ def _is_loopback(url: str) -> bool:
         return False
 
 
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Takes a redirect for what it is here, an error: the robot never redirects, so another machine answered."""
+
+    def redirect_request(self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, newurl: Any) -> None:
+        return None
+
+
+_LONGEST_SHOWN = 200
+"""Characters of an answer that an error shows."""
+
+
+def _shown(text: bytes) -> str:
+    return text.decode(errors="replace")[:_LONGEST_SHOWN]
+
+
+def _retry_after_secs(value: Optional[str]) -> Optional[float]:
+    """Reads Retry-After: seconds or a date (RFC 9110, section 10.2.3); anything else says nothing."""
+    text = (value or "").strip()
+    if text.isascii() and text.isdigit():
+        return float(text[:9]) or None
+    try:
+        at = parsedate_to_datetime(text)
+        # Without a zone it is UTC.
+        until = at if at.tzinfo is not None else at.replace(tzinfo=timezone.utc)
+        return max((until - datetime.now(timezone.utc)).total_seconds(), 0.0) or None
+    except (IndexError, OverflowError, TypeError, ValueError):
+        return None
+
+
+def _whole(reply: Any) -> bytes:
+    """Reads a body to its end, or to where it broke off."""
+    try:
+        body: bytes = reply.read()
+    except http.client.IncompleteRead as broken:
+        body = broken.partial
+    return body
+
+
+def _no_answer(reply: Any, expected: str, text: bytes) -> SlagError:
+    """Makes the error for an answer with status 200 that is none of a robot."""
+    encoding = reply.headers.get("Content-Encoding")
+    found = f"{len(text)} bytes of {reply.headers.get_content_type()}" + (f" in {encoding}" if encoding else "")
+    detail = f"the answer is {found}, expected {expected}; is the address a robot's slag-edge serve? {_shown(text)!r}"
+    return SlagError(reply.status, {"detail": detail})
+
+
 _hints = lru_cache(maxsize=None)(get_type_hints)
 
 
@@ -143,11 +193,11 @@ class Robot:
         self.timeout_secs = timeout_secs
         # A proxy of the environment would take requests to this machine, and the token, to another one.
         proxies = [urllib.request.ProxyHandler({})] if _is_loopback(self.url) else []
-        self._opener = urllib.request.build_opener(*proxies)
+        self._opener = urllib.request.build_opener(_NoRedirects(), *proxies)
 
     def ask(self, **request: Any) -> Reply:
         """Asks anything that `POST /v1/query` takes: texts, vectors, phrases, region, near, limit ..."""
-        reply: Reply = _read(Reply, self._send("/v1/query", request))
+        reply: Reply = _read(Reply, self._send("/v1/query", request, members=("generation", "results")))
         return reply
 
     def find(self, text: str, near: Optional[Point] = None, **request: Any) -> Result:
@@ -172,7 +222,8 @@ class Robot:
         """Yields the things on board, page by page: near, radius, sort, min_size, limit as `GET /v1/objects` takes
         them."""
         while True:
-            page = self._send("/v1/objects?" + urllib.parse.urlencode(_pairs(near, parameters)))
+            query = urllib.parse.urlencode(_pairs(near, parameters))
+            page = self._send("/v1/objects?" + query, members=("objects", "next_after"))
             yield from page["objects"]
             if page["next_after"] is None:
                 return
@@ -186,7 +237,9 @@ class Robot:
     def thumbnail(self, id: str) -> bytes:
         """Returns the small picture of one thing on board, a JPEG file; balanced and exact shards have them."""
         with self._open(f"/v1/objects/{urllib.parse.quote(id, safe='')}/thumbnail", None, self.timeout_secs) as reply:
-            picture: bytes = reply.read()
+            picture = _whole(reply)
+            if reply.headers.get_content_type() != "image/jpeg":
+                raise _no_answer(reply, "a JPEG file", picture)
         return picture
 
     def map(self) -> dict[str, Any]:
@@ -197,7 +250,8 @@ class Robot:
     def goal(self, text: Optional[str] = None, near: Optional[Point] = None, **parameters: Any) -> Goals:
         """Returns places to stand near a thing: by text, or by id="o...", with radius_m, reach_m,
         sensor_height_m ..."""
-        reply = self._send("/v1/goal?" + urllib.parse.urlencode(_pairs(near, {"text": text, **parameters})))
+        query = urllib.parse.urlencode(_pairs(near, {"text": text, **parameters}))
+        reply = self._send("/v1/goal?" + query, members=("generation", "frame", "goals", "none"))
         goals: Goals = _read(Goals, reply)
         return goals
 
@@ -210,7 +264,7 @@ class Robot:
         """Returns what changed between two generations: from_, to, radius as `GET /v1/changes` takes them.
         `texts`: kinds of things; each changed thing names the one that it is most like."""
         pairs = [("text", text) for text in texts] + _pairs(near, parameters)
-        reply = self._send("/v1/changes?" + urllib.parse.urlencode(pairs))
+        reply = self._send("/v1/changes?" + urllib.parse.urlencode(pairs), members=("from", "to", "frame", "none"))
         earlier = None if reply["from"] is None else reply["from"]["generation"]
         generations = {"from_generation": earlier, "to_generation": reply["to"]["generation"]}
         changes: Changes = _read(Changes, {**reply, **generations})
@@ -221,19 +275,34 @@ class Robot:
         error."""
         name, data = "message", []
         with self._open("/v1/events", None, timeout_secs) as stream:
+            if stream.headers.get_content_type() != "text/event-stream":
+                raise _no_answer(stream, "events", stream.read(4 * _LONGEST_SHOWN))
             for line in stream:
-                text = line.decode().rstrip("\r\n")
+                text = line.decode(errors="replace").rstrip("\r\n")
                 if text.startswith("event:"):
                     name = text[6:].strip()
                 elif text.startswith("data:"):
                     data.append(text[5:].strip())
                 elif not text and data:
-                    yield Event(name, json.loads("\n".join(data)))
+                    try:
+                        event = Event(name, json.loads("\n".join(data)))
+                    except (RecursionError, ValueError):
+                        raise _no_answer(stream, "events in JSON", "\n".join(data).encode()) from None
+                    yield event
                     name, data = "message", []
 
-    def _send(self, path: str, body: Optional[Mapping[str, Any]] = None) -> Any:
+    def _send(self, path: str, body: Optional[Mapping[str, Any]] = None, members: Sequence[str] = ()) -> Any:
+        """Returns the answer, an object with these members."""
         with self._open(path, body, self.timeout_secs) as reply:
-            return json.load(reply)
+            text = _whole(reply)
+            try:
+                answer = json.loads(text)
+            except (RecursionError, ValueError):
+                raise _no_answer(reply, "JSON", text) from None
+            if not isinstance(answer, dict) or any(name not in answer for name in members):
+                expected = "an object with " + ", ".join(members) if members else "an object"
+                raise _no_answer(reply, expected, text)
+            return answer
 
     def _open(self, path: str, body: Optional[Mapping[str, Any]], timeout_secs: float) -> Any:
         request = urllib.request.Request(self.url + path)
@@ -247,10 +316,18 @@ class Robot:
             return self._opener.open(request, timeout=timeout_secs)
         except urllib.error.HTTPError as error:
             with error:
-                text = error.read()
+                text = _whole(error)
             try:
                 problem = json.loads(text)
-            except ValueError:
-                problem = {"detail": text.decode(errors="replace")[:200]}
-            problem["retry_after_secs"] = float(error.headers.get("Retry-After") or 0) or None
+            except (RecursionError, ValueError):
+                problem = None
+            if not isinstance(problem, dict):
+                problem = {"detail": _shown(text) or f"HTTP status {error.code} without a reason"}
+                location = error.headers.get("Location")
+                if location is not None:
+                    problem["detail"] = (
+                        f"the answer is a redirect to {location[:_LONGEST_SHOWN]!r}, and a robot never redirects; "
+                        "give the address of its slag-edge serve"
+                    )
+            problem["retry_after_secs"] = _retry_after_secs(error.headers.get("Retry-After"))
             raise SlagError(error.code, problem) from None

@@ -1,30 +1,48 @@
 """Checks what the client sends, without a robot: python3 without_a_robot.py"""
 
+import gzip
 import os
 import sys
 import threading
+import time
 import urllib.parse
+from collections.abc import Callable
+from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from slag_robot import Robot, SlagError  # noqa: E402
+from slag_robot import Robot, SlagError, _retry_after_secs  # noqa: E402
 
 ASKED: list[tuple[str, str]] = []
 TOKENS: list[str | None] = []
+# Status, headers and body of the next answers, where they are not the usual ones.
+ANSWERS: list[tuple[int, dict[str, str], bytes]] = []
 
 
 class Listener(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         ASKED.append((self.server.name, self.path))  # type: ignore[attr-defined]
         TOKENS.append(self.headers.get("Authorization"))
+        if ANSWERS:
+            status, headers, body = ANSWERS.pop(0)
+            self.send_response(status)
+            for name, value in headers.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(body)
+            return
         if self.path == "/v1/map":
             self.send_response(302)
             self.send_header("Location", "/elsewhere")
         else:
             self.send_response(503)
         self.end_headers()
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.do_GET()
 
     def log_message(self, *_: object) -> None:
         pass
@@ -35,6 +53,57 @@ def listen(name: str) -> str:
     server.name = name  # type: ignore[attr-defined]
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return f"http://127.0.0.1:{server.server_port}"
+
+
+def error_of(call: Callable[[], object]) -> SlagError:
+    try:
+        found = call()
+    except SlagError as error:
+        return error
+    raise AssertionError(found)
+
+
+def what_is_no_answer_is_an_error(robot: Robot) -> None:
+    html = {"Content-Type": "text/html"}
+    calls: list[Callable[[], object]] = [
+        robot.map,
+        lambda: robot.ask(texts=["chair"]),
+        lambda: list(robot.objects()),
+        lambda: robot.object("o1"),
+        lambda: robot.goal("chair"),
+        robot.floor,
+        robot.changes,
+        lambda: robot.thumbnail("o1"),
+        lambda: list(robot.events()),
+    ]
+    bodies = [b"<html>no robot</html>", b"", gzip.compress(b"{}"), b"\xff\xfe", b"[1]", b"null", b'"x"', b"[" * 100_000]
+    for call in calls:
+        for body in bodies:
+            ANSWERS.append((200, html, body))
+            error = error_of(call)
+            assert error.status == 200 and "slag-edge serve" in error.detail and not ANSWERS, error
+    ANSWERS.append((200, {**html, "Content-Encoding": "gzip"}, gzip.compress(b"{}")))
+    assert "text/html in gzip" in error_of(robot.map).detail
+    ANSWERS.append((200, html, b"<html>no robot</html>"))
+    assert "no robot" in error_of(robot.map).detail, "what came is shown"
+    ANSWERS.append((200, {"Content-Length": "9"}, b'{"a"'))
+    assert "4 bytes" in error_of(robot.map).detail, "it broke off"
+    ANSWERS.append((200, {}, b'{"other": 1}'))
+    assert "objects, next_after" in error_of(lambda: list(robot.objects())).detail
+    ANSWERS.append((200, {"Content-Type": "text/event-stream"}, b"data: {no\n\n"))
+    assert "events in JSON" in error_of(lambda: list(robot.events())).detail
+    for body, detail in [(b"[1]", "[1]"), (b'"busy"', '"busy"'), (b"null", "null"), (b"", "HTTP status 503"), (b"\xff", "\ufffd")]:
+        ANSWERS.append((503, {"Retry-After": "soon"}, body))
+        error = error_of(robot.map)
+        assert (error.status, error.kind, error.retry_after_secs) == (503, "", None), error
+        assert detail in error.detail, error.detail
+    ANSWERS.append((503, {"Retry-After": "7"}, b'{"type": "urn:slag:problem:overloaded", "detail": "later"}'))
+    error = error_of(robot.map)
+    assert (error.kind, error.detail, error.retry_after_secs) == ("overloaded", "later", 7.0), error
+    in_a_minute = formatdate(time.time() + 60, usegmt=True)
+    assert 50.0 < (_retry_after_secs(in_a_minute) or 0.0) <= 61.0, in_a_minute
+    for nothing in [None, "", "soon", "nan", "-3", "1e9", "Sun, 06 Nov 1994 08:49:37 GMT", "99 Foo 9999999999 25:61:61"]:
+        assert _retry_after_secs(nothing) is None, nothing
 
 
 def main() -> None:
@@ -60,11 +129,11 @@ def main() -> None:
         assert name == "robot", "a proxy was asked for this machine"
         assert dict(urllib.parse.parse_qsl(urllib.parse.urlsplit(path).query)) == expected, path
     TOKENS.clear()
-    try:
-        robot.map()
-    except SlagError as error:
-        assert error.status == 503, error
-    assert TOKENS == ["Bearer secret", None], "a redirect takes no token along"
+    ASKED.clear()
+    refused = error_of(robot.map)
+    assert (refused.status, len(ASKED), TOKENS) == (302, 1, ["Bearer secret"]), "a redirect is not followed"
+    assert "redirect to '/elsewhere'" in refused.detail, refused.detail
+    what_is_no_answer_is_an_error(robot)
     for wrong in [{"lat": 1.0}, {"x": 1.0, "y": 2.0}, {"lat": 1.0, "lon": 2.0, "alt": 3.0}]:
         try:
             robot.goal("chair", near=wrong)

@@ -2,7 +2,6 @@
 
 use std::fmt;
 use std::io::{self, BufRead, IsTerminal, Write};
-use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
@@ -64,9 +63,16 @@ pub struct RunArgs {
         help_heading = "Machine"
     )]
     pub provider: Vec<Provider>,
-    /// Threads for each run of a model [default: 1 if views are encoded in parallel, else all cores, at most 4].
-    #[arg(long, value_name = "N", help_heading = "Machine", hide_short_help = true)]
-    pub model_threads: Option<NonZeroUsize>,
+    /// Threads for each run of a model, at most 256 [default: 1 if views are encoded in parallel, else all cores, at
+    /// most 4].
+    #[arg(
+        long,
+        value_name = "N",
+        value_parser = clap::value_parser!(u32).range(1..=256),
+        help_heading = "Machine",
+        hide_short_help = true
+    )]
+    pub model_threads: Option<u32>,
 }
 
 impl RunArgs {
@@ -77,7 +83,7 @@ impl RunArgs {
         beside: &[PathBuf],
         default_threads: usize,
     ) -> Result<SessionOptions, SessionError> {
-        let intra_op_threads = self.model_threads.map_or(default_threads, NonZeroUsize::get);
+        let intra_op_threads = self.model_threads.map_or(default_threads, |n| n as usize);
         let runtime = find_runtime(self.runtime.as_deref(), beside)?;
         let providers = self.provider.clone();
         Ok(SessionOptions { intra_op_threads, providers, ..SessionOptions::new(runtime) })

@@ -73,8 +73,11 @@ pub trait Watch: Sync {
 pub enum DownloadFailure {
     #[error("{0}")]
     Transport(#[from] Box<ureq::Error>),
-    #[error("TLS failed: {0}; give the authority that vouches for the server with --ca FILE")]
-    Tls(String),
+    #[error("TLS failed: {what}; {advice}")]
+    Tls { what: String, advice: &'static str },
+    /// In answer to a request without TLS.
+    #[error("the answer is no HTTP ({what}); if the server speaks TLS there, give its address with https://")]
+    NotHttp { what: String },
     #[error("the body ended at byte {found_bytes} of {expected_bytes}")]
     Cut { expected_bytes: u64, found_bytes: u64 },
     /// The server refuses. `retry_after`: when to ask again (429 and 503).
@@ -93,20 +96,62 @@ pub enum DownloadFailure {
 impl From<ureq::Error> for DownloadFailure {
     fn from(e: ureq::Error) -> Self {
         match &e {
-            ureq::Error::Rustls(tls) => Self::Tls(tls.to_string()),
+            ureq::Error::Rustls(tls) => Self::of_tls(tls.to_string()),
             // What rustls finds wrong while it reads and writes.
-            ureq::Error::Io(io) if io.kind() == io::ErrorKind::InvalidData => Self::Tls(io.to_string()),
+            ureq::Error::Io(io) if io.kind() == io::ErrorKind::InvalidData => Self::of_tls(io.to_string()),
             _ => Self::Transport(Box::new(e)),
         }
     }
 }
 
+/// What to do about a failure of TLS, by what rustls says of it.
+const TLS_ADVICE: [(&str, &str); 8] = [
+    ("UnknownIssuer", "give the authority that vouches for the server with --ca FILE"),
+    (
+        "CaUsedAsEndEntity",
+        "the server shows the certificate of an authority: make its own with basicConstraints=critical,CA:FALSE",
+    ),
+    (
+        "InvalidContentType",
+        "the server does not speak TLS there: give its address with http://, or its other port",
+    ),
+    ("NotValidYet", TLS_CLOCK),
+    ("not valid yet", TLS_CLOCK),
+    ("xpired", TLS_CLOCK),
+    ("NotValidForName", TLS_NAME),
+    ("not valid for name", TLS_NAME),
+];
+const TLS_CLOCK: &str = "check the clock of this machine, or have the server's certificate renewed";
+const TLS_NAME: &str = "give the address with a name that the server's certificate is for";
+
 impl DownloadFailure {
+    fn of_tls(what: String) -> Self {
+        let advice = TLS_ADVICE.iter().find(|(of, _)| what.contains(of));
+        let advice = advice.map_or("check the server's certificate", |(_, advice)| advice);
+        Self::Tls { what, advice }
+    }
+
+    /// Returns the failure of a request; without TLS, what is no HTTP may be the other side's TLS.
+    fn of_request(e: ureq::Error, uri: &Uri) -> Self {
+        match &e {
+            ureq::Error::Protocol(what) if uri.scheme_str() == Some("http") => match what.to_string() {
+                what if what.starts_with("http parse") => Self::NotHttp { what },
+                _ => e.into(),
+            },
+            _ => e.into(),
+        }
+    }
+
+    /// Returns whether its text says what to do.
+    pub fn has_advice(&self) -> bool {
+        matches!(self, Self::Tls { .. } | Self::NotHttp { .. } | Self::Redirect { .. })
+    }
+
     /// Returns whether another attempt may help.
     fn is_passing(&self) -> bool {
         match self {
             // A certificate does not become another one by asking again.
-            Self::Redirect { .. } | Self::Tls(_) => false,
+            Self::Redirect { .. } | Self::Tls { .. } | Self::NotHttp { .. } => false,
             Self::Status { status, .. } => *status >= 500 || matches!(status, 408 | 416 | 429),
             Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
             Self::Cut { .. } | Self::Length { .. } | Self::Hash { .. } => true,
@@ -426,7 +471,8 @@ impl<'a> Client<'a> {
             }
             let request = request.body(()).map_err(ureq::Error::from)?;
             let request = self.agent.configure_request(request).timeout_recv_body(body_timeout).build();
-            let response = self.agent.run(request)?;
+            let response = self.agent.run(request);
+            let response = response.map_err(|e| DownloadFailure::of_request(e, &uri))?;
             seen(&uri, &response);
             if !response.status().is_redirection() || response.status() == StatusCode::NOT_MODIFIED {
                 return Ok(response);
@@ -533,6 +579,52 @@ fn redirected(from: &Uri, location: &str) -> Option<Uri> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    struct Nobody;
+
+    impl Watch for Nobody {}
+
+    /// Answers each connection with some bytes, whatever it asks.
+    fn answering(bytes: &'static [u8]) -> u16 {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let port = listener.local_addr().expect("bound").port();
+        std::thread::spawn(move || {
+            for mut stream in listener.incoming().flatten() {
+                let mut asked = [0; 4096];
+                // A client that leaves is none to answer.
+                let _ = stream.read(&mut asked).and_then(|_| io::Write::write_all(&mut stream, bytes));
+            }
+        });
+        port
+    }
+
+    #[test]
+    fn tls_on_one_side_alone_is_told() {
+        let client = Client::new(NetworkLimits::default(), TlsConfig::default(), None, "test", &Nobody);
+        let failed = |url: &str| client.small(url, 100).expect_err("not both speak TLS").to_string();
+        let plain = answering(b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n");
+        let error = failed(&format!("https://127.0.0.1:{plain}/x"));
+        assert!(error.contains("with http://") && error.contains("(1 attempts)"), "{error}");
+        // The alert "protocol version" of TLS 1.2.
+        let encrypted = answering(&[21, 3, 3, 0, 2, 2, 70]);
+        let error = failed(&format!("http://127.0.0.1:{encrypted}/x"));
+        assert!(error.contains("with https://") && error.contains("(1 attempts)"), "{error}");
+    }
+
+    #[test]
+    fn failures_of_tls_have_their_own_advice() {
+        let advice = |what: &str| match DownloadFailure::of_tls(what.to_owned()) {
+            DownloadFailure::Tls { advice, .. } => advice,
+            other => panic!("{other}"),
+        };
+        let of_authority = advice("invalid peer certificate: Other(OtherError(CaUsedAsEndEntity))");
+        assert!(of_authority.contains("CA:FALSE") && !of_authority.contains("--ca"), "{of_authority}");
+        assert!(advice("invalid peer certificate: UnknownIssuer").contains("--ca"));
+        assert!(
+            advice("invalid peer certificate: certificate expired: verification time 1").contains("clock")
+        );
+        assert_eq!(advice("something new"), "check the server's certificate");
+    }
 
     #[test]
     fn redirects_keep_encryption() {

@@ -130,14 +130,15 @@ impl Access {
     /// Checks a request.
     ///
     /// # Errors
-    /// 421 for another host's name, 403 for another origin and for writes where none are accepted, 401 without the
-    /// token.
+    /// 400 for a `Host` that cannot be read or is one of several, 421 for another host's name, 403 for another origin
+    /// and for writes where none are accepted, 401 without the token.
     pub(crate) fn check(&self, request: &Request) -> Result<(), Problem> {
         let headers = request.headers();
-        let host = text(headers, header::HOST).or_else(|| request.uri().authority().map(|a| a.as_str()));
-        if let Some(host) = host {
-            self.check_host(host)?;
-        }
+        let of_header = one_host(headers)?;
+        // It comes before the header (RFC 9112, section 3.2.2), but not every program on the way knows that.
+        let of_uri = request.uri().authority().map(|authority| authority.as_str());
+        of_header.into_iter().chain(of_uri).try_for_each(|host| self.check_host(host))?;
+        let host = of_uri.or(of_header);
         self.check_origin(headers, host)?;
         let is_read = matches!(*request.method(), Method::GET | Method::HEAD | Method::OPTIONS);
         if is_read || self.reads.contains(&request.uri().path()) {
@@ -240,6 +241,25 @@ impl Access {
 
 fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
     headers.get(name).and_then(|value| value.to_str().ok())
+}
+
+/// Returns the only `Host`; `None` if there is none.
+fn one_host(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
+    let refused = |found: &str| {
+        let detail =
+            format!("the request has {found}, expected one Host header: this machine's name or address");
+        Err(Problem::new(StatusCode::BAD_REQUEST, "bad-host", "Bad host", detail))
+    };
+    let mut values = headers.get_all(header::HOST).iter();
+    let Some(host) = values.next() else { return Ok(None) };
+    let others = values.count();
+    if others > 0 {
+        return refused(&format!("{} Host headers", others + 1));
+    }
+    match host.to_str() {
+        Ok(host) => Ok(Some(host)),
+        Err(_) => refused("a Host with other characters than visible ASCII"),
+    }
 }
 
 /// Returns a `Host` without its port.

@@ -1,15 +1,22 @@
 //! A request's body, with a deadline and a greatest length.
 
+use std::future::poll_fn;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
-use hyper::body::{Body as _, Frame, SizeHint};
+use hyper::body::{Body as _, Frame, Incoming, SizeHint};
+use tokio::runtime::Handle;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::problem::Problem;
+
+/// Most bytes of a body that are read for nothing: one just beyond the longest body in JSON, 1 MiB, is read whole.
+const DRAINED_BYTES: usize = 2 << 20;
+/// Longest time for that.
+const DRAIN_TIME: Duration = Duration::from_secs(1);
 
 type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
@@ -20,22 +27,29 @@ struct TooSlow {
     after: Duration,
 }
 
-/// A body that fails once its deadline passes; the deadline counts from the end of the head.
-pub(crate) struct TimedBody<B> {
-    body: B,
+/// A body that fails once its deadline passes; the deadline counts from the end of the head. What is left of it when it
+/// is dropped is read and thrown away, within [`DRAINED_BYTES`] and [`DRAIN_TIME`]: a connection that closes on unread
+/// bytes is reset, and the client sees a broken pipe in place of the answer.
+pub(crate) struct TimedBody {
+    /// Absent once it ended or failed.
+    body: Option<Incoming>,
     timeout: Duration,
     deadline: Instant,
     /// Made when the body first has to be waited for: most requests have none.
     sleep: Option<Pin<Box<Sleep>>>,
+    /// Whether the client waits for leave before it sends the body; then nothing is under way.
+    waits_for_leave: bool,
 }
 
-impl<B> TimedBody<B> {
-    pub fn new(body: B, timeout: Duration) -> Self {
-        Self { body, timeout, deadline: Instant::now() + timeout, sleep: None }
+impl TimedBody {
+    /// `headers`: those of the request.
+    pub fn new(body: Incoming, headers: &HeaderMap, timeout: Duration) -> Self {
+        let waits_for_leave = headers.contains_key(header::EXPECT);
+        Self { body: Some(body), timeout, deadline: Instant::now() + timeout, sleep: None, waits_for_leave }
     }
 }
 
-impl<B: hyper::body::Body<Data = Bytes, Error: Into<BoxError>> + Unpin> hyper::body::Body for TimedBody<B> {
+impl hyper::body::Body for TimedBody {
     type Data = Bytes;
     type Error = BoxError;
 
@@ -43,28 +57,53 @@ impl<B: hyper::body::Body<Data = Bytes, Error: Into<BoxError>> + Unpin> hyper::b
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, BoxError>>> {
-        if let Poll::Ready(frame) = Pin::new(&mut self.body).poll_frame(context) {
+        let Some(body) = &mut self.body else { return Poll::Ready(None) };
+        if let Poll::Ready(frame) = Pin::new(body).poll_frame(context) {
+            if !matches!(frame, Some(Ok(_))) {
+                self.body = None;
+            }
             return Poll::Ready(frame.map(|frame| frame.map_err(Into::into)));
         }
         let (deadline, after) = (self.deadline, self.timeout);
         let sleep = self.sleep.get_or_insert_with(|| Box::pin(sleep_until(deadline)));
-        sleep.as_mut().poll(context).map(|()| Some(Err(TooSlow { after }.into())))
+        if sleep.as_mut().poll(context).is_pending() {
+            return Poll::Pending;
+        }
+        self.body = None;
+        Poll::Ready(Some(Err(TooSlow { after }.into())))
     }
 
     fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
+        self.body.as_ref().is_none_or(Incoming::is_end_stream)
     }
 
     fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
+        self.body.as_ref().map_or(SizeHint::with_exact(0), Incoming::size_hint)
+    }
+}
+
+impl Drop for TimedBody {
+    fn drop(&mut self) {
+        let is_under_way = !self.waits_for_leave && !hyper::body::Body::is_end_stream(self);
+        let Some(mut body) = self.body.take().filter(|_| is_under_way) else { return };
+        let Ok(runtime) = Handle::try_current() else { return };
+        let draining = async move {
+            let mut n_bytes = 0;
+            while n_bytes < DRAINED_BYTES {
+                let frame = poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await;
+                let Some(Ok(frame)) = frame else { return };
+                n_bytes += frame.data_ref().map_or(0, Bytes::len);
+            }
+        };
+        // Beyond either bound the connection closes on the rest.
+        runtime.spawn(tokio::time::timeout(DRAIN_TIME, draining));
     }
 }
 
 /// Reads a whole body of at most `max_bytes`.
 ///
 /// # Errors
-/// 413 if it is longer, 408 if it was not complete in time, 400 if it broke off. Each ends the connection: what is
-/// left of the body is not read.
+/// 413 if it is longer, 408 if it was not complete in time, 400 if it broke off. Each ends the connection.
 pub(crate) async fn read(mut body: Body, max_bytes: usize) -> Result<Bytes, Problem> {
     let ends = |problem: Problem| problem.with_header(header::CONNECTION, HeaderValue::from_static("close"));
     let too_long = || {
@@ -76,7 +115,7 @@ pub(crate) async fn read(mut body: Body, max_bytes: usize) -> Result<Bytes, Prob
         return Err(too_long());
     }
     let mut whole = Vec::new();
-    while let Some(frame) = std::future::poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await {
+    while let Some(frame) = poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await {
         let frame = frame.map_err(|error| match too_slow(&error) {
             Some(slow) => ends(Problem::new(
                 StatusCode::REQUEST_TIMEOUT,
@@ -120,11 +159,24 @@ pub(crate) fn check_type(headers: &HeaderMap, media_types: &[&str]) -> Result<()
         return Ok(());
     }
     let shown: String = kind.chars().take(60).collect();
-    let detail = format!("the body's Content-Type is {shown:?}, expected {}", media_types.join(" or "));
-    Err(Problem::new(
-        StatusCode::UNSUPPORTED_MEDIA_TYPE,
-        "unsupported-media-type",
-        "Unsupported media type",
-        detail,
-    ))
+    Err(unsupported(format!("the body's Content-Type is {shown:?}, expected {}", media_types.join(" or "))))
+}
+
+/// Refuses a body that is compressed: nothing here unpacks one, so that a few bytes cannot become many.
+pub(crate) fn check_encoding(headers: &HeaderMap) -> Result<(), Problem> {
+    let values = headers.get_all(header::CONTENT_ENCODING).iter();
+    let found: Vec<_> = values.map(|value| String::from_utf8_lossy(value.as_bytes())).collect();
+    let found = found.join(", ");
+    let is_none = |coding: &str| coding.is_empty() || coding.eq_ignore_ascii_case("identity");
+    if found.split(',').all(|coding| is_none(coding.trim())) {
+        return Ok(());
+    }
+    let shown: String = found.chars().take(60).collect();
+    let detail = format!("the body's Content-Encoding is {shown:?}, expected none; send the body as it is");
+    Err(unsupported(detail).with_header(header::ACCEPT_ENCODING, HeaderValue::from_static("identity")))
+}
+
+fn unsupported(detail: String) -> Problem {
+    let status = StatusCode::UNSUPPORTED_MEDIA_TYPE;
+    Problem::new(status, "unsupported-media-type", "Unsupported media type", detail)
 }

@@ -123,7 +123,9 @@ async fn converse(
     let at_most = |timeout: Duration| if is_reserved { timeout.min(RESERVED_TIMEOUT) } else { timeout };
     let router = TowerToHyperService::new(router);
     let service = service_fn(move |request: Request<Incoming>| {
-        let mut request = request.map(|body| Body::new(TimedBody::new(body, limits.body_timeout)));
+        let (head, body) = request.into_parts();
+        let body = Body::new(TimedBody::new(body, &head.headers, limits.body_timeout));
+        let mut request = Request::from_parts(head, body);
         if is_reserved {
             request.extensions_mut().insert(Reserved);
         }

@@ -175,7 +175,7 @@ const OF_BODIES: [(u16, &str); 6] = [
     ),
     (408, "The body was not complete in time."),
     (413, "The body is too long."),
-    (415, "The body's Content-Type is none that the resource takes."),
+    (415, "The body's Content-Type is none that the resource takes, or it has a Content-Encoding."),
 ];
 
 pub(crate) fn sentence(summary: &str) -> String {

@@ -3,7 +3,9 @@
 use std::fmt;
 use std::str::FromStr;
 
-use axum::extract::{FromRequestParts, Query};
+use axum::extract::path::ErrorKind;
+use axum::extract::rejection::PathRejection;
+use axum::extract::{FromRequestParts, Path, Query};
 use axum::http::StatusCode;
 use axum::http::request::Parts;
 use schemars::{JsonSchema, SchemaGenerator};
@@ -83,6 +85,30 @@ impl From<RequestError> for Problem {
         })
     }
 }
+
+/// A part of the path, as text.
+pub struct PathText(pub String);
+
+impl<S: Send + Sync> FromRequestParts<S> for PathText {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        let read = Path::<String>::from_request_parts(parts, state).await;
+        let refused = |rejection: PathRejection| match &rejection {
+            PathRejection::FailedToDeserializePathParams(failed) => match failed.kind() {
+                ErrorKind::InvalidUtf8InPathParam { key } => {
+                    RequestError::new(key, parts.uri.path(), "text in UTF-8 where %XX stand for its bytes")
+                        .into()
+                }
+                kind => Problem::internal(kind),
+            },
+            other => Problem::internal(other),
+        };
+        read.map(|Path(text)| Self(text)).map_err(refused)
+    }
+}
+
+impl Taken for PathText {}
 
 /// A query string as a struct, or as a tuple of structs that share it. Parameters that none of them has are refused.
 pub struct Params<T>(pub T);

@@ -8,6 +8,9 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
+/// The member of [`crate::params::ParameterMembers`] that names a parameter.
+const PARAMETER: &str = "parameter";
+
 /// The body of an error (RFC 9457).
 #[derive(Serialize, JsonSchema)]
 #[schemars(rename = "Problem")]
@@ -92,12 +95,32 @@ impl Problem {
         self
     }
 
+    /// Says more in `detail` than the members of the problem do.
+    pub fn with_detail(self, detail: impl Into<String>) -> Self {
+        Self { detail: detail.into(), ..self }
+    }
+
+    /// Returns the part of the request that is refused.
+    pub fn parameter(&self) -> Option<&str> {
+        self.members.get(PARAMETER)?.as_str()
+    }
+
+    /// Calls the part of the request that is refused as the request itself does.
+    pub fn rename_parameter(&mut self, name: &str) {
+        if let Some(rest) = self.parameter().and_then(|old| self.detail.strip_prefix(old)?.strip_prefix(": "))
+        {
+            self.detail = format!("{name}: {rest}");
+        }
+        self.members.insert(PARAMETER.to_owned(), name.into());
+    }
+
     /// Returns the cause that goes to the log.
     pub(crate) fn cause(&self) -> Option<&str> {
         self.cause.as_deref()
     }
 
-    /// Returns the problem of an error response that came without one, from a layer or the router.
+    /// Returns the problem of an error response that came without one, from a layer or the router. A service that
+    /// does not list its resources at `/` has its own for paths that it does not know.
     pub(crate) fn of_status(status: StatusCode, method: &str, path: &str) -> Self {
         let shown: String = path.chars().take(80).collect();
         match status {

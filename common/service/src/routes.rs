@@ -220,7 +220,9 @@ async fn whole_body(
     next: Next,
 ) -> Response {
     let (head, body) = request.into_parts();
-    let checked = match body::check_type(&head.headers, media_types) {
+    let is_taken =
+        body::check_type(&head.headers, media_types).and_then(|()| body::check_encoding(&head.headers));
+    let checked = match is_taken {
         Ok(()) => body::read(body, max_bytes).await,
         Err(problem) => Err(problem),
     };

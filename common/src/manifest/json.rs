@@ -1,5 +1,7 @@
 //! Manifests as bytes.
 
+use serde::Deserialize;
+
 use super::records::{MAX_BYTES, MAX_TEXT_FILES, Manifest, VERSION};
 use crate::frames::Aabb;
 use crate::shard::MAX_DIM;
@@ -10,6 +12,15 @@ pub enum ManifestError {
         "the manifest has {len_bytes} bytes, expected at most {MAX_BYTES}: this is not a slag manifest; check the address"
     )]
     TooLong { len_bytes: u64 },
+    /// Its version can be read, and is another.
+    #[error(
+        "the manifest has version {found}, expected {VERSION}; use a robot program and an encoder of matching versions"
+    )]
+    Version { found: u64 },
+    /// No JSON, or members are missing.
+    #[error("the manifest is damaged: {what}; fetch again, or encode again where it is published")]
+    Damaged { what: String },
+    /// All members are there, but not as this version knows them.
     #[error(
         "the text is not a manifest of version {VERSION}: {what}; use a robot program and an encoder of matching versions"
     )]
@@ -26,8 +37,7 @@ impl Manifest {
         if bytes.len() as u64 > MAX_BYTES {
             return Err(ManifestError::TooLong { len_bytes: bytes.len() as u64 });
         }
-        let manifest: Self =
-            serde_json::from_slice(bytes).map_err(|e| ManifestError::Content { what: e.to_string() })?;
+        let manifest: Self = serde_json::from_slice(bytes).map_err(|e| refusal(bytes, &e))?;
         manifest.check_content()?;
         Ok(manifest)
     }
@@ -36,7 +46,7 @@ impl Manifest {
     fn check_content(&self) -> Result<(), ManifestError> {
         let refuse = |what: String| Err(ManifestError::Content { what });
         if self.version != VERSION {
-            return refuse(format!("its version is {}", self.version));
+            return Err(ManifestError::Version { found: self.version.into() });
         }
         if self.encoder.dim == 0 || self.encoder.dim as usize > MAX_DIM {
             return refuse(format!(
@@ -63,5 +73,19 @@ impl Manifest {
             }
         }
         Ok(())
+    }
+}
+
+/// Says what is wrong with a text that is no manifest of this version.
+fn refusal(bytes: &[u8], error: &serde_json::Error) -> ManifestError {
+    #[derive(Deserialize)]
+    struct Head {
+        version: u64,
+    }
+    let what = error.to_string();
+    match serde_json::from_slice::<Head>(bytes) {
+        Ok(Head { version: found }) if found != u64::from(VERSION) => ManifestError::Version { found },
+        Ok(_) if !what.starts_with("missing field") => ManifestError::Content { what },
+        _ => ManifestError::Damaged { what },
     }
 }

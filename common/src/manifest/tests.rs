@@ -37,9 +37,30 @@ fn round_trip_and_refusals() {
     let bytes = manifest(4).to_bytes();
     assert_eq!(Manifest::parse(&bytes).expect("valid"), manifest(4));
     let unordered = Manifest { cells: manifest(4).cells.into_iter().rev().collect(), ..manifest(0) };
-    let other_version = Manifest { version: VERSION + 1, ..manifest(1) };
-    for wrong in [unordered, other_version] {
-        assert!(matches!(Manifest::parse(&wrong.to_bytes()), Err(ManifestError::Content { .. })));
+    assert!(matches!(Manifest::parse(&unordered.to_bytes()), Err(ManifestError::Content { .. })));
+}
+
+/// A file that was cut is damaged, whatever is left of it; only one whose version can be read is of another version,
+/// whatever else it holds.
+#[test]
+fn damaged_manifests_and_those_of_other_versions_are_told_apart() {
+    let refused = |bytes: &[u8]| Manifest::parse(bytes).expect_err("refused");
+    let bytes = manifest(2).to_bytes();
+    let without_cells = String::from_utf8(bytes.clone()).expect("JSON").replace("\"cells\"", "\"cella\"");
+    let cut = (0..bytes.len()).step_by(7).map(|len| &bytes[..len]);
+    for damaged in cut.chain([&b"{}"[..], b"\xff\x00", &[&bytes[..], b"}"].concat()]) {
+        let error = refused(damaged);
+        assert!(matches!(error, ManifestError::Damaged { .. }), "{error}");
+        assert!(!error.to_string().contains("matching versions"), "{error}");
+    }
+    for other in [
+        Manifest { version: VERSION + 1, ..manifest(1) }.to_bytes(),
+        b"{\"version\":3,\"of_later\":[]}".to_vec(),
+        without_cells.replace("\"version\":2", "\"version\":1").into_bytes(),
+    ] {
+        let error = refused(&other);
+        assert!(matches!(error, ManifestError::Version { found: 1 | 3 }), "{error}");
+        assert!(error.to_string().contains("matching versions"), "{error}");
     }
 }
 

@@ -3,7 +3,7 @@
 //!
 //! Points and 2D features are skipped without being stored.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Component, Path, PathBuf};
 
@@ -12,8 +12,9 @@ use fs_err::File;
 use super::checks::{affine_from_wxyz, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
 use super::paths::{PhotoFinder, parent};
-use super::view_set::{PoseSource, ViewSet, view_set};
+use super::view_set::{Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
+use crate::files::{self, NotUtf8};
 
 /// Longest image name read from a binary file, bytes: Linux's limit for a path.
 const MAX_NAME_BYTES: u64 = 4096;
@@ -29,9 +30,6 @@ const MODELS: [(i32, &str, usize); 6] = [
     (4, "OPENCV", 8),
     (5, "OPENCV_FISHEYE", 8),
 ];
-
-/// Windows' editors begin a text with it.
-const BYTE_ORDER_MARK: char = '\u{feff}';
 
 type Cameras = BTreeMap<u32, Intrinsics>;
 
@@ -53,10 +51,10 @@ pub(super) fn read(
         }
         _ => images_from_text(&images_path, &cameras_from_text(&cameras_path)?, &images_dir)?,
     };
-    let mut set = view_set(&images_path, images.views, source)?;
-    set.damaged = images.damaged;
+    let mut set = view_set(&images_path, images.views, source, images.damaged)?;
     set.notes = notes(model_dir, extension, set.views.len());
-    set.notes.extend(PhotoFinder::new(images_dir).find_missing(&mut set.views));
+    set.notes.extend(PhotoFinder::new(images_dir).find_missing(&mut set.views, &images.foreign));
+    set.views.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(set)
 }
 
@@ -153,57 +151,72 @@ fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsi
     check_intrinsics(size_px, focal, centre, distortion)
 }
 
+/// What a model's images refer to.
+struct Model<'a> {
+    cameras: &'a Cameras,
+    images_dir: &'a Path,
+    /// The file with the images, for errors.
+    path: &'a Path,
+}
+
+/// An image record.
+struct Record<'a> {
+    name: &'a str,
+    camera_id: u32,
+    wxyz: [f64; 4],
+    translation: [f64; 3],
+    place: Place,
+}
+
 #[derive(Default)]
 struct Images {
     views: Vec<View>,
-    /// Names of images without a pose, with the reason.
-    damaged: Vec<(String, String)>,
+    /// Images without a pose.
+    damaged: Damaged,
+    /// Names that were paths of another machine: absolute, or above the folder of images.
+    foreign: BTreeSet<String>,
 }
 
 impl Images {
     /// Adds an image record; one without a pose (zeros, NaN), as some exporters write it for photos that they
-    /// could not place, is left out.
-    fn push(
-        &mut self,
-        name: &str,
-        wxyz: [f64; 4],
-        view: Result<View, PoseProblem>,
-    ) -> Result<(), PoseProblem> {
+    /// could not place, is left out, and so is one whose pose is none.
+    fn push(&mut self, model: &Model<'_>, record: Record<'_>) -> Result<(), PoseError> {
+        let Record { camera_id, wxyz, translation, place, .. } = record;
         if wxyz == [0.0; 4] || wxyz.iter().any(|q| q.is_nan()) {
-            self.damaged.push((name.trim().to_owned(), format!("its quaternion is {wxyz:?}")));
+            self.damaged.add_unplaced(record.name.trim(), format!("its quaternion is {wxyz:?}"));
             return Ok(());
         }
-        self.views.push(view?);
+        let (name, is_foreign) = relative(record.name);
+        let is_inside = |path: &Path| path.components().all(|c| matches!(c, Component::Normal(_)));
+        if name.is_empty() || name.contains('\0') || !is_inside(Path::new(&name)) {
+            return Err(PoseProblem::UnsafeName { image: name }.at(model.path, place));
+        }
+        let Some(intrinsics) = model.cameras.get(&camera_id).copied() else {
+            return Err(PoseProblem::UnknownCamera { image: name, camera_id }.at(model.path, place));
+        };
+        match affine_from_wxyz(&name, wxyz, translation) {
+            Err(problem) => self.damaged.add(&name, problem, model.path, place),
+            Ok(camera_from_world) => {
+                if is_foreign {
+                    self.foreign.insert(name.clone());
+                }
+                let image_path = model.images_dir.join(&name);
+                self.views.push(View { image_path, camera_from_world, name, intrinsics });
+            }
+        }
         Ok(())
     }
 }
 
-fn view(
-    cameras: &Cameras,
-    images_dir: &Path,
-    name: &str,
-    camera_id: u32,
-    wxyz: [f64; 4],
-    translation: [f64; 3],
-) -> Result<View, PoseProblem> {
+/// Returns an image's name as a path inside the folder of images, and whether it was one of another machine.
+fn relative(name: &str) -> (String, bool) {
     let name = name.replace('\\', "/");
-    let name = name.strip_prefix("./").unwrap_or(&name).to_owned();
-    let relative = Path::new(&name);
-    if name.is_empty()
-        || name.contains('\0')
-        || !relative.components().all(|c| matches!(c, Component::Normal(_)))
-    {
-        return Err(PoseProblem::UnsafeName { image: name });
+    let mut inside = name.strip_prefix("./").unwrap_or(&name);
+    let mut is_foreign = matches!(name.as_bytes(), [drive, b':', b'/', ..] if drive.is_ascii_alphabetic());
+    while let Some(rest) = ["/", "../", "./"].iter().find_map(|start| inside.strip_prefix(start)) {
+        (inside, is_foreign) = (rest, true);
     }
-    let intrinsics = *cameras
-        .get(&camera_id)
-        .ok_or_else(|| PoseProblem::UnknownCamera { image: name.clone(), camera_id })?;
-    Ok(View {
-        image_path: images_dir.join(relative),
-        camera_from_world: affine_from_wxyz(&name, wxyz, translation)?,
-        name,
-        intrinsics,
-    })
+    (inside.to_owned(), is_foreign)
 }
 
 fn insert(cameras: &mut Cameras, camera_id: u32, camera: Intrinsics) -> Result<(), PoseProblem> {
@@ -237,12 +250,11 @@ impl Lines {
         bytes.clear();
         self.number += 1;
         let n = self.reader.read_until(b'\n', &mut bytes)?;
-        self.line = String::from_utf8(bytes).map_err(|_| {
-            self.fail(PoseProblem::Expected { expected: "UTF-8 text", found: "other bytes".to_owned() })
-        })?;
-        if self.number == 1 && self.line.starts_with(BYTE_ORDER_MARK) {
-            self.line.remove(0);
-        }
+        let text = match self.number {
+            1 => files::text_of(&bytes).map(str::to_owned),
+            _ => String::from_utf8(bytes).map_err(|_| NotUtf8::Other),
+        };
+        self.line = text.map_err(|fault| self.fail(PoseProblem::NotUtf8(fault)))?;
         Ok(n > 0)
     }
 
@@ -304,12 +316,13 @@ fn camera_from_line(line: &str) -> Result<(u32, Intrinsics), PoseProblem> {
 }
 
 fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Images, PoseError> {
-    let mut images = Images::default();
+    let (model, mut images) = (Model { cameras, images_dir, path }, Images::default());
     let mut lines = Lines::open(path)?;
     let mut has_record = lines.advance_to_record()?;
     while has_record {
-        add_image_line(&lines.line, cameras, images_dir, &mut images)
-            .map_err(|problem| lines.fail(problem))?;
+        let place = Place::Line(lines.number);
+        let record = record_of_line(&lines.line, place).map_err(|problem| lines.fail(problem))?;
+        images.push(&model, record)?;
         // A line of features follows each image, perhaps an empty one; some exporters leave it out.
         has_record = lines.advance()?;
         if has_record && is_features(&lines.line) {
@@ -326,20 +339,14 @@ fn is_features(line: &str) -> bool {
         || line.split_whitespace().count().is_multiple_of(3) && line.split_whitespace().all(is_number)
 }
 
-fn add_image_line(
-    line: &str,
-    cameras: &Cameras,
-    images_dir: &Path,
-    images: &mut Images,
-) -> Result<(), PoseProblem> {
+fn record_of_line(line: &str, place: Place) -> Result<Record<'_>, PoseProblem> {
     let mut rest = line;
     let _image_id: u32 =
         take(&mut rest, "an image id, or the 2D features (X Y POINT3D_ID ...) of the image before")?;
     let wxyz = take_numbers(&mut rest, "a quaternion QW QX QY QZ")?;
     let translation = take_numbers(&mut rest, "a translation TX TY TZ")?;
     let camera_id = take(&mut rest, "a camera id")?;
-    let name = rest.trim();
-    images.push(name, wxyz, view(cameras, images_dir, name, camera_id, wxyz, translation))
+    Ok(Record { name: rest.trim(), camera_id, wxyz, translation, place })
 }
 
 /// A binary file that is read front to back; counts are checked against its length.
@@ -453,7 +460,7 @@ fn cameras_from_binary(path: &Path) -> Result<Cameras, PoseError> {
 }
 
 fn images_from_binary(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Images, PoseError> {
-    let mut images = Images::default();
+    let (model, mut images) = (Model { cameras, images_dir, path }, Images::default());
     let mut file = Binary::open(path)?;
     for _ in 0..file.u64("the number of images")? {
         let _image_id = file.u32("an image id")?;
@@ -461,8 +468,8 @@ fn images_from_binary(path: &Path, cameras: &Cameras, images_dir: &Path) -> Resu
         let translation = file.numbers("a translation")?;
         let camera_id = file.u32("a camera id")?;
         let name = file.name()?;
-        let view = view(cameras, images_dir, &name, camera_id, wxyz, translation);
-        images.push(&name, wxyz, view).map_err(|problem| file.fail(problem))?;
+        let place = Place::Byte(file.offset_bytes);
+        images.push(&model, Record { name: &name, camera_id, wxyz, translation, place })?;
         let n_features = file.u64("the number of 2D features")?;
         file.skip(n_features, FEATURE_BYTES, "the image's 2D features")?;
     }

@@ -4,6 +4,8 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use crate::files::NotUtf8;
+
 #[derive(Debug, thiserror::Error)]
 pub enum PoseError {
     #[error("{0}; check that the file exists and is readable")]
@@ -48,6 +50,8 @@ impl fmt::Display for Place {
 pub enum PoseProblem {
     #[error("expected {expected}, found {found:?}; export the poses again")]
     Expected { expected: &'static str, found: String },
+    #[error("{0}")]
+    NotUtf8(NotUtf8),
     #[error("the file ends before {expected}; copy or export it again")]
     Truncated { expected: &'static str },
     #[error("{model} has {expected} parameters, found {found}; export the cameras again")]
@@ -109,6 +113,16 @@ impl From<io::Error> for PoseError {
 }
 
 impl PoseProblem {
+    /// Returns what is wrong with a pose, for a sentence that names its frame.
+    pub(super) fn of_pose(&self) -> String {
+        match self {
+            Self::NotARotation { deviation, .. } => format!("its rotation is off by {deviation:.3e}"),
+            Self::Mirrored { .. } => "its matrix mirrors".to_owned(),
+            Self::Expected { expected, found } => format!("expected {expected}, found {found:?}"),
+            other => other.to_string(),
+        }
+    }
+
     pub(super) fn at(self, path: &Path, place: Place) -> PoseError {
         PoseError::Invalid { path: path.to_owned(), place, problem: self }
     }

@@ -17,7 +17,9 @@ impl ViewSet {
             .views
             .iter()
             .map(|v| v.name.as_str())
-            .chain(self.without_pose.iter().map(String::as_str))
+            .chain(
+                self.without_pose.iter().chain(self.damaged.iter().map(|(name, _)| name)).map(String::as_str),
+            )
             .collect();
         names.sort_unstable();
         let numbers: Option<Vec<u64>> = names.iter().map(|name| number(name)).collect();
@@ -40,6 +42,7 @@ impl ViewSet {
         let is_kept = |name: &String| kept.binary_search(name).is_ok();
         self.views.retain(|view| is_kept(&view.name));
         self.without_pose.retain(is_kept);
+        self.damaged.retain(|(name, _)| is_kept(name));
         self
     }
 }

@@ -1,8 +1,10 @@
 //! Paths of pose files, and of photos that are not where the poses say.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io;
 use std::path::{Component, Path, PathBuf};
+
+use unicode_normalization::UnicodeNormalization;
 
 use crate::camera::View;
 
@@ -62,17 +64,28 @@ impl PhotoFinder {
         files.get(&stem_of(path)?)?.clone()
     }
 
-    /// Finds the photos of the views whose file does not exist; returns a sentence on them, if there are any.
-    pub(super) fn find_missing(&mut self, views: &mut [View]) -> Option<String> {
-        let mut moved = Vec::new();
-        for view in views.iter_mut().filter(|view| !view.image_path.is_file()) {
-            if let Some((path, _)) = self.find(&view.name) {
-                moved.push(format!("{} for {}", path.display(), view.name));
-                view.image_path = path;
-            }
+    /// Finds the photos of the views whose file does not exist. Views of `foreign` names, paths of another machine,
+    /// are then called by the ending that exists. Returns sentences on what was found.
+    pub(super) fn find_missing(&mut self, views: &mut [View], foreign: &BTreeSet<String>) -> Vec<String> {
+        let mut elsewhere: Vec<Option<Stated>> = Vec::with_capacity(views.len());
+        for view in views.iter_mut() {
+            let found = if view.image_path.is_file() { None } else { self.find(&view.name) };
+            elsewhere.push(found.map(|(path, ending)| {
+                let name = if foreign.contains(&view.name) { ending } else { view.name.clone() };
+                let image_path = std::mem::replace(&mut view.image_path, path);
+                let name = std::mem::replace(&mut view.name, name);
+                Stated { image_path, said: name.clone(), name }
+            }));
         }
-        let first = moved.first()?;
-        Some(format!("{} photos have other names than the poses say, such as {first}", moved.len()))
+        let mut notes: Vec<String> = take_back_shared(views, &mut elsewhere).into_iter().collect();
+        let moved = views.iter().zip(&elsewhere).filter_map(|(view, stated)| Some((view, stated.as_ref()?)));
+        let moved: Vec<String> = moved
+            .map(|(view, stated)| format!("{} for {}", view.image_path.display(), stated.said))
+            .collect();
+        notes.extend(moved.first().map(|first| {
+            format!("{} photos have other names than the poses say, such as {first}", moved.len())
+        }));
+        notes
     }
 }
 
@@ -83,6 +96,36 @@ pub(super) fn parts_of(path: &str) -> Vec<&str> {
         _ => None,
     };
     Path::new(path).components().filter_map(part).collect()
+}
+
+/// What the poses say of a photo that was found elsewhere.
+pub(super) struct Stated {
+    pub(super) image_path: PathBuf,
+    pub(super) name: String,
+    /// The path as it is written.
+    pub(super) said: String,
+}
+
+/// Gives back what the poses say to views of which several found the same photo, or found that of another view, and
+/// clears it in `elsewhere`, which has an entry a view. Returns a sentence on them, if there are any.
+pub(super) fn take_back_shared(views: &mut [View], elsewhere: &mut [Option<Stated>]) -> Option<String> {
+    let mut n_views_of: HashMap<PathBuf, usize> = HashMap::new();
+    views.iter().for_each(|view| *n_views_of.entry(view.image_path.clone()).or_default() += 1);
+    let mut shared = Vec::new();
+    for (view, stated) in views.iter_mut().zip(elsewhere) {
+        if n_views_of.get(&view.image_path).is_some_and(|n| *n > 1)
+            && let Some(Stated { image_path, name, said }) = stated.take()
+        {
+            shared.push(format!("{} for {said}", view.image_path.display()));
+            (view.image_path, view.name) = (image_path, name);
+        }
+    }
+    let first = shared.first()?;
+    let advice = "put the photos into the folders that the poses name";
+    Some(format!(
+        "{} photos are ambiguous and left out, such as {first}, which another view names, too; {advice}",
+        shared.len()
+    ))
 }
 
 /// Returns the text with `%20` and the like as the characters that they stand for; `None` without any.
@@ -97,6 +140,7 @@ fn without_escapes(text: &str) -> Option<String> {
     String::from_utf8(bytes).ok().filter(|found| found != text)
 }
 
+/// Returns a file's name without its ending, in small letters and composed: archives of macOS take letters apart.
 fn stem_of(path: &Path) -> Option<String> {
-    Some(path.file_stem()?.to_str()?.to_lowercase())
+    Some(path.file_stem()?.to_str()?.nfc().collect::<String>().to_lowercase())
 }

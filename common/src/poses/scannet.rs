@@ -17,8 +17,9 @@ use glam::DMat3;
 use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
 use super::transforms::existing;
-use super::view_set::{PoseSource, ViewSet, view_set};
+use super::view_set::{Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
+use crate::files;
 
 pub(super) const POSES: &str = "pose";
 const PHOTOS: &str = "color";
@@ -58,22 +59,31 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
         }
     }
     stems.sort_unstable();
-    let (mut posed, mut without_pose) = (Vec::new(), Vec::new());
+    let (mut posed, mut without_pose, mut damaged) = (Vec::new(), Vec::new(), Damaged::default());
     for stem in stems {
         let path = dir.join(POSES).join(format!("{stem}.txt"));
         let (image_path, extension) = existing(&photos.join(&stem));
         let name = format!("{stem}{extension}");
-        match read_matrix(&path)? {
-            Matrix::Lost => without_pose.push(name),
-            Matrix::Known(rows) => {
-                let world_from_camera = affine_from_rows(&name, &rows, DMat3::IDENTITY)
-                    .map_err(|problem| problem.at(&path, Place::File))?;
-                posed.push((name, image_path, world_from_camera.inverse()));
+        // Whatever is wrong with a frame's own file is wrong with its pose.
+        let rows = match read_matrix(&path) {
+            Ok(Matrix::Known(rows)) => rows,
+            Ok(Matrix::Lost) => {
+                without_pose.push(name);
+                continue;
             }
+            Err(PoseError::Invalid { path, place, problem }) => {
+                damaged.add(&name, problem, &path, place);
+                continue;
+            }
+            Err(other) => return Err(other),
+        };
+        match affine_from_rows(&name, &rows, DMat3::IDENTITY) {
+            Ok(world_from_camera) => posed.push((name, image_path, world_from_camera.inverse())),
+            Err(problem) => damaged.add(&name, problem, &path, Place::File),
         }
     }
     if posed.is_empty() {
-        return Err(PoseProblem::NoViews.at(&dir.join(POSES), Place::File));
+        return view_set(&dir.join(POSES), Vec::new(), PoseSource::Scannet, damaged);
     }
     // All photos have one size: that of the first that can be read.
     let Some(size_px) = posed.iter().find_map(|(_, path, _)| image::image_dimensions(path).ok()) else {
@@ -85,7 +95,7 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
     let view =
         |(name, image_path, camera_from_world)| View { name, image_path, intrinsics, camera_from_world };
     let views = posed.into_iter().map(view).collect();
-    Ok(ViewSet { without_pose, ..view_set(&dir.join(POSES), views, PoseSource::Scannet)? })
+    Ok(ViewSet { without_pose, ..view_set(&dir.join(POSES), views, PoseSource::Scannet, damaged)? })
 }
 
 fn intrinsics(camera: &[Vec<f64>], (width_px, height_px): (u32, u32)) -> Result<Intrinsics, PoseProblem> {
@@ -110,9 +120,9 @@ fn read_matrix(path: &Path) -> Result<Matrix, PoseError> {
         let expected = "the text of one 4 x 4 matrix";
         return fail(PoseProblem::TooLarge { bytes, most: MAX_MATRIX_BYTES, expected }, Place::File);
     }
-    let Ok(text) = String::from_utf8(bytes) else {
-        let found = "other bytes".to_owned();
-        return fail(PoseProblem::Expected { expected: "UTF-8 text", found }, Place::File);
+    let text = match files::text_of(&bytes) {
+        Ok(text) => text,
+        Err(fault) => return fail(PoseProblem::NotUtf8(fault), Place::File),
     };
     let mut rows = Vec::new();
     for (index, line) in text.lines().enumerate() {

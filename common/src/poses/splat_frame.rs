@@ -61,8 +61,9 @@ impl SplatFrame {
             let bytes = fs_err::metadata(path)?.len();
             return Err(fail(PoseProblem::TooLarge { bytes, most: MAX_BYTES, expected: FRAME_FILE }));
         }
-        let json: Json = serde_json::from_slice(&bytes)
-            .map_err(|cause| PoseError::Frame { path: path.to_owned(), cause })?;
+        let text = files::text_of(&bytes).map_err(|fault| fail(PoseProblem::NotUtf8(fault)))?;
+        let json: Json =
+            serde_json::from_str(text).map_err(|cause| PoseError::Frame { path: path.to_owned(), cause })?;
         // A factor beyond this is no change of unit, and squares of lengths would leave the range of f32.
         if !(1e-9..=1e9).contains(&json.scale) {
             let found = json.scale.to_string();

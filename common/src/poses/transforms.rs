@@ -11,8 +11,8 @@ use serde::Deserialize;
 
 use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
-use super::paths::{PhotoFinder, parent, parts_of};
-use super::view_set::{AppliedTransform, PoseSource, ViewSet, view_set};
+use super::paths::{PhotoFinder, Stated, parent, parts_of, take_back_shared};
+use super::view_set::{AppliedTransform, Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::files;
 
@@ -44,8 +44,8 @@ struct Camera {
 #[derive(Deserialize)]
 struct FrameEntry {
     file_path: String,
-    /// NaN, which is no JSON, was replaced by null.
-    transform_matrix: Vec<Vec<Option<f64>>>,
+    /// NaN, which is no JSON, was replaced by null. `None`: the frame was not placed.
+    transform_matrix: Option<Vec<Vec<Option<f64>>>>,
     #[serde(flatten)]
     camera: Camera,
 }
@@ -60,14 +60,16 @@ struct Transforms {
 }
 
 pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
-    let bytes = null_for_nan(&files::read(path)?);
-    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+    let bytes = files::read(path)?;
+    let in_file = |problem: PoseProblem| problem.at(path, Place::File);
+    let text = files::text_of(&bytes).map_err(|fault| in_file(PoseProblem::NotUtf8(fault)))?;
+    let text = null_for_nan(text.as_bytes());
     if text.trim_ascii_start().starts_with(b"[") {
         let what = "this is a list, as the cameras.json of a training run, not a transforms.json";
-        return Err(PoseProblem::OtherKind { what }.at(path, Place::File));
+        return Err(in_file(PoseProblem::OtherKind { what }));
     }
     let transforms: Transforms =
-        serde_json::from_slice(text).map_err(|cause| PoseError::Json { path: path.to_owned(), cause })?;
+        serde_json::from_slice(&text).map_err(|cause| PoseError::Json { path: path.to_owned(), cause })?;
     let folder = parent(path)?;
     let mut frames = Frames {
         paths: transforms.frames.iter().map(|frame| frame.file_path.replace('\\', "/")).collect(),
@@ -77,29 +79,48 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
             Some(dir) => vec![PhotoFinder::new(dir.to_owned())],
             None => vec![PhotoFinder::new(folder.clone()), PhotoFinder::new(folder.join("images"))],
         },
-        moved: Vec::new(),
     };
     let names = names_of(&frames.paths);
-    let (mut views, mut damaged) = (Vec::new(), Vec::new());
+    let (mut views, mut stated, mut damaged) = (Vec::new(), Vec::new(), Damaged::default());
     for (index, (frame, name)) in transforms.frames.iter().zip(names).enumerate() {
-        let at = |problem: PoseProblem| problem.at(path, Place::Frame(index));
+        let place = Place::Frame(index);
         let image = frames.paths[index].clone();
-        let Some(rows) = finite(&frame.transform_matrix) else {
-            damaged.push((image, "a value of its transform_matrix is not a number".to_owned()));
-            continue;
+        let world_from_camera = match world_from_camera(frame, name.as_deref().unwrap_or(&image)) {
+            Ok(found) => found,
+            Err(problem) => {
+                damaged.add(name.as_deref().unwrap_or(&image), problem, path, place);
+                continue;
+            }
         };
-        let (image_path, name) =
-            frames.photo(index, name).ok_or_else(|| at(PoseProblem::UnsafeName { image }))?;
+        let photo = frames.photo(index, name);
+        let photo = photo.ok_or_else(|| PoseProblem::UnsafeName { image }.at(path, place))?;
+        let FramePhoto { name, image_path, elsewhere } = photo;
         let camera = frame.camera.clone().or(&transforms.camera);
-        views.push(view(&rows, name, image_path, &camera).map_err(at)?);
+        let intrinsics = camera.intrinsics(&name, &image_path).map_err(|problem| problem.at(path, place))?;
+        views.push(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() });
+        stated.push(elsewhere);
     }
-    let applied = applied(&transforms, &folder).map_err(|problem| problem.at(path, Place::File))?;
-    let first = frames.moved.first();
-    let notes = first
-        .map(|first| format!("{} photos are not where the file says; found {first}", frames.moved.len()))
-        .into_iter()
-        .collect();
-    Ok(ViewSet { applied, damaged, notes, ..view_set(path, views, PoseSource::Transforms)? })
+    let mut notes: Vec<String> = take_back_shared(&mut views, &mut stated).into_iter().collect();
+    let moved = views.iter().zip(&stated).filter_map(|(view, stated)| Some((view, stated.as_ref()?)));
+    let moved: Vec<String> =
+        moved.map(|(view, stated)| format!("{} for {}", view.image_path.display(), stated.said)).collect();
+    notes.extend(
+        moved
+            .first()
+            .map(|first| format!("{} photos are not where the file says; found {first}", moved.len())),
+    );
+    let applied = applied(&transforms, &folder).map_err(in_file)?;
+    Ok(ViewSet { applied, notes, ..view_set(path, views, PoseSource::Transforms, damaged)? })
+}
+
+/// Returns a frame's pose. `image`: its name.
+fn world_from_camera(frame: &FrameEntry, image: &str) -> Result<DAffine3, PoseProblem> {
+    let expected = "a transform_matrix of finite numbers";
+    let missing = |found: &str| PoseProblem::Expected { expected, found: found.to_owned() };
+    let matrix = frame.transform_matrix.as_ref().ok_or_else(|| missing("none"))?;
+    let rows = finite(matrix).ok_or_else(|| missing("null or NaN"))?;
+    let opencv_axes_in_opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+    affine_from_rows(image, &rows, opencv_axes_in_opengl)
 }
 
 /// Replaces NaN and infinities, which some writers put into JSON, by null.
@@ -130,26 +151,32 @@ struct Frames<'a> {
     images_dir: Option<&'a Path>,
     folder: &'a Path,
     finders: Vec<PhotoFinder>,
-    /// Photos that were not where the file says.
-    moved: Vec<String>,
+}
+
+struct FramePhoto {
+    name: String,
+    image_path: PathBuf,
+    /// What the file says, if the photo was found elsewhere.
+    elsewhere: Option<Stated>,
 }
 
 impl Frames<'_> {
     /// Returns the path of a frame's photo and its name: where the file says, or else at the longest ending of
     /// that path that exists. `name`: by the file, perhaps without an ending.
-    fn photo(&mut self, index: usize, name: Option<String>) -> Option<(PathBuf, String)> {
+    fn photo(&mut self, index: usize, name: Option<String>) -> Option<FramePhoto> {
         let (name, file_path) = (name?, &self.paths[index]);
         let (image_path, ending) = match self.images_dir {
             Some(dir) => existing(&dir.join(&name)),
             None => existing(&self.folder.join(file_path)),
         };
+        let name = name + &ending;
         if !image_path.is_file()
-            && let Some((found, name)) = self.finders.iter_mut().find_map(|finder| finder.find(file_path))
+            && let Some((found, ending)) = self.finders.iter_mut().find_map(|finder| finder.find(file_path))
         {
-            self.moved.push(format!("{} for {file_path}", found.display()));
-            return Some((found, name));
+            let stated = Stated { image_path, name, said: file_path.clone() };
+            return Some(FramePhoto { name: ending, image_path: found, elsewhere: Some(stated) });
         }
-        Some((image_path, name + &ending))
+        Some(FramePhoto { name, image_path, elsewhere: None })
     }
 }
 
@@ -173,18 +200,6 @@ fn applied(transforms: &Transforms, folder: &Path) -> Result<Option<AppliedTrans
 /// Nerfstudio's world axes from COLMAP's and ScanNet's: x and y swapped, z negated.
 pub(super) const COLMAP_AXES: DMat3 =
     DMat3::from_cols(DVec3::new(0.0, 1.0, 0.0), DVec3::new(1.0, 0.0, 0.0), DVec3::new(0.0, 0.0, -1.0));
-
-fn view(
-    matrix: &[Vec<f64>],
-    name: String,
-    image_path: PathBuf,
-    camera: &Camera,
-) -> Result<View, PoseProblem> {
-    let opencv_axes_in_opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-    let world_from_camera = affine_from_rows(&name, matrix, opencv_axes_in_opengl)?;
-    let intrinsics = camera.intrinsics(&name, &image_path)?;
-    Ok(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() })
-}
 
 /// Returns the name of each image: its path relative to the folder of the images; `None` if it has none.
 ///

@@ -54,15 +54,40 @@ impl ViewSet {
     }
 }
 
+/// Frames that are left out, and what is wrong with the first of them.
+#[derive(Default)]
+pub(super) struct Damaged {
+    frames: Vec<(String, String)>,
+    first: Option<PoseError>,
+}
+
+impl Damaged {
+    /// Adds a frame whose pose has a problem; where no frame is left, the first of them is the file's.
+    pub(super) fn add(&mut self, frame: &str, problem: PoseProblem, path: &Path, place: Place) {
+        self.frames.push((frame.to_owned(), problem.of_pose()));
+        self.first.get_or_insert_with(|| problem.at(path, place));
+    }
+
+    /// Adds a frame without a pose, as programs write it that could not place the photo.
+    pub(super) fn add_unplaced(&mut self, frame: &str, reason: String) {
+        self.frames.push((frame.to_owned(), reason));
+    }
+}
+
 /// Sorts views by name; an empty set or two equal names are errors.
-pub(super) fn view_set(path: &Path, mut views: Vec<View>, source: PoseSource) -> Result<ViewSet, PoseError> {
+pub(super) fn view_set(
+    path: &Path,
+    mut views: Vec<View>,
+    source: PoseSource,
+    damaged: Damaged,
+) -> Result<ViewSet, PoseError> {
     if views.is_empty() {
-        return Err(PoseProblem::NoViews.at(path, Place::File));
+        return Err(damaged.first.unwrap_or_else(|| PoseProblem::NoViews.at(path, Place::File)));
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     if let Some(pair) = views.windows(2).find(|pair| pair[0].name == pair[1].name) {
         return Err(PoseProblem::DuplicateImage { image: pair[0].name.clone() }.at(path, Place::File));
     }
-    let (without_pose, damaged, notes) = Default::default();
-    Ok(ViewSet { views, source, without_pose, damaged, notes, applied: None })
+    let (without_pose, notes) = Default::default();
+    Ok(ViewSet { views, source, without_pose, damaged: damaged.frames, notes, applied: None })
 }

@@ -155,10 +155,7 @@ impl ShardView<'_> {
     }
 
     pub fn position_box(&self) -> Aabb {
-        let steps = self.header.position_bits.map(|bits| ((1u64 << bits) - 1) as f64);
-        let min = DVec3::from(self.header.origin_in_world);
-        let size = DVec3::new(steps[0], steps[1], steps[2]) * DVec3::from(self.header.position_step);
-        Aabb { min, max: min + size }
+        self.header.position_box()
     }
 
     pub fn members(&self, centroid: usize) -> Range<usize> {

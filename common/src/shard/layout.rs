@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use bytemuck::Pod;
+use glam::DVec3;
 use half::f16;
 
 use super::columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView};
@@ -12,7 +13,8 @@ use super::format::{
 use super::indices::{self, IndicesHeader, PackedIndices};
 use super::write::Additions;
 use crate::appearance::Appearance;
-use crate::container::{ContainerError, Layout, damaged};
+use crate::container::{ContainerError, Layout, damaged, section_by_start};
+use crate::frames::Aabb;
 use crate::landmarks::LandmarksLayout;
 use crate::objects::ObjectsLayout;
 use crate::occupancy::OccupancyLayout;
@@ -20,6 +22,26 @@ use crate::photo_poses::PhotoPosesLayout;
 
 /// Largest length accepted: embeddings have unit length, and components are scaled to about that.
 const MAX_LENGTH: f32 = 4096.0;
+
+/// First bytes of a shard that hold its header: preamble and table, padded, and the header.
+pub const HEADER_END_BYTES: u64 = 4096;
+
+impl ShardHeader {
+    /// Returns the header by the first [`HEADER_END_BYTES`] of a shard, unchecked; `None` where they have none.
+    pub fn of_start(start: &[u8]) -> Option<Self> {
+        let at = section_by_start(start, MAGIC, section::HEADER)?;
+        let header: Self = bytemuck::try_pod_read_unaligned(start.get(at)?).ok()?;
+        check_header(&header).is_ok().then_some(header)
+    }
+
+    /// Returns the box of the places that positions may have: that of the means.
+    pub fn position_box(&self) -> Aabb {
+        let steps = self.position_bits.map(|bits| ((1u64 << bits) - 1) as f64);
+        let min = DVec3::from(self.origin_in_world);
+        let size = DVec3::new(steps[0], steps[1], steps[2]) * DVec3::from(self.position_step);
+        Aabb { min, max: min + size }
+    }
+}
 
 /// The header of a checked shard and the places of its columns; [`ShardLayout::view`] gives the columns.
 #[derive(Clone, Debug)]

@@ -30,5 +30,5 @@ pub use format::{
     VERSION, section,
 };
 pub use indices::{IndexColumn, IndicesHeader, PackedIndices};
-pub use layout::ShardLayout;
+pub use layout::{HEADER_END_BYTES, ShardLayout};
 pub use write::Additions;

@@ -136,3 +136,19 @@ fn invalid_contents_are_refused() {
     assert!(refused(|p| p.indices.least = u32::MAX - 62).contains("Gaussian 1"));
     assert!(refused(|p| p.index_words[1] |= 1 << 4).contains("not zero"));
 }
+
+/// The first bytes of a file are enough for its header, and too few or others have none.
+#[test]
+fn a_header_is_read_from_the_start_of_a_file() {
+    let bytes = written(|_| {});
+    let whole = AlignedBytes::copy_of(&bytes);
+    let layout = ShardLayout::check(&whole).expect("valid");
+    let start = &bytes[..bytes.len().min(HEADER_END_BYTES as usize)];
+    let header = ShardHeader::of_start(start).expect("it is there");
+    assert_eq!(header, layout.header);
+    assert_eq!(header.position_box(), layout.view(&whole).position_box());
+    let other = [&b"OTHER"[..], &start[5..]].concat();
+    for start in [&start[..0], &start[..40], &start[..200], &other[..]] {
+        assert_eq!(ShardHeader::of_start(start), None);
+    }
+}

@@ -5,6 +5,8 @@ use std::fmt::{self, Display};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use crate::files::NotUtf8;
+
 #[derive(Debug, thiserror::Error)]
 pub enum SplatError {
     #[error("{cause}; check the path and its permissions")]
@@ -13,6 +15,8 @@ pub enum SplatError {
     Malformed { path: PathBuf, place: Place, expected: String, found: String, advice: &'static str },
     #[error("{}: {place}: {what} cannot be decompressed: {cause}; copy or export the file again", path.display())]
     Undecodable { path: PathBuf, place: Place, what: &'static str, cause: Box<dyn Error + Send + Sync> },
+    #[error("{}: {place}: {fault}", path.display())]
+    Text { path: PathBuf, place: Place, fault: NotUtf8 },
     #[error("{}: {format} is not supported; {advice}", path.display())]
     Unsupported { path: PathBuf, format: String, advice: &'static str },
 }

@@ -209,7 +209,12 @@ impl Sog {
 
     fn meta(&mut self, part: &str) -> Result<Meta, SplatError> {
         let bytes = self.bytes(part, MAX_META_BYTES)?;
-        serde_json::from_slice(&bytes).map_err(|source| {
+        let text = files::text_of(&bytes).map_err(|fault| SplatError::Text {
+            path: self.path.clone(),
+            place: Place::Part(part.into()),
+            fault,
+        })?;
+        serde_json::from_str(text).map_err(|source| {
             SplatError::undecodable(&self.path, Place::Part(part.into()), "the meta data", source)
         })
     }

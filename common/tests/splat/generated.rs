@@ -229,6 +229,15 @@ fn sog_version_1() {
     write_sog_v1(folder.path());
     let found = read_all(folder.path()).unwrap_or_else(|error| panic!("{error}"));
     assert_eq!((found.len(), found.sh_degree), (6, 1));
+    // Its text as programs of Windows save it.
+    let path = folder.path().join("meta.json");
+    let meta = std::fs::read_to_string(&path).expect("was written");
+    std::fs::write(&path, format!("\u{feff}{meta}")).expect("writes");
+    assert!(read_all(folder.path()).expect("a byte order mark") == found);
+    std::fs::write(&path, meta.encode_utf16().flat_map(u16::to_le_bytes).collect::<Vec<u8>>())
+        .expect("writes");
+    let refused = read_all(folder.path()).expect_err("another encoding").to_string();
+    assert!(refused.contains("UTF-16, expected UTF-8"), "{refused}");
     for i in 0..6_usize {
         let byte =
             |seed: u8, c: usize| f64::from(seed.wrapping_mul(31).wrapping_add((i * 40 + c * 11) as u8));

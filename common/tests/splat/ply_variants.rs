@@ -281,6 +281,9 @@ fn files_of_other_kinds_are_read_or_named() {
     for (found, expected) in flat.rgb_dc(0).into_iter().zip([1.0, 0.5, 0.0]) {
         assert_near(found.into(), expected, 1e-6, "colour");
     }
+    // One scale is that of all axes.
+    let ball: Vec<_> = geometry("float").into_iter().filter(|(_, name, _)| *name != "scale_1").collect();
+    assert_eq!(read_back(&[&ball[..], &colours].concat()).expect("balls").scales[0], [1.0; 3]);
     let rest: Vec<String> = (0..72).map(|i| format!("f_rest_{i}")).collect();
     let mut fourth = [&geometry("float")[..], &[("float", "scale_2", 0.0)]].concat();
     fourth.extend((0..3).map(|i| ("float", ["f_dc_0", "f_dc_1", "f_dc_2"][i], 0.25)));

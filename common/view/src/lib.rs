@@ -11,7 +11,6 @@ mod scores;
 use std::io::Read;
 
 use axum::Router;
-use axum::extract::Path;
 use axum::http::header::{
     ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG,
     IF_NONE_MATCH, REFERRER_POLICY, VARY, X_CONTENT_TYPE_OPTIONS,
@@ -19,6 +18,7 @@ use axum::http::header::{
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use slag_service::params::PathText;
 use slag_service::problem::Problem;
 
 pub use cell::{CELL_HEAD_BYTES, GAUSSIAN_BYTES, Step, cell_message};
@@ -53,7 +53,7 @@ pub fn router<S: Clone + Send + Sync + 'static>() -> Router<S> {
         .route("/view/", get(async |headers: HeaderMap| reply("index.html", &headers)))
         .route(
             "/view/{*path}",
-            get(async |Path(path): Path<String>, headers: HeaderMap| reply(&path, &headers)),
+            get(async |PathText(path): PathText, headers: HeaderMap| reply(&path, &headers)),
         )
 }
 

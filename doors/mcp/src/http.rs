@@ -10,10 +10,9 @@ use slag_service::listen::{Listen, Listener};
 use slag_service::listener::{self, ConnectionLimits};
 
 use crate::Tools;
+use crate::locate::MAX_MESSAGE_BYTES;
 
 pub const PATH: &str = "/mcp";
-/// Longest request: a photo of 3 MB in base64.
-const MAX_BODY_BYTES: usize = 4 << 20;
 
 /// Serves until `stop` completes.
 ///
@@ -31,7 +30,7 @@ pub async fn serve(
         .enforce_origin_validation()
         .with_legacy_session_mode(false)
         .with_json_response(true)
-        .with_max_request_body_bytes(MAX_BODY_BYTES);
+        .with_max_request_body_bytes(MAX_MESSAGE_BYTES);
     let sessions = Arc::<NeverSessionManager>::default();
     let service = StreamableHttpService::new(move || Ok(tools.clone()), sessions, config);
     let router = Router::new().route_service(PATH, service);

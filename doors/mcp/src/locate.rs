@@ -1,18 +1,28 @@
 //! What `where_am_i` takes and gives.
 
-use base64::Engine;
-use base64::prelude::BASE64_STANDARD;
+use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
+use base64::{Engine, alphabet};
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
 use slag_robot::api::locate::{self, Answer};
 use slag_robot::{Robot, xyz};
 
+/// Longest photo, characters in base64: a file of 6 MB.
+pub const MAX_PHOTO_CHARS: usize = 8_000_000;
+/// Longest message on either transport. What is beyond the photo's limit but not beyond this one is told by the tool.
+pub const MAX_MESSAGE_BYTES: usize = 2 * MAX_PHOTO_CHARS;
+/// With or without what fills it up to four characters.
+const BASE64: GeneralPurpose = GeneralPurpose::new(
+    &alphabet::STANDARD,
+    GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
+);
+
 /// A photo, and what is known about its camera.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Seen {
-    /// A JPEG or PNG file in base64.
-    #[schemars(length(min = 1, max = 4_000_000))]
+    /// A JPEG, PNG or WebP file in base64.
+    #[schemars(length(min = 1, max = MAX_PHOTO_CHARS))]
     pub photo_base64: String,
     /// Focal length of its camera, pixels of the photo.
     #[schemars(range(min = 1.0))]
@@ -53,9 +63,7 @@ pub struct Pose {
 
 impl Seen {
     pub fn locate(&self, robot: &Robot) -> Result<Places, String> {
-        let photo = BASE64_STANDARD.decode(&self.photo_base64);
-        let photo =
-            photo.map_err(|error| format!("photo_base64: {error}; give a JPEG or PNG file in base64"))?;
+        let photo = decoded(&self.photo_base64)?;
         let parameters = [
             Some(("focal_px", self.focal_px.to_string())),
             self.gravity.map(|gravity| ("gravity", xyz(gravity))),
@@ -65,6 +73,25 @@ impl Seen {
         let parameters: Vec<(&str, String)> = parameters.into_iter().flatten().collect();
         robot.locate(&parameters, &photo).map(Places::from).map_err(|error| error.to_string())
     }
+}
+
+/// Decodes a file, also where it comes as a `data:` URL, in lines, or in the alphabet of URLs.
+fn decoded(text: &str) -> Result<Vec<u8>, String> {
+    if text.len() > MAX_PHOTO_CHARS {
+        return Err(format!(
+            "photo_base64: longer than {MAX_PHOTO_CHARS} characters, the limit; give a smaller photo"
+        ));
+    }
+    let of_url = text.trim_start().strip_prefix("data:").and_then(|url| url.split_once(','));
+    let data = of_url.map_or(text, |(_, data)| data);
+    let standard = |byte| match byte {
+        b'-' => b'+',
+        b'_' => b'/',
+        byte => byte,
+    };
+    let data: Vec<u8> = data.bytes().filter(|byte| !byte.is_ascii_whitespace()).map(standard).collect();
+    let photo = BASE64.decode(data);
+    photo.map_err(|error| format!("photo_base64: {error}; give a JPEG, PNG or WebP file in base64"))
 }
 
 impl From<Answer> for Places {
@@ -87,5 +114,32 @@ impl From<locate::Pose> for Pose {
             heading_rad: (2.0 * (x * y + w * z)).atan2(1.0 - 2.0 * (y * y + z * z)),
             lat_lon_deg: of.geographic.map(|place| [place.latitude_deg, place.longitude_deg]),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn base64_comes_in_many_forms() {
+        let file = [0xFB, 0xEF, 0xBE, 0xFF, 7];
+        for text in [
+            "++++/wc=",
+            "++++/wc",
+            "----_wc=",
+            "++++\r\n/wc=\n",
+            "data:image/png;base64,++++/wc=",
+            " data:;base64,----_wc",
+        ] {
+            assert_eq!(decoded(text).expect(text), file, "{text}");
+        }
+        for (text, expected) in [("no base64!", "give a JPEG"), ("++++/w=c", "give a JPEG")] {
+            let error = decoded(text).expect_err(text);
+            assert!(error.contains(expected), "{error}");
+        }
+        assert!(decoded(&"A".repeat(MAX_PHOTO_CHARS)).is_ok());
+        let error = decoded(&"A".repeat(MAX_PHOTO_CHARS + 1)).expect_err("too long");
+        assert!(error.contains("8000000 characters"), "{error}");
     }
 }

@@ -6,7 +6,8 @@ use std::process::ExitCode;
 use anyhow::{Context, Result};
 use clap::Parser;
 use rmcp::ServiceExt;
-use slag_mcp::{Args, Tools, http};
+use rmcp::transport::async_rw::AsyncRwTransport;
+use slag_mcp::{Args, MAX_MESSAGE_BYTES, ShortTexts, Tools, http};
 use slag_service::listen::bind;
 use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
@@ -55,7 +56,10 @@ fn run(args: Args) -> Result<()> {
 }
 
 async fn speak_on_stdio(tools: Tools) -> Result<()> {
-    let service = tools.serve(rmcp::transport::stdio()).await.context("no MCP client on stdin")?;
+    let (input, output) = rmcp::transport::stdio();
+    let messages = AsyncRwTransport::new_server(ShortTexts::of(input), output);
+    let messages = messages.with_max_line_length(MAX_MESSAGE_BYTES);
+    let service = tools.serve(messages).await.context("no MCP client on stdin")?;
     service.waiting().await?;
     Ok(())
 }

@@ -131,6 +131,8 @@ async def check(client, robot, word):
     seen = {"photo_base64": base64.b64encode(photo).decode(), "focal_px": 80}
     here = (await client.call_tool("where_am_i", seen)).structured_content
     assert here["state"] == truth["state"] == "lost" and here["reason"] == truth["reason"], (here, truth)
+    as_url = {**seen, "photo_base64": "data:image/png;base64," + base64.encodebytes(photo).decode()}
+    assert (await client.call_tool("where_am_i", as_url)).structured_content == here
 
     # Errors go to the model, which can correct its request.
     for name, asked, expected in [
@@ -147,8 +149,9 @@ async def check(client, robot, word):
         ("picture", {"id": "o0123456789abcdef"}, "has no object o0123456789abcdef"),
         ("picture", {"id": "../map?"}, "no id of a thing"),
         ("what_changed", {"from_generation": 10**6}, "generation"),
-        ("where_am_i", {"photo_base64": "no base64", "focal_px": 80}, "photo_base64"),
+        ("where_am_i", {"photo_base64": "no base64!", "focal_px": 80}, "photo_base64"),
         ("where_am_i", {**seen, "near": [0, 0, 0]}, "sigma"),
+        ("where_am_i", {**seen, "photo_base64": "A" * 8_000_001}, "8000000 characters"),
         ("what_changed", {"radius": 1.0}, "near"),
     ]:
         refused = await client.call_tool(name, asked)
@@ -190,6 +193,10 @@ async def main(program, robot, word, store, url):
     over_stdio = StdioServerParameters(command=program, args=["--robot", robot])
     async with Client(over_stdio) as client:
         n = await check(client, robot, word)
+        # Longer than any line that the library reads.
+        seen = {"photo_base64": "A" * 20_000_000, "focal_px": 80}
+        refused = await asyncio.wait_for(client.call_tool("where_am_i", seen), 60)
+        assert refused.is_error and "8000000 characters" in refused.content[0].text, refused
     said = [f"stdio: {n} things"]
     async with Client(url) as client:
         n = await check(client, robot, word)

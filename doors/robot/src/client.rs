@@ -100,7 +100,11 @@ impl Robot {
     }
 
     pub fn locate(&self, parameters: &[(&str, String)], photo: &[u8]) -> Result<locate::Answer, RobotError> {
-        let media_type = if photo.starts_with(b"\x89PNG") { "image/png" } else { "image/jpeg" };
+        let media_type = match photo {
+            [0x89, b'P', b'N', b'G', ..] => "image/png",
+            [b'R', b'I', b'F', b'F', ..] => "image/webp",
+            _ => "image/jpeg",
+        };
         self.send("/v1/locate", parameters, media_type, photo)
     }
 

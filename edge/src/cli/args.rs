@@ -1,11 +1,11 @@
 //! Arguments shared by several commands.
 
 use std::ffi::OsString;
-use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use crate::fetch::{FetchRequest, Position};
-use crate::query::Engine;
+use crate::query::{Engine, LENGTHS, is_length};
+use crate::score::MAX_COORDINATE;
 use crate::store::EdgeCache;
 use crate::text::TextService;
 use anyhow::anyhow;
@@ -78,16 +78,16 @@ impl DownloadArgs {
 
 #[derive(Debug, Args)]
 pub struct ThreadArgs {
-    /// Threads for answering questions [default: the number of cores].
-    #[arg(long, value_name = "N")]
-    pub threads: Option<NonZeroUsize>,
+    /// Threads for answering questions, at most 256 [default: the number of cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub threads: Option<u32>,
 }
 
 impl ThreadArgs {
     /// Sets the number of threads for answering questions; once per process.
     pub fn apply(&self) -> Result<(), Failure> {
         let Some(n) = self.threads else { return Ok(()) };
-        let built = rayon::ThreadPoolBuilder::new().num_threads(n.get()).build_global();
+        let built = rayon::ThreadPoolBuilder::new().num_threads(n as usize).build_global();
         built.map_err(|e| Failure::Failed("threads", e.into()))
     }
 }
@@ -134,14 +134,14 @@ pub fn variable(name: &str) -> Option<OsString> {
 }
 
 pub(super) fn parse_radius(text: &str) -> Result<f64, String> {
-    let radius = text.parse::<f64>().ok().filter(|radius| *radius >= 0.0 && radius.is_finite());
-    radius.ok_or_else(|| "expected world units, 0 or more".to_owned())
+    let radius = text.parse::<f64>().ok().filter(|radius| *radius == 0.0 || is_length(*radius));
+    radius.ok_or_else(|| format!("expected world units, 0 or more, at most {MAX_COORDINATE:e}"))
 }
 
 /// Reads the radius of a search, which finds nothing at 0.
 pub(super) fn parse_reach(text: &str) -> Result<f64, String> {
     let radius = parse_radius(text).ok().filter(|radius| *radius > 0.0);
-    radius.ok_or_else(|| "expected world units, more than 0".to_owned())
+    radius.ok_or_else(|| format!("expected world units, {LENGTHS}"))
 }
 
 /// Reads a number of bytes: 2GB, 2GiB or 2G.

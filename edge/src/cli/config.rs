@@ -3,14 +3,17 @@
 //! In the file, a table holds a command's flags by their long names, and keys before the first table count for
 //! every command that has the flag. The environment's names are made of the same words: `SLAG_EDGE_FETCH_RADIUS`
 //! for `fetch --radius`, `SLAG_EDGE_CACHE` for `--cache` of every command. Values become the flags' defaults, so
-//! clap parses them, and `--help` shows them.
+//! clap parses them, and `--help` shows them. To clap a default neither needs nor excludes another flag, so that is
+//! checked here.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::io;
 use std::path::PathBuf;
 
-use clap::{Arg, ArgAction, ArgMatches, Command, parser::ValueSource};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::parser::ValueSource;
+use clap::{Arg, ArgAction, ArgMatches, Command};
 use slag_common::files;
 use toml::{Table, Value};
 
@@ -46,11 +49,12 @@ pub fn parse(
     variable: &dyn Fn(&str) -> Option<OsString>,
 ) -> Result<ArgMatches, ConfigError> {
     // Without the checks of what is missing: the file may have it.
-    let first = command.clone().ignore_errors(true).try_get_matches_from(line);
+    let first = switchable(command.clone()).ignore_errors(true).try_get_matches_from(line);
     let Ok(first) = first else { return Ok(command.try_get_matches_from(line)?) };
     let named = first.try_get_one::<OsString>(FILE_FLAG).ok().flatten().map(PathBuf::from);
     let file = read(named, variable)?;
-    let settings = Settings { variable, file, explicit: explicit(&first), root: command.clone() };
+    let settings =
+        Settings { variable, file, explicit: explicit(&first), asked: asked(&first), root: command.clone() };
     let command = settings.apply(command, &[])?;
     settings.refuse_unknown(&command)?;
     Ok(command.try_get_matches_from(line)?)
@@ -94,6 +98,68 @@ fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
     ids
 }
 
+/// Lets `--trust-first=false` switch off what a file switches on.
+fn switch(arg: Arg) -> Arg {
+    let arg = arg.action(ArgAction::Set).num_args(0..=1).require_equals(true);
+    arg.value_parser(clap::value_parser!(bool)).default_missing_value("true")
+}
+
+/// Lets all flags be switched off, so that what follows one on the line is read.
+fn switchable(command: Command) -> Command {
+    let below: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_owned()).collect();
+    let command = below.iter().fold(command, |command, name| command.mut_subcommand(name, switchable));
+    let is_switch = |arg: &Arg| matches!(arg.get_action(), ArgAction::SetTrue);
+    command.mut_args(|arg| if is_switch(&arg) { switch(arg) } else { arg })
+}
+
+/// Returns the names of the command that is asked for and of those above it.
+fn asked(matches: &ArgMatches) -> Vec<String> {
+    let mut names = Vec::new();
+    let mut at = matches;
+    while let Some((name, below)) = at.subcommand() {
+        names.push(name.to_owned());
+        at = below;
+    }
+    names
+}
+
+/// Returns a warning for each variable that begins as ours do and is none.
+pub fn unknown_variables(root: &Command, names: impl Iterator<Item = String>) -> Vec<String> {
+    let known = known_variables(root);
+    let warning = |name: String| {
+        let likeness = |known: &&String| strsim::jaro(known, &name);
+        let nearest = known.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
+        let hint = nearest.map(|nearest| format!("; perhaps {nearest}")).unwrap_or_default();
+        format!("{name} is set, but it is no variable of a flag{hint}")
+    };
+    names.filter(|name| is_ours(name) && !known.contains(name)).map(warning).collect()
+}
+
+fn is_ours(name: &str) -> bool {
+    name.strip_prefix(PREFIX).is_some_and(|rest| rest.starts_with('_'))
+}
+
+fn known_variables(root: &Command) -> BTreeSet<String> {
+    let mut known = BTreeSet::from([variable_of([FILE_FLAG])]);
+    let mut waiting = vec![(root, Vec::new())];
+    while let Some((command, path)) = waiting.pop() {
+        for long in flags(command).filter_map(Arg::get_long) {
+            known.insert(variable_of([long]));
+            known.insert(variable_of(path.iter().copied().chain([long])));
+        }
+        for below in command.get_subcommands() {
+            waiting.push((below, path.iter().copied().chain([below.get_name()]).collect()));
+        }
+    }
+    known
+}
+
+/// Returns the name in the environment of a flag, by the names of the commands above it and its own.
+fn variable_of<'a>(words: impl IntoIterator<Item = &'a str>) -> String {
+    let words: Vec<&str> = [PREFIX].into_iter().chain(words).collect();
+    words.join("_").replace('-', "_").to_uppercase()
+}
+
 /// Returns the flags of a command that a file may set: all but those that must be given on the command line each
 /// time.
 fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
@@ -106,34 +172,62 @@ fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
     command.get_arguments().filter(is_named).filter(move |arg| !is_help(arg) && by_hand(arg))
 }
 
+/// What the environment or the file gives a flag.
+struct Given {
+    id: clap::Id,
+    values: Vec<String>,
+    /// The variable, or the file and the key.
+    place: String,
+    rank: Rank,
+}
+
+/// What comes before what: the environment before the file, and in each a command's own before that of all commands.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Rank {
+    is_environment: bool,
+    is_own: bool,
+}
+
+impl Given {
+    /// Returns whether this gives the flag: one that is switched off is as one that is absent.
+    fn is_on(&self, arg: &Arg) -> bool {
+        match arg.get_action() {
+            ArgAction::SetTrue => self.values.iter().any(|value| value == "true"),
+            ArgAction::Count => self.values.iter().any(|value| value != "0"),
+            _ => !self.values.is_empty(),
+        }
+    }
+}
+
 struct Settings<'a> {
     variable: &'a dyn Fn(&str) -> Option<OsString>,
     file: Option<File>,
     explicit: BTreeSet<String>,
+    /// The command that is asked for.
+    asked: Vec<String>,
     root: Command,
 }
 
 impl Settings<'_> {
     /// Makes the values of the environment and the file the defaults of a command and those below it.
     fn apply(&self, command: Command, path: &[&str]) -> Result<Command, ConfigError> {
-        let mut defaults: Vec<(clap::Id, Vec<String>)> = Vec::new();
+        let mut given: Vec<Given> = Vec::new();
         for arg in flags(&command) {
-            if let Some(values) = self.value(arg, path)?
+            if let Some(of) = self.value(arg, path)?
                 && !self.is_overruled(&command, arg)
             {
-                defaults.push((arg.get_id().clone(), values));
+                given.push(of);
             }
         }
+        if self.asked.iter().map(String::as_str).zip(path).filter(|(a, b)| a == *b).count() == path.len() {
+            given = self.with_what_it_needs(&command, compatible(&command, given)?)?;
+        }
         let mut command = command;
-        for (id, values) in defaults {
+        for Given { id, values, .. } in given {
             // clap keeps names and defaults for as long as the program runs.
             let values: Vec<&'static str> = values.into_iter().map(|value| &*value.leak()).collect();
             command = command.mut_arg(id, |arg| match arg.get_action() {
-                // `--trust-first=false` switches off what a file switches on.
-                ArgAction::SetTrue => (arg.action(ArgAction::Set).num_args(0..=1).require_equals(true))
-                    .value_parser(clap::value_parser!(bool))
-                    .default_missing_value("true")
-                    .default_values(values),
+                ArgAction::SetTrue => switch(arg).default_values(values),
                 _ => arg.default_values(values).required(false),
             });
         }
@@ -156,23 +250,68 @@ impl Settings<'_> {
     /// Returns whether the command line gives a flag that this one cannot stand beside.
     fn is_overruled(&self, command: &Command, arg: &Arg) -> bool {
         let is_given = |other: &Arg| self.explicit.contains(other.get_id().as_str());
-        let against = |one: &Arg, other: &Arg| {
-            command.get_arg_conflicts_with(one).iter().any(|against| against.get_id() == other.get_id())
-        };
-        command.get_arguments().any(|other| is_given(other) && (against(arg, other) || against(other, arg)))
+        command.get_arguments().any(|other| is_given(other) && exclude(command, arg, other))
     }
 
-    /// Returns the values of a flag: the environment's, else the file's; its own command's, else those for all.
-    fn value(&self, arg: &Arg, path: &[&str]) -> Result<Option<Vec<String>>, ConfigError> {
-        let Some(long) = arg.get_long() else { return Ok(None) };
-        let whole = |words: &mut dyn Iterator<Item = &str>| {
-            words.collect::<Vec<_>>().join("_").replace('-', "_").to_uppercase()
+    /// Refuses a flag that needs another one which nobody gives. One for all commands is left out instead where it
+    /// stands alone in another command: `radius` is a fetch's before it is a question's.
+    fn with_what_it_needs(
+        &self,
+        command: &Command,
+        mut given: Vec<Given>,
+    ) -> Result<Vec<Given>, ConfigError> {
+        loop {
+            let lacking = given.iter().enumerate().find_map(|(at, of)| {
+                let lacks = self.lacks(command, of, &given);
+                (!lacks.is_empty()).then_some((at, lacks))
+            });
+            let Some((at, lacks)) = lacking else { return Ok(given) };
+            let of = given.remove(at);
+            if of.rank.is_own || !self.stands_alone(command, &of) {
+                let what = format!("needs {} as well; give it, or take this away", lacks.join(" and "));
+                return Err(wrong(&of.place, &what));
+            }
+        }
+    }
+
+    /// Returns the flags that one needs and nobody gives.
+    fn lacks(&self, command: &Command, of: &Given, given: &[Given]) -> Vec<String> {
+        let Some(arg) = argument(command, &of.id).filter(|arg| of.is_on(arg)) else { return Vec::new() };
+        let is_given = |arg: &Arg| {
+            self.explicit.contains(arg.get_id().as_str())
+                || given.iter().any(|of| of.id == *arg.get_id() && of.is_on(arg))
         };
-        let own = whole(&mut [PREFIX].into_iter().chain(path.iter().copied()).chain([long]));
-        for (name, is_own) in [(own, !path.is_empty()), (whole(&mut [PREFIX, long].into_iter()), false)] {
+        let is_there = |usage: &String| {
+            let flag = usage.split(' ').next().and_then(|flag| flag.strip_prefix("--"));
+            command.get_arguments().any(|arg| arg.get_long() == flag && flag.is_some() && is_given(arg))
+        };
+        needs(command, arg, &of.values).into_iter().filter(|usage| !is_there(usage)).collect()
+    }
+
+    /// Returns whether the flag of this name of another command takes the values, and needs nothing beside it.
+    fn stands_alone(&self, command: &Command, of: &Given) -> bool {
+        let long = argument(command, &of.id).and_then(Arg::get_long);
+        let mut waiting = vec![&self.root];
+        while let Some(command) = waiting.pop() {
+            let mut same = flags(command).filter(|other| other.get_long() == long);
+            let fits = |arg: &Arg| checked(arg, of.values.clone(), &of.place).is_ok();
+            if same.any(|arg| fits(arg) && needs(command, arg, &of.values).is_empty()) {
+                return true;
+            }
+            waiting.extend(command.get_subcommands());
+        }
+        false
+    }
+
+    /// Returns what a flag is given: by the environment, else by the file; for its own command, else for all.
+    fn value(&self, arg: &Arg, path: &[&str]) -> Result<Option<Given>, ConfigError> {
+        let Some(long) = arg.get_long() else { return Ok(None) };
+        let own = variable_of(path.iter().copied().chain([long]));
+        for (name, is_own) in [(own, !path.is_empty()), (variable_of([long]), false)] {
             if let Some(text) = (self.variable)(&name) {
                 let text = text.into_string().map_err(|_| wrong(&name, "not text in UTF-8"))?;
-                return self.fitting(arg, is_own, &name, &|arg| Ok(from_text(arg, &text)));
+                let rank = Rank { is_environment: true, is_own };
+                return self.fitting(arg, rank, name, &|arg| Ok(from_text(arg, &text)));
             }
         }
         let Some(file) = &self.file else { return Ok(None) };
@@ -181,8 +320,8 @@ impl Settings<'_> {
                 .and_then(|table| table.get(long))
                 .filter(|value| !value.is_table())
             {
-                let place = file.place(path, long);
-                return self.fitting(arg, !path.is_empty(), &place, &|arg| from_value(arg, value));
+                let rank = Rank { is_environment: false, is_own: !path.is_empty() };
+                return self.fitting(arg, rank, file.place(path, long), &|arg| from_value(arg, value));
             }
         }
         Ok(None)
@@ -193,11 +332,11 @@ impl Settings<'_> {
     fn fitting(
         &self,
         arg: &Arg,
-        is_own: bool,
-        place: &str,
+        rank: Rank,
+        place: String,
         texts: &dyn Fn(&Arg) -> Result<Vec<String>, String>,
-    ) -> Result<Option<Vec<String>>, ConfigError> {
-        let check = |arg: &Arg| checked(arg, texts(arg).map_err(|what| wrong(place, &what))?, place);
+    ) -> Result<Option<Given>, ConfigError> {
+        let check = |arg: &Arg| checked(arg, texts(arg).map_err(|what| wrong(&place, &what))?, &place);
         let fits_another = || {
             let mut waiting = vec![&self.root];
             while let Some(command) = waiting.pop() {
@@ -210,8 +349,11 @@ impl Settings<'_> {
             false
         };
         match check(arg) {
-            Err(_) if !is_own && fits_another() => Ok(None),
-            checked => checked.map(Some),
+            Err(_) if !rank.is_own && fits_another() => Ok(None),
+            checked => {
+                let values = checked?;
+                Ok(Some(Given { id: arg.get_id().clone(), values, place, rank }))
+            }
         }
     }
 
@@ -267,6 +409,67 @@ impl File {
         }
         Ok(())
     }
+}
+
+/// Leaves out what something before it excludes; refuses two that come together.
+fn compatible(command: &Command, mut given: Vec<Given>) -> Result<Vec<Given>, ConfigError> {
+    given.sort_by_key(|of| std::cmp::Reverse(of.rank));
+    let mut kept: Vec<Given> = Vec::new();
+    for of in given {
+        let exclude_each_other = |before: &&Given| {
+            let args = argument(command, &before.id).zip(argument(command, &of.id));
+            args.is_some_and(|(a, b)| before.is_on(a) && of.is_on(b) && exclude(command, a, b))
+        };
+        match kept.iter().find(exclude_each_other) {
+            None => kept.push(of),
+            Some(before) if before.rank > of.rank => {}
+            Some(before) => {
+                let what = format!("cannot stand beside {}; take one of the two away", before.place);
+                return Err(wrong(&of.place, &what));
+            }
+        }
+    }
+    Ok(kept)
+}
+
+fn argument<'a>(command: &'a Command, id: &clap::Id) -> Option<&'a Arg> {
+    command.get_arguments().find(|arg| arg.get_id() == id)
+}
+
+fn exclude(command: &Command, one: &Arg, other: &Arg) -> bool {
+    let against = |one: &Arg, other: &Arg| {
+        command.get_arg_conflicts_with(one).iter().any(|against| against.get_id() == other.get_id())
+    };
+    against(one, other) || against(other, one)
+}
+
+/// Returns the flags that one needs beside it, as `--near <X,Y,Z>`: what clap asks for where it stands alone, and not
+/// where nothing stands.
+fn needs(command: &Command, arg: &Arg, values: &[String]) -> Vec<String> {
+    let is_help = |arg: &&Arg| matches!(arg.get_action(), ArgAction::HelpShort | ArgAction::HelpLong);
+    let args = || command.get_arguments().filter(|arg| !is_help(arg)).cloned().map(|arg| arg.required(false));
+    let groups = || command.get_groups().cloned().map(|group| group.required(false));
+    let missing = |line: Vec<String>| {
+        let alone = Command::new("alone").no_binary_name(true).disable_help_flag(true);
+        let parsed =
+            alone.disable_version_flag(true).args(args()).groups(groups()).try_get_matches_from(line);
+        match parsed {
+            Err(error) if error.kind() == ErrorKind::MissingRequiredArgument => {
+                match error.get(ContextKind::InvalidArg) {
+                    Some(ContextValue::Strings(usages)) => usages.clone(),
+                    _ => Vec::new(),
+                }
+            }
+            _ => Vec::new(),
+        }
+    };
+    let flag = format!("--{}", arg.get_long().unwrap_or_default());
+    let line = match arg.get_action() {
+        ArgAction::SetTrue | ArgAction::Count => vec![flag],
+        _ => values.iter().map(|value| format!("{flag}={value}")).collect(),
+    };
+    let of_nothing = missing(Vec::new());
+    missing(line).into_iter().filter(|usage| !of_nothing.contains(usage)).collect()
 }
 
 fn table_at<'a>(table: &'a Table, path: &[&str]) -> Option<&'a Table> {

@@ -1,6 +1,7 @@
 //! `doctor`: can this robot answer, and what is missing?
 
 use std::io::{self, Write};
+use std::path::Path;
 
 use anyhow::anyhow;
 use clap::Args;
@@ -93,7 +94,7 @@ fn print(findings: &[Finding]) -> io::Result<()> {
 fn disk(cache: &EdgeCache) -> Finding {
     let dir = cache.dir();
     // A folder that no fetch has made yet: the disk is that of the nearest one above.
-    let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(dir);
+    let there = dir.ancestors().find(|dir| or_here(dir).is_dir()).map_or(dir, or_here);
     match cache.files().free_bytes(there) {
         Err(error) => Finding::new("disk", Verdict::Missing, format!("{error}; give another --cache")),
         Ok(free) => {
@@ -101,6 +102,11 @@ fn disk(cache: &EdgeCache) -> Finding {
             Finding::new("disk", verdict, format!("{} free for {}", ByteSize(free), dir.display()))
         }
     }
+}
+
+/// The folder of a name alone is the empty path, which cannot be opened.
+fn or_here(dir: &Path) -> &Path {
+    if dir.as_os_str().is_empty() { Path::new(".") } else { dir }
 }
 
 fn trust(cache: &EdgeCache) -> Finding {
@@ -194,6 +200,15 @@ fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// As `fetch --cache NAME` would make them, in the current folder or in a new one of it.
+    #[test]
+    fn a_cache_that_is_yet_to_be_made_has_a_disk() {
+        for name in ["no-such-cache", "no-such-folder/cache"] {
+            let found = disk(&EdgeCache::open(name));
+            assert!(found.verdict != Verdict::Missing && found.text.ends_with(name), "{}", found.text);
+        }
+    }
 
     /// A clock of robot or store that is wrong is not an age of no hours.
     #[test]

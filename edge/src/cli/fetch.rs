@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::fetch::{FetchRequest, Position, fetch};
 use crate::query::parse_point;
+use crate::score::MAX_COORDINATE;
 use anyhow::anyhow;
 use clap::Args;
 use glam::DVec3;
@@ -14,7 +15,7 @@ use slag_service::stop::on_stop;
 use super::args::{CacheArgs, DownloadArgs};
 use super::failure::Failure;
 use super::follow::{FollowArgs, watch};
-use super::network::{environment, failure};
+use super::network::{environment, failure, parse_store};
 use super::output::print_json;
 use super::progress::{Bar, bad_cells, print_report};
 
@@ -27,7 +28,7 @@ const EXAMPLES: &str = "Examples:\n\
 #[command(before_help = EXAMPLES)]
 pub struct FetchArgs {
     /// Address of the store [default: that of the last fetch].
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", value_parser = parse_store)]
     pub from: Option<String>,
     /// Position of the robot, world frame [default: that of the last fetch].
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
@@ -56,7 +57,7 @@ pub struct FetchArgs {
 
 pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     let at = args.at.map(Position::World).or(args.at_geo);
-    let settings = args.follow.settings(args.download.radius)?;
+    let settings = args.follow.settings(args.download.radius);
     let ca = args.download.ca.clone();
     let request = FetchRequest { scene: args.scene, ..args.download.request(args.from, at) };
     let cache = args.cache.open()?;
@@ -85,5 +86,5 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
 fn parse_geographic(text: &str) -> Result<Position, &'static str> {
     let position =
         text.parse::<Position>().ok().filter(|position| matches!(position, Position::Geographic { .. }));
-    position.ok_or("degrees LAT,LON within ±90 and ±180, optionally a height in metres")
+    position.ok_or("degrees LAT,LON within ±90 and ±180, optionally a height in metres, at most 1e9")
 }

@@ -10,9 +10,9 @@ use crate::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow,
 use crate::fetch::{FetchRequest, fetch, last_position};
 use crate::http::{App, RESTARTS, keep_following};
 use crate::store::EdgeCache;
-use anyhow::anyhow;
 use clap::Args;
 
+use super::args::parse_reach;
 use super::failure::Failure;
 use super::network::{environment, failure, random};
 use super::output::print_json;
@@ -23,7 +23,7 @@ use super::progress::{Bar, print_line};
 pub struct FollowArgs {
     /// When following: distance fetched beyond the radius, world units [default: a quarter of the radius, 1 if
     /// that is 0].
-    #[arg(long, value_name = "D")]
+    #[arg(long, value_name = "D", value_parser = parse_reach)]
     pub margin: Option<f64>,
     /// When following: least seconds between fetches.
     #[arg(long, value_name = "S", default_value_t = 2)]
@@ -34,18 +34,14 @@ pub struct FollowArgs {
 }
 
 impl FollowArgs {
-    pub fn settings(&self, radius: f64) -> Result<FollowSettings, Failure> {
-        let margin = self.margin.unwrap_or(if radius > 0.0 { radius / 4.0 } else { 1.0 });
-        if !(margin > 0.0 && margin.is_finite()) {
-            return Err(Failure::Usage(anyhow!("the margin is {margin}, it must be greater than 0")));
-        }
-        Ok(FollowSettings {
+    pub fn settings(&self, radius: f64) -> FollowSettings {
+        FollowSettings {
             radius,
-            margin,
+            margin: self.margin.unwrap_or(if radius > 0.0 { radius / 4.0 } else { 1.0 }),
             min_interval: Duration::from_secs(self.min_interval_secs),
             refresh: (self.refresh_secs > 0).then(|| Duration::from_secs(self.refresh_secs)),
             ..FollowSettings::default()
-        })
+        }
     }
 }
 
@@ -146,4 +142,30 @@ pub fn follow_in_background(
         }
     })?;
     Ok(cancel)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use crate::cli::{Cli, Exit};
+
+    /// Lengths that no coordinate reaches would be tried for ever.
+    #[test]
+    fn lengths_keep_their_limits() {
+        for line in [
+            "slag-edge fetch --watch --radius 1.7e308",
+            "slag-edge fetch --radius 1e10",
+            "slag-edge fetch --margin 1e10",
+            "slag-edge fetch --margin 0",
+            "slag-edge serve --margin -1",
+            "slag-edge serve --radius inf",
+            "slag-edge list --near 0,0,0 --radius 1e10",
+            "slag-edge fetch --at-geo 46.8,-92,1e300",
+        ] {
+            let error = Cli::try_parse_from(line.split(' ')).expect_err(line);
+            assert_eq!(error.exit_code(), Exit::Usage as i32, "{line}");
+        }
+        assert!(Cli::try_parse_from("slag-edge fetch --radius 0 --margin 1e9".split(' ')).is_ok());
+    }
 }

@@ -13,7 +13,7 @@ use slag_common::note;
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, named, parse_radius, parse_reach};
 use super::failure::{Failure, store_failure};
 use super::text::{table, visible};
-use crate::query::{ListFormat, ObjectFilter, ObjectOrder, parse_box, parse_point};
+use crate::query::{ListFormat, ObjectFilter, ObjectOrder, check_region, parse_box, parse_point};
 use crate::score::{Ball, Budget, Region};
 
 /// Longest wait for the words to be encoded: a large text model on a slow core takes minutes, once.
@@ -66,6 +66,7 @@ pub fn run(args: ListArgs) -> Result<(), Failure> {
     let around = args.near.zip(args.radius);
     let ball = around.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
     let region = Region { ball, bounds: args.bounds, polygon: None };
+    check_region(&region).map_err(|e| Failure::Usage(e.into()))?;
     let filter = ObjectFilter { after: None, region, min_size: args.min_size, order: args.sort };
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
@@ -108,4 +109,18 @@ fn print_page(page: &ObjectPage) -> Result<(), Failure> {
     let rows: Vec<Vec<String>> = page.objects.iter().map(row).collect();
     let head = [&format!("position [{unit}]"), &format!("size [{unit}]"), "id", "names"];
     Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use crate::cli::{Cli, Exit};
+
+    /// As a question is: in a flat box lies nothing, and a scene is not looked for.
+    #[test]
+    fn flat_boxes_are_refused() {
+        let line = ["slag-edge", "list", "--box", "0,0,1,5,5,1", "--cache", "nowhere"];
+        assert_eq!(Cli::try_parse_from(line).expect("a line").run(), Exit::Usage);
+    }
 }

@@ -18,6 +18,7 @@ use slag_service::tls::{Tls, TlsFiles};
 use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, parse_bytes};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
+use super::network::parse_store;
 use crate::fetch::follow::Following;
 use crate::http::{self, App, Settings};
 use crate::query::Engine;
@@ -66,7 +67,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "S", default_value_t = 24 * 3600)]
     pub scrub_secs: u64,
     /// Follow the robot: fetch from this store around the positions posted to POST /position.
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", value_parser = parse_store)]
     pub follow: Option<String>,
     #[command(flatten, next_help_heading = "When following")]
     pub download: DownloadArgs,
@@ -126,7 +127,7 @@ async fn serve(
     let app = App::following(engine, settings, following.clone());
     let follower = match following {
         Some(following) => {
-            let settings = args.following.settings(args.download.radius)?;
+            let settings = args.following.settings(args.download.radius);
             let ca = args.download.ca.clone();
             let request = args.download.request(args.follow, None);
             Some(follow_in_background(request, ca, settings, cache, following, Arc::clone(&app))?)

@@ -10,7 +10,7 @@ use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
 
 use super::args::CacheArgs;
 use super::failure::Failure;
-use super::network::{environment, failure};
+use super::network::{environment, failure, parse_store};
 use super::output::{print_json, print_pairs};
 
 #[derive(Debug, Subcommand)]
@@ -40,7 +40,7 @@ const EXAMPLES: &str = "Examples:\n\
 #[command(group = ArgGroup::new("first").required(true).args(["root", "sha256", "trust_first"]))]
 pub struct AddArgs {
     /// Address of the store; not needed with --root.
-    #[arg(value_name = "URL", required_unless_present = "root")]
+    #[arg(value_name = "URL", required_unless_present = "root", value_parser = parse_store)]
     pub from: Option<String>,
     /// The root itself, brought by hand.
     #[arg(long, value_name = "FILE")]

@@ -36,25 +36,34 @@ impl Watch for Environment<'_> {
     }
 }
 
+/// Checks the address of a store.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_address(from: &str) -> Result<(), &'static str> {
+    let uri: Uri = from.parse().map_err(|_| "it is not a URL")?;
+    if !matches!(uri.scheme_str(), Some("http" | "https")) {
+        return Err("it does not begin with http:// or https://");
+    }
+    if uri.authority().is_none_or(|a| a.host().is_empty() || a.as_str().contains('@')) {
+        return Err("it has no host, or names a user");
+    }
+    // A port beyond 65535 would be taken for none.
+    let end = uri.authority().and_then(|a| a.as_str().rsplit(']').next()).unwrap_or_default();
+    if end.contains(':') && uri.port_u16().is_none() {
+        return Err("its port is no number from 0 to 65535");
+    }
+    if uri.query().is_some() || from.contains('#') {
+        return Err("it has a query or a fragment");
+    }
+    Ok(())
+}
+
 impl<'a> Client<'a> {
     /// Checks the address of a store.
     pub fn new(from: &str, environment: &'a Environment<'a>) -> Result<Self, FetchError> {
         let bad = |what: &str| FetchError::Address { from: from.to_owned(), what: what.to_owned() };
-        let uri: Uri = from.parse().map_err(|_| bad("it is not a URL"))?;
-        if !matches!(uri.scheme_str(), Some("http" | "https")) {
-            return Err(bad("it does not begin with http:// or https://"));
-        }
-        if uri.authority().is_none_or(|a| a.host().is_empty() || a.as_str().contains('@')) {
-            return Err(bad("it has no host, or names a user"));
-        }
-        // A port beyond 65535 would be taken for none.
-        let end = uri.authority().and_then(|a| a.as_str().rsplit(']').next()).unwrap_or_default();
-        if end.contains(':') && uri.port_u16().is_none() {
-            return Err(bad("its port is no number from 0 to 65535"));
-        }
-        if uri.query().is_some() || from.contains('#') {
-            return Err(bad("it has a query or a fragment"));
-        }
+        check_address(from).map_err(bad)?;
         let tls = download::tls(environment.ca).map_err(|what| {
             let path = environment.ca.unwrap_or("".as_ref()).to_owned();
             FetchError::Ca { path, what }
@@ -78,7 +87,7 @@ impl<'a> Client<'a> {
             DownloadError::TooLong { max_bytes } => {
                 TufError::TooLong { what: path.to_owned(), max_bytes }.into()
             }
-            e => FetchError::of_download(url, e),
+            e => FetchError::of_download(url, e, 0),
         })
     }
 
@@ -104,7 +113,7 @@ impl<'a> Client<'a> {
         let url = format!("{}/v1/objects/{hash}", self.base);
         let part = StagedObject { files, hash, len_bytes, path };
         let received = self.http.large(&url, &part, Expected::Exactly(len_bytes));
-        received.map_err(|e| FetchError::of_download(url, e))
+        received.map_err(|e| FetchError::of_download(url, e, part.len_bytes().unwrap_or(0)))
     }
 }
 

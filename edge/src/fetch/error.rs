@@ -25,10 +25,14 @@ pub enum FetchError {
     Records(#[from] RecordsError),
     #[error(transparent)]
     Store(#[from] StoreError),
-    #[error(
-        "{url}: {failure} ({attempts} attempts); check the address and the connection, then fetch again: bytes received so far are kept"
-    )]
-    Download { url: String, attempts: u32, failure: DownloadFailure },
+    #[error("{url}: {failure} ({attempts} attempts){}", what_next(failure, *kept_bytes))]
+    Download {
+        url: String,
+        attempts: u32,
+        failure: DownloadFailure,
+        /// Of the file, where the next fetch resumes.
+        kept_bytes: u64,
+    },
     #[error(transparent)]
     Manifest(#[from] ManifestError),
     #[error(transparent)]
@@ -71,6 +75,15 @@ pub enum FetchError {
     Cancelled,
 }
 
+fn what_next(failure: &DownloadFailure, kept_bytes: u64) -> String {
+    let check = if failure.has_advice() { "" } else { "check the address and the connection, " };
+    let kept = match kept_bytes {
+        0 => String::new(),
+        bytes => format!("; the {bytes} bytes of it that have arrived are kept"),
+    };
+    format!("; {check}then fetch again{kept}")
+}
+
 impl FetchError {
     /// Returns whether it may be gone once somebody has told the robot whom to trust.
     pub(super) fn is_want_of_trust(&self) -> bool {
@@ -82,9 +95,12 @@ impl FetchError {
         }
     }
 
-    pub(super) fn of_download(url: String, error: DownloadError) -> Self {
+    /// `kept_bytes`: of the file, which the next fetch does not download again.
+    pub(super) fn of_download(url: String, error: DownloadError, kept_bytes: u64) -> Self {
         match error {
-            DownloadError::Failed { attempts, failure } => Self::Download { url, attempts, failure },
+            DownloadError::Failed { attempts, failure } => {
+                Self::Download { url, attempts, failure, kept_bytes }
+            }
             DownloadError::Io(e) => Self::Io(e),
             DownloadError::Cancelled => Self::Cancelled,
             DownloadError::TooLong { max_bytes } => TufError::TooLong { what: url, max_bytes }.into(),

@@ -27,6 +27,7 @@ mod run;
 mod staging;
 mod trust;
 
+pub use download::check_address;
 pub use error::FetchError;
 pub use plan::{Held, Plan, Wanted};
 pub use position::{NotAPosition, PlanError, Position, Spoken};

@@ -102,7 +102,9 @@ impl FromStr for Position {
                 Ok(Self::World(DVec3::new(x, y, z)))
             }
             Spoken::Geographic { lat, lon, height }
-                if lat.abs() <= 90.0 && lon.abs() <= 180.0 && height.is_none_or(f64::is_finite) =>
+                if lat.abs() <= 90.0
+                    && lon.abs() <= 180.0
+                    && height.is_none_or(|height| height.abs() <= MAX_COORDINATE) =>
             {
                 Ok(Self::Geographic { latitude_deg: lat, longitude_deg: lon, height_m: height })
             }
@@ -125,14 +127,14 @@ impl Position {
         match self {
             Self::World(position) => {
                 for (name, value) in [("x", position.x), ("y", position.y), ("z", position.z)] {
-                    number(name, value, f64::MAX, "finite")?;
+                    number(name, value, MAX_COORDINATE, "within ±1e9")?;
                 }
                 Ok(position)
             }
             Self::Geographic { latitude_deg, longitude_deg, height_m } => {
                 number("latitude", latitude_deg, 90.0, "within -90..90 degrees")?;
                 number("longitude", longitude_deg, 180.0, "within -180..180 degrees")?;
-                number("height", height_m.unwrap_or(0.0), f64::MAX, "finite")?;
+                number("height", height_m.unwrap_or(0.0), MAX_COORDINATE, "within ±1e9 metres")?;
                 let geo = manifest
                     .geo_reference
                     .ok_or_else(|| PlanError::NoGeoReference { scene: manifest.scene.clone() })?;
@@ -223,6 +225,8 @@ mod tests {
             r#"{"x":1,"y":2}"#,
             r#"{"x":1,"y":2,"z":3,"w":4}"#,
             r#"{"lat":91,"lon":0}"#,
+            "46.8,-92,1e10",
+            r#"{"lat":46.8,"lon":-92,"height":1e300}"#,
             "{\"x\":",
             &long,
         ] {

@@ -226,8 +226,9 @@ impl<'a> Planned<'a> {
                 return Err(error);
             }
         }
-        // Readers open the generation again where a shard of it was replaced.
-        if locked.current.as_ref() != Some(&current) || !downloaded.good.is_empty() {
+        // Readers open the generation again where a file of it was replaced, be it the manifest alone.
+        let is_same = locked.current.as_ref() == Some(&current) && locked.on_board.is_some();
+        if !is_same || !downloaded.good.is_empty() {
             put(cache, &offer.bytes, &cache.manifest_path(offer.manifest_hash))?;
             let bytes = serde_json::to_vec(&current).map_err(io::Error::from)?;
             put(cache, &bytes, &cache.current_path())?;

@@ -8,8 +8,8 @@ use slag_common::frames::Aabb;
 use slag_common::objects::parse_public_id;
 
 use crate::query::{
-    Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, numbers, parse_box,
-    parse_point,
+    Area, AreaBall, AreaBox, Corner, LatLon, Negatives, OBJECT_ID, Point, RequestError, check_length,
+    numbers, parse_box, parse_point,
 };
 use crate::score::{MAX_COORDINATE, MAX_CORNERS};
 
@@ -152,12 +152,11 @@ pub struct BallParams {
 
 impl BallParams {
     /// # Errors
-    /// One is there without the other, or the radius is not positive.
+    /// One is there without the other, or the radius is none.
     pub fn ball(self) -> Result<Option<(Point, f64)>, RequestError> {
         match (point(self.near, self.near_lat_lon)?, self.radius) {
             (None, None) => Ok(None),
-            (Some(near), Some(radius)) if radius > 0.0 && radius.is_finite() => Ok(Some((near, radius))),
-            (Some(_), Some(radius)) => Err(RequestError::new("radius", &radius.to_string(), "more than 0")),
+            (Some(near), Some(radius)) => check_length("radius", radius).map(|()| Some((near, radius))),
             (None, Some(_)) => Err(RequestError::new("near", "nothing", "x,y,z, because there is a radius")),
             (Some(_), None) => Err(RequestError::new("radius", "nothing", "a number, because there is near")),
         }

@@ -4,6 +4,7 @@ mod app;
 mod ask;
 mod follower;
 mod forms;
+mod named;
 mod position;
 mod problem;
 mod query;

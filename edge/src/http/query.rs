@@ -20,11 +20,14 @@ use tokio::sync::mpsc::{Sender, channel};
 use super::app::App;
 use super::ask::{AskParams, ShortParams};
 use super::forms::AreaParams;
+use super::named::as_in_json;
 use super::problem::query_problem;
 use crate::query::{AnswersOrBatch, Ask, Format, Page, RequestError};
 
 /// Longest body: 32 vectors of 2048 components as text.
 pub const MAX_BODY_BYTES: usize = 1 << 20;
+/// Longest reason why a body is no request.
+const MAX_REASON_CHARS: usize = 300;
 /// Pieces made ahead of the client.
 const PIECES_AHEAD: usize = 2;
 
@@ -60,10 +63,21 @@ pub async fn get(
 }
 
 pub async fn post(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Json<Page<'static>>>, Problem> {
-    let ask = serde_json::from_slice(&body).map_err(|e| {
-        RequestError::new("body", &e.to_string(), "a request as GET /openapi.json describes it").into()
-    });
-    answer(&app, ask).await.map(As::new)
+    let ask: Ask = match serde_json::from_slice(&body) {
+        Ok(ask) => ask,
+        Err(error) => return answer(&app, Err(unreadable(&error))).await.map(As::new),
+    };
+    let named = as_in_json(&ask);
+    answer(&app, Ok(ask)).await.map(As::new).map_err(named)
+}
+
+/// Returns the problem of a body that is no request: what serde says names the member, and the names it may have.
+fn unreadable(error: &serde_json::Error) -> Problem {
+    let (text, expected) = (error.to_string(), "a request as GET /openapi.json describes it");
+    let shown: String = text.chars().take(MAX_REASON_CHARS).collect();
+    let dots = if shown.len() < text.len() { "…" } else { "" };
+    let problem = Problem::from(RequestError::new("body", &text, expected));
+    problem.with_detail(format!("body: {shown}{dots}; expected {expected}"))
 }
 
 async fn answer(app: &Arc<App>, ask: Result<Ask, Problem>) -> Result<Response, Problem> {

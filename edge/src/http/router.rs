@@ -4,6 +4,7 @@ use std::io;
 use std::sync::Arc;
 
 use axum::Router;
+use axum::middleware::from_fn;
 use slag_service::listen::Listener;
 use slag_service::listener;
 use slag_service::openapi::About;
@@ -12,7 +13,7 @@ use slag_service::routes::{Route, Routes};
 
 use super::app::App;
 use super::problem::{Members, SCENE, TEXTS, TIME_BUDGET};
-use super::{position, query, status, v1};
+use super::{named, position, query, status, v1};
 use crate::fetch::Spoken;
 
 /// This service, as its help text and description name it.
@@ -72,6 +73,7 @@ pub(super) fn router(app: Arc<App>) -> Router {
     let reads = table.iter().filter(|route| route.reads).map(|route| route.path).collect();
     let (responses, access) =
         (Arc::clone(&app.metrics.responses), app.settings.access.clone().with_reads(reads));
+    let router = router.layer(from_fn(named::as_in_query));
     observed(router.merge(slag_view::router()).with_state(app), responses, access)
 }
 

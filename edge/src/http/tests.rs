@@ -421,6 +421,7 @@ async fn positions_are_handed_on_or_refused() {
         r#"{"x":1}"#,
         r#"{"x":1e300,"y":0,"z":0}"#,
         r#"{"lat":91,"lon":0}"#,
+        r#"{"lat":46.8,"lon":-92,"height":1e300}"#,
         "\u{1b}[2J",
         &"1".repeat(900),
     ] {

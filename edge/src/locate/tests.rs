@@ -73,7 +73,14 @@ fn what_cannot_be_matched_is_told() {
         bytes[29..33].copy_from_slice(&checksum.to_be_bytes());
         bytes
     };
+    // What decoders take for a photo, or do not name: a copy that was cut, and what stands in a photo's place.
+    let jpeg = written(&image::RgbImage::new(64, 48).into(), image::ImageFormat::Jpeg);
     let cases = [
+        (jpeg[..jpeg.len() - 20].to_vec(), "ends before"),
+        (b"\0\0\0\x24ftypheic\0\0\0\0mif1heic".to_vec(), "heif-convert"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n".to_vec(), "git lfs pull"),
+        (b"\n<html>Please log in</html>".to_vec(), "a web page"),
+        (written(&DynamicImage::new_rgba8(64, 48), image::ImageFormat::Png), "transparent"),
         (b"hello".to_vec(), "JPEG, PNG or WebP"),
         (photo[..40].to_vec(), "JPEG, PNG or WebP"),
         (stating(0x7fff_ffff, 1), "limit"),
@@ -84,6 +91,20 @@ fn what_cannot_be_matched_is_told() {
         let error = answer(&snapshot, &bytes).expect_err("no picture").to_string();
         assert!(error.contains(expected), "{error}");
     }
+    // Colours that nobody sees have no features: noise below one white pixel.
+    let mut random = Random::new(1);
+    let mut hidden = image::RgbaImage::from_fn(640, 480, |_, _| {
+        let [r, g, b] = [(); 3].map(|()| random.bits() as u8);
+        image::Rgba([r, g, b, 0])
+    });
+    let noise = DynamicImage::from(hidden.clone()).into_rgb8();
+    hidden.put_pixel(0, 0, image::Rgba([255; 4]));
+    let found = |photo: &DynamicImage| {
+        answer(&snapshot, &written(photo, image::ImageFormat::Png)).expect("an answer")
+    };
+    let few = reason(Reason::FewFeatures { found: 0 });
+    assert_eq!(found(&hidden.into()), few);
+    assert_ne!(found(&noise.into()), few);
 }
 
 /// The checksum of PNG (ISO 3309), bit by bit.
@@ -93,8 +114,12 @@ fn crc32(bytes: &[u8]) -> u32 {
 }
 
 fn png(width: u32, height: u32) -> Vec<u8> {
+    written(&image::RgbImage::new(width, height).into(), image::ImageFormat::Png)
+}
+
+fn written(photo: &DynamicImage, format: image::ImageFormat) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
-    image::RgbImage::new(width, height).write_to(&mut bytes, image::ImageFormat::Png).expect("memory");
+    photo.write_to(&mut bytes, format).expect("memory");
     bytes.into_inner()
 }
 

@@ -10,7 +10,7 @@ use super::cluster::{Cluster, Clusters, Grouping, cluster};
 use super::objects::{self, FoundObject};
 use super::oriented::Extent;
 use super::rank::{Order, Ranked};
-use super::reason;
+use super::reason::{self, BestObject};
 use super::relations::ClustersOfThing;
 use super::reply::RelatedAnswers;
 use super::request::{AnswerKind, QueryRequest};
@@ -80,7 +80,12 @@ impl Answering<'_> {
             match (&mut answers[at].reason, &clusters.reason) {
                 // Neither answers: both say why.
                 (Some(of_objects), Some(of_clusters)) => {
-                    of_objects.detail = format!("{}; {}", of_objects.detail, of_clusters.detail);
+                    let detail = format!("{}; {}", of_objects.detail, of_clusters.detail);
+                    // Where there is no object, Gaussians have the nearest miss.
+                    if of_objects.best_score.is_none() {
+                        of_objects.clone_from(of_clusters);
+                    }
+                    of_objects.detail = detail;
                 }
                 _ => answers[at] = clusters,
             }
@@ -144,10 +149,16 @@ impl Answering<'_> {
             budget.take(bytes).then(|| object_answer(scene, ranked, score, region, request.members))
         });
         let found = Found::Clusters(described.collect());
-        let best = objects::best(&scored.scores);
-        let best =
-            best.map(|best| (scale.shown(scored.scores[best]), objects::record(scene, best).position()));
         let empty = self.empty((text, AnswerKind::Objects), scale, threshold);
+        let area_fetched = empty.searched.area_fetched;
+        let reason = || {
+            let best = objects::best_in(scene, &scored.scores, region).map(|best| BestObject {
+                score: scale.shown(best.score),
+                reaches: best.score >= of_score,
+                position_in_world: best.extent().position_in_world,
+            });
+            reason::of_objects(scene, request, threshold.0, best, area_fetched)
+        };
         Answers {
             searched: Searched {
                 n_searched: n_with_evidence(scene, region),
@@ -155,7 +166,7 @@ impl Answering<'_> {
                 score_error_bound: scale.error_bound(scored.error_bound),
                 ..empty.searched
             },
-            reason: found.is_empty().then(|| reason::of_objects(request, threshold.0, best)),
+            reason: found.is_empty().then(reason),
             answers: found,
             ..empty
         }
@@ -180,8 +191,10 @@ impl Answering<'_> {
         // With negatives a score is the difference of two products.
         let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
         let measured = search.measured_errors();
-        let reason = || reason::of_gaussians(search, scale, self.request, threshold, n_matching);
         let empty = self.empty(asked, scale, (threshold, source));
+        let area_fetched = empty.searched.area_fetched;
+        let reason =
+            || reason::of_gaussians(search, scale, self.request, threshold, n_matching, area_fetched);
         Answers {
             searched: Searched {
                 n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),

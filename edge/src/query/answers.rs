@@ -274,7 +274,7 @@ impl GaussianAnswer {
 pub enum ReasonKind {
     /// No Gaussian or object reaches the threshold.
     BelowThreshold,
-    /// Gaussians match, but no cluster has enough of them.
+    /// Gaussians or objects match, but no cluster and no object has enough Gaussians.
     ClustersTooSmall,
     /// The region asked for holds nothing that could match.
     NothingThere,

@@ -9,7 +9,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use slag_common::frames::{Aabb, Geographic};
 use slag_common::manifest::Manifest;
 
-use super::request::RequestError;
+use super::request::{RequestError, check_region};
 use crate::score::{Ball, MAX_COORDINATE, MAX_CORNERS, Polygon, Region};
 
 /// A ball, a box and a polygon, each optional; what lies in all of them is asked for.
@@ -62,27 +62,28 @@ fn corners<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<Corner>, D::Error> 
 }
 
 impl Area {
+    /// Returns the region in the world frame. Errors name the member that is wrong.
     pub(crate) fn in_world(&self, manifest: &Manifest) -> Result<Region, RequestError> {
-        let point = |point: Point| point.in_world("region", manifest);
         let ball = self.ball.map(|AreaBall { centre, radius }| {
-            Ok::<_, RequestError>(Ball { centre_in_world: point(centre)?, radius })
+            Ok::<_, RequestError>(Ball { centre_in_world: centre.in_world("centre", manifest)?, radius })
         });
         let bounds = self.bounds.map(|AreaBox { from, to }| {
-            let (from, to) = (point(from)?, point(to)?);
+            let (from, to) = (from.in_world("box", manifest)?, to.in_world("box", manifest)?);
             Ok::<_, RequestError>(Aabb { min: from.min(to), max: from.max(to) })
         });
         let mut region = Region { ball: ball.transpose()?, bounds: bounds.transpose()?, polygon: None };
         if !self.polygon.is_empty() {
-            let corners = self.polygon.iter().map(|corner| corner.in_world("region", manifest));
+            let corners = self.polygon.iter().map(|corner| corner.in_world("polygon", manifest));
             let corners = corners.collect::<Result<Vec<_>, _>>()?;
             let found = format!("{} corners", corners.len());
             let refused = || {
                 let expected =
                     format!("a polygon of 3 to {MAX_CORNERS} corners within bounds, not all on a line");
-                RequestError::new("region", &found, expected)
+                RequestError::new("polygon", &found, expected)
             };
             region.polygon = Some(Arc::new(Polygon::new(corners).ok_or_else(refused)?));
         }
+        check_region(&region)?;
         Ok(region)
     }
 }

@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::de::{DeserializeOwned, IntoDeserializer};
+use serde::{Deserialize, Deserializer};
 
 use super::area::{Area, Point};
 use super::format::Format;
@@ -34,6 +35,7 @@ pub struct Ask {
     #[schemars(with = "Vec<Words>", length(max = MAX_NEGATIVES))]
     pub negatives: Negatives,
     /// Kind of answers.
+    #[serde(deserialize_with = "by_name_if_any")]
     pub kind: Option<AnswerKind>,
     /// The part of space to search.
     pub region: Area,
@@ -56,6 +58,7 @@ pub struct Ask {
     #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE))]
     pub voxel: Option<f64>,
     /// Where scores come from.
+    #[serde(deserialize_with = "by_name")]
     pub precision: Precision,
     /// Most time to compute, milliseconds.
     #[schemars(range(min = 1))]
@@ -66,6 +69,16 @@ pub struct Ask {
 }
 
 slag_common::named_members!(Ask);
+
+/// Reads the name of a variant: serde would take `{"exact": null}` as well.
+fn by_name<'de, D: Deserializer<'de>, T: DeserializeOwned>(from: D) -> Result<T, D::Error> {
+    T::deserialize(String::deserialize(from)?.into_deserializer())
+}
+
+fn by_name_if_any<'de, D: Deserializer<'de>, T: DeserializeOwned>(from: D) -> Result<Option<T>, D::Error> {
+    let name = Option::<String>::deserialize(from)?;
+    name.map(|name| T::deserialize(name.into_deserializer())).transpose()
+}
 
 impl Ask {
     pub(crate) fn time_budget(&self) -> Result<Option<Duration>, RequestError> {
@@ -80,7 +93,14 @@ impl Ask {
         let n = self.texts.len() + self.vectors.len() + self.phrases.len();
         if !(1..=MAX_TEXTS).contains(&n) {
             let expected = format!("1 to {MAX_TEXTS} texts, vectors and phrases together");
-            return Err(RequestError::new("texts", &format!("{n} questions"), expected));
+            let counts = [
+                ("texts", self.texts.len()),
+                ("vectors", self.vectors.len()),
+                ("phrases", self.phrases.len()),
+            ];
+            let most = counts.into_iter().reduce(|most, of| if of.1 > most.1 { of } else { most });
+            let member = most.map_or("texts", |(member, _)| member);
+            return Err(RequestError::new(member, &format!("{n} questions"), expected));
         }
         let texts = self.texts.into_iter().map(Asked::Text);
         let vectors = self.vectors.into_iter().enumerate().map(|(at, vector)| Asked::Vector { at, vector });

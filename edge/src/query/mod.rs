@@ -46,9 +46,9 @@ pub use page::Page;
 pub use rank::relevance;
 pub use reply::{Outcome, RelatedAnswers, Reply};
 pub use request::{
-    AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_CLUSTERS, MAX_GAUSSIANS,
-    MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, Words, numbers, parse_box,
-    parse_point,
+    AnswerKind, Asked, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, LENGTHS, MAX_CLUSTERS,
+    MAX_GAUSSIANS, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Negatives, QueryRequest, RequestError, Words,
+    check_length, check_region, is_length, numbers, parse_box, parse_point,
 };
 pub use scale::{RELEVANCY_THRESHOLD, ScoreKind, ThresholdSource, calibrated_threshold};
 pub use scene::{Scene, default_voxel, unit};

@@ -67,19 +67,37 @@ pub fn matching<'a>(
     min_count: u64,
 ) -> Vec<FoundObject<'a>> {
     let reaching = (0..scores.len()).filter(|object| scores[*object] >= threshold);
-    let found = |object| {
-        let (parts, record, score) = (scene.index.parts(object), record(scene, object), scores[object]);
-        let n_gaussians = count_in(scene, object, region);
-        if n_gaussians < min_count.max(1) {
-            return None;
+    reaching.filter_map(|object| found(scene, scores, object, region, min_count)).collect()
+}
+
+/// Returns the object with the best score of those with a Gaussian in a region, the first among equals.
+pub fn best_in<'a>(scene: &Scene<'a>, scores: &[f32], region: &Region) -> Option<FoundObject<'a>> {
+    let mut best: Option<usize> = None;
+    for (object, score) in scores.iter().enumerate() {
+        if best.is_none_or(|best| *score > scores[best]) && in_region(scene, object, region, 1) {
+            best = Some(object);
         }
-        let cut = (!region.covers(&record.bounds())).then(|| {
-            let inside: Vec<DVec3> = parts.iter().flat_map(|part| points(scene, *part, region)).collect();
-            Extent::of(&inside)
-        });
-        Some(FoundObject { object, record, score, n_gaussians, cut })
-    };
-    reaching.filter_map(found).collect()
+    }
+    found(scene, scores, best?, region, 1)
+}
+
+fn found<'a>(
+    scene: &Scene<'a>,
+    scores: &[f32],
+    object: usize,
+    region: &Region,
+    min_count: u64,
+) -> Option<FoundObject<'a>> {
+    let (parts, record, score) = (scene.index.parts(object), record(scene, object), scores[object]);
+    let n_gaussians = count_in(scene, object, region);
+    if n_gaussians < min_count.max(1) {
+        return None;
+    }
+    let cut = (!region.covers(&record.bounds())).then(|| {
+        let inside: Vec<DVec3> = parts.iter().flat_map(|part| points(scene, *part, region)).collect();
+        Extent::of(&inside)
+    });
+    Some(FoundObject { object, record, score, n_gaussians, cut })
 }
 
 pub fn record<'a>(scene: &Scene<'a>, object: usize) -> &'a ObjectRecord {

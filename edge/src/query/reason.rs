@@ -8,6 +8,7 @@ use slag_common::shard::ShardView;
 use super::answers::{Reason, ReasonKind};
 use super::request::QueryRequest;
 use super::scale::Scale;
+use super::scene::Scene;
 use crate::score::{Region, Search};
 
 /// A region was looked at if views saw at least this share of its Gaussians.
@@ -61,28 +62,71 @@ fn reason((kind, detail): (ReasonKind, String), best: Option<(f32, DVec3)>) -> R
     Reason { kind, detail, seen_share: None, best_score, best_position_in_world }
 }
 
-/// Returns why no object was found. `best`: score and position of the best object on board.
-pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVec3)>) -> Reason {
+/// The best object in the region asked for.
+pub struct BestObject {
+    pub score: f32,
+    /// Whether it would answer if it had enough Gaussians there.
+    pub reaches: bool,
+    /// Where the part in the region is.
+    pub position_in_world: DVec3,
+}
+
+/// Returns what to do where nothing is. `area_fetched`: whether all of the region was fetched; `None` if nobody knows.
+fn elsewhere(region: &Region, area_fetched: Option<bool>) -> &'static str {
+    match area_fetched {
+        Some(true) => "search elsewhere",
+        Some(false) => "fetch that area, or search elsewhere",
+        None if region.polygon.is_some() => "fetch that area if it is not on board, or search elsewhere",
+        None => "fetch another area",
+    }
+}
+
+/// Returns why no object was found in the region asked for.
+pub fn of_objects(
+    scene: &Scene<'_>,
+    request: &QueryRequest,
+    threshold: f32,
+    best: Option<BestObject>,
+    area_fetched: Option<bool>,
+) -> Reason {
     let place = &request.region;
-    let (kind, detail) = match best {
-        None => (
+    let (kind, detail) = match &best {
+        None if scene.index.is_empty() => (
             ReasonKind::NothingThere,
             "the shards on board have no objects; ask with kind=clusters, or encode the scene with objects"
                 .to_owned(),
         ),
-        Some((score, at)) if score < threshold => (
-            ReasonKind::BelowThreshold,
-            format!("no object reaches {threshold}; the best has {score:.3}, at {at:.2}"),
-        ),
-        Some(_) => (
+        None if seen_share(scene.shards, place).is_some() => {
+            let advice =
+                if request.kind.is_some() { "; ask with kind=clusters, or search elsewhere" } else { "" };
+            let detail = format!("there are Gaussians{place}, but none of an object{advice}");
+            (ReasonKind::BelowThreshold, detail)
+        }
+        None => (
             ReasonKind::NothingThere,
+            format!("there is no object{place}; {}", elsewhere(place, area_fetched)),
+        ),
+        Some(BestObject { reaches: false, score, position_in_world }) => (
+            ReasonKind::BelowThreshold,
             format!(
-                "no object that reaches {threshold} has {} Gaussians{place}; fetch that area, or search elsewhere",
-                request.min_count
+                "no object{place} reaches {threshold}; the best has {score:.3}, at {position_in_world:.2}"
             ),
         ),
+        Some(BestObject { reaches: true, .. }) => {
+            let advice = match area_fetched {
+                Some(false) => "lower min_count, or fetch that area",
+                _ => "lower min_count",
+            };
+            (
+                ReasonKind::ClustersTooSmall,
+                format!(
+                    "no object that reaches {threshold} has {} Gaussians{place}; {advice}",
+                    request.min_count
+                ),
+            )
+        }
     };
-    reason((kind, detail), best)
+    reason((kind, detail), best.map(|best| (best.score, best.position_in_world)))
 }
 
 pub fn of_gaussians(
@@ -91,6 +135,7 @@ pub fn of_gaussians(
     request: &QueryRequest,
     threshold: f32,
     n_matching: u64,
+    area_fetched: Option<bool>,
 ) -> Reason {
     let place = &request.region;
     let best = search.best(1, f32::NEG_INFINITY, request.near).first().map(|hit| {
@@ -99,7 +144,7 @@ pub fn of_gaussians(
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
-            format!("there is no Gaussian with an embedding{place}; fetch that area, or search elsewhere"),
+            format!("there is no Gaussian with an embedding{place}; {}", elsewhere(place, area_fetched)),
         ),
         Some(_) if n_matching > 0 => (
             ReasonKind::ClustersTooSmall,

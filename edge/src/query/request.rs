@@ -100,6 +100,45 @@ pub fn numbers(text: &str) -> Option<Vec<f64>> {
     text.split(',').map(|number| number.trim().parse().ok()).collect()
 }
 
+/// The lengths that [`is_length`] takes, in words.
+pub const LENGTHS: &str = "more than 0, at most 1e9";
+
+/// Returns whether a radius, a margin or an edge is one that every face of this program takes.
+pub fn is_length(length: f64) -> bool {
+    length > 0.0 && length <= MAX_COORDINATE
+}
+
+/// Checks a length. `parameter`: its name, for the error.
+pub fn check_length(parameter: &str, length: f64) -> Result<(), RequestError> {
+    match is_length(length) {
+        true => Ok(()),
+        false => Err(RequestError::new(parameter, &length.to_string(), LENGTHS)),
+    }
+}
+
+fn is_within(point: DVec3) -> bool {
+    point.is_finite() && point.abs().max_element() <= MAX_COORDINATE
+}
+
+/// Checks a region, the same for questions and lists. A polygon is sound if there is one.
+pub fn check_region(region: &Region) -> Result<(), RequestError> {
+    // In a flat box lies nothing.
+    let is_box = |b: &Aabb| b.min.cmplt(b.max).all() && is_within(b.min) && is_within(b.max);
+    if let Some(bounds) = region.bounds.filter(|bounds| !is_box(bounds)) {
+        let found = format!("{} to {}", bounds.min, bounds.max);
+        let expected = format!("two corners within ±{MAX_COORDINATE:e} that differ along each axis");
+        return Err(RequestError::new("box", &found, expected));
+    }
+    if let Some(Ball { centre_in_world, radius }) = region.ball {
+        check_length("radius", radius)?;
+        if !is_within(centre_in_world) {
+            let expected = format!("a centre within ±{MAX_COORDINATE:e}");
+            return Err(RequestError::new("centre", &centre_in_world.to_string(), expected));
+        }
+    }
+    Ok(())
+}
+
 /// Parses `X0,Y0,Z0,X1,Y1,Z1`: two opposite corners of a box.
 pub fn parse_box(text: &str) -> Result<Aabb, String> {
     match numbers(text).as_deref() {
@@ -248,7 +287,10 @@ impl QueryRequest {
         for asked in &mut self.asked {
             let Asked::Text(text) = asked else { continue };
             match relations::understand(text) {
-                Some(phrase) if phrase.n_things() > relations::MAX_THINGS => phrase.check()?,
+                // It is the text that is too long: nobody gave a phrase.
+                Some(phrase) if phrase.n_things() > relations::MAX_THINGS => {
+                    phrase.check().map_err(|error| RequestError { parameter: "text".to_owned(), ..error })?;
+                }
                 // A phrase that breaks another limit is one text for the text model, as one without relations is.
                 Some(phrase) if phrase.check().is_ok() => {
                     *asked = Asked::Phrase { text: Some(std::mem::take(text)), phrase };
@@ -270,8 +312,6 @@ impl QueryRequest {
 
     /// Checks every limit that does not depend on the scene.
     pub fn check(&self) -> Result<(), RequestError> {
-        let positive = |v: f64| v > 0.0 && v <= MAX_COORDINATE;
-        let within = |v: DVec3| v.is_finite() && v.abs().max_element() <= MAX_COORDINATE;
         let refuse = |parameter: &str, found: &dyn ToString, expected: String| {
             Err(RequestError::new(parameter, &found.to_string(), expected))
         };
@@ -288,29 +328,12 @@ impl QueryRequest {
         if let Some(heading) = self.heading_rad.filter(|heading| !heading.is_finite()) {
             return refuse("heading_rad", &heading, "a number".into());
         }
-        if let Some(near) = self.near.filter(|near| !within(*near)) {
+        if let Some(near) = self.near.filter(|near| !is_within(*near)) {
             return refuse("near", &near, format!("three numbers X,Y,Z within ±{MAX_COORDINATE:e}"));
         }
-        // In a flat box lies nothing.
-        let is_box = |b: &Aabb| b.min.cmplt(b.max).all() && within(b.min) && within(b.max);
-        if let Some(bounds) = self.region.bounds.filter(|bounds| !is_box(bounds)) {
-            let found = format!("{} to {}", bounds.min, bounds.max);
-            return refuse(
-                "box",
-                &found,
-                format!("two corners within ±{MAX_COORDINATE:e} that differ along each axis"),
-            );
-        }
-        if let Some(Ball { centre_in_world, radius }) = self.region.ball {
-            if !positive(radius) {
-                return refuse("radius", &radius, format!("more than 0, at most {MAX_COORDINATE:e}"));
-            }
-            if !within(centre_in_world) {
-                return refuse("region", &centre_in_world, format!("a centre within ±{MAX_COORDINATE:e}"));
-            }
-        }
-        if let Some(voxel) = self.voxel.filter(|voxel| !positive(*voxel)) {
-            return refuse("voxel", &voxel, format!("more than 0, at most {MAX_COORDINATE:e}"));
+        check_region(&self.region)?;
+        if let Some(voxel) = self.voxel {
+            check_length("voxel", voxel)?;
         }
         if self.min_count == 0 {
             return refuse("min_count", &0, "at least 1".into());
@@ -400,6 +423,24 @@ mod tests {
         for bad in ["", "1,2", "1,2,3,4", "1,2,x", "NaN,0,0", "inf,0,0", "0,0,1e10"] {
             assert!(parse_point(bad).is_err(), "{bad}");
         }
+    }
+
+    /// Lists and questions have the same limits.
+    #[test]
+    fn lengths_and_regions_keep_their_limits() {
+        assert_eq!(LENGTHS, format!("more than 0, at most {MAX_COORDINATE:e}"));
+        assert!(is_length(1e-9) && is_length(1e9));
+        for bad in [0.0, -1.0, 1e10, f64::INFINITY, f64::NAN] {
+            let ball = Some(Ball { centre_in_world: DVec3::ZERO, radius: bad });
+            let refused = check_region(&Region { ball, ..Region::default() }).expect_err("a wrong radius");
+            assert_eq!((refused.parameter.as_str(), refused.expected.as_str()), ("radius", LENGTHS));
+        }
+        for max in [DVec3::new(1.0, 1.0, 0.0), DVec3::new(1.0, -1.0, 1.0), DVec3::new(1.0, 1.0, 1e10)] {
+            let bounds = Some(Aabb { min: DVec3::ZERO, max });
+            let refused = check_region(&Region { bounds, ..Region::default() }).expect_err("no box");
+            assert_eq!(refused.parameter, "box", "{max}");
+        }
+        assert_eq!(check_region(&Region::default()), Ok(()));
     }
 
     #[test]

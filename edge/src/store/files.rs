@@ -37,6 +37,35 @@ fn at(path: &Path) -> impl Fn(io::Error) -> io::Error {
     }
 }
 
+/// Opens a file of the cache to read. What else stands at its place is refused: a pipe keeps its reader waiting,
+/// perhaps for ever.
+pub(super) fn open(path: &Path) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    options.read(true);
+    #[cfg(unix)]
+    {
+        let flags = rustix::fs::OFlags::NONBLOCK.bits() as i32;
+        std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, flags);
+    }
+    let file = options.open(path).map_err(at(path))?;
+    if file.metadata().map_err(at(path))?.is_file() {
+        return Ok(file);
+    }
+    let what = "a folder, a pipe or a device is there, expected a file";
+    Err(bad_medium(path, io::Error::new(io::ErrorKind::InvalidData, what)))
+}
+
+/// Removes what is no file from a file's place: a rename does not replace a folder, and a pipe keeps its writer
+/// waiting. Links stay.
+fn make_way(path: &Path) -> io::Result<()> {
+    match fs::symlink_metadata(path) {
+        Ok(about) if about.is_dir() => fs::remove_dir_all(path).map_err(at(path)),
+        Ok(about) if !about.is_file() && !about.is_symlink() => fs::remove_file(path).map_err(at(path)),
+        // What is wrong with the path, its user tells.
+        _ => Ok(()),
+    }
+}
+
 /// Returns the error of a medium that does not give a file back.
 pub fn bad_medium(path: &Path, source: io::Error) -> io::Error {
     io::Error::new(source.kind(), BadMedium { path: path.to_owned(), source })
@@ -53,7 +82,8 @@ pub struct Stat {
 
 /// File operations of the cache.
 ///
-/// Errors are those of the file system, with the path. Nothing is durable before [`Files::sync`] of the file
+/// Errors are those of the file system, with the path. All paths are the cache's own: a folder, a pipe or a device in
+/// a file's place is not read, and is removed where a file is written, renamed or removed. Nothing is durable before [`Files::sync`] of the file
 /// and [`Files::sync_dir`] of its folder.
 pub trait Files: Send + Sync {
     /// Creates a folder and its parents, durably.
@@ -100,6 +130,7 @@ impl Files for DiskFiles {
     }
 
     fn write_from(&self, path: &Path, offset_bytes: u64, bytes: &[u8]) -> io::Result<()> {
+        make_way(path)?;
         let write = || {
             let mut file = OpenOptions::new().write(true).create(true).truncate(false).open(path)?;
             file.set_len(offset_bytes)?;
@@ -114,6 +145,7 @@ impl Files for DiskFiles {
     }
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        make_way(to)?;
         fs::rename(from, to).map_err(at(to))
     }
 
@@ -122,6 +154,7 @@ impl Files for DiskFiles {
     }
 
     fn remove(&self, path: &Path) -> io::Result<()> {
+        make_way(path)?;
         match fs::remove_file(path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
             other => other.map_err(at(path)),
@@ -143,7 +176,7 @@ impl Files for DiskFiles {
     }
 
     fn read(&self, path: &Path, max_bytes: u64) -> io::Result<AlignedBytes> {
-        let file = File::open(path).map_err(at(path))?;
+        let file = open(path)?;
         let len_bytes = file.metadata().map_err(at(path))?.len();
         if len_bytes > max_bytes {
             let path = path.display();

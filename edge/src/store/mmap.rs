@@ -6,6 +6,8 @@ use std::path::Path;
 
 use slag_common::container::AlignedBytes;
 
+use super::files;
+
 /// The bytes of an immutable file, aligned for every column type.
 #[derive(Debug)]
 pub enum FileBytes {
@@ -31,7 +33,7 @@ impl Deref for FileBytes {
 /// mapped only after its last write, by the process that holds the cache's lock.
 #[expect(unsafe_code, reason = "mapping a file is unsafe by nature; every other module is safe")]
 pub fn map(path: &Path) -> io::Result<FileBytes> {
-    let file = fs_err::File::open(path)?;
+    let file = files::open(path)?;
     // Not every system can map an empty file.
     if file.metadata()?.len() == 0 {
         return Ok(FileBytes::Read(AlignedBytes::default()));
@@ -40,7 +42,7 @@ pub fn map(path: &Path) -> io::Result<FileBytes> {
     // name, old names are only unlinked, and an unlinked file stays readable while mapped), so the bytes
     // behind the shared slice do not change. Another program could still truncate the file in place: access
     // to the lost pages then raises SIGBUS, which ends the process.
-    let map = unsafe { memmap2::Mmap::map(file.file()) };
+    let map = unsafe { memmap2::Mmap::map(&file) };
     map.map(FileBytes::Mapped)
         .map_err(|e| io::Error::new(e.kind(), format!("mapping {}: {e}", path.display())))
 }

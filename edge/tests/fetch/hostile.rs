@@ -95,7 +95,10 @@ fn lasting_faults_are_given_up_and_told() {
         let (server, robot) = Robot::started(scene.clone());
         server.fault_at("objects", fault.clone());
         let count = Count::default();
-        match robot.fetch_watched(&count, &AtomicBool::new(false)).expect_err("lasting") {
+        let error = robot.fetch_watched(&count, &AtomicBool::new(false)).expect_err("lasting");
+        // What is wrong is dropped.
+        assert_eq!(error.to_string().contains("are kept"), fault == Fault::Cut(100), "{fault:?}: {error}");
+        match error {
             FetchError::Download { attempts, failure, .. } => {
                 assert!(
                     attempts == expected_attempts && is_expected(&failure),

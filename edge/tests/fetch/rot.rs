@@ -1,5 +1,6 @@
 //! A shard that rots on board costs its cell only, is named, and is fetched again.
 
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
@@ -20,7 +21,7 @@ use super::{Robot, assert_holds, at, cells};
 const UNREADABLE: BadCell = BadCell { cell_id: 1, fault: CellFault::Unreadable, old: None };
 
 /// Flips a bit of a file, and leaves its time as it was: no fetch would read it before a day has passed.
-pub fn flip_unseen(path: &std::path::Path) {
+pub fn flip_unseen(path: &Path) {
     let modified = fs_err::metadata(path).expect("there").modified().expect("known");
     let mut bytes = fs_err::read(path).expect("there");
     bytes[600] ^= 1;
@@ -58,6 +59,40 @@ fn a_rotten_shard_costs_its_cell_only() {
         assert_holds(&snapshot, &scene, 0..3);
         assert_eq!(snapshot.bad_cells, [], "{name}");
         assert_eq!(robot.fetch().expect("nothing new").downloaded.n_shards, 0, "{name}");
+    }
+}
+
+/// Each file of the generation on board, and what may stand in its place. A reader comes first: it waits for nobody,
+/// and marks what it finds.
+#[cfg(unix)]
+#[test]
+fn whatever_is_lost_is_put_back() {
+    let scene = Published::new(1, &[0; 3], 40);
+    let (_server, robot) = Robot::fetched(scene.clone());
+    let current = robot.cache.current().expect("readable").expect("fetched");
+    let mut paths = vec![robot.cache.current_path(), robot.cache.manifest_path(current.manifest_hash)];
+    paths.extend(current.shards().map(|hash| robot.cache.shard_path(hash)));
+    let faults: [(&str, fn(&Path)); 5] = [
+        ("nothing", |_| {}),
+        ("an empty file", |path| fs_err::write(path, b"").expect("written")),
+        ("another file", |path| fs_err::write(path, b"{}").expect("written")),
+        ("a folder", |path| fs_err::create_dir_all(path.join("inside")).expect("made")),
+        ("a pipe", |path| {
+            let made = std::process::Command::new("mkfifo").arg(path).status();
+            assert!(made.expect("runs").success());
+        }),
+    ];
+    for path in &paths {
+        for (name, put) in faults {
+            let context = format!("{name} at {}", path.display());
+            fs_err::remove_file(path).expect("there");
+            put(path);
+            drop(Snapshot::open(&robot.cache));
+            robot.fetch().unwrap_or_else(|e| panic!("{context}: {e}"));
+            let snapshot = Snapshot::open(&robot.cache).unwrap_or_else(|e| panic!("{context}: {e}"));
+            assert_eq!(snapshot.bad_cells, [], "{context}");
+            assert_holds(&snapshot, &scene, 0..3);
+        }
     }
 }
 

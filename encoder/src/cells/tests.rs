@@ -61,6 +61,57 @@ fn errors_finer_than_coordinates_are_counted() {
     assert_eq!((result.cells.len(), result.n_for_precision), (100, 100));
 }
 
+/// A hundred thousand Gaussians of a sky do not decide how exact the few thousand of a chair are, nor where the
+/// nearest are; ordinary cells, whose sizes differ less, keep their 10th percentile.
+#[test]
+fn a_sky_costs_the_chair_no_precision() {
+    let (n_near, n_far) = (3_500, 60_000);
+    let place = |i: usize| DVec3::new((i % 17) as f64, (i % 19) as f64, (i % 23) as f64) / 30.0;
+    let near = (0..n_near).map(place);
+    let means: Vec<DVec3> =
+        near.chain((0..n_far).map(|i| place(i).normalize_or(DVec3::X) * 1000.0)).collect();
+    let mut scene = Gaussians::balls(means, 15.0);
+    scene.scales[..n_near].fill([0.01; 3]);
+    let result = split(&scene, CellLimits::by_count(65_536));
+    for g in 0..n_near {
+        let cell = &result.cells[result.cell_of_gaussian[g] as usize];
+        let error = cell.grid.step.into_iter().fold(0.0, f64::max) / 2.0;
+        assert!(error <= 0.01 / 4.0, "{error}");
+    }
+    let all: Vec<u32> = (0..scene.len() as u32).collect();
+    let error = PositionError::OfSize.of_part(&scene, &all);
+    assert!((error - f64::from(0.01f32) / 4.0).abs() < 1e-9, "{error}");
+    // Sizes of 1 to 7 are those of one scene.
+    let ordinary: Vec<f32> = (0..60_000).map(|i| 1.0 + 6.0 * (i as f32 / 6_000.0).min(1.0)).collect();
+    assert_eq!(of_small(ordinary), 7.0);
+    // Points without a size say nothing of it, nor do few Gaussians.
+    assert_eq!(of_small([vec![0.0; 600], vec![5.0; 60_000]].concat()), 5.0);
+    assert_eq!(of_small([vec![0.01; 512], vec![5.0; 60_000]].concat()), 5.0);
+    assert_eq!(of_small(vec![1.0; 9]), 1.0);
+}
+
+/// A few huge Gaussians count in their cell's box like the largest of the others, which count whole.
+#[test]
+fn huge_gaussians_leave_the_boxes_of_cells_small() {
+    let means: Vec<[f64; 3]> = (0..4000).map(|i| [f64::from(i) / 100.0, 0.0, 0.0]).collect();
+    let mut huge = scene(&means, 0.1);
+    let ordinary = split(&huge, CellLimits::by_count(1000));
+    (0..4).for_each(|k| huge.scales[500 + 1000 * k] = [490.0; 3]);
+    let result = split(&huge, CellLimits::by_count(1000));
+    assert_eq!((result.cells.len(), ordinary.cells.len()), (4, 4));
+    for (cell, before) in result.cells.iter().zip(&ordinary.cells) {
+        assert_eq!((&cell.gaussians, cell.mean_bounds), (&before.gaussians, before.mean_bounds));
+        let width = cell.mean_bounds.size().max_element();
+        assert!(cell.bounds.size().max_element() <= width + 1.3, "{:?}", cell.bounds);
+        assert!(before.bounds.size().max_element() > width + 0.5, "their own extents stay");
+    }
+    // Of a hundred, one is no stray.
+    let mut few = scene(&means[..100], 0.1);
+    few.scales[7] = [490.0; 3];
+    let bounds = split(&few, CellLimits::by_count(1000)).cells[0].bounds;
+    assert!(bounds.size().min_element() >= 6.0 * 490.0, "{bounds:?}");
+}
+
 #[test]
 fn morton_interleaves_bits() {
     assert_eq!(spread_bits(0b1011), 0b1_000_001_001);

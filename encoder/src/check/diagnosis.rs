@@ -26,6 +26,8 @@ const SWEEP_LIMIT: f64 = 64.0;
 /// First step of the refinement: rotation in radians, scale in its logarithm, translation in scene diagonals.
 const FIRST_STEP: f64 = 0.02;
 const HALVINGS: u32 = 6;
+/// The same of a focal length, in its logarithm: half the way to the next that is tried.
+const FIRST_FOCAL_STEP: f64 = 0.1;
 /// Gain below which the refinement fits noise of the few small samples, dB: the frame stays as computed.
 const REFINED_GAIN_DB: f64 = 1.0;
 
@@ -66,11 +68,18 @@ pub(super) struct Means {
     /// PSNR of photos against their mean colour.
     pub(super) flat_psnr_db: f64,
     pub(super) covered_share: f64,
+    /// Whether more than half of the views fit.
+    pub(super) most_fit: bool,
 }
 
 impl Means {
-    /// Returns whether the drawings look like their photos.
+    /// Returns whether the drawings look like their photos, on average and most of them: a few that are drawn well
+    /// raise an average.
     pub(super) fn fit(&self) -> bool {
+        self.average_fits() && self.most_fit
+    }
+
+    pub(super) fn average_fits(&self) -> bool {
         self.psnr_db >= self.flat_psnr_db + CLEAR_GAIN_DB
     }
 }
@@ -236,6 +245,9 @@ impl Search<'_> {
     /// Moves a similarity that is computed from other data than the trainer's, or swept, to where the drawings
     /// match best (pattern search, Hooke and Jeeves 1961). Others are exact.
     fn refined(&self, best: Trial) -> Result<Trial, CheckError> {
+        if let Mistake::FocalScale(_) = best.mistake {
+            return self.refined_focal(best);
+        }
         // Directions of the search: scale, three rotations and three translations, up and down.
         let (directions, least_gain_db) = match best.mistake {
             Mistake::Frame(FrameCandidate { cause: FrameCause::NerfstudioDefaults, .. }) => {
@@ -263,6 +275,23 @@ impl Search<'_> {
             step *= 0.5;
         }
         Ok(if found.psnr_db > best.psnr_db + least_gain_db { found } else { best })
+    }
+}
+
+impl Search<'_> {
+    /// Moves a factor of focal lengths, of which few are tried, to where the drawings match best.
+    fn refined_focal(&self, best: Trial) -> Result<Trial, CheckError> {
+        let (mut found, mut step) = (best, FIRST_FOCAL_STEP);
+        for _ in 0..=HALVINGS {
+            for step in [step, -step] {
+                if let (Mistake::FocalScale(factor), true) = (found.mistake, self.goes_on()) {
+                    let moved = self.trial(Mistake::FocalScale(factor * f64::exp(step)))?;
+                    found = if moved.psnr_db > found.psnr_db { moved } else { found };
+                }
+            }
+            step *= 0.5;
+        }
+        Ok(if found.psnr_db > best.psnr_db + REFINED_GAIN_DB { found } else { best })
     }
 }
 

@@ -24,6 +24,13 @@ pub enum Mistake {
     IntrinsicsOfSize(f64),
     /// The principal point is at 0 instead of the middle.
     CentreAtZero,
+    /// Principal point, and perhaps focal lengths, are shares of the image: x and y must be multiplied by these.
+    SharesOfImage {
+        centre_by: [f64; 2],
+        focal_by: [f64; 2],
+    },
+    /// x and y of the principal point are swapped.
+    CentreSwapped,
     /// The scene is larger than the cameras' world by this factor.
     SceneScale(f64),
     /// The worlds differ by right angles: axis i of the splat's is this axis of the cameras', counted from 1, with
@@ -68,6 +75,9 @@ pub enum FrameCause {
 /// Nerfstudio's world axes from COLMAP's: x and y swapped, z negated.
 const COLMAP_AXES: [i8; 3] = [2, 1, -3];
 
+/// Factors of focal lengths that are tried; the best is refined.
+const FOCAL_SCALES: [f64; 8] = [0.5, 2.0, 0.25, 4.0, 0.7, 1.4, 0.35, 2.8];
+
 impl Mistake {
     /// Mistakes under which drawings still look like their photos.
     pub(super) const UNNOTICED: [Self; 2] = [Self::RotationsXyzw, Self::RotationsInverted];
@@ -76,7 +86,7 @@ impl Mistake {
     pub(super) fn common() -> Vec<Self> {
         let cameras =
             [Self::OpenGlAxes, Self::WorldFromCamera, Self::WorldFromOpenGlCamera, Self::UpsideDown];
-        let focals = [0.5, 2.0].map(Self::FocalScale);
+        let focals = FOCAL_SCALES.map(Self::FocalScale);
         let scales = [0.01, 0.1, 10.0, 100.0].map(Self::SceneScale);
         let axes = right_angles().into_iter().map(Self::WorldAxes);
         let mirrored = (0..3).map(Self::Mirrored);
@@ -120,6 +130,13 @@ impl Mistake {
                 camera.centre_x_px = f64::from(camera.width_px) / 2.0;
                 camera.centre_y_px = f64::from(camera.height_px) / 2.0;
             }
+            Self::SharesOfImage { centre_by, focal_by } => {
+                camera.focal_x_px *= focal_by[0];
+                camera.focal_y_px *= focal_by[1];
+                camera.centre_x_px *= centre_by[0];
+                camera.centre_y_px *= centre_by[1];
+            }
+            Self::CentreSwapped => std::mem::swap(&mut camera.centre_x_px, &mut camera.centre_y_px),
             Self::SceneScale(_) | Self::WorldAxes(_) | Self::Frame(_) => {
                 if let Some(similarity) = self.splat_from_poses() {
                     *pose = similarity.camera_from_target(*pose);
@@ -183,6 +200,7 @@ impl fmt::Display for Mistake {
                  pixels (exiftran -a, or mogrify -auto-orient)"
             ),
             Self::FocalScale(factor) => {
+                let factor = (factor * 1000.0).round() / 1000.0;
                 write!(f, "the focal length belongs to another image size or sensor; multiply it by {factor}")
             }
             Self::IntrinsicsOfSize(factor) => write!(
@@ -193,6 +211,12 @@ impl fmt::Display for Mistake {
             Self::CentreAtZero => {
                 write!(f, "the principal point is at 0; set it to half the width and half the height")
             }
+            Self::SharesOfImage { focal_by, .. } => {
+                let what =
+                    if focal_by[0] == 1.0 { "principal point is a share" } else { "intrinsics are shares" };
+                write!(f, "the {what} of the image, not pixels; multiply by width and height")
+            }
+            Self::CentreSwapped => write!(f, "x and y of the principal point are swapped; swap them back"),
             Self::SceneScale(factor) => write!(
                 f,
                 "the scene is {factor:.4} times as large as the cameras' world; multiply the camera positions by \

@@ -63,7 +63,7 @@ where
     let means = means_of(&checks);
     let mut suspicions: Vec<String> =
         options.suspicions.iter().map(|suspicion| suspicion.text.clone()).collect();
-    suspicions.extend(odd_views(&checks).filter(|_| means.fit()));
+    suspicions.extend(odd_views(&checks).filter(|_| means.average_fits()));
     let is_suspect = options.suspicions.iter().any(|suspicion| suspicion.mistake.is_some());
     let diagnosis = if means.psnr_db < FLAWLESS_DB || !means.fit() || is_suspect {
         let found = samples.diagnose(scene, &*loaded, rasterizer, &means, options)?;
@@ -142,6 +142,7 @@ fn means_of(checks: &[ViewCheck]) -> Means {
         psnr_db: mean(told.iter().map(|c| c.psnr_db)),
         flat_psnr_db: mean(told.iter().map(|c| c.flat_psnr_db)),
         covered_share: mean(checks.iter().map(|c| c.covered_share)),
+        most_fit: 2 * told.iter().filter(|c| c.fits()).count() > told.len(),
     }
 }
 

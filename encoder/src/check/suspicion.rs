@@ -3,7 +3,7 @@
 use std::hash::{DefaultHasher, Hash, Hasher};
 
 use glam::DVec3;
-use slag_common::{Gaussians, Similarity, View};
+use slag_common::{Distortion, Gaussians, Intrinsics, Similarity, View};
 use slag_math::stats::{Rank, quantile};
 
 use super::mistake::{FrameCandidate, FrameCause, Mistake};
@@ -18,6 +18,14 @@ const ACTIVATED_OPACITY: f32 = 0.7311;
 const INVISIBLE: f32 = 1.0 / 255.0;
 /// Relative difference between the middle of a photo and its principal point that no lens has.
 const OFF_CENTRE: f64 = 0.15;
+/// Logarithm of the ratio of both focal lengths that no lens has.
+const UNEQUAL_FOCALS: f64 = 0.15;
+/// Fields of view that photos of a scene have, degrees.
+const USUAL_DEGREES: std::ops::RangeInclusive<f64> = 3.0..=150.0;
+/// Focal lengths below it are no pixels, if the principal point is none, either.
+const MOST_SHARES: f64 = 16.0;
+/// Gaussians below which a splat is hardly one.
+const FEW: usize = 10;
 /// The worlds of splat and cameras are apart if their middles are this many of their sizes from each other.
 const APART: f64 = 10.0;
 
@@ -44,7 +52,7 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
         );
         Suspicion { text, mistake: Some(Mistake::Frame(frame)) }
     }));
-    found.extend(intrinsics(views).map(of_mistake));
+    found.extend(intrinsics(&views.iter().map(|view| view.intrinsics).collect::<Vec<_>>()));
     found
 }
 
@@ -53,6 +61,9 @@ fn undrawable(scene: &Gaussians, usable: &[usize]) -> Vec<String> {
     let mut found: Vec<String> = Vec::new();
     if usable.is_empty() {
         found.push("the splat has no Gaussians that can be drawn".into());
+    } else if usable.len() < FEW {
+        let n = usable.len();
+        found.push(format!("the splat has only {n} Gaussians that can be drawn: is it the whole export?"));
     } else if share(usable, |i| scene.scales[i] == [0.0; 3]) > 0.5 {
         let advice = "export the splat again, or leave out --activated scales";
         found.push(format!("most Gaussians are points without a size; {advice}"));
@@ -163,12 +174,85 @@ fn shifted(scene: &Gaussians, views: &[View]) -> Option<FrameCandidate> {
     translation.is_finite().then_some(FrameCandidate { cause: FrameCause::Shifted, splat_from_poses })
 }
 
+/// Returns what is wrong with the intrinsics of all photos in the same way.
+fn intrinsics(cameras: &[Intrinsics]) -> Vec<Suspicion> {
+    let Some(first) = cameras.first() else { return Vec::new() };
+    if let Some(mistake) = mistaken_centre(cameras, first) {
+        return vec![Suspicion { text: mistake.to_string(), mistake: Some(mistake) }];
+    }
+    let Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, .. } = *first;
+    let mut texts = Vec::new();
+    if cameras.iter().all(|camera| is_off(relative_centre(camera))) {
+        texts.push(format!(
+            "the principal point ({centre_x_px:.1}, {centre_y_px:.1}) px is far from the middle of photos of {width_px} x \
+             {height_px} px: check the intrinsics, and that the photos are not cropped"
+        ));
+    }
+    if cameras.iter().all(|camera| (camera.focal_x_px / camera.focal_y_px).ln().abs() > UNEQUAL_FOCALS) {
+        texts.push(format!(
+            "the focal lengths along x and y, {focal_x_px:.2} and {focal_y_px:.2} px, differ as those of no lens do: one \
+             of them is wrong"
+        ));
+    }
+    let is_unusual = |camera: &Intrinsics| {
+        // The angles of a fisheye's pixels are no tangents.
+        !matches!(camera.distortion, Distortion::Fisheye { .. })
+            && !USUAL_DEGREES.contains(&field_of_view_degrees(camera))
+    };
+    if cameras.iter().all(is_unusual) {
+        let degrees = field_of_view_degrees(first);
+        texts.push(format!(
+            "a focal length of {focal_x_px:.2} px is a field of view of {degrees:.1} degrees: focal lengths are pixels, neither \
+             millimetres nor shares of the image"
+        ));
+    }
+    texts.into_iter().map(|text| Suspicion { text, mistake: None }).collect()
+}
+
+/// Returns the wider of a pinhole camera's angles.
+fn field_of_view_degrees(camera: &Intrinsics) -> f64 {
+    let x = f64::from(camera.width_px) / camera.focal_x_px;
+    let y = f64::from(camera.height_px) / camera.focal_y_px;
+    (2.0 * (x.max(y) / 2.0).atan()).to_degrees()
+}
+
+/// Returns the principal point in halves of the image's sides.
+fn relative_centre(camera: &Intrinsics) -> [f64; 2] {
+    let of = |centre_px: f64, side_px: u32| 2.0 * centre_px / f64::from(side_px);
+    [of(camera.centre_x_px, camera.width_px), of(camera.centre_y_px, camera.height_px)]
+}
+
+fn is_off(centre: [f64; 2]) -> bool {
+    centre.iter().any(|at| (at - 1.0).abs() > OFF_CENTRE)
+}
+
 /// Returns the mistake of principal points that are far from the middle of the photos in the same way.
-fn intrinsics(views: &[View]) -> Option<Mistake> {
+fn mistaken_centre(cameras: &[Intrinsics], first: &Intrinsics) -> Option<Mistake> {
+    let is_share = |camera: &Intrinsics| {
+        let is_within = |centre: f64| centre > 0.0 && centre <= 1.0;
+        is_within(camera.centre_x_px) && is_within(camera.centre_y_px) && is_off(relative_centre(camera))
+    };
+    if cameras.iter().all(is_share) {
+        let [width, height] = [first.width_px, first.height_px].map(f64::from);
+        // One focal length is a share of the width, two are of their own sides.
+        let focal_by = match [first.focal_x_px, first.focal_y_px] {
+            [x, y] if x.max(y) >= MOST_SHARES => [1.0; 2],
+            [x, y] if x == y => [width; 2],
+            _ => [width, height],
+        };
+        return Some(Mistake::SharesOfImage { centre_by: [width, height], focal_by });
+    }
+    let is_swapped = |camera: &Intrinsics| {
+        let swapped =
+            Intrinsics { centre_x_px: camera.centre_y_px, centre_y_px: camera.centre_x_px, ..*camera };
+        is_off(relative_centre(camera)) && !is_off(relative_centre(&swapped))
+    };
+    if cameras.iter().all(is_swapped) {
+        return Some(Mistake::CentreSwapped);
+    }
     let mut factors = Vec::new();
-    for camera in views.iter().map(|view| view.intrinsics) {
-        let x = 2.0 * camera.centre_x_px / f64::from(camera.width_px);
-        let y = 2.0 * camera.centre_y_px / f64::from(camera.height_px);
+    for camera in cameras {
+        let [x, y] = relative_centre(camera);
         if x == 0.0 || y == 0.0 {
             return Some(Mistake::CentreAtZero);
         }

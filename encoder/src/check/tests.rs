@@ -1,4 +1,4 @@
-//! Tests of similarities from camera centres and of nerfstudio's frames.
+//! Tests of similarities from camera centres, of nerfstudio's frames, and of what is suspected without a drawing.
 
 use std::path::PathBuf;
 
@@ -6,8 +6,8 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use slag_common::{Similarity, View};
 
 use super::align::AlignError;
-use super::{FrameCause, align, nerfstudio_defaults};
-use crate::raster::pinhole;
+use super::{FrameCause, Mistake, Suspicion, ViewCheck, align, means_of, nerfstudio_defaults, suspicions};
+use crate::raster::{RasterView, pinhole};
 
 fn view(name: &str, world_from_camera: DAffine3) -> View {
     View {
@@ -157,4 +157,94 @@ fn nerfstudios_defaults_are_its_formulas() {
             assert!((image - expected * scale).length() < 1e-12, "{image}");
         }
     }
+}
+
+/// By hand: two of five photos that are drawn well raise the average above that of plain colours, and half of the
+/// photos are no majority. A photo under a lens cap does not count.
+#[test]
+fn most_views_must_fit() {
+    let checked = |psnr_db: f64, flat_psnr_db: f64| ViewCheck {
+        name: String::new(),
+        psnr_db,
+        flat_psnr_db,
+        covered_share: 1.0,
+        visible_gaussians: 1,
+    };
+    let fit = |good: usize, bad: usize, capped: usize| {
+        let all = [
+            vec![checked(45.0, 12.0); good],
+            vec![checked(11.0, 12.0); bad],
+            vec![checked(5.0, 99.0); capped],
+        ];
+        let means = means_of(&all.concat());
+        (means.average_fits(), means.fit())
+    };
+    assert_eq!(fit(2, 3, 0), (true, false));
+    assert_eq!(fit(2, 2, 1), (true, false));
+    assert_eq!(fit(3, 2, 3), (true, true));
+    assert_eq!(fit(0, 5, 0), (false, false));
+}
+
+/// Intrinsics of photos of 640 x 480 pixels as people have them wrong, and right.
+#[test]
+fn intrinsics_of_no_camera_are_suspected() {
+    let said = |focal: [f64; 2], centre: [f64; 2]| -> Vec<Suspicion> {
+        let intrinsics = slag_common::Intrinsics {
+            focal_x_px: focal[0],
+            focal_y_px: focal[1],
+            centre_x_px: centre[0],
+            centre_y_px: centre[1],
+            ..pinhole([640, 480], 1.0)
+        };
+        let views: Vec<View> = views(&FROM).into_iter().map(|view| View { intrinsics, ..view }).collect();
+        let scene = slag_common::Gaussians::balls(views.iter().map(View::position_in_world).collect(), 0.1);
+        let scene = scene.select(&[0, 1, 2, 3, 4, 5, 0, 1, 2, 3]);
+        suspicions(&scene, &views)
+    };
+    let middle = [320.0, 240.0];
+    for right in [[557.0; 2], [557.0, 600.0], [100.0; 2], [9000.0; 2]] {
+        assert_eq!(said(right, middle), []);
+    }
+    assert_eq!(said([557.0; 2], [340.0, 225.0]), []);
+    let mistake = |focal: [f64; 2], centre: [f64; 2]| {
+        let found = said(focal, centre);
+        assert_eq!(found.len(), 1, "{focal:?} {centre:?}: {found:?}");
+        found[0].mistake
+    };
+    let shares = |focal_by| Some(Mistake::SharesOfImage { centre_by: [640.0, 480.0], focal_by });
+    assert_eq!(mistake([0.87; 2], [0.5, 0.5]), shares([640.0; 2]));
+    assert_eq!(mistake([0.87, 1.16], [0.5, 0.5]), shares([640.0, 480.0]));
+    assert_eq!(mistake([557.0; 2], [0.5, 0.48]), shares([1.0; 2]));
+    assert_eq!(mistake([557.0; 2], [240.0, 320.0]), Some(Mistake::CentreSwapped));
+    assert_eq!(mistake([557.0; 2], [0.0, 0.0]), Some(Mistake::CentreAtZero));
+    assert_eq!(mistake([557.0; 2], [640.0, 480.0]), Some(Mistake::IntrinsicsOfSize(2.0)));
+    for (focal, centre, words) in [
+        ([557.0; 2], [-320.0, -240.0], "far from the middle of photos of 640 x 480 px"),
+        ([557.0; 2], [600.0, 240.0], "far from the middle"),
+        ([557.0, 139.0], middle, "557.00 and 139.00 px, differ"),
+        ([26.0; 2], middle, "neither millimetres nor shares"),
+        ([20_000.0; 2], middle, "field of view of 1.8 degrees"),
+    ] {
+        let found = said(focal, centre);
+        let [Suspicion { text, mistake: None }] = &found[..] else { panic!("{words}: {found:?}") };
+        assert!(text.contains(words), "{text}");
+    }
+    // The corrections are those of cameras at any size.
+    let camera = slag_common::Intrinsics { centre_x_px: 0.5, centre_y_px: 0.5, ..pinhole([640, 480], 0.87) };
+    let small = RasterView { intrinsics: camera.scaled_to(320, 240), camera_from_world: DAffine3::IDENTITY };
+    let corrected = shares([640.0; 2]).expect("a mistake").corrected(&small).intrinsics;
+    assert!(
+        (corrected.focal_y_px - 0.87 * 320.0).abs() < 1e-9 && corrected.centre_y_px == 120.0,
+        "{corrected:?}"
+    );
+}
+
+#[test]
+fn a_splat_of_a_few_gaussians_is_suspected() {
+    let said = |n: usize| {
+        let means = (0..n).map(|i| DVec3::X * i as f64).collect();
+        suspicions(&slag_common::Gaussians::balls(means, 0.1), &[])
+    };
+    assert!(said(1)[0].text.contains("only 1 Gaussians"));
+    assert_eq!(said(10), []);
 }

@@ -23,8 +23,8 @@ use super::summary::lines;
 use crate::cells::PositionError;
 use crate::encode::front::{Expectation, Front, Target};
 use crate::encode::{
-    DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, InputSettings, MAX_CELL_GAUSSIANS, Masks, ViewsLimit,
-    count_inputs,
+    DEFAULT_CELL_WIDTH_M, EncodeSettings, Engines, InputSettings, MAX_CELL_GAUSSIANS, Masks, Restart,
+    ViewsLimit, count_inputs,
 };
 use crate::occupancy::OccupancySettings;
 use crate::progress::Progress;
@@ -32,6 +32,7 @@ use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::report::{self, Recorder};
 use crate::segment::{SamLevels, SamSettings};
+use crate::store;
 use crate::viewpoints::{DEFAULT_N_VIEWS, POSES_FILE, ViewpointSettings};
 
 #[cfg(not(feature = "fleet"))]
@@ -103,7 +104,7 @@ pub struct EncodeArgs {
     memory: Option<u64>,
     #[command(flatten)]
     up: UpArgs,
-    /// Name of the scene [default: the name of the store's folder].
+    /// Name of the scene [default: that of the store's generation, or else of the store's folder].
     #[arg(long, value_name = "NAME", value_parser = parse_name, help_heading = "Output", hide_short_help = true)]
     name: Option<String>,
     /// World units are metres; a geo-reference implies it.
@@ -160,7 +161,7 @@ pub struct EncodeArgs {
     /// left out and why.
     #[arg(long, value_name = "FILE", help_heading = "Output")]
     report: Option<PathBuf>,
-    /// Drops an unfinished encode of another splat or with other settings in the store.
+    /// Drops the views that the store keeps, of an unfinished encode or of any other: all are made again.
     #[arg(long, help_heading = "Output", hide_short_help = true)]
     restart: bool,
 }
@@ -195,7 +196,7 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     run.memory_bytes = args.memory.unwrap_or_else(default_memory_bytes);
     run.time_budget = args.time_budget;
     run.strict = input.strict;
-    run.restart = args.restart;
+    run.restart = if args.restart { Restart::Always } else { Restart::Never };
     run.keep_views = args.keep_views || !args.added.is_empty() || !args.dropped.is_empty();
     run.allow_empty = args.allow_empty;
     choices.apply(&mut settings);
@@ -226,8 +227,11 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     cells.occupancy = args.occupancy.map(|voxel_m| OccupancySettings { voxel_m });
     cells.photo_poses = args.photo_poses;
     cells.landmarks = args.locate;
-    let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
-    output.scene_name = args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into());
+    // Robots keep to the scene that they know by its name.
+    let published_name = || store::scene_name(&args.store);
+    let folder_name = || args.store.file_name().map(|name| name.to_string_lossy().into_owned());
+    let name = args.name.clone().or_else(published_name).or_else(folder_name);
+    output.scene_name = name.unwrap_or_else(|| "scene".into());
     output.created_unix_secs = now_unix_secs()?;
     output.models = args.models.models.as_deref().map(lasting_name);
     output.text_model = args.text_model;
@@ -425,10 +429,12 @@ fn parse_offset(text: &str) -> Result<f32, String> {
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
+    use std::ffi::OsStr;
+
+    use clap::{CommandFactory, Parser};
 
     use super::*;
-    use crate::cli::Cli;
+    use crate::cli::{Cli, Command};
     use crate::encode::{EncodeSettings, ViewsLimit};
 
     #[test]
@@ -444,6 +450,30 @@ mod tests {
             let message = format!("{:#}", parse_choices(wrong).expect_err("refused"));
             assert!(message.contains(wrong), "{message}");
         }
+    }
+
+    /// A scene that was named once keeps its name, also where its manifest is damaged since; a new one has that of its
+    /// folder.
+    #[test]
+    fn a_scene_keeps_its_name() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let folder = dir.path().join("lab");
+        let name = |flags: &[&str]| {
+            let line = ["slag-encoder", "encode", "--scene", "a.ply", "--views", "b", "--store"];
+            let line = line.iter().map(OsStr::new).chain([folder.as_os_str()]);
+            let parsed = Cli::try_parse_from(line.chain(flags.iter().map(OsStr::new))).expect("flags");
+            let Command::Encode(args) = parsed.command else { panic!("encode") };
+            settings(&args, &args.choices).expect("settings").output.scene_name
+        };
+        assert_eq!((name(&[]), name(&["--name", "hall"])), ("lab".to_owned(), "hall".to_owned()));
+        let published = store::Store::create_or_open(&folder).expect("opens");
+        for generation in 1..=2 {
+            let manifest = store::tests::manifest(generation, &[]);
+            published.publish(&manifest, &store::Extras::new()).expect("publishes");
+        }
+        assert_eq!((name(&[]), name(&["--name", "hall"])), ("yard".to_owned(), "hall".to_owned()));
+        fs_err::write(folder.join("manifest"), "{").expect("damages");
+        assert_eq!(name(&[]), "yard");
     }
 
     #[test]

@@ -216,6 +216,9 @@ mod tests {
             "--time-budget 0",
             "--time-budget inf",
             "--threads 0",
+            "--threads 1025",
+            "--model-threads 257",
+            "--sam-threads 1025",
             "--preset best",
         ] {
             assert!(

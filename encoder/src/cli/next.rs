@@ -6,12 +6,13 @@ use std::path::Path;
 
 use anyhow::Result;
 use glam::DVec3;
+use slag_common::files;
 use slag_common::frames::Aabb;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::CellRecord;
+use slag_common::shard::{HEADER_END_BYTES, ShardHeader};
 
 use super::common::InputArgs;
 use crate::store::StoreReader;
-use crate::store::ceremony::default_root_folder;
 use crate::store::metadata::MetadataReader;
 
 /// Share of the Gaussians that the extent leaves out on each side of each axis: strays lie far away.
@@ -32,8 +33,11 @@ pub(super) fn of_store(store: &Path) -> Result<String> {
 pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
     let reader = StoreReader::open(store)?;
     let manifest = reader.manifest();
-    let root = MetadataReader::new(store).keys_status(&default_root_folder(store))?.root_sha256;
-    let (extent, at) = extent_and_place(manifest);
+    let root = MetadataReader::new(store).root_sha256()?;
+    let boxes: Vec<(Aabb, f64)> = (manifest.cells.iter())
+        .map(|cell| (mean_box(&reader, cell).unwrap_or(cell.bounds), f64::from(cell.n_gaussians)))
+        .collect();
+    let (extent, at) = extent_and_place(&boxes);
     let unit = if manifest.metric { "m" } else { "world units" };
     let size = extent.max - extent.min;
     let base = ["0.0.0.0", "[::]"].iter().fold(url.to_owned(), |url, any| url.replace(any, &host_name()));
@@ -62,14 +66,21 @@ pub(super) fn of_check(input: &InputArgs) -> String {
     )
 }
 
-/// Returns the extent without strays, and the centre of the cell in the middle of the Gaussians.
-fn extent_and_place(manifest: &Manifest) -> (Aabb, DVec3) {
-    let total: f64 = manifest.cells.iter().map(|cell| f64::from(cell.n_gaussians)).sum();
+/// Returns the box around the means of a cell, which large Gaussians do not reach beyond, by the head of one of its
+/// shards; `None` where that cannot be read.
+fn mean_box(reader: &StoreReader, cell: &CellRecord) -> Option<Aabb> {
+    let shard = cell.shards.values().next()?;
+    let head = files::read_short(&reader.object_path(shard.hash), HEADER_END_BYTES).ok()?;
+    Some(ShardHeader::of_start(&head)?.position_box())
+}
+
+/// Returns the extent without strays, and the centre of the cell in the middle of the Gaussians. `boxes`: of each
+/// cell, with the number of its Gaussians.
+fn extent_and_place(boxes: &[(Aabb, f64)]) -> (Aabb, DVec3) {
+    let total: f64 = boxes.iter().map(|(_, n)| n).sum();
     // The coordinate below which a share of the Gaussians lies, each at its cell's side.
     let quantile = |axis: usize, share: f64, side: fn(&Aabb) -> DVec3| {
-        let mut sides: Vec<(f64, f64)> = (manifest.cells.iter())
-            .map(|cell| (side(&cell.bounds)[axis], f64::from(cell.n_gaussians)))
-            .collect();
+        let mut sides: Vec<(f64, f64)> = boxes.iter().map(|(of, n)| (side(of)[axis], *n)).collect();
         sides.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut below = 0.0;
         let found = sides.iter().find(|(_, n)| {
@@ -82,9 +93,8 @@ fn extent_and_place(manifest: &Manifest) -> (Aabb, DVec3) {
         DVec3::from_array([0, 1, 2].map(|axis| quantile(axis, share, side)))
     };
     let extent = Aabb { min: all(STRAY_SHARE, |b| b.min), max: all(1.0 - STRAY_SHARE, |b| b.max) };
-    let centre = |b: &Aabb| (b.min + b.max) / 2.0;
-    let middle = all(0.5, |b| (b.min + b.max) / 2.0);
-    let centres = manifest.cells.iter().map(|cell| centre(&cell.bounds));
+    let middle = all(0.5, Aabb::centre);
+    let centres = boxes.iter().map(|(of, _)| of.centre());
     let nearest = centres.min_by(|a, b| a.distance_squared(middle).total_cmp(&b.distance_squared(middle)));
     (extent, nearest.unwrap_or(middle))
 }
@@ -113,6 +123,15 @@ fn shell_word(path: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// By hand: two cells side by side, and a stray one far away with a hundredth of the Gaussians.
+    #[test]
+    fn the_extent_is_that_of_most_cells() {
+        let cell = |x: f64, n| (Aabb { min: DVec3::new(x, 0.0, 0.0), max: DVec3::new(x + 2.0, 3.0, 1.0) }, n);
+        let (extent, at) = extent_and_place(&[cell(0.0, 500.0), cell(2.0, 480.0), cell(900.0, 9.0)]);
+        assert_eq!((extent.min, extent.max), (DVec3::ZERO, DVec3::new(4.0, 3.0, 1.0)));
+        assert_eq!(at, DVec3::new(1.0, 1.5, 0.5));
+    }
 
     #[test]
     fn odd_paths_are_quoted() {

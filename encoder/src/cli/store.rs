@@ -23,8 +23,8 @@ use crate::store::{
 pub enum StoreCommand {
     /// Lists the generations of a store with their cells and bytes.
     Ls(StoreArgs),
-    /// Reads every byte that a store publishes, and names what is damaged or missing: another encode writes it
-    /// anew.
+    /// Reads every byte that a store publishes, follows its metadata as a robot does, and names what is damaged or
+    /// missing: another encode writes it anew.
     Verify(StoreArgs),
     /// Removes what neither the current generation nor the one before it needs.
     Gc(StoreArgs),
@@ -192,18 +192,25 @@ impl fmt::Display for Lines<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Verified { n_files, len_bytes, bad } = self.0;
         for object in bad {
-            let fault = match &object.fault {
-                Fault::Missing => "missing",
-                Fault::Damaged => "damaged",
-                Fault::Unreadable(error) => error,
-            };
-            writeln!(f, "{}: {fault} ({})", object.path.display(), object.holds.join("; "))?;
+            let path = object.path.display();
+            match &object.fault {
+                Fault::Missing => write!(f, "{path}: missing")?,
+                Fault::Damaged => write!(f, "{path}: damaged")?,
+                Fault::Unreadable(error) => write!(f, "{path}: {error}")?,
+                Fault::Refused(what) => write!(f, "{path}: robots refuse it: {what}")?,
+            }
+            match object.holds.is_empty() {
+                true => writeln!(f)?,
+                false => writeln!(f, " ({})", object.holds.join("; "))?,
+            }
         }
         write!(f, "{n_files} files, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
+        // What helps against faults of metadata stands beside them.
+        let has_objects = bad.iter().any(|file| file.hash.is_some());
         writeln!(
             f,
             "{}",
-            if bad.is_empty() { "" } else { "; another encode into this store writes what is bad anew" }
+            if has_objects { "; another encode into this store writes objects anew" } else { "" }
         )
     }
 }

@@ -72,10 +72,12 @@ pub(super) fn open_text(models: ModelArgs) -> OpenText {
 }
 
 pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
+    let viewer = Viewer::new(shown(args)?);
+    // A store that is not there, or of another splat, is told here, not to the page alone.
+    viewer.check()?;
     check_page()?;
-    let shown = shown(args)?;
     let access = Access::new(&args.listen, AccessSettings::default())?;
-    let viewer = serve::bounded(router(Viewer::new(shown)), serve::Limits::default(), access);
+    let viewer = serve::bounded(router(viewer), serve::Limits::default(), access);
     runtime()?.block_on(async {
         let opened = |url: String| {
             let link = format!("{url}/view");

@@ -13,7 +13,7 @@ use crate::lift::ContributionError;
 use crate::memory::MemoryError;
 use crate::raster::RasterError;
 use crate::segment::SegmentError;
-use crate::store::StoreError;
+use crate::store::{StoreError, io_help, records_help};
 use crate::viewpoints::{DrawError, ViewpointError};
 
 #[derive(Debug, thiserror::Error)]
@@ -56,9 +56,11 @@ pub enum EncodeError {
     Store(#[from] StoreError),
     #[error(transparent)]
     Contributions(#[from] ContributionError),
-    #[error(transparent)]
+    #[error("view {view}: {}: {what}; run the same encode again: this view is made again, the others are kept", path.display())]
+    KeptView { view: String, path: PathBuf, what: String },
+    #[error("{0}; {help}", help = io_help(.0))]
     Io(#[from] std::io::Error),
-    #[error("job records: {0}; start over with --restart")]
+    #[error("job records: {0}; {help}", help = records_help(.0, "start over with --restart"))]
     Records(#[from] sled::Error),
     #[error(
         "{}: holds an unfinished encode of another splat or with other settings ({n_done} views done); finish it with its own \

@@ -172,6 +172,7 @@ fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<usize, Enco
     set.views.sort_by(|a, b| a.name.cmp(&b.name));
     set.without_pose.extend(added.without_pose);
     set.without_pose.sort();
+    set.damaged.extend(added.damaged);
     Ok(n_drawn)
 }
 

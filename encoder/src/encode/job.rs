@@ -1,15 +1,18 @@
 //! The state of an unfinished encode: which views are done, and their files of contributions.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io;
 use std::path::PathBuf;
 
 use serde::Serialize;
+use slag_common::container::ContainerError;
 use slag_common::{Hash32, View, durable};
 
 use super::error::EncodeError;
+use super::settings::Restart;
 use super::sink::{ViewRecord, ViewSink};
-use crate::lift::ViewContributions;
 use crate::lift::photos::{self, MaskOutline};
+use crate::lift::{ContributionError, ContributionFile, ViewContributions};
 use crate::store::Store;
 
 const TREE: &str = "job";
@@ -58,12 +61,12 @@ pub(crate) struct Job {
 
 impl Job {
     /// Takes up what an encode of the same scene left, or begins one. Views that it has done are done here, too,
-    /// where their identities are the same. `id_of_view`: by name.
+    /// where their identities are the same and their files are sound. `id_of_view`: by name.
     pub(super) fn open(
         store: &Store,
         of_scene: Hash32,
         id_of_view: BTreeMap<String, Hash32>,
-        restart: bool,
+        restart: Restart,
     ) -> Result<Self, EncodeError> {
         let folder = store.job_dir()?;
         let records = store.db().open_tree(TREE)?;
@@ -73,20 +76,78 @@ impl Job {
         let same = found.as_deref() == Some(&of_scene.0);
         let published = job.records.contains_key(PUBLISHED_KEY)?;
         // A published job loses only its contributions, which the published generation does not need.
-        if found.is_some() && !same && !restart && !published {
+        if found.is_some() && !same && restart == Restart::Never && !published {
             return Err(EncodeError::OtherJob {
                 path: store.dir().to_owned(),
                 n_done: job.records.scan_prefix(VIEW_PREFIX).count(),
             });
         }
-        if !same {
+        if !same || restart == Restart::Always {
             job.clear()?;
             job.records.insert(IDENTITY_KEY, &of_scene.0)?;
             job.flush()?;
         }
         fs_err::create_dir_all(job.views_folder())?;
         durable::write(&job.identity_path(), of_scene.to_string().as_bytes())?;
+        job.drop_damaged()?;
         Ok(job)
+    }
+
+    /// Drops the views of this encode that are recorded as done, but whose files are lost or damaged: they are made
+    /// again. The entries of contributions have checksums of their own, which the lift sees.
+    fn drop_damaged(&self) -> Result<(), EncodeError> {
+        for (view, id) in &self.id_of_view {
+            if !self.records.contains_key(record_key(*id))? {
+                continue;
+            }
+            let what = match self.check_files(view) {
+                Ok(()) => continue,
+                Err(ContributionError::Damaged { path, source }) => {
+                    format!("{}: {}", path.display(), first_clause(&source))
+                }
+                Err(ContributionError::Io(e)) if is_lost(&e) => e.to_string(),
+                Err(e) => return Err(e.into()),
+            };
+            tracing::warn!("view {view} is made again: {what}");
+            self.forget(*id)?;
+        }
+        Ok(())
+    }
+
+    /// Checks the files of a view, but for the entries of its contributions.
+    fn check_files(&self, view: &str) -> Result<(), ContributionError> {
+        let (_, regions) = ContributionFile::open(&self.contributions_path(view))?;
+        let n_masks = regions.mask_vectors.len() / regions.dim;
+        photos::read_outlines(&self.outlines_path(view), n_masks).map(drop)
+    }
+
+    /// Drops the view whose kept files an error names, so that the next encode makes it again, and returns the error
+    /// that says so.
+    pub(super) fn forget_damaged(&self, error: ContributionError) -> EncodeError {
+        let ContributionError::Damaged { path, source } = &error else { return error.into() };
+        let stem = path.file_stem().and_then(|stem| stem.to_str());
+        let of_path = |(_, id): &(&String, &Hash32)| stem.is_some_and(|stem| id.to_string() == stem);
+        let Some((view, id)) = self.id_of_view.iter().find(of_path) else { return error.into() };
+        match self.forget(*id) {
+            Ok(()) => {
+                let what = first_clause(source);
+                EncodeError::KeptView { view: view.clone(), path: path.clone(), what }
+            }
+            Err(error) => error,
+        }
+    }
+
+    /// Drops the record and then the files of a view.
+    fn forget(&self, id: Hash32) -> Result<(), EncodeError> {
+        self.records.remove(record_key(id))?;
+        self.flush()?;
+        for extension in ["contributions", "outlines"] {
+            match fs_err::remove_file(self.views_folder().join(format!("{id}.{extension}"))) {
+                Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e.into()),
+                _ => {}
+            }
+        }
+        Ok(())
     }
 
     /// Returns the views of this encode whose contributions are on disk.
@@ -267,12 +328,25 @@ impl ViewSink for Job {
     }
 }
 
+/// Returns what an error found, without its advice to delete the file.
+fn first_clause(error: &ContainerError) -> String {
+    let text = error.to_string();
+    text.split("; ").next().unwrap_or_default().to_owned()
+}
+
+/// Returns whether a file is gone, or shorter than it says.
+fn is_lost(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::UnexpectedEof)
+}
+
 fn record_key(id: Hash32) -> Vec<u8> {
     format!("{VIEW_PREFIX}{id}").into_bytes()
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
     fn keep(job: &Job, view: &str) {
@@ -290,7 +364,7 @@ mod tests {
 
     fn open_with(store: &Store, of_scene: u8, views: &[(&str, u8)]) -> Result<Job, EncodeError> {
         let id_of_view = views.iter().map(|(name, id)| ((*name).to_owned(), Hash32([*id; 32]))).collect();
-        Job::open(store, Hash32([of_scene; 32]), id_of_view, false)
+        Job::open(store, Hash32([of_scene; 32]), id_of_view, Restart::Never)
     }
 
     /// A view is done where its identity is: photos come, go and are replaced, and what none of them is goes when
@@ -352,6 +426,73 @@ mod tests {
             open_with(&store, 1, &[("a", 1)]).expect("goes on").clear_steps(n_steps).expect("drops");
             let other = open_with(&store, 2, &[("a", 1)]).unwrap_or_else(|e| panic!("{n_steps} steps: {e}"));
             assert!(other.done_views().expect("reads").is_empty(), "{n_steps} steps");
+        }
+    }
+
+    /// Every way in which a kept file can be lost, cut or damaged, but for entries: the view is made again, and no
+    /// other. A view is done again once its files are.
+    #[test]
+    fn views_with_damaged_files_are_made_again() {
+        let damages: [fn(&Path); 4] = [
+            |path| fs_err::remove_file(path).expect("there"),
+            |path| fs_err::write(path, b"").expect("writes"),
+            |path| {
+                let bytes = fs_err::read(path).expect("there");
+                fs_err::write(path, &bytes[..bytes.len() - 1]).expect("writes");
+            },
+            |path| {
+                let mut bytes = fs_err::read(path).expect("there");
+                bytes[20] ^= 1;
+                fs_err::write(path, bytes).expect("writes");
+            },
+        ];
+        for (number, damage) in damages.iter().enumerate() {
+            for of_contributions in [true, false] {
+                let dir = tempfile::tempdir().expect("a folder");
+                let store = Store::create_or_open(dir.path()).expect("opens");
+                let open = || open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("opens");
+                let done = |job: &Job| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
+                let job = open();
+                keep(&job, "a");
+                keep(&job, "b");
+                damage(&if of_contributions { job.contributions_path("a") } else { job.outlines_path("a") });
+                let job = open();
+                assert_eq!(done(&job), ["b"], "damage {number}");
+                assert!(!job.contributions_path("a").exists() && !job.outlines_path("a").exists());
+                keep(&job, "a");
+                assert_eq!(done(&open()), ["a", "b"], "damage {number}");
+            }
+        }
+    }
+
+    /// A checksum that the lift finds wrong names its file: the record of that view goes, and the error says what to
+    /// do.
+    #[test]
+    fn a_view_that_the_lift_finds_damaged_is_forgotten() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
+        keep(&job, "a");
+        keep(&job, "b");
+        let source = ContainerError::Checksum { id: 6, offset_bytes: 64, expected: 1, found: 2 };
+        let found = ContributionError::Damaged { path: job.contributions_path("a"), source };
+        let error = job.forget_damaged(found).to_string();
+        assert!(error.contains("view a") && error.contains("run the same encode again"), "{error}");
+        assert!(error.contains("section 6") && !error.contains("delete it"), "{error}");
+        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on");
+        assert_eq!(job.done_views().expect("reads").into_keys().collect::<Vec<_>>(), ["b"]);
+    }
+
+    /// `--restart` drops the views of the same encode, too.
+    #[test]
+    fn a_restart_takes_nothing_over() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        for (restart, n_done) in [(Restart::Never, 1), (Restart::IfOther, 1), (Restart::Always, 0)] {
+            keep(&open_with(&store, 1, &[("a", 1)]).expect("opens"), "a");
+            let id_of_view = BTreeMap::from([("a".to_owned(), Hash32([1; 32]))]);
+            let job = Job::open(&store, Hash32([1; 32]), id_of_view, restart).expect("opens");
+            assert_eq!(job.done_views().expect("reads").len(), n_done, "{restart:?}");
         }
     }
 

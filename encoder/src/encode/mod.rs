@@ -58,7 +58,7 @@ pub(crate) use report::{GpuReport, Phase, StageReport};
 #[cfg(feature = "fleet")]
 pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
-pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, ViewOrder, ViewsLimit};
+pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, Restart, ViewOrder, ViewsLimit};
 
 /// The parts of which a fleet makes its own encode.
 #[cfg(feature = "fleet")]
@@ -134,6 +134,8 @@ fn encode_into(
         EncodeError::Contributions(ContributionError::Cancelled) => {
             EncodeError::Interrupted { n_done: n_views, n_views }
         }
+        // Checksums of contributions are first seen here: the next encode must not meet the same file again.
+        EncodeError::Contributions(error) => plan.job.forget_damaged(error),
         error => error,
     })?;
     context.begin_phase(Phase::Publish);

@@ -177,6 +177,17 @@ pub struct OutputSettings {
     pub text_model: bool,
 }
 
+/// Which kept views of an encode are dropped before this one begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Restart {
+    /// None: an unfinished encode of another splat or with other settings is refused.
+    Never,
+    /// Those of another splat or of other settings.
+    IfOther,
+    /// All.
+    Always,
+}
+
 #[derive(Clone, Debug, PartialEq)]
 pub struct RunSettings {
     /// Worker threads, and views worked on at a time.
@@ -192,8 +203,7 @@ pub struct RunSettings {
     pub strict: bool,
     /// Publishes a generation in which no Gaussian has an embedding.
     pub(crate) allow_empty: bool,
-    /// Whether an unfinished encode of another splat or with other settings is dropped.
-    pub restart: bool,
+    pub restart: Restart,
     /// Whether the views' contributions are kept after publication, for an encode with another aggregation.
     pub keep_views: bool,
     /// The NVIDIA GPUs that share the work of models, as CUDA numbers them, at least one; without an NVIDIA
@@ -293,7 +303,7 @@ impl EncodeSettings {
                 time_budget: None,
                 strict: false,
                 allow_empty: false,
-                restart: false,
+                restart: Restart::Never,
                 keep_views: false,
                 gpus: vec![0],
             },

@@ -237,9 +237,11 @@ impl<'a> ViewStages<'a> {
         self.rotated.warn();
         let n = self.n_unrepresentable.load(Ordering::Relaxed);
         if n > 0 {
+            let is_on_gpu = self.tools.scene.gpus().is_some();
+            let advice =
+                if is_on_gpu { "; on a GPU without f64, --device cpu draws more of them" } else { "" };
             tracing::warn!(
-                "up to {n} Gaussians of a view contribute nothing: their ellipses are beyond the numbers of the device; on a \
-                 GPU without f64, --device cpu draws more of them"
+                "up to {n} Gaussians of a view contribute nothing: their ellipses are beyond the numbers of the device{advice}"
             );
         }
     }

@@ -19,6 +19,12 @@ pub enum GeoError {
         #[source]
         source: serde_json::Error,
     },
+    #[error("{}: {source}", path.display())]
+    Text {
+        path: PathBuf,
+        #[source]
+        source: files::NotUtf8,
+    },
     #[error("{}: origin.{field} = {value} is outside {min}..={max}; write degrees and metres of WGS 84", path.display())]
     Range { path: PathBuf, field: &'static str, value: f64, min: f64, max: f64 },
 }
@@ -41,15 +47,16 @@ const MAX_BYTES: u64 = 1 << 20;
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let mut bytes = Vec::new();
     files::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
-    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+    let text = files::text_of(&bytes);
+    let text = text.map_err(|source| GeoError::Text { path: path.to_owned(), source })?;
     let malformed = |source| GeoError::Json { path: path.to_owned(), source };
     // Maps, since a struct would take `[8.5, 47.4, 400]`, whose order may be GeoJSON's; then structs, since a map
     // would take a name twice.
-    let maps: HashMap<String, Value> = serde_json::from_slice(text).map_err(malformed)?;
+    let maps: HashMap<String, Value> = serde_json::from_str(text).map_err(malformed)?;
     if let Some(origin) = maps.get("origin") {
         HashMap::<String, Value>::deserialize(origin).map_err(malformed)?;
     }
-    let GeoFile { origin } = serde_json::from_slice(text).map_err(malformed)?;
+    let GeoFile { origin } = serde_json::from_str(text).map_err(malformed)?;
     let range = |field: &'static str, value: f64, min: f64, max: f64| match (min..=max).contains(&value) {
         true => Ok(value),
         false => Err(GeoError::Range { path: path.to_owned(), field, value, min, max }),

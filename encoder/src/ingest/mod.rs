@@ -1,20 +1,18 @@
 //! Ingest: loads photos as ideal pinhole images of known size.
 
 mod geo;
-mod jpeg;
 mod splat_frame;
 mod undistort;
 
-use std::io::{self, BufRead};
+use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
+use image::{DynamicImage, ImageDecoder, RgbImage};
 use serde::Deserialize;
+use slag_common::photo::{self, PhotoError};
 use slag_common::{ByteSize, Distortion, Hash32, Intrinsics, View, files};
-
-use jpeg::Damage;
 
 pub use geo::{GeoError, read_geo_reference};
 pub use splat_frame::{Activated, FrameChoice, to_poses};
@@ -75,31 +73,19 @@ impl RotatedPhotos {
 pub enum IngestError {
     #[error("{0}; check that the file exists and may be read")]
     Io(#[from] io::Error),
-    #[error("{}: {source}; give a JPEG, PNG or WebP that opens elsewhere", path.display())]
-    Decode {
-        path: PathBuf,
-        #[source]
-        source: ImageError,
-    },
-    #[error("{}: the file ends before its image does; copy the photo again", path.display())]
-    Cut { path: PathBuf },
+    #[error("{}: {fault}", path.display())]
+    Photo { path: PathBuf, fault: PhotoError },
     #[error(
         "{}: nothing of it is seen: it is transparent, or the camera's lens distortion leaves no pixel; give another \
          copy, or leave the photo out",
         path.display()
     )]
     Blank { path: PathBuf },
-    #[error("{}: a piece of the image is zeros, which no camera writes; copy the photo again", path.display())]
-    Zeros { path: PathBuf },
     #[error(
         "{}: {} x {} px take {needed} while they are loaded, and {free} are free; give smaller copies",
         path.display(), size_px[0], size_px[1]
     )]
     TooLarge { path: PathBuf, size_px: [u32; 2], needed: ByteSize, free: ByteSize },
-    #[error("{}: {what}; {advice}", path.display())]
-    StandIn { path: PathBuf, what: &'static str, advice: &'static str },
-    #[error("{}: a HEIC or AVIF image; convert the photos to JPEG, for example with heif-convert", path.display())]
-    Heif { path: PathBuf },
     #[error(
         "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other; \
          give the images that the poses were computed from, or whole-factor reductions of them",
@@ -119,9 +105,9 @@ pub fn drawn_from(poses: &Path) -> Option<String> {
     let inside = poses.join("transforms.json");
     let path = if poses.is_dir() { &inside } else { poses };
     let is_json = path.extension().is_some_and(|extension| extension == "json");
-    let text = is_json.then(|| fs_err::read(path).ok())??;
+    let bytes = is_json.then(|| fs_err::read(path).ok())??;
     // What is malformed is told by the reader of poses.
-    serde_json::from_slice::<Drawn>(&text).ok().map(|drawn| drawn.drawn_from)
+    serde_json::from_str::<Drawn>(files::text_of(&bytes).ok()?).ok().map(|drawn| drawn.drawn_from)
 }
 
 pub(crate) fn hash_file(path: &Path) -> io::Result<Hash32> {
@@ -140,8 +126,10 @@ pub(crate) fn photo_area_px(view: &View) -> u64 {
 
 /// Returns the size of a view's photo by its header; that of the camera where the header cannot be read.
 fn photo_size_px(view: &View) -> [u32; 2] {
-    let of_header =
-        || ImageReader::open(&view.image_path).ok()?.with_guessed_format().ok()?.into_dimensions().ok();
+    let of_header = || {
+        let input = BufReader::new(files::open(&view.image_path).ok()?);
+        Some(photo::head(input).ok()?.dimensions())
+    };
     let of_camera = (view.intrinsics.width_px, view.intrinsics.height_px);
     let (width_px, height_px) = of_header()
         .filter(|(width_px, height_px)| is_scale_of(&view.intrinsics, *width_px, *height_px))
@@ -164,22 +152,16 @@ pub fn check_memory(view: &View, free_bytes: u64) -> Result<(), IngestError> {
 /// unchanged. Transparent pixels are outside of the photo. An EXIF orientation is applied where only the turned
 /// photo has its camera's size, and else ignored, see [`RotatedPhotos`].
 pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
-    let (photo, is_rotated) = decode(&view.image_path, &view.intrinsics)?;
-    let intrinsics = view.intrinsics.scaled_to(photo.width(), photo.height());
+    let (decoded, is_rotated) = decode(&view.image_path, &view.intrinsics)?;
+    let intrinsics = view.intrinsics.scaled_to(decoded.width(), decoded.height());
     let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
-    let opaque = photo.color().has_alpha().then(|| opaque_pixels(&photo)).filter(|all| all.contains(&false));
     let or_blank = |loaded: LoadedImage| match &loaded.valid {
         Some(valid) if !valid.contains(&true) => {
             Err(IngestError::Blank { path: loaded.view.image_path.clone() })
         }
         _ => Ok(loaded),
     };
-    let mut image = photo.into_rgb8();
-    if let Some(opaque) = &opaque {
-        // Their colours are left from editing, or noise.
-        let hidden = image.pixels_mut().zip(opaque).filter(|(_, opaque)| !**opaque);
-        hidden.for_each(|(pixel, _)| pixel.0 = [0; 3]);
-    }
+    let (image, opaque) = photo::colours(decoded);
     if intrinsics.distortion == Distortion::None {
         return or_blank(LoadedImage { view, image, undistorter: None, valid: opaque, is_rotated });
     }
@@ -193,31 +175,13 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     or_blank(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid), is_rotated })
 }
 
-/// Returns which pixels are at least half opaque.
-fn opaque_pixels(photo: &DynamicImage) -> Vec<bool> {
-    photo.to_luma_alpha8().pixels().map(|pixel| pixel.0[1] >= 128).collect()
-}
-
 /// Returns the pixels, and whether the file has an EXIF orientation that was ignored.
 fn decode(path: &Path, camera: &Intrinsics) -> Result<(DynamicImage, bool), IngestError> {
-    let failed = |source| IngestError::Decode { path: path.to_owned(), source };
-    let open = || Ok::<_, IngestError>(io::BufReader::new(files::open(path)?));
-    let mut reader = open()?;
-    let start = reader.fill_buf()?;
-    if let Some((what, advice)) = files::stand_in(start) {
-        return Err(IngestError::StandIn { path: path.to_owned(), what, advice });
-    }
-    if start.get(4..12).is_some_and(|brand| HEIF_BRANDS.contains(&brand)) {
-        return Err(IngestError::Heif { path: path.to_owned() });
-    }
-    let reader = ImageReader::new(open()?).with_guessed_format()?;
-    let damage = if reader.format() == Some(ImageFormat::Jpeg) { jpeg::damage(open()?)? } else { None };
-    match damage {
-        Some(Damage::Cut) => return Err(IngestError::Cut { path: path.to_owned() }),
-        Some(Damage::Zeros) => return Err(IngestError::Zeros { path: path.to_owned() }),
-        None => {}
-    }
-    let mut decoder = reader.into_decoder().map_err(failed)?;
+    let failed = |fault| match fault {
+        PhotoError::Io(error) => IngestError::Io(error),
+        fault => IngestError::Photo { path: path.to_owned(), fault },
+    };
+    let mut decoder = photo::open(BufReader::new(files::open(path)?)).map_err(failed)?;
     let (width_px, height_px) = decoder.dimensions();
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     // Checks the size before it allocates any pixel.
@@ -230,15 +194,12 @@ fn decode(path: &Path, camera: &Intrinsics) -> Result<(DynamicImage, bool), Inge
             expected_px: [camera.width_px, camera.height_px],
         });
     }
-    let mut photo = DynamicImage::from_decoder(decoder).map_err(failed)?;
+    let mut photo = DynamicImage::from_decoder(decoder).map_err(|error| failed(error.into()))?;
     if !fits {
         photo.apply_orientation(orientation);
     }
     Ok((photo, fits && orientation != Orientation::NoTransforms))
 }
-
-/// Bytes 4 to 12 of HEIF files, which phones write.
-const HEIF_BRANDS: [&[u8]; 4] = [b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypavif"];
 
 fn swaps_sides(orientation: Orientation) -> bool {
     use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};

@@ -14,6 +14,7 @@ use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
 use crate::cells::{CellSplit, NO_CELL};
 use crate::raster::RegionWeight;
+use crate::store::io_help;
 
 const MAGIC: [u8; 8] = *b"SLAGCONT";
 const VERSION: u32 = 2;
@@ -106,7 +107,7 @@ pub struct ViewContributions {
 
 #[derive(Debug, thiserror::Error)]
 pub enum ContributionError {
-    #[error(transparent)]
+    #[error("{0}; {help}", help = io_help(.0))]
     Io(#[from] std::io::Error),
     #[error("{}: {source}", path.display())]
     Damaged { path: PathBuf, source: ContainerError },

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use image::RgbImage;
 use rayon::ThreadPool;
+use slag_common::files::NotUtf8;
 use slag_common::{Hash32, View};
 use slag_models::session::SessionError;
 
@@ -126,6 +127,12 @@ pub enum SegmentError {
         path: PathBuf,
         #[source]
         source: serde_json::Error,
+    },
+    #[error("{}: {source}", path.display())]
+    Text {
+        path: PathBuf,
+        #[source]
+        source: NotUtf8,
     },
     #[error("{}: {what}; correct it, or export the data set again", path.display())]
     DataSet { path: PathBuf, what: String },

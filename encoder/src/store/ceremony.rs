@@ -99,8 +99,10 @@ impl Metadata {
             roles::promote(&self.store, role, &root.body)?;
         }
         let is_changed = |role: &str| root.body.roles[role] != present.body.roles[role];
-        if let (Some(published), true) = (self.published()?, roles::ONLINE.into_iter().any(is_changed)) {
-            self.sign_all(&published.body, now_unix_secs)?;
+        if roles::ONLINE.into_iter().any(is_changed)
+            && let Some(targets) = self.targets(&present.body)?
+        {
+            self.sign_all(&targets, now_unix_secs)?;
         }
         let made_here = self.store.join("keys").join(format!("{root_version}.root.draft.json"));
         if made_here.exists() {
@@ -149,7 +151,7 @@ impl MetadataReader {
     pub(crate) fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
         let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
         let mut here: Vec<String> =
-            roles::read_folder(root_folder)?.iter().map(|key| Key::of(key).id()).collect();
+            roles::read_sound(root_folder)?.iter().map(|key| Key::of(key).id()).collect();
         let online = roles::ONLINE.iter().filter_map(|role| roles::read(&self.store, role).ok());
         here.extend(online.map(|key| Key::of(&key).id()));
         let mut keys = Vec::new();
@@ -168,6 +170,11 @@ impl MetadataReader {
             keys,
             timestamp_expires_unix_secs: self.timestamp()?.map(|timestamp| timestamp.expires_unix_secs),
         })
+    }
+
+    /// Returns the SHA-256 of the newest root, hex.
+    pub(crate) fn root_sha256(&self) -> Result<String, StoreError> {
+        Ok(sha256_hex(&self.newest_root()?.ok_or_else(|| self.no_root())?.bytes))
     }
 
     fn no_root(&self) -> StoreError {

@@ -124,3 +124,69 @@ fn a_key_that_a_crash_left_behind_is_put_in_place() {
     metadata.refresh(clock_unix_secs(), 1).expect("signs with the new key");
     follows(&mut kept, dir.path()).expect("fresh");
 }
+
+/// A role's key that is lost or damaged: the error names the command that helps, and robots follow it.
+#[test]
+fn a_lost_key_of_a_role_is_rotated() {
+    for role in ["targets", "snapshot", "timestamp"] {
+        for text in [None, Some(""), Some("0123")] {
+            let dir = tempfile::tempdir().expect("temporary folder");
+            publish(dir.path(), 1);
+            let mut kept = client(dir.path());
+            follows(&mut kept, dir.path()).expect("honest");
+            let path = dir.path().join("keys").join(format!("{role}.key"));
+            match text {
+                Some(text) => fs_err::write(&path, text).expect("written"),
+                None => fs_err::remove_file(&path).expect("there"),
+            }
+            let store = Store::create_or_open(dir.path()).expect("what is published needs no key");
+            let refused = store.publish(&manifest_of(2, &[]), &Extras::new()).expect_err("no key");
+            assert!(matches!(refused, StoreError::Key { .. }), "{refused}");
+            let text = refused.to_string();
+            assert!(
+                text.contains(&format!("slag-encoder keys rotate {role}")) && !text.contains("remove"),
+                "{text}"
+            );
+            drop(store);
+            let root_keys = default_root_folder(dir.path());
+            let metadata = Metadata::open(dir.path()).expect("opens");
+            metadata.change_keys(&roles(&[role]), &root_keys, clock_unix_secs()).expect("signs");
+            drop(metadata);
+            publish(dir.path(), 3);
+            follows(&mut kept, dir.path()).unwrap_or_else(|e| panic!("{role}: {e}"));
+        }
+    }
+}
+
+/// Only a change of keys needs root's keys: a damaged one stops nothing else, and is named where it is needed.
+#[test]
+fn a_damaged_root_key_stops_changes_of_keys_alone() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    publish(dir.path(), 1);
+    let root_keys = default_root_folder(dir.path());
+    fs_err::write(root_keys.join("1.key"), "damaged").expect("written");
+    publish(dir.path(), 2);
+    let metadata = Metadata::open(dir.path()).expect("opens");
+    metadata.refresh(clock_unix_secs(), 1).expect("signs");
+    let status = metadata.keys_status(&root_keys).expect("a root");
+    let root = status.keys.iter().find(|key| key.role == "root").expect("listed");
+    assert!(!root.is_here && status.root_sha256 == metadata.root_sha256().expect("a root"));
+    let refused = metadata.change_keys(&roles(&["timestamp"]), &root_keys, clock_unix_secs());
+    let refused = refused.expect_err("no key").to_string();
+    assert!(refused.contains("1.key") && refused.contains("restore it from a backup"), "{refused}");
+}
+
+/// Before there is a root, a damaged key may be made anew, and the error says so.
+#[test]
+fn a_damaged_key_that_no_root_names_is_made_anew() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let path = dir.path().join("keys/targets.key");
+    fs_err::create_dir(dir.path().join("keys")).expect("made");
+    fs_err::write(&path, "damaged").expect("written");
+    let metadata = Metadata::open(dir.path()).expect("opens");
+    let make = || metadata.make_root(&default_root_folder(dir.path()), 1, 1, clock_unix_secs());
+    let refused = make().expect_err("damaged").to_string();
+    assert!(refused.contains("move it away, and a new key is made"), "{refused}");
+    fs_err::remove_file(path).expect("there");
+    make().expect("makes");
+}

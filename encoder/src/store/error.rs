@@ -1,7 +1,7 @@
 //! Errors of a store.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use slag_common::Hash32;
 use slag_common::container::ContainerError;
@@ -10,25 +10,36 @@ use slag_common::tuf::TufError;
 
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    #[error("{0}; check permissions and free space")]
+    #[error("{0}; {help}", help = io_help(.0))]
     Io(io::Error),
     #[error("another slag-encoder is writing to {}; wait for it or stop it", store.display())]
     Locked { store: PathBuf },
     #[error(
-        "{}: {cause}; if the database is damaged, remove this folder: published scenes stay, unfinished jobs start over",
-        path.display()
+        "{}: {cause}; {}", path.display(),
+        records_help(cause, "if the database is damaged, remove this folder: published scenes stay, unfinished jobs start over")
     )]
     Records { path: PathBuf, cause: sled::Error },
     #[error("this machine's clock says a time before 1970; set it")]
     Clock,
     #[error("{} is missing: nothing has been published here yet; run `slag-encoder encode` first", path.display())]
     NotPublished { path: PathBuf },
-    #[error("{}: expected 64 hex digits; restore the file from a backup, or remove it: a new key is made, which robots must be told", path.display())]
-    Key { path: PathBuf },
-    #[error("{}: {cause}", path.display())]
+    #[error("{} is missing, though a scene was published here; run `slag-encoder encode` again, which writes it anew", path.display())]
+    ManifestLost { path: PathBuf },
+    #[error("{}: {what}; {help}", path.display())]
+    Key { path: PathBuf, what: &'static str, help: String },
+    #[error("{}: {}{}", path.display(), manifest_fault(cause), manifest_help(cause))]
     Manifest { path: PathBuf, cause: ManifestError },
-    #[error("{}: {cause}; restore the store's folder metadata/ from a backup", path.display())]
+    #[error("{}: {cause}; the store's metadata vouches for it, so it is not damaged", path.display())]
+    SignedManifest { path: PathBuf, cause: ManifestError },
+    #[error("{}: {}; {}", path.display(), metadata_fault(cause), metadata_help(path))]
     Metadata { path: PathBuf, cause: TufError },
+    #[error(
+        "{} is missing, but the store was signed by it; {ROOT_HELP}; without one, remove {}, encode again, and tell robots of the new root (`slag-edge trust add`)",
+        path.display(), path.parent().unwrap_or(path).display()
+    )]
+    RootLost { path: PathBuf },
+    #[error("{}: robots refuse it: {what}", path.display())]
+    Refused { path: PathBuf, what: String },
     #[error("{}: the newest root does not name the key in keys/{role}.key; restore that file, or run `slag-encoder keys rotate {role}`", path.display())]
     RoleKey { role: String, path: PathBuf },
     #[error("{}: {what}; encode again", path.display())]
@@ -58,5 +69,107 @@ pub enum StoreError {
 impl From<io::Error> for StoreError {
     fn from(cause: io::Error) -> Self {
         Self::Io(cause)
+    }
+}
+
+/// What helps where a root is damaged or missing: nothing else may take its place.
+const ROOT_HELP: &str =
+    "copy it from a backup of the store, or from v1/metadata/ of what `slag-encoder store export` wrote";
+
+/// Returns what helps against an error of the file system.
+pub(crate) fn io_help(error: &io::Error) -> &'static str {
+    by_the_system(error).unwrap_or("check permissions and free space")
+}
+
+/// Returns what helps against an error of the database: `otherwise`, unless the fault is the disk's.
+pub(crate) fn records_help(error: &sled::Error, otherwise: &'static str) -> &'static str {
+    match error {
+        sled::Error::Io(error) => by_the_system(error).unwrap_or(otherwise),
+        _ => otherwise,
+    }
+}
+
+fn by_the_system(error: &io::Error) -> Option<&'static str> {
+    use io::ErrorKind as Kind;
+
+    // sled wraps some errors, and then only the text tells.
+    let is_full = || error.to_string().contains("No space left");
+    match error.kind() {
+        Kind::StorageFull | Kind::QuotaExceeded => Some(FULL),
+        Kind::PermissionDenied => Some("give this user the right to read and write there"),
+        Kind::ReadOnlyFilesystem => Some("its disk takes no writes: mount it for writing, or use a copy"),
+        _ => is_full().then_some(FULL),
+    }
+}
+
+const FULL: &str = "free space on that disk, then run the same command again: what is done is kept";
+
+/// Says what is wrong with a manifest on this disk.
+pub(super) fn manifest_fault(cause: &ManifestError) -> String {
+    match cause {
+        ManifestError::Version { .. } => cause.to_string(),
+        ManifestError::TooLong { len_bytes } => format!("it is damaged: it has {len_bytes} bytes"),
+        ManifestError::Damaged { what } => format!("it is damaged: {what}"),
+        ManifestError::Content { what } => {
+            format!("it is damaged, or another version of slag-encoder wrote it: {what}")
+        }
+    }
+}
+
+fn manifest_help(cause: &ManifestError) -> &'static str {
+    match cause {
+        // The fault says it.
+        ManifestError::Version { .. } => "",
+        _ => "; run `slag-encoder encode` again, which writes it anew",
+    }
+}
+
+/// Says what is wrong with metadata, for those who have the store: other advice than robots get.
+pub(super) fn metadata_fault(cause: &TufError) -> String {
+    match cause {
+        TufError::Format { what, .. } => format!("it is damaged: {what}"),
+        TufError::Signatures { found, threshold, .. } => {
+            format!("{found} of its role's keys signed it, expected {threshold}")
+        }
+        TufError::Rollback { seen, offered, .. } => format!("version {offered} follows {seen}"),
+        TufError::Version { expected, found, .. } => format!("version {found}, expected {expected}"),
+        TufError::Expired { expired, .. } => format!("it expired at {expired}"),
+        TufError::Content { fault, .. } | TufError::Source { fault, .. } => fault.clone(),
+        TufError::TooLong { max_bytes, .. } => format!("it has more than {max_bytes} bytes"),
+        TufError::Missing { .. } => "it is missing".into(),
+        TufError::Order { .. } | TufError::TooMany { .. } => cause.to_string(),
+    }
+}
+
+/// Returns what helps where a file of metadata is damaged or missing.
+pub(super) fn metadata_help(path: &Path) -> &'static str {
+    let is_root = path.to_str().is_some_and(|path| path.ends_with(".root.json"));
+    if is_root { ROOT_HELP } else { "run `slag-encoder store refresh`, which signs it anew" }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A disk that is full, or takes no writes, is no damaged database.
+    #[test]
+    fn advice_fits_the_fault_of_the_disk() {
+        let said = |error: io::Error| {
+            let path = PathBuf::from("db");
+            let of_files = StoreError::Io(io::Error::new(error.kind(), error.to_string())).to_string();
+            (of_files, StoreError::Records { path, cause: sled::Error::Io(error) }.to_string())
+        };
+        for (error, expected) in [
+            (io::Error::from(io::ErrorKind::StorageFull), "free space"),
+            (io::Error::other("No space left on device (os error 28)"), "free space"),
+            (io::Error::from(io::ErrorKind::PermissionDenied), "the right to read and write"),
+            (io::Error::from(io::ErrorKind::ReadOnlyFilesystem), "takes no writes"),
+        ] {
+            let (of_files, of_records) = said(error);
+            assert!(of_files.contains(expected) && of_records.contains(expected), "{of_files}; {of_records}");
+            assert!(!of_records.contains("remove this folder"), "{of_records}");
+        }
+        let (_, damaged) = said(io::Error::from(io::ErrorKind::InvalidData));
+        assert!(damaged.contains("remove this folder"), "{damaged}");
     }
 }

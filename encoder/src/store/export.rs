@@ -16,8 +16,9 @@ use slag_common::{Hash32, durable, manifest};
 
 use super::error::StoreError;
 use super::files;
-use super::metadata::{self, TIMESTAMP_FILE};
+use super::metadata::clock_unix_secs;
 use super::reader::{Published, StoreReader};
+use super::walk::{self, Refused};
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Exported {
@@ -31,15 +32,24 @@ pub(crate) struct Exported {
 /// the old generation or the new one.
 ///
 /// # Errors
-/// [`StoreError`]; [`StoreError::ObjectHash`] for a damaged shard, before anything names it.
+/// [`StoreError`]; [`StoreError::ObjectHash`] for a damaged shard, before anything names it;
+/// [`StoreError::Refused`] where robots would refuse the metadata, before anything is written.
 pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
+    let mut n_tries = 0;
     let (reader, metadata) = loop {
         let reader = StoreReader::open(store)?;
-        let metadata = read_metadata(store)?;
+        let metadata = walk::read_all(store)?;
         // The manifest is published before the metadata that names it.
-        if reader.is_current() {
-            break (reader, metadata);
+        if !reader.is_current() {
+            continue;
         }
+        let refused = walk::refused_of(store, &metadata, &reader.current().bytes, clock_unix_secs());
+        let Some(Refused { path, what }) = refused.into_iter().next() else { break (reader, metadata) };
+        n_tries += 1;
+        if n_tries == walk::N_TRIES {
+            return Err(StoreError::Refused { path, what });
+        }
+        std::thread::sleep(walk::PAUSE);
     };
     let folder = to.join("v1");
     let [objects, targets, of_metadata] = ["objects", "targets", "metadata"].map(|name| folder.join(name));
@@ -63,8 +73,12 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
             durable::write(&targets.join(name), &published.bytes)?;
         }
     }
+    // The timestamp comes last by its name: roots, targets and snapshots are there before it names them.
     for (name, bytes) in &metadata {
-        durable::write(&of_metadata.join(name), bytes)?;
+        // What robots need was read, or the walk would have refused it.
+        if let Ok(bytes) = bytes {
+            durable::write(&of_metadata.join(name), bytes)?;
+        }
     }
     durable::write(&folder.join(manifest::TARGET), &reader.current().bytes)?;
     let mut n_removed = 0;
@@ -78,18 +92,4 @@ pub(crate) fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
     }
     let len_bytes = fresh.iter().map(|(_, len_bytes)| **len_bytes).sum();
     Ok(Exported { n_files: fresh.len(), len_bytes, n_removed })
-}
-
-/// Returns the files of metadata by name, the timestamp last: roots, targets and snapshots are there before it
-/// names them.
-fn read_metadata(store: &Path) -> Result<Vec<(String, Vec<u8>)>, StoreError> {
-    let mut files = Vec::new();
-    for entry in fs_err::read_dir(metadata::folder(store))? {
-        let name = entry?.file_name().to_string_lossy().into_owned();
-        if let Some(bytes) = metadata::read_published(store, &name)? {
-            files.push((name, bytes));
-        }
-    }
-    files.sort_by_key(|(name, _)| name == TIMESTAMP_FILE);
-    Ok(files)
 }

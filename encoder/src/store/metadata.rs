@@ -24,7 +24,7 @@ use slag_common::tuf::{
 };
 
 use super::error::StoreError;
-use super::{files, roles};
+use super::{files, reader, roles};
 
 pub(crate) const TIMESTAMP_FILE: &str = "timestamp.json";
 /// Days for which a timestamp counts, unless a refresh says otherwise.
@@ -42,6 +42,14 @@ pub(crate) struct Refreshed {
     pub(crate) timestamp_version: u64,
     pub(crate) snapshot_version: u64,
     pub(crate) expires_unix_secs: u64,
+}
+
+/// What clients are led to.
+struct PublishedMetadata {
+    targets: Targets,
+    snapshot_meta: FileMeta,
+    /// When the first of targets and snapshot expires.
+    soonest_unix_secs: u64,
 }
 
 pub(super) struct RootFile {
@@ -73,13 +81,97 @@ impl MetadataReader {
         Self { store: store.to_owned() }
     }
 
-    /// Returns the targets metadata that the timestamp names; `None` before the first publication.
-    pub(super) fn published(&self) -> Result<Option<SignedMetadata<Targets>>, StoreError> {
-        let Some(timestamp) = self.timestamp()? else { return Ok(None) };
-        let name = format!("{}.snapshot.json", timestamp.body.snapshot().version);
-        let Some(snapshot) = self.read::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)? else { return Ok(None) };
-        let name = format!("{}.targets.json", snapshot.body.meta["targets.json"].version);
-        self.read::<Targets>(&name, MAX_TARGETS_BYTES)
+    /// Returns what a root leads clients to, whatever its expiry; `None` where a file on the way is missing or
+    /// damaged, or not signed by a key that the root names.
+    fn published(&self, root: &Root) -> Result<Option<PublishedMetadata>, StoreError> {
+        let timestamp = self.read_signed::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES, root)?;
+        let Some((timestamp, _)) = timestamp else { return Ok(None) };
+        let snapshot_meta = timestamp.body.snapshot().clone();
+        let name = format!("{}.snapshot.json", snapshot_meta.version);
+        let snapshot = self.read_signed::<Snapshot>(&name, MAX_SNAPSHOT_BYTES, root)?;
+        let is_stated = |(found, bytes): &(SignedMetadata<Snapshot>, Vec<u8>)| {
+            FileMeta::of(found.head.version, bytes) == snapshot_meta
+        };
+        let Some((snapshot, _)) = snapshot.filter(is_stated) else { return Ok(None) };
+        let stated = &snapshot.body.meta["targets.json"];
+        let name = format!("{}.targets.json", stated.version);
+        let targets = self.read_signed::<Targets>(&name, MAX_TARGETS_BYTES, root)?;
+        let targets = targets.filter(|(found, bytes)| FileMeta::of(found.head.version, bytes) == *stated);
+        let of = |(targets, _): (SignedMetadata<Targets>, Vec<u8>)| PublishedMetadata {
+            soonest_unix_secs: targets.expires_unix_secs.min(snapshot.expires_unix_secs),
+            targets: targets.body,
+            snapshot_meta,
+        };
+        Ok(targets.map(of))
+    }
+
+    /// As [`Self::published`], by the newest root.
+    fn published_by_newest(&self) -> Result<Option<PublishedMetadata>, StoreError> {
+        let Some(RootFile { root, .. }) = self.newest_root()? else { return Ok(None) };
+        self.published(&root.body)
+    }
+
+    /// Returns the targets that a root leads clients to; where it leads nowhere, the manifest of the store. `None`
+    /// where nothing is published.
+    pub(super) fn targets(&self, root: &Root) -> Result<Option<Targets>, StoreError> {
+        if let Some(published) = self.published(root)? {
+            return Ok(Some(published.targets));
+        }
+        match reader::read_manifest(&self.store.join(files::MANIFEST)) {
+            Ok((_, bytes)) => Ok(Some(targets_of(&bytes))),
+            Err(StoreError::NotPublished { .. } | StoreError::Manifest { .. }) => Ok(None),
+            Err(e) => Err(e),
+        }
+    }
+
+    /// Returns whether clients are led to these bytes of a manifest.
+    pub(super) fn vouches_for(&self, manifest: &[u8]) -> Result<bool, StoreError> {
+        Ok(self.published_by_newest()?.is_some_and(|published| published.targets == targets_of(manifest)))
+    }
+
+    /// Reads metadata that keys of a root signed; `None` if it is missing, damaged or not signed.
+    fn read_signed<T: Body>(
+        &self,
+        name: &str,
+        max_bytes: u64,
+        root: &Root,
+    ) -> Result<Option<(SignedMetadata<T>, Vec<u8>)>, StoreError> {
+        let bytes = match read_file(&self.store, name, max_bytes) {
+            Err(StoreError::Metadata { .. }) => None,
+            bytes => bytes?,
+        };
+        let Some(bytes) = bytes else { return Ok(None) };
+        let Ok(found) = SignedMetadata::<T>::parse(T::TYPE, &bytes) else { return Ok(None) };
+        let is_signed = found.check_signatures(T::TYPE, &root.keys, &root.roles[T::TYPE]).is_ok();
+        Ok(is_signed.then_some((found, bytes)))
+    }
+
+    /// Reads metadata that keys of any root of this store signed, the newest first: what it states was seen by
+    /// clients.
+    fn read_of_any_root<T: Body>(
+        &self,
+        name: &str,
+        max_bytes: u64,
+    ) -> Result<Option<SignedMetadata<T>>, StoreError> {
+        let mut versions = self.versions(Root::TYPE)?;
+        versions.sort_unstable_by(|a, b| b.cmp(a));
+        for version in versions {
+            let root = match self.read::<Root>(&format!("{version}.root.json"), MAX_ROOT_BYTES) {
+                Err(StoreError::Metadata { .. }) => None,
+                root => root?,
+            };
+            let Some(root) = root else { continue };
+            if let Some((found, _)) = self.read_signed::<T>(name, max_bytes, &root.body)? {
+                return Ok(Some(found));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Returns whether anything was signed here, by whatever root.
+    fn is_begun(&self) -> Result<bool, StoreError> {
+        let has = |role: &str| Ok::<_, StoreError>(!self.versions(role)?.is_empty());
+        Ok(self.path(TIMESTAMP_FILE).exists() || has(Targets::TYPE)? || has(Snapshot::TYPE)?)
     }
 
     pub(super) fn timestamp(&self) -> Result<Option<SignedMetadata<Timestamp>>, StoreError> {
@@ -89,12 +181,9 @@ impl MetadataReader {
     /// Returns when the timestamp was signed; `None` if that was not with a key of the newest root, which clients
     /// forget with its key.
     fn signed_unix_secs(&self) -> Result<Option<u64>, StoreError> {
-        let (Some(timestamp), Some(RootFile { root, .. })) = (self.timestamp()?, self.newest_root()?) else {
-            return Ok(None);
-        };
-        let role = &root.body.roles[Timestamp::TYPE];
-        let counts = timestamp.check_signatures(Timestamp::TYPE, &root.body.keys, role).is_ok();
-        Ok(timestamp.body.signed_at.as_deref().and_then(parse_utc).filter(|_| counts))
+        let Some(RootFile { root, .. }) = self.newest_root()? else { return Ok(None) };
+        let timestamp = self.read_signed::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES, &root.body)?;
+        Ok(timestamp.and_then(|(timestamp, _)| parse_utc(timestamp.body.signed_at.as_deref()?)))
     }
 
     /// Returns the newest root and its bytes; `None` before the first one.
@@ -102,19 +191,25 @@ impl MetadataReader {
         let name = format!("{}.root.json", self.next_version(Root::TYPE)? - 1);
         let Some(bytes) = read_file(&self.store, &name, MAX_ROOT_BYTES)? else { return Ok(None) };
         let refuse = |cause| StoreError::Metadata { path: self.path(&name), cause };
-        Ok(Some(RootFile { root: SignedMetadata::parse(Root::TYPE, &bytes).map_err(refuse)?, bytes }))
+        let root = SignedMetadata::<Root>::parse(Root::TYPE, &bytes).map_err(refuse)?;
+        // A damaged one must not say which keys count.
+        root.check_signatures(Root::TYPE, &root.body.keys, &root.body.roles[Root::TYPE]).map_err(refuse)?;
+        Ok(Some(RootFile { root, bytes }))
     }
 
     /// Returns the version after the highest one of a role's numbered files.
     fn next_version(&self, role: &str) -> Result<u64, StoreError> {
+        Ok(self.versions(role)?.into_iter().max().unwrap_or(0).saturating_add(1))
+    }
+
+    /// Returns the versions of a role's numbered files, in no order.
+    fn versions(&self, role: &str) -> Result<Vec<u64>, StoreError> {
         let suffix = format!(".{role}.json");
-        let mut highest = 0;
-        for entry in fs_err::read_dir(folder(&self.store))? {
-            let name = entry?.file_name();
-            let number = name.to_str().and_then(|name| name.strip_suffix(&suffix)?.parse::<u64>().ok());
-            highest = highest.max(number.unwrap_or(0));
+        let mut versions = Vec::new();
+        for name in names(&self.store)? {
+            versions.extend(name.strip_suffix(&suffix).and_then(|number| number.parse::<u64>().ok()));
         }
-        Ok(highest.saturating_add(1))
+        Ok(versions)
     }
 
     fn read<T: Body>(&self, name: &str, max_bytes: u64) -> Result<Option<SignedMetadata<T>>, StoreError> {
@@ -187,30 +282,39 @@ impl Metadata {
         if self.newest_root()?.is_none() {
             self.make_root(&roles::root_folder(&self.store), 1, 1, now_unix_secs)?;
         }
-        let targets = BTreeMap::from([(TARGET.to_owned(), TargetFile::of(manifest))]);
-        if self.published()?.is_some_and(|published| published.body.targets == targets) {
-            return Ok(());
+        let targets = targets_of(manifest);
+        match self.published_by_newest()? {
+            Some(published) if published.targets == targets => return Ok(()),
+            None if self.is_begun()? => tracing::warn!(
+                "{}: what robots follow is damaged or missing; it is signed anew",
+                folder(&self.store).display()
+            ),
+            _ => {}
         }
-        self.sign_all(&Targets { targets }, now_unix_secs)
+        self.sign_all(&targets, now_unix_secs).map(drop)
     }
 
-    /// Signs the timestamp anew, and the rest before half of its time is over. Needs the root's key never.
+    /// Signs the timestamp anew, and the rest before half of its time is over, or where it is damaged or missing.
+    /// Needs the root's key never.
     ///
     /// # Errors
     /// [`StoreError::NotPublished`] before the first publication; [`StoreError`] otherwise.
     pub(crate) fn refresh(&self, now_unix_secs: u64, days: u32) -> Result<Refreshed, StoreError> {
-        let not_published = || StoreError::NotPublished { path: self.path(TIMESTAMP_FILE) };
-        let targets = self.published()?.ok_or_else(not_published)?;
-        let timestamp = self.timestamp()?.ok_or_else(not_published)?;
-        let name = format!("{}.snapshot.json", timestamp.body.snapshot().version);
-        let snapshot = self.read::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)?.ok_or_else(not_published)?;
-        let soonest = targets.expires_unix_secs.min(snapshot.expires_unix_secs);
-        if soonest < now_unix_secs.saturating_add(TARGETS_SECS / 2) {
-            self.sign_all(&targets.body, now_unix_secs)?;
-        }
-        let version = self.timestamp()?.ok_or_else(not_published)?.body.snapshot().version;
-        let bytes = fs_err::read(self.path(&format!("{version}.snapshot.json")))?;
-        self.sign_timestamp(FileMeta::of(version, &bytes), now_unix_secs, days)
+        let published = match self.published_by_newest()? {
+            Some(published) => published,
+            None => {
+                let path = self.store.join(files::MANIFEST);
+                let (manifest, bytes) = reader::read_manifest(&path)?;
+                self.publish(&bytes, manifest.created_unix_secs.max(now_unix_secs))?;
+                self.published_by_newest()?.ok_or(StoreError::NotPublished { path })?
+            }
+        };
+        let snapshot_meta = match published.soonest_unix_secs < now_unix_secs.saturating_add(TARGETS_SECS / 2)
+        {
+            true => self.sign_all(&published.targets, now_unix_secs)?,
+            false => published.snapshot_meta,
+        };
+        self.sign_timestamp(snapshot_meta, now_unix_secs, days, false)
     }
 
     /// Makes keys and the first root. `root_folder`: where root's keys lie, `n_root_keys` of them.
@@ -224,6 +328,10 @@ impl Metadata {
         if self.newest_root()?.is_some() {
             return Err(StoreError::HasRoot { store: self.store.clone() });
         }
+        if self.is_begun()? {
+            // Robots trust a root of this store, and a new one of its version would not follow it.
+            return Err(StoreError::RootLost { path: self.path("1.root.json") });
+        }
         let (body, keys) = roles::make_all(&self.store, root_folder, n_root_keys, threshold)?;
         let keys: Vec<&SigningKey> = keys.iter().collect();
         let bytes = sign(1, now_unix_secs.saturating_add(ROOT_SECS), &body, &keys);
@@ -236,22 +344,47 @@ impl Metadata {
         Ok(())
     }
 
-    pub(super) fn sign_all(&self, targets: &Targets, now_unix_secs: u64) -> Result<(), StoreError> {
+    /// Signs targets, snapshot and timestamp; returns what the timestamp states of the snapshot. No version goes
+    /// back, neither behind the files that are there nor behind what they state of those that are not.
+    pub(super) fn sign_all(&self, targets: &Targets, now_unix_secs: u64) -> Result<FileMeta, StoreError> {
         let expires = now_unix_secs.saturating_add(TARGETS_SECS);
-        let version = self.next_version("targets")?;
+        let timestamp = self.read_of_any_root::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)?;
+        let snapshot_before = timestamp.map_or(0, |timestamp| timestamp.body.snapshot().version);
+        let newest = snapshot_before.max(self.next_version(Snapshot::TYPE)? - 1);
+        let name = format!("{newest}.snapshot.json");
+        let snapshot = self.read_of_any_root::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)?;
+        let targets_before = snapshot.map_or(0, |snapshot| snapshot.body.meta["targets.json"].version);
+
+        let version = self.next_version(Targets::TYPE)?.max(targets_before.saturating_add(1));
         let bytes = sign(version, expires, targets, &[&self.key(Targets::TYPE)?]);
         self.write(&format!("{version}.targets.json"), &bytes)?;
+        let mut is_first = version == 1;
         let meta = BTreeMap::from([("targets.json".to_owned(), FileMeta::of(version, &bytes))]);
-        let version = self.next_version("snapshot")?;
+        let version = self.next_version(Snapshot::TYPE)?.max(snapshot_before.saturating_add(1));
         let bytes = sign(version, expires, &Snapshot { meta }, &[&self.key(Snapshot::TYPE)?]);
         self.write(&format!("{version}.snapshot.json"), &bytes)?;
-        self.sign_timestamp(FileMeta::of(version, &bytes), now_unix_secs, TIMESTAMP_DAYS).map(drop)
+        is_first &= version == 1;
+        let meta = FileMeta::of(version, &bytes);
+        self.sign_timestamp(meta.clone(), now_unix_secs, TIMESTAMP_DAYS, is_first)?;
+        Ok(meta)
     }
 
     /// Never signs as of an earlier time than before with the same key: clients that saw the later one take it for
-    /// the time, and refuse what has expired by then.
-    fn sign_timestamp(&self, snapshot: FileMeta, now: u64, days: u32) -> Result<Refreshed, StoreError> {
-        let timestamp_version = self.timestamp()?.map_or(1, |before| before.head.version.saturating_add(1));
+    /// the time, and refuse what has expired by then. `is_first`: no timestamp was ever signed.
+    fn sign_timestamp(
+        &self,
+        snapshot: FileMeta,
+        now: u64,
+        days: u32,
+        is_first: bool,
+    ) -> Result<Refreshed, StoreError> {
+        let before = self.read_of_any_root::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)?;
+        let timestamp_version = match before {
+            Some(before) => before.head.version.saturating_add(1),
+            None if is_first => 1,
+            // The version before is lost, and robots refuse a lower one: no store signs more than once a second.
+            None => now.max(signing_unix_secs()),
+        };
         let now = now.max(self.signed_unix_secs()?.unwrap_or(0));
         let expires_unix_secs = now.saturating_add(u64::from(days) * SECS_PER_DAY);
         let snapshot_version = snapshot.version;
@@ -324,6 +457,20 @@ fn read_file(store: &Path, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>
         }
         false => Ok(Some(bytes)),
     }
+}
+
+/// Lists the names in the folder of a store's metadata; none if there is no such folder.
+pub(super) fn names(store: &Path) -> io::Result<Vec<String>> {
+    let entries = match fs_err::read_dir(folder(store)) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries?,
+    };
+    entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect()
+}
+
+/// Returns the targets of a store with this manifest.
+fn targets_of(manifest: &[u8]) -> Targets {
+    Targets { targets: BTreeMap::from([(TARGET.to_owned(), TargetFile::of(manifest))]) }
 }
 
 pub(super) fn folder(store: &Path) -> PathBuf {

@@ -36,13 +36,16 @@ mod roles;
 #[cfg(test)]
 pub(crate) mod tests;
 mod verify;
+mod walk;
+#[cfg(test)]
+mod walk_tests;
 mod writer;
 
 pub(crate) use catalogue::{CatalogueCopy, GenerationRecord};
-pub(crate) use error::StoreError;
+pub(crate) use error::{StoreError, io_help, records_help};
 pub(crate) use export::{Exported, export};
 pub(crate) use files::ModelsRecord;
 pub use reader::{Extras, StoreReader};
-pub(crate) use reader::{Published, Stamp, StoredShard};
+pub(crate) use reader::{Published, Stamp, StoredShard, scene_name};
 pub(crate) use verify::{Fault, Verified};
 pub use writer::Store;

@@ -95,11 +95,13 @@ impl StoreReader {
     /// Reads the manifest.
     ///
     /// # Errors
-    /// [`StoreError::NotPublished`] before the first publication, [`StoreError`] otherwise.
+    /// [`StoreError::NotPublished`] before the first publication, [`StoreError::ManifestLost`] where its manifest is
+    /// gone since, [`StoreError`] otherwise.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         let path = dir.join(files::MANIFEST);
         // Before the content: a manifest that is replaced in between is then noticed, not missed.
         let stamp = Stamp::of(&path).map_err(|e| match e.kind() {
+            io::ErrorKind::NotFound if was_published(dir) => StoreError::ManifestLost { path },
             io::ErrorKind::NotFound => StoreError::NotPublished { path },
             _ => e.into(),
         })?;
@@ -192,6 +194,19 @@ pub(super) fn object_path(dir: &Path, hash: Hash32) -> PathBuf {
 
 pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
     dir.join("extras").join(manifest_hash.to_string())
+}
+
+/// Returns whether something was published into a store, whatever became of it.
+fn was_published(dir: &Path) -> bool {
+    [files::MANIFEST_PREVIOUS, "metadata/timestamp.json"].iter().any(|name| dir.join(name).exists())
+}
+
+/// Returns the name of the scene that a store publishes; of the generation before where the current one cannot be
+/// read, and `None` where neither can.
+pub(crate) fn scene_name(dir: &Path) -> Option<String> {
+    let read = |name: &str| read_manifest(&dir.join(name)).ok();
+    let (manifest, _) = read(files::MANIFEST).or_else(|| read(files::MANIFEST_PREVIOUS))?;
+    Some(manifest.scene)
 }
 
 pub(super) fn read_manifest(path: &Path) -> Result<(Manifest, Vec<u8>), StoreError> {

@@ -28,7 +28,16 @@ pub(super) fn root_folder(store: &Path) -> PathBuf {
 }
 
 pub(super) fn read(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
-    Ok(SigningKey::from_bytes(&read_hex_key(&key_path(store, role))?.0))
+    let path = key_path(store, role);
+    let what = match KeyFile::read(&path)? {
+        KeyFile::Key(key) => return Ok(key),
+        KeyFile::Missing => "it is missing",
+        KeyFile::Damaged => DAMAGED,
+    };
+    let help = format!(
+        "restore it from a backup, or run `slag-encoder keys rotate {role}`, which makes a new key that robots follow by themselves"
+    );
+    Err(StoreError::Key { path, what, help })
 }
 
 /// Makes the keys of all roles that have none, and returns the body of a root that names them and root's keys.
@@ -41,7 +50,7 @@ pub(super) fn make_all(
 ) -> Result<(Root, Vec<SigningKey>), StoreError> {
     files::ensure_folder(&store.join("keys"))?;
     fs_err::create_dir_all(root_folder)?;
-    let mut root_keys = read_folder(root_folder)?;
+    let mut root_keys = read_folder(root_folder).map_err(before_root)?;
     while root_keys.len() < n_root_keys {
         root_keys.push(make_root_key(root_folder)?);
     }
@@ -55,13 +64,46 @@ pub(super) fn make_all(
     };
     add(Root::TYPE, &root_keys, threshold);
     for role in ONLINE {
-        add(role, &[read_or_make(&key_path(store, role))?], 1);
+        add(role, &[read_or_make(&key_path(store, role)).map_err(before_root)?], 1);
     }
     Ok((Root { consistent_snapshot: true, keys, roles }, root_keys))
 }
 
-/// Reads all keys of a folder, by name; none if the folder is not there.
+/// Keys that no root names yet may be made anew.
+fn before_root(error: StoreError) -> StoreError {
+    match error {
+        StoreError::Key { path, what, .. } => {
+            let help = "no root names it yet: move it away, and a new key is made".into();
+            StoreError::Key { path, what, help }
+        }
+        error => error,
+    }
+}
+
+/// Reads all keys of root in a folder, by name; none if the folder is not there.
 pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
+    let read = |path: PathBuf| match KeyFile::read(&path)? {
+        KeyFile::Key(key) => Ok(Some(key)),
+        KeyFile::Missing => Ok(None),
+        KeyFile::Damaged => Err(damaged(path)),
+    };
+    files_of_keys(folder)?.into_iter().filter_map(|path| read(path).transpose()).collect()
+}
+
+/// As [`read_folder`], without those that are damaged: these are warned of.
+pub(super) fn read_sound(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
+    let mut keys = Vec::new();
+    for path in files_of_keys(folder)? {
+        match KeyFile::read(&path)? {
+            KeyFile::Key(key) => keys.push(key),
+            KeyFile::Missing => {}
+            KeyFile::Damaged => tracing::warn!("{}", damaged(path)),
+        }
+    }
+    Ok(keys)
+}
+
+fn files_of_keys(folder: &Path) -> Result<Vec<PathBuf>, StoreError> {
     let mut names = Vec::new();
     match fs_err::read_dir(folder) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => {}
@@ -73,7 +115,7 @@ pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> 
     }
     names.retain(|path| path.extension().is_some_and(|extension| extension == "key"));
     names.sort();
-    names.iter().map(|path| Ok(SigningKey::from_bytes(&read_hex_key(path)?.0))).collect()
+    Ok(names)
 }
 
 /// Makes a further key of root.
@@ -82,17 +124,18 @@ pub(super) fn make_root_key(folder: &Path) -> Result<SigningKey, StoreError> {
     read_or_make(&path.unwrap_or_else(|| folder.join("0.key")))
 }
 
-/// Makes the key that a role will have, unless there is one.
+/// Makes the key that a role will have, unless there is one that can sign.
 pub(super) fn make_next(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
-    read_or_make(&next_path(store, role))
+    let path = next_path(store, role);
+    if matches!(KeyFile::read(&path)?, KeyFile::Damaged) {
+        fs_err::remove_file(&path)?;
+    }
+    read_or_make(&path)
 }
 
 /// Puts a role's next key in place of its key, if a root names it.
 pub(super) fn promote(store: &Path, role: &str, root: &Root) -> Result<(), StoreError> {
-    let next = match read_hex_key(&next_path(store, role)) {
-        Err(StoreError::Io(e)) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-        next => SigningKey::from_bytes(&next?.0),
-    };
+    let KeyFile::Key(next) = KeyFile::read(&next_path(store, role))? else { return Ok(()) };
     if root.roles[role].keyids.contains(&Key::of(&next).id()) {
         files::move_into_place(&next_path(store, role), &key_path(store, role))?;
     }
@@ -108,10 +151,10 @@ fn key_path(store: &Path, role: &str) -> PathBuf {
 }
 
 fn read_or_make(path: &Path) -> Result<SigningKey, StoreError> {
-    match read_hex_key(path) {
-        Ok(secret) => return Ok(SigningKey::from_bytes(&secret.0)),
-        Err(StoreError::Io(e)) if e.kind() == io::ErrorKind::NotFound => {}
-        Err(e) => return Err(e),
+    match KeyFile::read(path)? {
+        KeyFile::Key(key) => return Ok(key),
+        KeyFile::Missing => {}
+        KeyFile::Damaged => return Err(damaged(path.to_owned())),
     }
     let key = generate_key();
     let part = path.with_extension("part");
@@ -123,14 +166,34 @@ fn read_or_make(path: &Path) -> Result<SigningKey, StoreError> {
     Ok(key)
 }
 
-/// Reads 32 bytes of hex and a line end.
-fn read_hex_key(path: &Path) -> Result<Hash32, StoreError> {
-    let mut text = String::new();
-    let file = fs_err::File::open(path)?;
-    let wrong = || StoreError::Key { path: path.to_owned() };
-    match file.take(256).read_to_string(&mut text) {
-        Err(e) if e.kind() == io::ErrorKind::InvalidData => return Err(wrong()),
-        read => read?,
-    };
-    text.trim_end().parse().map_err(|_| wrong())
+const DAMAGED: &str = "it is damaged: expected 64 hex digits";
+
+/// Says that a key is damaged which cannot be made anew.
+fn damaged(path: PathBuf) -> StoreError {
+    let help = "restore it from a backup, or move it away if root's other keys are enough (`slag-encoder keys status` tells the threshold)";
+    StoreError::Key { path, what: DAMAGED, help: help.into() }
+}
+
+/// What a file has in which a key should be.
+enum KeyFile {
+    Key(SigningKey),
+    Missing,
+    Damaged,
+}
+
+impl KeyFile {
+    /// Reads 32 bytes of hex and a line end.
+    fn read(path: &Path) -> Result<Self, StoreError> {
+        let file = match fs_err::File::open(path) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Self::Missing),
+            file => file?,
+        };
+        let mut text = String::new();
+        match file.take(256).read_to_string(&mut text) {
+            Err(e) if e.kind() == io::ErrorKind::InvalidData => return Ok(Self::Damaged),
+            read => read?,
+        };
+        let secret: Option<Hash32> = text.trim_end().parse().ok();
+        Ok(secret.map_or(Self::Damaged, |secret| Self::Key(SigningKey::from_bytes(&secret.0))))
+    }
 }

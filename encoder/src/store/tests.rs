@@ -8,6 +8,7 @@ use slag_common::frames::Aabb;
 use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
 use slag_common::shard::Profile;
 
+use super::metadata::Metadata;
 use super::*;
 
 /// A manifest of cells without shards.
@@ -369,4 +370,66 @@ fn verification_reads_every_byte_and_names_what_is_bad() {
     let expected =
         [("cell 0, compact, generation 2", Fault::Damaged), ("field, generation 1", Fault::Missing)];
     assert_eq!(bad, expected.map(|(holds, fault)| (vec![holds.to_owned()], fault)));
+}
+
+/// A manifest that is cut, empty, changed or lost: readers say what helps, and the next encode does it. Fetches under
+/// way keep the generation before.
+#[test]
+fn a_damaged_manifest_is_published_anew() {
+    let damages: [fn(&Path); 4] = [
+        |path| {
+            let bytes = fs_err::read(path).expect("there");
+            fs_err::write(path, &bytes[..bytes.len() / 2]).expect("written");
+        },
+        |path| fs_err::write(path, "").expect("written"),
+        |path| {
+            let text = fs_err::read_to_string(path).expect("there");
+            fs_err::write(path, text.replace("\"dim\":4", "\"dim\":0")).expect("written");
+        },
+        |path| fs_err::remove_file(path).expect("there"),
+    ];
+    for (number, damage) in damages.iter().enumerate() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        for generation in 1..=2 {
+            store.publish(&manifest(generation, &[]), &Extras::new()).expect("publishes");
+        }
+        drop(store);
+        damage(&dir.path().join("manifest"));
+        let error = StoreReader::open(dir.path()).expect_err("damaged");
+        assert!(matches!(error, StoreError::Manifest { .. } | StoreError::ManifestLost { .. }), "{error}");
+        let text = error.to_string();
+        assert!(text.contains("run `slag-encoder encode` again"), "damage {number}: {text}");
+        assert!(!text.contains("matching versions") && !text.contains("nothing has been"), "{text}");
+        let store = Store::create_or_open(dir.path()).expect("an encode goes on");
+        assert_eq!(store.next_generation().expect("records"), 3, "damage {number}");
+        store.publish(&manifest(3, &[]), &Extras::new()).expect("publishes");
+        let reader = store.reader().expect("whole");
+        let previous = reader.previous().expect("readable").manifest.generation;
+        assert_eq!((reader.manifest().generation, previous), (3, 1), "damage {number}");
+        assert!(reader.listing().verify(|| {}).bad.is_empty(), "damage {number}");
+    }
+}
+
+/// What a program of another version wrote is no damage, and is not written over.
+#[test]
+fn a_manifest_of_another_version_is_kept() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    store.publish(&manifest(1, &[]), &Extras::new()).expect("publishes");
+    drop(store);
+    let path = dir.path().join("manifest");
+    let ours = fs_err::read_to_string(&path).expect("there");
+    let later = ours.replace(&format!("{{\"version\":{VERSION}"), &format!("{{\"version\":{}", VERSION + 1));
+    fs_err::write(&path, later).expect("written");
+    let refused = Store::create_or_open(dir.path()).expect_err("another version");
+    assert!(refused.to_string().contains("matching versions"), "{refused}");
+    // One of this version's number with a member that this program does not know, which is signed.
+    let later = ours.replacen('{', "{\"later\":1,", 1);
+    fs_err::write(&path, &later).expect("written");
+    Store::create_or_open(dir.path()).expect("it is not signed: damage");
+    Metadata::open(dir.path()).and_then(|metadata| metadata.publish(later.as_bytes(), 1)).expect("signs");
+    let refused = Store::create_or_open(dir.path()).expect_err("another version");
+    assert!(matches!(refused, StoreError::SignedManifest { .. }), "{refused}");
+    assert!(fs_err::read_to_string(&path).expect("there") == later);
 }

@@ -1,4 +1,4 @@
-//! Reads every byte of what a store publishes.
+//! Reads every byte of what a store publishes, and follows its metadata as a robot does.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -10,8 +10,9 @@ use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::manifest::TextModelRecord;
 
-use super::files;
 use super::reader::{Published, StoreReader};
+use super::walk::{self, Refused};
+use super::{files, metadata};
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -21,15 +22,19 @@ pub(crate) enum Fault {
     Damaged,
     /// It cannot be read; the system's error.
     Unreadable(String),
+    /// Robots refuse it: why, and what helps.
+    Refused(String),
 }
 
-/// An object that robots or queries would fail on.
+/// A file that robots or queries would fail on.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub(crate) struct BadObject {
-    pub(crate) hash: Hash32,
+pub(crate) struct BadFile {
+    /// Of an object; absent of the manifest and of metadata.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) hash: Option<Hash32>,
     pub(crate) path: PathBuf,
     pub(crate) fault: Fault,
-    /// What it holds, such as `cell 3, balanced, generation 2`.
+    /// What an object holds, such as `cell 3, balanced, generation 2`.
     pub(crate) holds: Vec<String>,
 }
 
@@ -39,8 +44,8 @@ pub(crate) struct Verified {
     /// Objects that the current generation and the one before it list.
     pub(crate) n_files: usize,
     pub(crate) len_bytes: u64,
-    /// Bad ones, by hash.
-    pub(crate) bad: Vec<BadObject>,
+    /// Bad objects, by hash; then what robots refuse of metadata and manifest.
+    pub(crate) bad: Vec<BadFile>,
 }
 
 pub(crate) struct Listing<'a> {
@@ -68,7 +73,7 @@ impl Listing<'_> {
         self.holds.len()
     }
 
-    /// Reads every object, several at a time. `on_read`: called after each, from any thread.
+    /// Reads every object, several at a time, and the metadata. `on_read`: called after each, from any thread.
     pub(crate) fn verify(&self, on_read: impl Fn() + Sync) -> Verified {
         let bytes_read = AtomicU64::new(0);
         let check = |((hash, len_bytes), holds): (&(Hash32, Option<u64>), &Vec<String>)| {
@@ -83,9 +88,17 @@ impl Listing<'_> {
                 Err(e) => Some(Fault::Unreadable(e.to_string())),
             };
             on_read();
-            fault.map(|fault| BadObject { hash: *hash, path, fault, holds: holds.clone() })
+            fault.map(|fault| BadFile { hash: Some(*hash), path, fault, holds: holds.clone() })
         };
-        let bad = self.holds.par_iter().filter_map(check).collect();
+        let mut bad: Vec<BadFile> = self.holds.par_iter().filter_map(check).collect();
+        let of = |path, fault| BadFile { hash: None, path, fault, holds: Vec::new() };
+        let store = self.reader.dir();
+        match walk::refused(store) {
+            Ok(refused) => {
+                bad.extend(refused.into_iter().map(|Refused { path, what }| of(path, Fault::Refused(what))))
+            }
+            Err(e) => bad.push(of(metadata::folder(store), Fault::Unreadable(e.to_string()))),
+        }
         Verified { n_files: self.n_files(), len_bytes: bytes_read.into_inner(), bad }
     }
 }

@@ -8,10 +8,10 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use slag_common::Hash32;
-use slag_common::manifest::{Manifest, TextModelRecord};
+use slag_common::manifest::{Manifest, ManifestError, TextModelRecord};
 
 use super::catalogue::Catalogue;
-use super::error::StoreError;
+use super::error::{StoreError, manifest_fault};
 use super::files::{self, Access, HashingWriter, ModelsRecord};
 use super::metadata::Metadata;
 use super::reader::{self, Extras, Published, StoreReader};
@@ -155,7 +155,11 @@ impl Store {
         let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
         Manifest::parse(&bytes).map_err(refuse)?;
         let hash = Hash32::of(&bytes);
-        let current = files::read_manifest_bytes(&path)?;
+        let current = match files::read_manifest_bytes(&path) {
+            Err(StoreError::Manifest { .. }) => None,
+            // A damaged one serves no fetch under way: the one before it stays.
+            current => current?.filter(|bytes| Manifest::parse(bytes).is_ok()),
+        };
         let again = current.as_deref() == Some(&bytes);
         match self.catalogue.last_generation()? {
             Some(generation) if manifest.generation <= generation && !again => {
@@ -220,11 +224,36 @@ impl Store {
         if let Ok(Some((manifest, bytes))) = read(files::MANIFEST_PREVIOUS) {
             self.catalogue.record(&manifest, Hash32::of(&bytes))?;
         }
-        if let Some((manifest, bytes)) = read(files::MANIFEST)? {
+        let current = match read(files::MANIFEST) {
+            Err(StoreError::Manifest { path, cause }) => {
+                self.check_is_damaged(&path, &cause)?;
+                let fault = manifest_fault(&cause);
+                tracing::warn!("{}: {fault}; the next publication writes it anew", path.display());
+                None
+            }
+            read => read?,
+        };
+        if let Some((manifest, bytes)) = current {
             Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
             self.catalogue.record(&manifest, Hash32::of(&bytes))?;
         }
         Ok(())
+    }
+
+    /// Refuses a manifest that cannot be read but is not damaged: a program of another version goes on from it.
+    fn check_is_damaged(&self, path: &Path, cause: &ManifestError) -> Result<(), StoreError> {
+        let (path, cause) = (path.to_owned(), cause.clone());
+        match &cause {
+            ManifestError::Version { .. } => Err(StoreError::Manifest { path, cause }),
+            ManifestError::Content { .. } => {
+                let bytes = files::read_manifest_bytes(&path)?.unwrap_or_default();
+                match Metadata::open(&self.dir)?.vouches_for(&bytes)? {
+                    true => Err(StoreError::SignedManifest { path, cause }),
+                    false => Ok(()),
+                }
+            }
+            ManifestError::Damaged { .. } | ManifestError::TooLong { .. } => Ok(()),
+        }
     }
 
     fn check_object(&self, hash: Hash32, expected_bytes: Option<u64>) -> Result<(), StoreError> {

@@ -49,7 +49,7 @@ impl From<ViewError> for Problem {
             }
             ViewError::Models(_) => (StatusCode::CONFLICT, "encoder-mismatch", "No text model"),
             ViewError::OtherSplat { .. } => (StatusCode::CONFLICT, "other-splat", "Another splat"),
-            ViewError::Store(StoreError::NotPublished { .. }) => {
+            ViewError::Store(StoreError::NotPublished { .. } | StoreError::ManifestLost { .. }) => {
                 (StatusCode::SERVICE_UNAVAILABLE, "no-scene", "No scene")
             }
             _ => return Self::internal(slag_common::error_line(&error)),

@@ -4,12 +4,13 @@ use std::iter;
 use std::sync::Arc;
 
 use axum::extract::rejection::QueryRejection;
-use axum::extract::{Path, Query, State};
+use axum::extract::{Query, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Json, Router};
 use serde_json::{Value, json};
 use slag_common::objects::parse_public_id;
+use slag_service::params::PathText;
 use slag_service::problem::Problem;
 use slag_view::{Description, Step, Words};
 
@@ -57,7 +58,7 @@ async fn words(State(viewer): AppState) -> Result<Json<Words>, Problem> {
     blocking(viewer, Viewer::words).await.map(Json)
 }
 
-async fn cell(State(viewer): AppState, Path(id): Path<String>, pairs: Pairs) -> Result<Response, Problem> {
+async fn cell(State(viewer): AppState, PathText(id): PathText, pairs: Pairs) -> Result<Response, Problem> {
     let pairs = read(pairs, &["generation", "step"])?;
     let cell_id = number("id", &id)?;
     let of = |wanted: &str| pairs.iter().find(|(name, _)| name == wanted);
@@ -98,7 +99,7 @@ async fn changes(State(viewer): AppState) -> Result<Json<Diff>, Problem> {
 }
 
 /// Sends the small picture of a thing, by its id.
-async fn thumbnail(State(viewer): AppState, Path(id): Path<String>) -> Result<Response, Problem> {
+async fn thumbnail(State(viewer): AppState, PathText(id): PathText) -> Result<Response, Problem> {
     let wanted = parse_public_id(&id).ok_or_else(|| bad("id: expected o and 16 hex digits"))?;
     let picture = blocking(viewer, move |viewer| viewer.thumbnail(wanted)).await?;
     let gone = || {
@@ -109,7 +110,7 @@ async fn thumbnail(State(viewer): AppState, Path(id): Path<String>) -> Result<Re
 }
 
 /// Sends a photo as it lies on disk, by its number in the description.
-async fn photo(State(viewer): AppState, Path(number): Path<String>) -> Result<Response, Problem> {
+async fn photo(State(viewer): AppState, PathText(number): PathText) -> Result<Response, Problem> {
     let number: usize = self::number("number", &number)?;
     let path = viewer.photo(number);
     let gone = |detail: String| Problem::new(StatusCode::NOT_FOUND, "no-such-photo", "No such photo", detail);

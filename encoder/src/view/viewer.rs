@@ -96,6 +96,11 @@ impl Viewer {
         }
     }
 
+    /// Opens what is shown, as the first request would.
+    pub(crate) fn check(&self) -> Result<(), ViewError> {
+        self.describe().map(drop)
+    }
+
     pub(super) fn describe(&self) -> Result<Description, ViewError> {
         let mut description = match (&self.shown.store, &self.shown.splat) {
             (None, Some(splat)) => splat.describe(),
@@ -229,8 +234,10 @@ pub(crate) fn up_of(views: &[View]) -> Option<Vec3> {
 #[cfg(test)]
 mod tests {
     use glam::{DAffine3, DMat3};
+    use slag_common::Gaussians;
 
     use super::*;
+    use crate::store;
 
     /// A camera at (1, 2, 3) that looks along the world's y, with the world's z upward.
     fn level() -> View {
@@ -244,6 +251,29 @@ mod tests {
             intrinsics: crate::raster::pinhole([64, 48], 60.0),
             camera_from_world: world_from_camera.inverse(),
         }
+    }
+
+    /// What no request can be answered from is refused before there is an address.
+    #[test]
+    fn a_store_that_is_not_there_or_of_another_splat_is_refused() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let check = |splat: Option<usize>| {
+            let scene = |n| Gaussians { means_in_world: vec![DVec3::ZERO; n], ..Gaussians::default() };
+            let splat = splat.map(|n| Splat::new("splat".into(), scene(n), false));
+            let open_text: OpenText = Box::new(|_| Err("none".into()));
+            let store = Some(dir.path().to_owned());
+            Viewer::new(Viewed { store, splat, views: Vec::new(), up: None, open_text }).check()
+        };
+        let missing = check(None).expect_err("nothing there").to_string();
+        assert!(missing.contains("nothing has been published here yet"), "{missing}");
+        let store = store::Store::create_or_open(dir.path()).expect("opens");
+        store.publish(&store::tests::manifest(1, &[]), &store::Extras::new()).expect("publishes");
+        check(None).expect("a store");
+        let other = check(Some(7)).expect_err("another splat").to_string();
+        assert!(
+            other.contains("the splat has 7 Gaussians, but the store was encoded from one with 0"),
+            "{other}"
+        );
     }
 
     #[test]

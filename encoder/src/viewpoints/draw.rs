@@ -1,14 +1,15 @@
 //! Images of a splat, and the poses file that says that they are drawings.
 
 use std::f32::consts::SQRT_2;
-use std::io::{self, Cursor};
+use std::io::{self, BufReader, Cursor};
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DVec3};
-use image::{ImageError, ImageFormat, Rgb, RgbImage};
+use image::{DynamicImage, ImageError, ImageFormat, Rgb, RgbImage};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Value, json};
+use slag_common::photo::{self, PhotoError};
 use slag_common::{Gaussians, Intrinsics, durable, npy};
 
 use super::looks::pinhole;
@@ -34,6 +35,8 @@ pub enum DrawError {
     Io(#[from] io::Error),
     #[error("a drawing as PNG: {0}")]
     Image(#[from] ImageError),
+    #[error("{}: {fault}", path.display())]
+    Drawn { path: PathBuf, fault: PhotoError },
 }
 
 /// A view to draw, with its file's name below `images/`.
@@ -131,9 +134,15 @@ pub fn draw_sharpened(
     scene.scales = scales;
     let loaded = rasterizer.load(scene)?;
     draw_images(folder, views, loaded.as_ref(), progress, |_, drawing, path| {
-        Ok(sharpened(&drawing.image(), &image::open(path)?.into_rgb8()))
+        Ok(sharpened(&drawing.image(), &read(path)?))
     })?;
     write_poses(folder, views, drawn_from, about)
+}
+
+fn read(path: &Path) -> Result<RgbImage, DrawError> {
+    let input = BufReader::new(fs_err::File::open(path)?);
+    let read = photo::open(input).and_then(|decoder| Ok(DynamicImage::from_decoder(decoder)?.into_rgb8()));
+    read.map_err(|fault| DrawError::Drawn { path: path.to_owned(), fault })
 }
 
 /// Writes the drawing of each view as `finish` makes it, which gets the file that it replaces.

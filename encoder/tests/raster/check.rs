@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{DAffine3, DVec3};
+use slag_common::photo::PhotoError;
 use slag_common::{Gaussians, Intrinsics, View, poses};
 use slag_encoder::check::{
     CheckError, CheckOptions, CheckReport, CheckView, FrameCause, Mistake, check, suspicions,
@@ -279,7 +280,7 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
 /// Photos that cannot be read are left out and named; transparent parts do not count.
 #[test]
 fn unreadable_photos_are_left_out_and_hidden_pixels_do_not_count() {
-    let unreadable = || Err(IngestError::Cut { path: "b.jpg".into() });
+    let unreadable = || Err(IngestError::Photo { path: "b.jpg".into(), fault: PhotoError::Cut });
     let views = [Ok(tiny_view()), unreadable(), Ok(tiny_view())];
     let report = check(&Gaussians::default(), views, &CpuRasterizer, &CheckOptions::default()).unwrap();
     assert_eq!((report.views.len(), report.unreadable.len()), (2, 1));

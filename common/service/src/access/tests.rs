@@ -65,6 +65,30 @@ fn a_rebound_name_is_refused() {
     assert_eq!(status(&access.clone().with_any_host(), Method::GET, &[("host", "evil.example")]), 200);
 }
 
+/// The attack: a host that the check does not see, but a program on the way or the handler does.
+#[test]
+fn hosts_that_hide_are_refused() {
+    let access = access("127.0.0.1:7734", &[], &[], None).expect("sound");
+    let of = |uri: &str, hosts: &[&[u8]]| {
+        let mut request = Request::get(uri);
+        for host in hosts {
+            request = request.header("host", HeaderValue::from_bytes(host).expect("a value"));
+        }
+        let request = request.body(Body::empty()).expect("a request");
+        access.check(&request).map_or_else(|problem| problem.into_response().status().as_u16(), |()| 200)
+    };
+    assert_eq!(of("/", &[b"localhost"]), 200);
+    assert_eq!(of("http://127.0.0.1:7734/", &[b"localhost"]), 200);
+    let hidden: [&[&[u8]]; 3] =
+        [&[b"evil\xe9.example"], &[b"localhost", b"evil.example"], &[b"localhost", b"localhost"]];
+    for hosts in hidden {
+        assert_eq!(of("/", hosts), 400, "{hosts:?}");
+    }
+    assert_eq!(of("http://evil.example/status", &[b"localhost"]), 421);
+    assert_eq!(of("http://localhost/status", &[b"evil.example"]), 421);
+    assert_eq!(of("http://evil.example/status", &[]), 421);
+}
+
 /// The attack: a page of another site asks, from a person's browser.
 #[test]
 fn pages_of_others_are_refused_unless_they_are_given() {

@@ -94,6 +94,12 @@ async fn bodies_are_whole_json_and_short() {
     let running = start(ConnectionLimits::default()).await;
     let whole = HALF_A_BODY.replace("{\"x\"", "{\"x\":1.5}").replace(": 9", ": 9\r\nConnection: close");
     assert!(ask_once(running.address, &whole).await.ends_with("{\"x\":1.5}"));
+    let identity = whole.replace("Content-Type", "Content-Encoding: identity\r\nContent-Type");
+    assert!(ask_once(running.address, &identity).await.ends_with("{\"x\":1.5}"));
+    let gzip = whole.replace("Content-Type", "Content-Encoding: GZIP\r\nContent-Type");
+    let answer = ask_once(running.address, &gzip).await.to_lowercase();
+    assert!(answer.starts_with("http/1.1 415") && answer.contains("accept-encoding: identity"), "{answer}");
+    assert!(answer.contains("content-encoding is \\\"gzip\\\", expected none"), "{answer}");
     for (from, to, status) in [
         ("application/json", "text/plain", 415),
         ("Content-Type: application/json\r\n", "", 415),
@@ -103,6 +109,36 @@ async fn bodies_are_whole_json_and_short() {
         let answer = ask_once(running.address, &whole.replace(from, to)).await;
         assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{to}: {answer}");
     }
+}
+
+/// A client that sends its whole body before it reads, as Python's does, reads why the body was refused.
+#[tokio::test]
+async fn refused_bodies_are_drained() {
+    let running = start(ConnectionLimits::default()).await;
+    let pieces = [[b' '; 100_000]; 4];
+    for (path, kind, status) in
+        [("things", "application/json", 413), ("things", "text/plain", 415), ("nowhere", "text/plain", 404)]
+    {
+        let head = format!(
+            "POST /{path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: {kind}\r\n\
+             Content-Length: 400000\r\n\r\n"
+        );
+        let mut stream = connect(running.address, &head).await;
+        for piece in &pieces {
+            // Long enough for the answer to be sent and the connection closed.
+            tokio::time::sleep(Duration::from_millis(60)).await;
+            stream.write_all(piece).await.unwrap_or_else(|e| panic!("{status}: {e}"));
+        }
+        let mut answer = String::new();
+        let whole = stream.read_to_string(&mut answer);
+        tokio::time::timeout(Duration::from_secs(5), whole).await.expect("ends").expect("an answer");
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{answer}");
+    }
+    // The attack: a body that never ends is left after a second.
+    let head = "POST /nowhere HTTP/1.1\r\nHost: localhost\r\nContent-Length: 400000\r\n\r\n";
+    let started = tokio::time::Instant::now();
+    assert!(ask_once(running.address, head).await.starts_with("HTTP/1.1 404"));
+    assert!(started.elapsed() < Duration::from_secs(4), "{:?}", started.elapsed());
 }
 
 #[tokio::test]

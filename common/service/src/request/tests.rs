@@ -6,6 +6,7 @@ use tower::ServiceExt;
 
 use super::*;
 use crate::metrics::Exposition;
+use crate::params::PathText;
 
 async fn broken() {
     panic!("secret of the house");
@@ -17,7 +18,7 @@ async fn refused() -> Problem {
 
 fn router(responses: &Arc<ResponseCounts>) -> Router {
     let routes = Router::new()
-        .route("/things/{name}", get(async || "a thing"))
+        .route("/things/{name}", get(async |PathText(_): PathText| "a thing"))
         .route("/broken", get(broken))
         .route("/refused", get(refused));
     observed(routes, Arc::clone(responses), Access::default())
@@ -37,6 +38,7 @@ async fn every_error_is_a_problem_with_the_id_of_its_request() {
     let cases = [
         (Method::GET, "/nowhere", 404, "not-found", "\"/nowhere\""),
         (Method::POST, "/things/chair", 405, "method-not-allowed", "does not take \"POST\""),
+        (Method::GET, "/things/%ff", 400, "bad-parameter", "name: found \"/things/%ff\", expected UTF-8"),
         (Method::GET, "/broken", 500, "internal", "the service failed"),
         (Method::GET, "/refused", 503, "overloaded", "come back later"),
     ];

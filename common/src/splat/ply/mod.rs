@@ -30,8 +30,9 @@ use sh_rest::sh_rest_properties;
 const NOT_A_SPLAT: &str =
     "this is not a trained splat but perhaps a point cloud or mesh: give the PLY of the splat";
 const VERTEX: &str = "vertex";
-const GEOMETRY: [&str; 10] =
-    ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0", "scale_1"];
+const GEOMETRY: [&str; 9] = ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0"];
+/// The second scale, which balls lack as they do the third.
+const SECOND_SCALE: &str = "scale_1";
 /// The third scale, which the flat Gaussians of 2DGS lack.
 const THIRD_SCALE: &str = "scale_2";
 
@@ -47,9 +48,16 @@ pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, Spla
 /// Reads the rows of a file with a property for each number.
 fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let mut wanted = ply.properties(vertex, &GEOMETRY, NOT_A_SPLAT)?;
-    let third_scale = ply.elements[vertex].property(THIRD_SCALE);
-    // A flat Gaussian's third axis is read as some other number and set to 0.
-    wanted.push(third_scale.unwrap_or(wanted[9]));
+    let [second_scale, third_scale] =
+        [SECOND_SCALE, THIRD_SCALE].map(|name| ply.elements[vertex].property(name));
+    // A ball has one scale for all axes; a flat Gaussian's third axis is read as some other number and set to 0.
+    let is_ball = second_scale.is_none() && third_scale.is_none();
+    if is_ball {
+        wanted.extend([wanted[8]; 2]);
+    } else {
+        wanted.extend(ply.properties(vertex, &[SECOND_SCALE], NOT_A_SPLAT)?);
+        wanted.push(third_scale.unwrap_or(wanted[9]));
+    }
     let rgb_names = ["red", "green", "blue"];
     let rgb: Option<Vec<usize>> = rgb_names.iter().map(|name| ply.elements[vertex].property(name)).collect();
     // nerfstudio exports plain colours on request ("rgb"), others as numbers of 0 to 1.
@@ -76,7 +84,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
         out.means_in_world.push(DVec3::new(*x, *y, *z));
         out.rotations_wxyz.push(unit_rotation([*w, *i, *j, *k]));
         let [s0, s1, s2] = [s0, s1, s2].map(|s| s.exp() as f32);
-        out.scales.push([s0, s1, if third_scale.is_some() { s2 } else { 0.0 }]);
+        out.scales.push([s0, s1, if is_ball || third_scale.is_some() { s2 } else { 0.0 }]);
         out.opacities.push(sigmoid(*logit));
         out.sh_dc.push([r, g, b].map(|c| white.map_or(*c as f32, |white| dc_of_colour(c / white))));
         out.sh_rest.extend(rest.iter().map(|c| *c as f32));

@@ -65,9 +65,76 @@ fn the_line_comes_before_the_environment_and_that_before_the_file() {
     assert_eq!(values(&quiet, "verbose"), ["0"]);
 }
 
+/// As on the command line, where clap refuses these.
+#[test]
+fn flags_of_a_file_need_and_exclude_others() {
+    let radius = [("SLAG_EDGE_QUERY_RADIUS", "0.5")];
+    for (line, environment, file, expected) in [
+        ("slag-edge query chair", &radius[..], "", "SLAG_EDGE_QUERY_RADIUS: needs --near <X,Y,Z> as well"),
+        ("slag-edge list", &[], "[list]\nradius = 3", "edge.toml: list.radius: needs --near"),
+        (
+            "slag-edge locate a.jpg",
+            &[],
+            "[locate]\nfocal-px = 500\nnear = '1,2,3'",
+            "locate.near: needs --sigma",
+        ),
+        ("slag-edge locate a.jpg --focal-px 500", &[], "sigma = 1", "edge.toml: sigma: needs --near"),
+        ("slag-edge serve", &[], "[serve]\ntls-cert = 'a'", "serve.tls-cert: needs --tls-key"),
+        ("slag-edge fetch", &[], "[fetch]\nat = '1,2,3'\nat-geo = '4,5'", "at-geo: cannot stand beside "),
+        ("slag-edge list", &[], "[list]\nformat = 'csv'\njson = true", "cannot stand beside "),
+        ("slag-edge status", &[], "quiet = true\nverbose = 1", "cannot stand beside "),
+    ] {
+        let error = parsed(line, environment, file).expect_err(line).to_string();
+        assert!(error.contains(expected), "{line}: {error}");
+    }
+    let here = [("SLAG_EDGE_FETCH_AT_GEO", "4,5")];
+    for (line, environment, file, id, expected) in [
+        ("slag-edge query chair --near 1,2,3", &radius[..], "", "radius", &["0.5"][..]),
+        ("slag-edge list", &[], "[list]\nradius = 3\nnear = '1,2,3'", "radius", &["3"]),
+        // One for all commands: fetches alone have a radius without a position.
+        ("slag-edge fetch", &[], "radius = 3", "radius", &["3"]),
+        ("slag-edge list", &[], "radius = 3", "radius", &[]),
+        ("slag-edge list --near 1,2,3 --radius 4", &[], "radius = 3", "radius", &["4"]),
+        // What is switched off on the line hides nothing that follows.
+        (
+            "slag-edge fetch --trust-first=false --at-geo 4,5",
+            &[],
+            "[fetch]\ntrust-first = true\nat = '1,2,3'",
+            "at",
+            &[],
+        ),
+        // The environment comes before the file.
+        ("slag-edge fetch", &here, "[fetch]\nat = '1,2,3'", "at", &[]),
+        ("slag-edge fetch", &here, "[fetch]\nat = '1,2,3'", "at_geo", &["4,5"]),
+        ("slag-edge list", &[], "[list]\nformat = 'csv'\njson = false", "format", &["csv"]),
+        // Those of other commands may be completed by their lines.
+        ("slag-edge status", &[], "[list]\nradius = 3", "cache", &[]),
+    ] {
+        let matches = parsed(line, environment, file).unwrap_or_else(|e| panic!("{line}: {e}"));
+        assert_eq!(values(&matches, id), expected, "{line}: {id}");
+    }
+}
+
+#[test]
+fn unknown_variables_are_told_with_the_nearest_name() {
+    let warnings =
+        |names: &[&str]| unknown_variables(&Cli::command(), names.iter().map(|name| (*name).to_owned()));
+    let known =
+        ["SLAG_EDGE_CACHE", "SLAG_EDGE_FETCH_RADIUS", "SLAG_EDGE_TRUST_SHOW_JSON", "SLAG_EDGE_CONFIG"];
+    let others = ["PATH", "SLAG_EDGES", "slag_edge_cahce"];
+    assert_eq!(warnings(&[&known[..], &others].concat()), Vec::<String>::new());
+    let told = warnings(&["SLAG_EDGE_CAHCE", "SLAG_EDGE_SERVE_LISTN"]);
+    let [cache, listen] = &told[..] else { panic!("{told:?}") };
+    assert!(cache.starts_with("SLAG_EDGE_CAHCE ") && cache.ends_with("perhaps SLAG_EDGE_CACHE"), "{cache}");
+    assert!(listen.ends_with("perhaps SLAG_EDGE_SERVE_LISTEN"), "{listen}");
+}
+
 #[test]
 fn errors_name_the_file_and_the_key() {
     for (file, key, what) in [
+        ("[serve]\nfollow = ''", "serve.follow", "give an address like http://host:port"),
+        ("[serve]\nfollow = 'ftp://x'", "serve.follow", "it does not begin with http:// or https://"),
+        ("[fetch]\nfrom = 'base:7733'", "fetch.from", "give an address like http://host:port"),
         ("[serve]\nlisten = 'nowhere'", "serve.listen", "IP:PORT or unix:PATH"),
         ("[serve]\nlisten = 7734", "serve.listen", "IP:PORT or unix:PATH"),
         ("[fetch]\nradius = 'far'", "fetch.radius", "0 or more"),
@@ -104,7 +171,8 @@ fn errors_name_the_file_and_the_key() {
     let line = ["slag-edge", "--config", "", "status"].map(OsString::from);
     let named = |name: &str| (name == "SLAG_EDGE_CONFIG").then(|| "nowhere.toml".into());
     assert!(parse(Cli::command(), &line, &named).is_ok(), "no file is read");
-    let error = parsed("slag-edge status", &[("SLAG_EDGE_FROM", "x y")], "nothing = 1").expect_err("no flag");
+    let error =
+        parsed("slag-edge status", &[("SLAG_EDGE_SCENE", "x y")], "nothing = 1").expect_err("no flag");
     assert!(error.to_string().len() < 120, "a hint, not all flags: {error}");
 }
 

@@ -100,7 +100,7 @@ async fn generations_are_compared_over_http() {
     let (_, near) = get("?near=22,0,0&radius=1").await;
     assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");
     // Places on the earth are in the world frame where the scene has an origin; this one has none.
-    assert_refused(&service.get("/v1/changes?near_lat_lon=46,7&radius=2").await, "near", "no origin");
+    assert_refused(&service.get("/v1/changes?near_lat_lon=46,7&radius=2").await, "near_lat_lon", "no origin");
     // Texts are axes: 33 is along axis 0, 20 along axis 2.
     let (_, named) = get("?text=0&text=2").await;
     assert_eq!(named["appeared"][0]["like"]["text"], "0", "{named:#}");

@@ -36,16 +36,26 @@ async fn photos_are_lost_or_refused() {
         ("focal_px=500&centre_px=NaN,1", "centre_px"),
         ("focal_px=500&centre_px=65,1", "centre_px"),
         ("focal_px=500&gravity=0,0,0", "gravity"),
+        ("focal_px=500&gravity=1e-170,0,0", "gravity"),
+        ("focal_px=500&gravity=0,1e-7,0", "gravity"),
+        ("focal_px=500&gravity=0,1e200,0", "gravity"),
         ("focal_px=500&near=1,2,3", "sigma"),
         ("focal_px=500&near=1,2,3&sigma=0", "sigma"),
         ("focal_px=500&sigma=1", "near"),
-        ("focal_px=500&near_lat_lon=46,8&sigma=1", "near"),
+        ("focal_px=500&near_lat_lon=46,8&sigma=1", "near_lat_lon"),
     ] {
         let (status, body) = post(&service, query, "image/jpeg", png(64, 48)).await;
         assert_eq!((status, &body["parameter"]), (StatusCode::BAD_REQUEST, &json!(parameter)), "{query}");
     }
-    let refused = post(&service, "focal_px=500", "image/png", b"hello".to_vec()).await;
-    assert_eq!(refused.0, StatusCode::BAD_REQUEST);
+    for (bytes, expected) in [("hello", "WebP"), ("<!DOCTYPE html>", "web page")] {
+        let (status, body) = post(&service, "focal_px=500", "image/png", bytes.into()).await;
+        assert_eq!(status, StatusCode::BAD_REQUEST, "{body:#}");
+        assert!(body["detail"].as_str().is_some_and(|detail| detail.contains(expected)), "{body:#}");
+    }
+    let mut webp = std::io::Cursor::new(Vec::new());
+    image::RgbImage::new(64, 48).write_to(&mut webp, image::ImageFormat::WebP).expect("memory");
+    let (status, body) = post(&service, "focal_px=500", "image/webp", webp.into_inner()).await;
+    assert_eq!((status, &body["state"]), (StatusCode::OK, &json!("lost")), "{body:#}");
     let refused = post(&service, "focal_px=500", "application/json", png(64, 48)).await;
     assert_eq!(refused.0, StatusCode::UNSUPPORTED_MEDIA_TYPE);
     let refused = post(&service, "focal_px=500", "image/png", vec![0; (32 << 20) + 1]).await;
@@ -67,10 +77,14 @@ async fn long_photos_are_taken() {
 /// A picture of one colour is short as a file: what it takes is refused before it is read.
 #[tokio::test]
 async fn memory_is_bounded() {
-    let settings = Settings { query_bytes: 16 << 20, ..Settings::default() };
-    let service = Service::new(Some(&chair(None)), settings);
+    let with =
+        |query_bytes: u64| Service::new(Some(&chair(None)), Settings { query_bytes, ..Settings::default() });
+    let service = with(20 << 20);
     let (status, body) = post(&service, "focal_px=500", "image/png", png(4000, 3000)).await;
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body:#}");
     let (status, _) = post(&service, "focal_px=500", "image/png", png(64, 48)).await;
     assert_eq!(status, StatusCode::OK);
+    // What stands before the pixels may inflate: it is not opened where there is no room for that.
+    let (status, body) = post(&with(10 << 20), "focal_px=500", "image/png", b"no photo".to_vec()).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body:#}");
 }

@@ -136,7 +136,11 @@ async fn areas_restrict_what_is_found() {
     let far = json!({"ball": {"centre": [50, 50, 0], "radius": 1.0}});
     let (_, _, body) = post(&service, &json!({"texts": ["0 on the 1"], "region": far})).await;
     assert_eq!(body["results"][0]["none"]["kind"], "not-in-region", "{body}");
-    assert_refused(&service.get("/v1/query?text=0&near_lat_lon=47,8&radius=5").await, "region", "no origin");
+    assert_refused(
+        &service.get("/v1/query?text=0&near_lat_lon=47,8&radius=5").await,
+        "near_lat_lon",
+        "no origin",
+    );
 }
 
 #[tokio::test]
@@ -243,17 +247,26 @@ async fn wrong_requests_are_refused_by_name() {
         (json!({"texts": ["0"], "limit": 0}), "limit"),
         (json!({"texts": ["0", "1"], "limit": 5001}), "limit"),
         (json!({"texts": ["0"], "offset": 1u64 << 40}), "limit"),
-        (json!({"texts": ["0"], "min_score": 3}), "threshold"),
+        (json!({"texts": ["0"], "min_score": 3}), "min_score"),
         (json!({"texts": ["0"], "precision": "maybe"}), "body"),
+        (json!({"texts": ["0"], "precision": {"exact": null}}), "body"),
+        (json!({"texts": ["0"], "kind": {"objects": null}}), "body"),
         (json!({"texts": ["0"], "time_budget_ms": 0}), "time_budget_ms"),
         (json!({"texts": ["0"], "near": [1e12, 0, 0]}), "near"),
-        (json!({"texts": ["0"], "region": {"polygon": [[0, 0], [1, 1]]}}), "region"),
-        (json!({"texts": ["0"], "region": {"polygon": [[0, 0], [1, 1], [2, 2]]}}), "region"),
+        (json!({"texts": ["0"], "region": {"polygon": [[0, 0], [1, 1]]}}), "polygon"),
+        (json!({"texts": ["0"], "region": {"polygon": [[0, 0], [1, 1], [2, 2]]}}), "polygon"),
+        (
+            json!({"texts": ["0"], "region": {"ball": {"centre": {"lat": 1, "lon": 2}, "radius": 1}}}),
+            "centre",
+        ),
+        (json!({"texts": ["0"], "region": {"box": {"from": [0, 0, 0], "to": [1e10, 1, 1]}}}), "box"),
         (json!({"texts": ["0"], "region": {"polygon": []}}), "body"),
         (json!({"texts": ["0"], "region": {"box": {"from": [0, 0, 1], "to": [5, 5, 1]}}}), "box"),
         (json!({"texts": ["0"], "region": {"ball": {"centre": [0, 0, 0], "radius": -1}}}), "radius"),
         (json!({"texts": ["0"], "negatives": ["0"]}), "negatives"),
-        (json!({"texts": [format!("0{}", " on 0".repeat(8))]}), "phrases"),
+        (json!({"texts": [format!("0{}", " on 0".repeat(8))]}), "texts"),
+        (json!({"texts": [" "]}), "texts"),
+        (json!({"vectors": vec![[1.0, 0.0, 0.0]; 33]}), "vectors"),
         (json!({"texts": ["0 behind the 1"]}), "near"),
         (json!({"texts": ["0 left of me"], "near": [0, 0, 0]}), "heading_rad"),
         (json!({"phrases": [{"thing": "me"}]}), "phrases"),
@@ -268,9 +281,29 @@ async fn wrong_requests_are_refused_by_name() {
         ("text=0&radius=3", "near"),
         ("text=0&relations=maybe", "relations"),
         ("text=0&polygon=1,2,3", "polygon"),
+        ("text=0&polygon=0,0,1,1,2,2", "polygon"),
+        ("text=0&polygon_lat_lon=46,8,47,8,47,9", "polygon_lat_lon"),
+        ("text=0&near_lat_lon=47,8", "near_lat_lon"),
+        ("text=0&min_score=2", "min_score"),
+        ("text=0&negative=%3F", "negative"),
+        ("text=0&texts=1", "texts"),
+        (&format!("text=0{}", "+on+0".repeat(8)), "text"),
+        (&"text=0&".repeat(33), "text"),
     ] {
-        assert_refused(&service.get(&format!("/v1/query?{query}")).await, parameter, query);
+        let refused = service.get(&format!("/v1/query?{query}")).await;
+        assert_refused(&refused, parameter, query);
+        let detail = refused.2["detail"].as_str().expect("text");
+        assert!(detail.starts_with(&format!("{parameter}: ")), "{detail}");
     }
+    assert_refused(&service.get("/v1/goal?text=0&near_lat_lon=47,8").await, "near_lat_lon", "a goal");
+    assert_refused(&service.get("/v1/objects?near_lat_lon=47,8&radius=1").await, "near_lat_lon", "a list");
+    let (status, _, body) = post(&service, &json!({"texts": ["sofa"]})).await;
+    assert_eq!((status.as_u16(), &body["parameter"]), (422, &json!("texts")), "{body}");
+    // What serde says is whole: it ends with the place, and lists the names.
+    let (_, _, body) = post(&service, &json!({"texts": ["0"], "colour": 1})).await;
+    let detail = body["detail"].as_str().expect("text");
+    assert!(detail.starts_with("body: unknown field `colour`, expected one of `texts`"), "{detail}");
+    assert!(detail.contains("`near`") && detail.len() < 400, "{detail}");
     // A negative may have a comma.
     let (_, _, reply) = post(&service, &json!({"texts": ["0"], "negatives": ["1 red, 2 blue"]})).await;
     assert_eq!(reply["results"][0]["negatives"], json!(["1 red, 2 blue"]), "{reply}");
@@ -288,7 +321,7 @@ async fn long_and_deep_questions_are_refused() {
         format!(r#"{{"phrases":[{levels}{{"thing":"a"}}{}]}}"#, "}}".repeat(n))
     };
     let bodies = [
-        (json!({"texts": [long]}).to_string(), "text"),
+        (json!({"texts": [long]}).to_string(), "texts"),
         (json!({"phrases": [{"thing": long}]}).to_string(), "phrases"),
         (json!({"texts": ["0"], "negatives": [long]}).to_string(), "negatives"),
         (deep(8), "phrases"),
@@ -356,6 +389,12 @@ async fn things_on_board_are_listed_in_pages() {
         "/v1/objects?limit=0",
         "/v1/objects?after=3",
         "/v1/objects?radius=3",
+        "/v1/objects?near=0,0,0&radius=1e10",
+        "/v1/objects?box=0,0,1,5,5,1",
+        "/v1/changes?near=0,0,0&radius=1e10",
+        "/v1/objects/%ff",
+        "/v1/objects/%ff/thumbnail",
+        "/v1/view/cells/%ff",
         "/v1/objects?x=1",
     ] {
         assert_eq!(service.get(bad).await.0, StatusCode::BAD_REQUEST, "{bad}");

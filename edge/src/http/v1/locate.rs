@@ -19,7 +19,7 @@ use crate::locate::{Answer, Camera, LocateError, PhotoFile, answer, map_working_
 use crate::query::{Point, QueryError, RequestError};
 use crate::score::{MAX_COORDINATE, ScoreError};
 
-pub const PHOTOS: &[&str] = &["image/jpeg", "image/png"];
+pub const PHOTOS: &[&str] = &["image/jpeg", "image/png", "image/webp"];
 
 /// The photo's camera, without lens distortion.
 #[derive(Deserialize, JsonSchema)]
@@ -84,8 +84,10 @@ pub async fn locate(
             let position_in_world = near.in_world("near", &snapshot.manifest)?;
             camera.prior = Some(Prior { position_in_world, sigma });
         }
-        let opened = PhotoFile::open(&photo).map_err(problem)?;
         let over_budget = |spent| query_problem(QueryError::Score(ScoreError::OverBudget(spent)));
+        budget.take(PhotoFile::opening_bytes(&photo));
+        budget.check().map_err(over_budget)?;
+        let opened = PhotoFile::open(&photo).map_err(problem)?;
         budget.take(opened.working_bytes() + map_working_bytes(&snapshot));
         budget.check().map_err(over_budget)?;
         answer(&snapshot, opened, &camera, budget).map(Json).map_err(problem)
@@ -101,7 +103,7 @@ fn problem(error: LocateError) -> Problem {
         LocateError::Camera { parameter, found, expected } => {
             RequestError::new(parameter, &found, expected).into()
         }
-        LocateError::Decode(_) | LocateError::TooLarge { .. } => {
+        LocateError::Photo(_) | LocateError::Blank | LocateError::TooLarge { .. } => {
             Problem::new(StatusCode::BAD_REQUEST, "bad-photo", "Bad photo", error.to_string())
         }
     }

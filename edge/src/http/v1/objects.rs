@@ -3,14 +3,14 @@
 use std::sync::Arc;
 
 use axum::Json;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::{StatusCode, header};
 use schemars::{JsonSchema, SchemaGenerator};
 use serde::Deserialize;
 use slag_api::objects::{ObjectOnBoard, ObjectPage};
 use slag_common::manifest::Manifest;
 use slag_common::objects::parse_public_id;
-use slag_service::params::Params;
+use slag_service::params::{Params, PathText};
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Binary, Described, Reply};
 
@@ -114,7 +114,7 @@ fn not_on_board(id: &str, snapshot: &Snapshot) -> Problem {
 
 pub async fn one(
     State(app): State<Arc<App>>,
-    Path(id): Path<String>,
+    PathText(id): PathText,
 ) -> Result<Json<ObjectOnBoard>, Problem> {
     let wanted = wanted(&id)?;
     app.within_limits(None, move |app, budget| {
@@ -130,7 +130,7 @@ pub async fn one(
 /// Sends the small picture of an object.
 pub async fn thumbnail(
     State(app): State<Arc<App>>,
-    Path(id): Path<String>,
+    PathText(id): PathText,
 ) -> Result<As<JpegPicture>, Problem> {
     let wanted = wanted(&id)?;
     let picture = app.within_limits(None, move |app, budget| {

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use axum::Json;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::{StatusCode, header};
 use schemars::JsonSchema;
 use serde::Deserialize;
-use slag_service::params::Params;
+use slag_service::params::{Params, PathText};
 use slag_service::problem::Problem;
 use slag_service::replies::{As, Binary};
 use slag_view::{Description, Step};
@@ -61,7 +61,7 @@ pub async fn scores(
 
 pub async fn cell(
     State(app): State<Arc<App>>,
-    Path(id): Path<String>,
+    PathText(id): PathText,
     Params(CellParams { generation, step }): Params<CellParams>,
 ) -> Result<As<Binary>, Problem> {
     let cell_id =

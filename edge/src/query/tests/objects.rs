@@ -153,7 +153,9 @@ fn objects_abstain_and_keep_to_the_region() {
     let answers = ask_objects(&|request| {
         (request.threshold, request.region.bounds) = (Some(0.5), Some(within(50.0, 60.0)));
     });
-    assert_eq!(answers.reason.map(|r| r.kind), Some(ReasonKind::NothingThere));
+    let nothing = answers.reason.expect("no answer");
+    assert_eq!((nothing.kind, answers.searched.area_fetched), (ReasonKind::NothingThere, Some(false)));
+    assert!(nothing.detail.contains("fetch that area"), "{}", nothing.detail);
     // With a negative the score is the difference of the object's scores: 0.8 - 0.9 for 21, 0 - 1 for 22.
     let question =
         Question { negatives: vec![std::sync::Arc::from([0.0f32, 1.0])], ..Question::new([1.0, 0.0]) };
@@ -167,6 +169,45 @@ fn objects_abstain_and_keep_to_the_region() {
     let answers = ask(&yard(), |request, _| request.kind = Some(AnswerKind::Objects));
     assert!(answers.reason.is_some_and(|r| r.detail.contains("kind=clusters")));
     assert_eq!(ask(&yard(), |_, _| ()).kind, AnswerKind::Clusters);
+}
+
+/// What is elsewhere is no miss, and an area that is on board need not be fetched. By hand: object 22 alone lies beyond
+/// x = 22.195, with a score of 0; from 20.5 to 20.9 lie Gaussians of no object, from 20.195 to 20.9 20 of object 21.
+#[test]
+fn reasons_are_of_the_region() {
+    let scene = scene_of_objects();
+    let reason = |from: f64, to: f64, min_count: u64, kind: Option<AnswerKind>| {
+        let answers = ask(&scene, |request, _| {
+            let bounds = Aabb { min: DVec3::new(from, -1.0, -1.0), max: DVec3::new(to, 1.0, 1.0) };
+            (request.kind, request.threshold, request.min_count) = (kind, Some(0.95), min_count);
+            request.region.bounds = Some(bounds);
+            if min_count == 30 {
+                request.threshold = Some(0.5);
+            }
+        });
+        let (is_on_board, reason) = (answers.searched.area_fetched, answers.reason.expect("no answer"));
+        assert_eq!(is_on_board, Some(true));
+        assert!(!reason.detail.contains("fetch"), "{}", reason.detail);
+        let is_inside = |at: DVec3| (from..=to).contains(&at.x);
+        assert!(reason.best_position_in_world.is_none_or(is_inside), "{reason:?}");
+        reason
+    };
+    let objects = Some(AnswerKind::Objects);
+    for kind in [objects, None] {
+        let low = reason(22.195, 22.6, 1, kind);
+        assert_eq!(low.kind, ReasonKind::BelowThreshold, "{}", low.detail);
+        assert!(
+            low.best_score.is_some_and(|score| score < 0.1) && low.detail.contains("in the box"),
+            "{low:?}"
+        );
+        let of_none = reason(20.5, 20.9, 1, kind);
+        assert_eq!(of_none.kind, ReasonKind::BelowThreshold, "{}", of_none.detail);
+        // Without objects the nearest miss is of the Gaussians.
+        assert_eq!(of_none.best_score.is_some(), kind.is_none(), "{of_none:?}");
+    }
+    let small = reason(20.195, 20.9, 30, objects);
+    assert_eq!(small.kind, ReasonKind::ClustersTooSmall, "{}", small.detail);
+    assert!(small.detail.contains("lower min_count"), "{}", small.detail);
 }
 
 /// By hand: of object 21's Gaussians 30 lie from 20.10 to 20.39, and 12 strays 1.6 m away.

@@ -7,7 +7,9 @@ use std::time::Instant;
 use anyhow::Result;
 use clap::Args;
 use slag_encoder::cli::common::{ModelArgs, cancel_flag, open_models};
-use slag_encoder::encode::{self, DEFAULT_MASK_LEVELS, EncodeSettings, EncodeSummary, Engines, Masks};
+use slag_encoder::encode::{
+    self, DEFAULT_MASK_LEVELS, EncodeSettings, EncodeSummary, Engines, Masks, Restart,
+};
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::devices::{DeviceChoice, Devices};
 use slag_encoder::raster::gpu::GpuOptions;
@@ -106,7 +108,7 @@ impl Runner {
         settings.output.scene_name = files.name.clone();
         settings.view.masks = masks;
         settings.run.strict = true;
-        settings.run.restart = true;
+        settings.run.restart = Restart::IfOther;
         settings.run.keep_views = true;
         change(&mut settings);
         let start = Instant::now();

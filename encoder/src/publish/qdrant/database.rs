@@ -1,8 +1,8 @@
 //! Requests to the database, repeated while their errors may pass.
 
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use qdrant_client::qdrant::{
     CollectionInfo, Condition, CountPointsBuilder, CreateFieldIndexCollectionBuilder, DeletePointsBuilder,
@@ -26,10 +26,15 @@ pub(super) struct Database<'a> {
     patient_client: Qdrant,
     options: &'a PushOptions,
     n_retries: AtomicU64,
+    /// Whether it has answered a request.
+    is_reached: AtomicBool,
 }
 
 impl<'a> Database<'a> {
     pub(super) fn new(options: &'a PushOptions) -> Result<Self, PushError> {
+        if !is_address(&options.url) {
+            return Err(PushError::Url { url: options.url.clone() });
+        }
         let client = |timeout| {
             Qdrant::from_url(&options.url)
                 .api_key(options.api_key.as_deref())
@@ -45,6 +50,7 @@ impl<'a> Database<'a> {
             patient_client: client(options.snapshot_timeout)?,
             options,
             n_retries: AtomicU64::new(0),
+            is_reached: AtomicBool::new(false),
         })
     }
 
@@ -64,12 +70,23 @@ impl<'a> Database<'a> {
     {
         let backoff = Backoff { first: self.options.retry_delay, longest: MAX_RETRY_DELAY };
         let mut retries = Retries::new(self.options.n_retries.saturating_add(1), backoff);
+        let begun = Instant::now();
         loop {
             let error = match request().await {
-                Ok(response) => return Ok(response),
+                Ok(response) => {
+                    self.is_reached.store(true, Ordering::Relaxed);
+                    return Ok(response);
+                }
                 Err(error) => error,
             };
-            let Some(pause) = retries.failed(false).filter(|_| may_pass(&error)) else {
+            // One that restarts during a push comes back; one that was never there is at another address.
+            let is_lasting = |pause: Duration| {
+                is_unreachable(&error)
+                    && !self.is_reached.load(Ordering::Relaxed)
+                    && begun.elapsed() + pause > self.options.connect_patience
+            };
+            let pause = retries.failed(false).filter(|pause| may_pass(&error) && !is_lasting(*pause));
+            let Some(pause) = pause else {
                 return Err(database_error(self.options, action, &error));
             };
             self.n_retries.fetch_add(1, Ordering::Relaxed);
@@ -101,6 +118,27 @@ fn words(error: &QdrantError) -> String {
     text.to_owned() + &cause.map_or(String::new(), |cause| format!(": {cause}"))
 }
 
+/// Returns whether a text is a URL with a host, and a port if it has one: a client tries others for a minute.
+fn is_address(url: &str) -> bool {
+    let Some((scheme, rest)) = url.split_once("://") else { return false };
+    let host = rest.split(['/', '?', '#']).next().unwrap_or(rest);
+    let host = host.rsplit('@').next().unwrap_or(host);
+    // The colons of an IPv6 address are in brackets.
+    let (name, port) = match host.rsplit_once(':') {
+        Some((name, port)) if !port.contains(']') => (name, Some(port)),
+        _ => (host, None),
+    };
+    ["http", "https"].iter().any(|known| scheme.eq_ignore_ascii_case(known))
+        && !name.is_empty()
+        && !url.contains(char::is_whitespace)
+        && port.is_none_or(|port| port.parse::<u16>().is_ok())
+}
+
+/// Returns whether no connection was made.
+fn is_unreachable(error: &QdrantError) -> bool {
+    matches!(error, QdrantError::ResponseError { status } if status.message().starts_with("Failed to connect"))
+}
+
 /// Returns whether the same request may succeed later.
 fn may_pass(error: &QdrantError) -> bool {
     match error {
@@ -111,7 +149,7 @@ fn may_pass(error: &QdrantError) -> bool {
             // time limit, and a connection that broke during a request.
             14 | 4 | 8 | 10 | 1 | 2 => true,
             // Internal: a refused connection.
-            13 => status.message().starts_with("Failed to connect"),
+            13 => is_unreachable(error),
             _ => false,
         },
         _ => false,

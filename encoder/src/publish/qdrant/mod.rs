@@ -53,6 +53,8 @@ pub(crate) struct PushOptions {
     pub(crate) n_retries: u32,
     /// Pause before the second attempt; it doubles with each.
     pub(crate) retry_delay: Duration,
+    /// How long a database that was never reached is waited for.
+    pub(crate) connect_patience: Duration,
     /// Time limit of one request, and of one for a snapshot.
     pub(crate) timeout: Duration,
     pub(crate) snapshot_timeout: Duration,
@@ -71,6 +73,7 @@ impl PushOptions {
             n_points_per_batch: const { NonZeroUsize::new(256).expect("not zero") },
             n_retries: 8,
             retry_delay: Duration::from_millis(250),
+            connect_patience: Duration::from_secs(10),
             timeout: Duration::from_secs(60),
             snapshot_timeout: Duration::from_secs(3600),
         }
@@ -124,6 +127,10 @@ pub(crate) enum PushError {
         "{url}: {action}: {cause}; does Qdrant run there, and is this its gRPC port (6334 by default; 6333 is REST's)? Check the key and the database's log, then run the push again: it continues"
     )]
     Database { url: String, action: &'static str, cause: String },
+    #[error(
+        "{url:?} is no address of Qdrant; write http://HOST:6334, or https:// where it has a certificate"
+    )]
+    Url { url: String },
     #[error("cell {cell_id} has no shard of profile {}; encode the scene with that profile", Profile::Exact)]
     NoShard { cell_id: u32 },
     #[error(transparent)]

@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use axum::error_handling::HandleErrorLayer;
 use axum::extract::State;
-use axum::http::StatusCode;
+use axum::http::{StatusCode, Uri};
+use axum::response::Redirect;
+use axum::routing::get;
 use axum::{BoxError, Json, Router};
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -37,6 +39,7 @@ const ABOUT: About = About {
     summary: "slag-encoder serves a scene's shards to robots.",
     errors: &[(503, "Too much is asked at once, or the answer took too long.")],
 };
+const PAGE: &str = "/view";
 const STORE: [(u16, &str); 1] = [(500, "The service failed.")];
 /// No request here needs a body; a few bytes of a careless client do no harm.
 const REQUEST_BODY_BYTES: usize = 1024;
@@ -49,9 +52,17 @@ pub(crate) fn router(dir: &Path, limits: Limits, access: Access, page: Router) -
     Ok(counted(router.with_state(service).merge(page), limits, responses, access))
 }
 
-/// Puts the limits around routes of a page, and a problem as the body of every error.
+/// Puts the limits around routes of a page, and a problem as the body of every error. Where a service lists its
+/// resources this one sends browsers to the page.
 pub fn bounded(routes: Router, limits: Limits, access: Access) -> Router {
-    counted(routes, limits, Arc::default(), access)
+    let to_page = get(async || Redirect::temporary(PAGE));
+    counted(routes.route("/", to_page).fallback(nothing_there), limits, Arc::default(), access)
+}
+
+async fn nothing_there(uri: Uri) -> Problem {
+    let shown: String = uri.path().chars().take(80).collect();
+    let detail = format!("there is nothing at {shown:?}; the page is at {PAGE}");
+    Problem::new(StatusCode::NOT_FOUND, "not-found", "Not found", detail)
 }
 
 pub(super) fn described() -> (Router<Arc<Service>>, Vec<Route>) {

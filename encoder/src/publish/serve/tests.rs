@@ -389,6 +389,25 @@ async fn overload_and_timeout_are_problems() {
     assert_eq!(late.header(header::RETRY_AFTER), "2");
 }
 
+/// A page alone has no list of resources, so nothing names one.
+#[tokio::test]
+async fn a_page_alone_is_found_from_the_root() {
+    let routes = Router::new().route("/view", get(async || "the page"));
+    let router = bounded(routes, Limits::default(), Access::default());
+    let root = get_with(&router, "/", &[]).await;
+    assert_eq!((root.status.as_u16(), root.header(header::LOCATION)), (307, "/view"));
+    let detail = get_with(&router, "/nowhere", &[]).await.problem(StatusCode::NOT_FOUND);
+    assert!(
+        detail.contains("\"/nowhere\"") && detail.contains("/view") && !detail.contains("GET /"),
+        "{detail}"
+    );
+    let fixture = fixture();
+    let router = fixture.router_within(Limits::default()).expect("published");
+    assert_eq!(get_with(&router, "/", &[]).await.status, StatusCode::OK);
+    let detail = get_with(&router, "/nowhere", &[]).await.problem(StatusCode::NOT_FOUND);
+    assert!(detail.contains("GET / lists the resources"), "{detail}");
+}
+
 #[tokio::test]
 async fn downloads_are_counted_until_they_end() {
     let fixture = fixture();

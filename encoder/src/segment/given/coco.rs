@@ -59,11 +59,12 @@ pub(super) fn read_list(path: &Path) -> Result<Vec<(usize, Rle)>, SegmentError> 
 fn parse(path: &Path) -> Result<MaskFile, SegmentError> {
     let mut bytes = Vec::new();
     files::open(path)?.read_to_end(&mut bytes)?;
-    let is_list = bytes.iter().find(|byte| !byte.is_ascii_whitespace()) == Some(&b'[');
-    let parsed = if is_list {
-        serde_json::from_slice(&bytes).map(|annotations| MaskFile { images: Vec::new(), annotations })
+    let text = files::text_of(&bytes);
+    let text = text.map_err(|source| SegmentError::Text { path: path.to_owned(), source })?;
+    let parsed = if text.trim_start().starts_with('[') {
+        serde_json::from_str(text).map(|annotations| MaskFile { images: Vec::new(), annotations })
     } else {
-        serde_json::from_slice(&bytes)
+        serde_json::from_str(text)
     };
     parsed.map_err(|source| SegmentError::Json { path: path.to_owned(), source })
 }
@@ -110,6 +111,7 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     }
     let mut named = MasksOfImage::new();
     for DataSetImage { id, file_name } in images {
+        let file_name = file_name.replace('\\', "/");
         if named.insert(file_name.clone(), rles_of_id.remove(&id).unwrap_or_default()).is_some() {
             return Err(inconsistent(format!("two images have the file_name {file_name:?}")));
         }
@@ -117,19 +119,22 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     Ok(named)
 }
 
-/// Returns the masks of a photo: by its name; or else by the one entry whose name is an ending of the photo's, or
+/// Returns the entry of a photo, with its name: by that of the photo; or else by the one entry whose name is an ending of the photo's, or
 /// the other way round, at a folder; or else by the name that Roboflow makes of it, `NAME_jpg.rf.HASH.jpg`.
-pub(super) fn entry<'a>(masks_of_image: &'a MasksOfImage, name: &str) -> Option<&'a Vec<(usize, Rle)>> {
+pub(super) fn entry<'a>(
+    masks_of_image: &'a MasksOfImage,
+    name: &str,
+) -> Option<(&'a String, &'a Vec<(usize, Rle)>)> {
     let is_ending =
         |long: &str, short: &str| long.strip_suffix(short).is_some_and(|rest| rest.ends_with('/'));
     let file = name.rsplit('/').next().unwrap_or(name);
     let exported = format!("{}.rf.", file.replace('.', "_"));
     let one = |is: &dyn Fn(&str) -> bool| {
         let mut found = masks_of_image.iter().filter(|(entry, _)| is(entry));
-        found.next().filter(|_| found.next().is_none()).map(|(_, rles)| rles)
+        found.next().filter(|_| found.next().is_none())
     };
     masks_of_image
-        .get(name)
+        .get_key_value(name)
         .or_else(|| one(&|entry| is_ending(entry, name) || is_ending(name, entry)))
         .or_else(|| one(&|entry| entry.rsplit('/').next().is_some_and(|entry| entry.starts_with(&exported))))
 }

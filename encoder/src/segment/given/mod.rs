@@ -3,6 +3,7 @@
 mod coco;
 mod id_image;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use slag_common::{Hash32, View};
@@ -59,7 +60,7 @@ impl GivenMasks {
         let path = match &self.source {
             Source::DataSet { path, masks_of_image } => {
                 let rles = coco::entry(masks_of_image, &input.view.name);
-                return rles.map(|rles| coco::masks_of_rles(path, rles, input)).transpose();
+                return rles.map(|(_, rles)| coco::masks_of_rles(path, rles, input)).transpose();
             }
             Source::Folder(dir) => file_of(dir, input.view),
         };
@@ -75,6 +76,23 @@ impl GivenMasks {
             true => self.masks_of_png(&path, input, false).map(Some),
             false => coco::masks_of_rles(&path, &coco::read_list(&path)?, input).map(Some),
         }
+    }
+
+    /// Refuses an entry of a data set that is found for several views: which one's it is, nothing says.
+    fn check_entries(&self, views: &[View]) -> Result<(), SegmentError> {
+        let Source::DataSet { path, masks_of_image } = &self.source else { return Ok(()) };
+        let mut view_of_entry: BTreeMap<&str, &str> = BTreeMap::new();
+        for view in views {
+            let Some((entry, _)) = coco::entry(masks_of_image, &view.name) else { continue };
+            if let Some(other) = view_of_entry.insert(entry, &view.name) {
+                let what = format!(
+                    "file_name {entry:?} is ambiguous: it may be {other:?} or {:?}; write the photo's folder into it",
+                    view.name
+                );
+                return Err(SegmentError::DataSet { path: path.clone(), what });
+            }
+        }
+        Ok(())
     }
 
     /// Names a file that is not read because its view has another one.
@@ -135,6 +153,7 @@ impl Segmenter for GivenMasks {
     }
 
     fn check_views(&self, views: &[View], strict: bool) -> Result<Option<String>, SegmentError> {
+        self.check_entries(views)?;
         let without: Vec<&View> = views.iter().filter(|view| !self.covers(view)).collect();
         let Some(first) = without.first() else { return Ok(self.second_file(views)) };
         let path = match &self.source {
@@ -172,7 +191,7 @@ impl Segmenter for GivenMasks {
         match &self.source {
             Source::Folder(dir) => file_of(dir, view).map(|path| hash_of_masks(&path)).transpose(),
             Source::DataSet { masks_of_image, .. } => {
-                let hash = |rles: &Vec<(usize, Rle)>| -> Result<Hash32, SegmentError> {
+                let hash = |(_, rles): (&String, &Vec<(usize, Rle)>)| -> Result<Hash32, SegmentError> {
                     // Their places in the file name them in errors only.
                     let rles: Vec<&Rle> = rles.iter().map(|(_, rle)| rle).collect();
                     Ok(Hash32::of(&serde_json::to_vec(&rles).map_err(std::io::Error::from)?))

@@ -363,6 +363,17 @@ async fn errors_that_do_not_pass_are_not_repeated_and_hide_the_key() {
     let refused = fixture.push(&unreachable).await.expect_err("nobody there").to_string();
     assert!(refused.contains("Failed to connect") && refused.contains("6333 is REST's"), "{refused}");
     assert!(refused.len() < 300 && !refused.contains("MetadataMap"), "{refused}");
-    let refused = fixture.push(&options("no address")).await.expect_err("no URL").to_string();
-    assert!(refused.contains("no address"), "{refused}");
+    // However many attempts are left, one that was never reached is not waited for.
+    let patient = PushOptions { n_retries: 1000, connect_patience: Duration::from_millis(50), ..unreachable };
+    let begun = std::time::Instant::now();
+    let refused = fixture.push(&patient).await.expect_err("nobody there").to_string();
+    assert!(refused.contains("Failed to connect") && begun.elapsed() < Duration::from_secs(20), "{refused}");
+    let begun = std::time::Instant::now();
+    for wrong in
+        ["no address", "127.0.0.1:6334", "http://", "http://host:port", "grpc://host:6334", "http://a b"]
+    {
+        let refused = fixture.push(&PushOptions::new(wrong, "yard")).await.expect_err("no URL").to_string();
+        assert!(refused.contains(wrong) && refused.contains("http://HOST:6334"), "{refused}");
+    }
+    assert!(begun.elapsed() < Duration::from_secs(10), "without a second attempt");
 }

@@ -1,0 +1,111 @@
+//! Photo files: what they are, and what is wrong with them that decoders do not tell.
+
+mod jpeg;
+
+use std::io::{self, BufRead, Seek, SeekFrom};
+
+use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, RgbImage};
+
+use crate::files;
+use jpeg::Damage;
+
+/// Most bytes that a file takes before its pixels are read, with what they inflate to: its colour profile, its texts
+/// and a row of pixels. A decoder of JPEG copies the file besides.
+pub const HEAD_BYTES: u64 = 16 << 20;
+/// Bytes 4 to 12 of HEIF files, which phones write.
+const HEIF_BRANDS: [&[u8]; 9] = [
+    b"ftypheic",
+    b"ftypheix",
+    b"ftypheim",
+    b"ftypheis",
+    b"ftyphevc",
+    b"ftyphevx",
+    b"ftypmif1",
+    b"ftypmsf1",
+    b"ftypavif",
+];
+
+#[derive(Debug, thiserror::Error)]
+pub enum PhotoError {
+    #[error("{what}; {advice}")]
+    StandIn { what: &'static str, advice: &'static str },
+    #[error("a HEIC or AVIF image; convert the photos to JPEG, for example with heif-convert")]
+    Heif,
+    #[error("the file ends before its image does; copy the photo again")]
+    Cut,
+    #[error("a piece of the image is zeros, which no camera writes; copy the photo again")]
+    Zeros,
+    #[error(
+        "its colour profile, its texts or a row of its pixels take more than {HEAD_BYTES} bytes, the limit; give a smaller copy without metadata"
+    )]
+    Head,
+    #[error("{0}; give a JPEG, PNG or WebP that opens elsewhere")]
+    Decode(ImageError),
+    #[error(transparent)]
+    Io(#[from] io::Error),
+}
+
+impl From<ImageError> for PhotoError {
+    fn from(error: ImageError) -> Self {
+        match error {
+            ImageError::Limits(_) => Self::Head,
+            error => Self::Decode(error),
+        }
+    }
+}
+
+/// Reads what stands before the pixels, within [`HEAD_BYTES`].
+pub fn head<'a>(input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDecoder + 'a>, PhotoError> {
+    let mut reader = ImageReader::new(input).with_guessed_format()?;
+    let mut limits = Limits::no_limits();
+    limits.max_alloc = Some(HEAD_BYTES);
+    reader.limits(limits);
+    Ok(Box::new(reader.into_decoder()?))
+}
+
+/// Opens a photo as [`head`] does. Refuses what is none, and what decoders would fill with grey or noise.
+pub fn open<'a>(mut input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDecoder + 'a>, PhotoError> {
+    let start = input.fill_buf()?;
+    if let Some((what, advice)) = files::stand_in(start) {
+        return Err(PhotoError::StandIn { what, advice });
+    }
+    if start.get(4..12).is_some_and(|brand| HEIF_BRANDS.contains(&brand)) {
+        return Err(PhotoError::Heif);
+    }
+    let stated_bytes = start.get(4..8).map_or(0, |len| u32::from_le_bytes([len[0], len[1], len[2], len[3]]));
+    let damage = match image::guess_format(start) {
+        Ok(ImageFormat::Jpeg) => jpeg::damage(&mut input)?,
+        // A piece of RIFF, behind its head of eight bytes; some writers count one that pads it.
+        Ok(ImageFormat::WebP) => {
+            let is_cut = input.seek(SeekFrom::End(0))? + 1 < u64::from(stated_bytes) + 8;
+            is_cut.then_some(Damage::Cut)
+        }
+        _ => None,
+    };
+    match damage {
+        Some(Damage::Cut) => return Err(PhotoError::Cut),
+        Some(Damage::Zeros) => return Err(PhotoError::Zeros),
+        None => input.rewind()?,
+    }
+    head(input)
+}
+
+/// Returns the colours of a photo, and, where some of its pixels are transparent, which are not. Those that are lie
+/// outside of the photo and are black: their colours are left from editing, or noise.
+pub fn colours(photo: DynamicImage) -> (RgbImage, Option<Vec<bool>>) {
+    let opaque = photo.color().has_alpha().then(|| opaque_pixels(&photo)).filter(|all| all.contains(&false));
+    let mut colours = photo.into_rgb8();
+    if let Some(opaque) = &opaque {
+        let hidden = colours.pixels_mut().zip(opaque).filter(|(_, opaque)| !**opaque);
+        hidden.for_each(|(pixel, _)| pixel.0 = [0; 3]);
+    }
+    (colours, opaque)
+}
+
+/// Returns which pixels are at least half opaque.
+fn opaque_pixels(photo: &DynamicImage) -> Vec<bool> {
+    photo.to_luma_alpha8().pixels().map(|pixel| pixel.0[1] >= 128).collect()
+}
+
+#[cfg(test)]
+mod tests;

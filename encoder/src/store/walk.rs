@@ -1,0 +1,166 @@
+//! Walks the metadata of a store as a robot does, from the first root to the manifest, and says what a robot would
+//! refuse.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use slag_common::manifest::TARGET;
+use slag_common::tuf::{Trusted, TufError};
+
+use super::error::{StoreError, metadata_fault, metadata_help};
+use super::files;
+use super::metadata::{TIMESTAMP_FILE, clock_unix_secs, folder, names, read_published};
+
+/// Times that metadata is read before a fault counts, and the pause between: an encode or a refresh replaces it file
+/// by file.
+pub(super) const N_TRIES: usize = 3;
+pub(super) const PAUSE: Duration = Duration::from_millis(if cfg!(test) { 1 } else { 200 });
+
+/// A file that robots refuse.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Refused {
+    pub(super) path: PathBuf,
+    /// What is wrong with it, and what helps.
+    pub(super) what: String,
+}
+
+/// The files of a store's metadata by name; the error of one that cannot be read.
+pub(super) type MetadataFiles = BTreeMap<String, Result<Vec<u8>, TufError>>;
+
+/// Reads all metadata of a store.
+pub(super) fn read_all(store: &Path) -> Result<MetadataFiles, StoreError> {
+    let mut found = MetadataFiles::new();
+    for name in names(store)? {
+        match read_published(store, &name) {
+            Ok(bytes) => found.extend(bytes.map(|bytes| (name, Ok(bytes)))),
+            Err(StoreError::Metadata { cause, .. }) => drop(found.insert(name, Err(cause))),
+            Err(e) => return Err(e),
+        }
+    }
+    Ok(found)
+}
+
+/// Returns what a robot would refuse of a store now.
+pub(super) fn refused(store: &Path) -> Result<Vec<Refused>, StoreError> {
+    let mut n_tries = 0;
+    loop {
+        let metadata = read_all(store)?;
+        let manifest = files::read_manifest_bytes(&store.join(files::MANIFEST))?.unwrap_or_default();
+        let found = refused_of(store, &metadata, &manifest, clock_unix_secs());
+        n_tries += 1;
+        if found.is_empty() || n_tries == N_TRIES {
+            return Ok(found);
+        }
+        std::thread::sleep(PAUSE);
+    }
+}
+
+/// Returns what a robot would refuse of some metadata and a manifest.
+pub(super) fn refused_of(
+    store: &Path,
+    metadata: &MetadataFiles,
+    manifest: &[u8],
+    now_unix_secs: u64,
+) -> Vec<Refused> {
+    let mut walk = Walk { store, metadata, found: Vec::new() };
+    if let Some(mut trusted) = walk.roots(now_unix_secs) {
+        // The first refusal ends a robot's fetch, and nothing after it can be told.
+        let _ = walk.follow(&mut trusted, manifest);
+    }
+    walk.found
+}
+
+struct Walk<'a> {
+    store: &'a Path,
+    metadata: &'a MetadataFiles,
+    found: Vec<Refused>,
+}
+
+/// What ended a walk was noted.
+struct Ended;
+
+impl Walk<'_> {
+    /// Follows all roots: robots may know any of them, and new ones ask for the first. Returns the newest one, unless
+    /// it is refused.
+    fn roots(&mut self, now_unix_secs: u64) -> Option<Trusted> {
+        let version = |name: &String| name.strip_suffix(".root.json")?.parse::<u64>().ok();
+        let mut versions: Vec<u64> = self.metadata.keys().filter_map(version).collect();
+        versions.sort_unstable();
+        let (mut trusted, mut expected) = (None::<Trusted>, 1);
+        for version in versions {
+            if version != expected {
+                let _ = self.refuse(&missing(format!("{expected}.root.json")));
+                trusted = None;
+            }
+            expected = version.saturating_add(1);
+            let name = format!("{version}.root.json");
+            let followed = self.get(&name).and_then(|bytes| match trusted.take() {
+                Some(mut before) => before.add_root(bytes).map(|()| before),
+                None => Trusted::new(bytes, now_unix_secs),
+            });
+            trusted = followed.map_err(|cause| self.refuse(&At { name, cause })).ok();
+        }
+        if expected == 1 {
+            let _ = self.refuse(&missing("1.root.json".into()));
+        }
+        trusted
+    }
+
+    /// Follows timestamp, snapshot and targets to the manifest.
+    fn follow(&mut self, trusted: &mut Trusted, manifest: &[u8]) -> Result<(), Ended> {
+        let root = trusted.root();
+        let name = format!("{}.root.json", root.head.version);
+        let is_current = root.check_expiry("root", trusted.now_unix_secs());
+        is_current.map_err(|cause| self.refuse(&At { name: name.clone(), cause }))?;
+        self.step(TIMESTAMP_FILE.into(), |bytes| trusted.add_timestamp(bytes).map(drop))?;
+        let stated = trusted.timestamp().map_or(0, |timestamp| timestamp.body.snapshot().version);
+        self.step(format!("{stated}.snapshot.json"), |bytes| trusted.add_snapshot(bytes, None))?;
+        let stated = trusted.snapshot().map_or(0, |snapshot| snapshot.body.meta["targets.json"].version);
+        self.step(format!("{stated}.targets.json"), |bytes| trusted.add_targets(bytes))?;
+        let listed = trusted.target(TARGET).ok_or(TufError::Missing { what: TARGET.into() });
+        let checked = listed.and_then(|target| target.check(TARGET, manifest));
+        checked.map_err(|cause| self.refuse(&At { name: TARGET.into(), cause }))
+    }
+
+    fn step(&mut self, name: String, add: impl FnOnce(&[u8]) -> Result<(), TufError>) -> Result<(), Ended> {
+        self.get(&name).and_then(add).map_err(|cause| self.refuse(&At { name, cause }))
+    }
+
+    fn get(&self, name: &str) -> Result<&[u8], TufError> {
+        match self.metadata.get(name) {
+            Some(Ok(bytes)) => Ok(bytes),
+            Some(Err(cause)) => Err(cause.clone()),
+            None => Err(TufError::Missing { what: name.to_owned() }),
+        }
+    }
+
+    /// Notes that a file is refused.
+    fn refuse(&mut self, At { name, cause }: &At) -> Ended {
+        let fault = metadata_fault(cause);
+        let refused = if name == TARGET {
+            let path = self.store.join(files::MANIFEST);
+            let what = format!("{fault}; run `slag-encoder encode` again, which publishes it anew");
+            Refused { path, what }
+        } else {
+            let path = folder(self.store).join(name);
+            let help = match cause {
+                TufError::Expired { role, .. } if role == "root" => "run `slag-encoder keys renew`",
+                _ => metadata_help(&path),
+            };
+            Refused { what: format!("{fault}; {help}"), path }
+        };
+        self.found.push(refused);
+        Ended
+    }
+}
+
+/// A file of metadata, or the manifest, and why it is refused.
+struct At {
+    name: String,
+    cause: TufError,
+}
+
+fn missing(name: String) -> At {
+    At { cause: TufError::Missing { what: name.clone() }, name }
+}
