@@ -6,7 +6,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::fetch::{FetchRequest, Position, fetch};
 use crate::query::parse_point;
-use crate::score::MAX_COORDINATE;
 use anyhow::anyhow;
 use clap::Args;
 use glam::DVec3;

@@ -4,7 +4,7 @@ use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use crate::fetch::{Environment, FetchError, NetworkLimits, Progress};
+use crate::fetch::{self, Environment, FetchError, NetworkLimits, Progress};
 
 use super::failure::Failure;
 

@@ -19,7 +19,7 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
         ("scene", report.scene.clone()),
         ("generation", report.generation.to_string()),
         ("encoder", format!("{} ({})", report.encoder_name, report.encoder_id)),
-        ("cells", format!("{} within {} of {}", report.n_cells, report.radius, report.centre_in_world)),
+        ("cells", format!("{} within {} of {:.2}", report.n_cells, report.radius, report.centre_in_world)),
         ("downloaded", format!("{} ({} resumed)", tally(&report.downloaded), ByteSize(report.resumed_bytes))),
         ("kept", tally(&report.kept)),
         ("spare", tally(&report.spare)),

@@ -173,7 +173,7 @@ fn notes(found: &Searched) -> String {
     };
     let Searched { n_matching, n_searched, threshold, .. } = found;
     let mut notes =
-        format!("{n_matching} Gaussians of {n_searched} reach {threshold}, {source}{exactness}\n");
+        format!("{n_matching} Gaussians of {n_searched} reach {threshold:.3}, {source}{exactness}\n");
     if found.area_fetched == Some(false) {
         notes += "part of that area is not on board; fetch it for a complete answer\n";
     }

@@ -109,7 +109,7 @@ pub fn of_objects(
         Some(BestObject { reaches: false, score, position_in_world }) => (
             ReasonKind::BelowThreshold,
             format!(
-                "no object{place} reaches {threshold}; the best has {score:.3}, at {position_in_world:.2}"
+                "no object{place} reaches {threshold:.3}; the best has {score:.3}, at {position_in_world:.2}"
             ),
         ),
         Some(BestObject { reaches: true, .. }) => {
@@ -120,7 +120,7 @@ pub fn of_objects(
             (
                 ReasonKind::ClustersTooSmall,
                 format!(
-                    "no object that reaches {threshold} has {} Gaussians{place}; {advice}",
+                    "no object that reaches {threshold:.3} has {} Gaussians{place}; {advice}",
                     request.min_count
                 ),
             )
@@ -149,7 +149,7 @@ pub fn of_gaussians(
         Some(_) if n_matching > 0 => (
             ReasonKind::ClustersTooSmall,
             format!(
-                "{n_matching} Gaussians{place} reach {threshold}, but no cluster of them has {}; lower min_count or increase voxel",
+                "{n_matching} Gaussians{place} reach {threshold:.3}, but no cluster of them has {}; lower min_count or increase voxel",
                 request.min_count
             ),
         ),
@@ -158,7 +158,7 @@ pub fn of_gaussians(
             (
                 ReasonKind::BelowThreshold,
                 format!(
-                    "no Gaussian of the {n} searched{place} reaches {threshold}; the best has {score:.3}, at {at:.2}"
+                    "no Gaussian of the {n} searched{place} reaches {threshold:.3}; the best has {score:.3}, at {at:.2}"
                 ),
             )
         }
