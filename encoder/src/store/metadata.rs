@@ -44,6 +44,9 @@ pub(crate) struct Refreshed {
     pub(crate) expires_unix_secs: u64,
 }
 
+/// Metadata and the bytes of its file.
+type WithBytes<T> = (SignedMetadata<T>, Vec<u8>);
+
 /// What clients are led to.
 struct PublishedMetadata {
     targets: Targets,
@@ -89,15 +92,14 @@ impl MetadataReader {
         let snapshot_meta = timestamp.body.snapshot().clone();
         let name = format!("{}.snapshot.json", snapshot_meta.version);
         let snapshot = self.read_signed::<Snapshot>(&name, MAX_SNAPSHOT_BYTES, root)?;
-        let is_stated = |(found, bytes): &(SignedMetadata<Snapshot>, Vec<u8>)| {
-            FileMeta::of(found.head.version, bytes) == snapshot_meta
-        };
+        let is_stated =
+            |(found, bytes): &WithBytes<Snapshot>| FileMeta::of(found.head.version, bytes) == snapshot_meta;
         let Some((snapshot, _)) = snapshot.filter(is_stated) else { return Ok(None) };
         let stated = &snapshot.body.meta["targets.json"];
         let name = format!("{}.targets.json", stated.version);
         let targets = self.read_signed::<Targets>(&name, MAX_TARGETS_BYTES, root)?;
         let targets = targets.filter(|(found, bytes)| FileMeta::of(found.head.version, bytes) == *stated);
-        let of = |(targets, _): (SignedMetadata<Targets>, Vec<u8>)| PublishedMetadata {
+        let of = |(targets, _): WithBytes<Targets>| PublishedMetadata {
             soonest_unix_secs: targets.expires_unix_secs.min(snapshot.expires_unix_secs),
             targets: targets.body,
             snapshot_meta,
@@ -135,7 +137,7 @@ impl MetadataReader {
         name: &str,
         max_bytes: u64,
         root: &Root,
-    ) -> Result<Option<(SignedMetadata<T>, Vec<u8>)>, StoreError> {
+    ) -> Result<Option<WithBytes<T>>, StoreError> {
         let bytes = match read_file(&self.store, name, max_bytes) {
             Err(StoreError::Metadata { .. }) => None,
             bytes => bytes?,

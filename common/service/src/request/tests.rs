@@ -38,7 +38,13 @@ async fn every_error_is_a_problem_with_the_id_of_its_request() {
     let cases = [
         (Method::GET, "/nowhere", 404, "not-found", "\"/nowhere\""),
         (Method::POST, "/things/chair", 405, "method-not-allowed", "does not take \"POST\""),
-        (Method::GET, "/things/%ff", 400, "bad-parameter", "name: found \"/things/%ff\", expected text in UTF-8"),
+        (
+            Method::GET,
+            "/things/%ff",
+            400,
+            "bad-parameter",
+            "name: found \"/things/%ff\", expected text in UTF-8",
+        ),
         (Method::GET, "/broken", 500, "internal", "the service failed"),
         (Method::GET, "/refused", 503, "overloaded", "come back later"),
     ];

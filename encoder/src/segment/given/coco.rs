@@ -119,8 +119,9 @@ pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
     Ok(named)
 }
 
-/// Returns the entry of a photo, with its name: by that of the photo; or else by the one entry whose name is an ending of the photo's, or
-/// the other way round, at a folder; or else by the name that Roboflow makes of it, `NAME_jpg.rf.HASH.jpg`.
+/// Returns the entry of a photo, with its name: the one of the photo's name; or else the one whose name is an ending of
+/// the photo's, or the other way round, at a folder; or else the one with the name that Roboflow makes of it,
+/// `NAME_jpg.rf.HASH.jpg`.
 pub(super) fn entry<'a>(
     masks_of_image: &'a MasksOfImage,
     name: &str,
