@@ -92,7 +92,7 @@ function scoresMessage(things, text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -155,7 +155,7 @@ export async function startService(behaviour = {}) {
     if (url.pathname !== "/v1/view" || !behaviour.hasScene) return json(response, 404, { detail: "nothing here" });
     json(response, 200, {
       program: behaviour.program, scene: "test room", generation: behaviour.generation, up: [0, 0, 1], metric: true, geographic: behaviour.geographic, can_ask: true, views: behaviour.photos,
-      n_gaussians: behaviour.things.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: behaviour.position, fetched: { centre_m: [-3, 3, 0], radius_m: 0.8 },
+      n_gaussians: behaviour.things.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: behaviour.position, fetched: { centre_m: [-3, 3, 0], radius_m: behaviour.fetchedM },
       cells: behaviour.things.map(({ min, max, n }, i) => ({
         cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : behaviour.stale.includes(i) ? "stale" : "on_board", generation: behaviour.generation - (behaviour.stale.includes(i) ? 1 : 0), box_m: { min, max },
       })),

@@ -31,7 +31,7 @@ export interface Viewpoint {
 
 export function lengthText(length: number, isMetric: boolean): string {
   if (!isMetric) return length.toPrecision(2);
-  return length >= 1000 ? `${(length / 1000).toFixed(1)} km` : length >= 20 ? `${length.toFixed(0)} m` : length >= 1 ? `${length.toFixed(1)} m` : `${(length * 100).toFixed(0)} cm`;
+  return length >= 1000 ? `${(length / 1000).toFixed(1)} km` : length >= 20 ? `${length.toFixed(0)} m` : length >= 0.995 ? `${length.toFixed(1)} m` : `${(length * 100).toFixed(0)} cm`;
 }
 
 export function whereabouts(to: Vector, { at, from, headingRad, isGeographic }: Viewpoint, isMetric: boolean): string {

@@ -50,6 +50,7 @@ export class Marks {
   readonly changes = new THREE.Group();
   private readonly measured = new THREE.Group();
   private photoPlaces: Vector[] = [];
+  private photosNear: boolean[] = [];
 
   constructor(parent: THREE.Object3D) {
     this.photos.visible = this.cells.visible = false;
@@ -133,6 +134,7 @@ export class Marks {
   showPhotos(photos: Photo[], lengthM: number): void {
     disposeAll(this.photos);
     const points: THREE.Vector3[] = [];
+    this.photosNear = [];
     this.photoPlaces = photos.slice(0, MAX_FRUSTA).map((photo) => photo.position_m);
     for (const photo of photos.slice(0, MAX_FRUSTA)) {
       const place = new THREE.Vector3(...photo.position_m);
@@ -149,11 +151,15 @@ export class Marks {
   hidePhotosNear(eye: Vector, leastM: number): void {
     const lines = this.photos.children[0];
     if (!(lines instanceof THREE.LineSegments)) return;
+    const near = this.photoPlaces.map((place) => Math.hypot(...place.map((v, k) => v - eye[k])) < leastM);
+    // A new index is a new buffer on the GPU.
+    if (near.every((isNear, i) => isNear === this.photosNear[i])) return;
+    this.photosNear = near;
     const index: number[] = [];
-    this.photoPlaces.forEach((place, i) => {
-      if (Math.hypot(...place.map((v, k) => v - eye[k])) < leastM) return;
-      for (let k = 0; k < POINTS_OF_FRUSTUM; k++) index.push(i * POINTS_OF_FRUSTUM + k);
+    near.forEach((isNear, i) => {
+      for (let k = 0; k < POINTS_OF_FRUSTUM && !isNear; k++) index.push(i * POINTS_OF_FRUSTUM + k);
     });
+    lines.geometry.dispose();
     lines.geometry.setIndex(index);
   }
 
