@@ -97,6 +97,9 @@ test("things on board are suggested of a model without a list of words, as they 
   assert.deepEqual(await options.allInnerTexts(), ["chair1"]);
   Object.assign(service.behaviour, { words: [{ word: "chair", n_things: 1 }, { word: "street lamp", n_things: 2 }], hasAllWords: true });
   await options.getByText("street lamp").waitFor({ timeout: 15000 });
+  await page.locator("#question").fill("tree");
+  assert.deepEqual(await options.allInnerTexts(), []);
+  await page.locator("#question").fill("");
   await page.locator("#question").pressSequentially("lamp");
   assert.deepEqual(await options.allInnerTexts(), ["street lamp2"]);
   const asked = () => service.behaviour.requests.filter((path) => path === "/v1/view/words").length;

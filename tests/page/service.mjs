@@ -29,7 +29,7 @@ const PARAMETERS = {
   "/v1/view": [],
   "/v1/view/cells": ["generation", "step"],
   "/v1/view/scores": ["text", "negative"],
-  "/v1/query": ["text", "negative", "limit"],
+  "/v1/query": ["text", "negative", "limit", "near", "heading_rad"],
   "/v1/goal": ["id", "radius_m"],
   "/v1/view/words": [],
   "/v1/changes": [],
@@ -92,7 +92,7 @@ function scoresMessage(things, text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -135,8 +135,11 @@ export async function startService(behaviour = {}) {
       return json(response, 200, { goals: isReached ? GOALS : [], thing: isReached ? { id: "o1", position_in_world: [1.2, 0.8, 0.5] } : null, none });
     }
     if (url.pathname === "/v1/query") {
-      const [name, support] = url.searchParams.get("text").split(" on the ");
-      const thing = THINGS.find((entry) => entry.name === name);
+      const missing = ["near", "heading_rad"].find((name) => !url.searchParams.has(name));
+      const isOfAsker = url.searchParams.get("text").endsWith(" near me");
+      if (isOfAsker && missing) return json(response, 400, { detail: `${missing}: found "nothing"`, parameter: missing });
+      const [name, support] = url.searchParams.get("text").replace(" near me", "").split(" on the ");
+      const thing = behaviour.known.find((entry) => entry.name === name);
       const understood = support ? { thing: name, relation: { is: "on", of: { thing: support } } } : null;
       const answers = thing ? [{
         ...(support ? { degree: 0.93, related_to: [{ thing: support, position_in_world: [0, 0, 0], score: 0.7 }] } : {}),
@@ -145,14 +148,14 @@ export async function startService(behaviour = {}) {
         id: "o1", score: 0.86, n_gaussians: 1536, position_in_world: thing.min.map((low, i) => (low + thing.max[i]) / 2),
         box_min_in_world: thing.min, box_max_in_world: thing.max,
       }] : [];
-      const none = thing ? null : { kind: "nothing-there", detail: "nothing found", thing: null };
-      const thresholds = support ? { parts: [{ thing: name, n_found: 1, threshold: 0.5 }] } : { threshold: 0.5 };
+      const none = thing ? null : behaviour.none ?? { kind: "nothing-there", detail: "nothing found", thing: null };
+      const thresholds = support ? { parts: [{ thing: name, n_found: 1, threshold: 0.5 }] } : { threshold: behaviour.threshold };
       return json(response, 200, { results: [{ question: {}, understood, answers, none, ...thresholds }] });
     }
     if (url.pathname !== "/v1/view" || !behaviour.hasScene) return json(response, 404, { detail: "nothing here" });
     json(response, 200, {
       program: behaviour.program, scene: "test room", generation: behaviour.generation, up: [0, 0, 1], metric: true, geographic: behaviour.geographic, can_ask: true, views: behaviour.photos,
-      n_gaussians: behaviour.things.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: behaviour.position, fetched: { centre_m: [-3, 3, 0], radius_m: 0.8 },
+      n_gaussians: behaviour.things.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: behaviour.position, fetched: { centre_m: [-3, 3, 0], radius_m: behaviour.fetchedM },
       cells: behaviour.things.map(({ min, max, n }, i) => ({
         cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : behaviour.stale.includes(i) ? "stale" : "on_board", generation: behaviour.generation - (behaviour.stale.includes(i) ? 1 : 0), box_m: { min, max },
       })),

@@ -91,6 +91,8 @@ test("a camera without its picture can be clicked and stood in", () => opened(as
   // Its rotation turns z, forward, to -y.
   assert.deepEqual(camera.slice(0, 3), PHOTO.position_m);
   assert.ok(Math.abs(camera[3] - 1.5) < 0.01 && camera[4] < 1.5 - 0.4 && Math.abs(camera[5] - 1.2) < 0.01, String(camera));
+  // One stands in its lines, which are left out.
+  assert.equal((await pixels(page, PANEL_PX, isColour([0x6f, 0xbf, 0x8b]))).length, 0);
 }, { isLookedAt: true, behaviour: { photos: [PHOTO] }, fragment: `camera=${CAMERA}` }));
 
 test("missing and earlier cells are told and outlined, and the robot is where it says", () => opened(async (page, service) => {
@@ -113,6 +115,13 @@ test("missing and earlier cells are told and outlined, and the robot is where it
   await page.waitForFunction(() => performance.getEntriesByType("resource").filter(({ name }) => name.endsWith("/v1/view")).length > 1);
   assert.ok(await isDrawnAt(ROBOT, [2, 1, 1]) && !(await isDrawnAt(ROBOT, [1, 2, 1])));
 }, { isLookedAt: true, behaviour: { missing: [2], stale: [1], position: [1, 2, 0] }, fragment: `camera=${CAMERA}` }));
+
+for (const [fetchedM, isSeen] of [[4, true], [7, false]]) {
+  test(`what was fetched has a ring, unless that is all of the scene: ${fetchedM} m`, () => opened(async (page) => {
+    await drawn(page);
+    assert.equal((await pixels(page, PANEL_PX, isColour([0x4f, 0xd1, 0xa5]))).length > 20, isSeen);
+  }, { isLookedAt: true, behaviour: { position: null, fetchedM }, fragment: `camera=${CAMERA}` }));
+}
 
 test("a geo-referenced scene has east, north and up, latitude and longitude, and an arrow to the north", () => opened(async (page) => {
   await drawn(page);

@@ -173,6 +173,57 @@ test("keys: the list of them, measuring, hovering, and the opening view again", 
   assert.notDeepEqual((await cameraOf(page))[0], before);
 }, { fragment: `camera=${CAMERA}` }));
 
+test("a pointer meets large Gaussians anywhere on them, and measuring says where there is nothing", () => opened(async (page) => {
+  await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined);
+  const at = (point) => page.mouse.click(...project(point));
+  await page.keyboard.press("m");
+  // Between the middles of four, which are 2 m apart.
+  await at([0, 2, 0]);
+  await page.getByText("Click the second point.").waitFor();
+  await page.mouse.click(600, 20);
+  await page.getByText("Nothing there: click on a surface.").waitFor();
+  await at([-2, 2, 0]);
+  await page.getByText("between the two points").waitFor();
+  const said = await page.locator("#message").innerText();
+  assert.ok(Math.abs(Number.parseFloat(said) - 2) < 0.1, said);
+  await page.keyboard.press("m");
+  await page.mouse.move(...project([0, 2, 0]));
+  await page.locator("#hover").waitFor();
+}, { behaviour: { things: [{ ...THINGS[0], n: [4, 4, 1] }] }, fragment: `camera=${CAMERA}` }));
+
+test("standing where a photo was taken, the scale is that of what is in the middle", () => opened(async (page) => {
+  await drawn(page);
+  await answered(page, "chair");
+  await page.locator("#answers .card").click();
+  await page.getByRole("button", { name: "Stand here" }).click();
+  const [position, target] = await cameraOf(page);
+  // The photo's middle shows the floor behind the chair's edge, or the chair: not 1.1 m before it.
+  assert.deepEqual(position, PHOTO.position_m);
+  assert.ok(Math.hypot(...minus(target, position)) > 2.5, `looks at ${target}`);
+}, { behaviour: { photos: [PHOTO], evidence: EVIDENCE, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
+
+test("on a phone layers lie over the compass, chips are whole, and answers have the header's room", () => opened(async (page) => {
+  await drawn(page);
+  const rows = await page.locator("#chips").evaluate((chips) => {
+    const { bottom } = chips.getBoundingClientRect();
+    return [...chips.children].map((chip) => chip.getBoundingClientRect()).filter(({ top }) => top < bottom).map((chip) => Math.round(bottom - chip.bottom));
+  });
+  assert.ok(rows.length > 3 && rows.every((left) => left >= 0), String(rows));
+  await page.locator("#layers summary").click();
+  const top = await page.locator("#show-boxes").evaluate((box) => {
+    const { x, y } = box.parentElement.getBoundingClientRect();
+    document.getElementById("hud").style.pointerEvents = "auto";
+    return document.elementFromPoint(x + 2, y + 4).closest("#hud, #layers").id;
+  });
+  assert.equal(top, "layers");
+  await page.locator("#layers summary").click();
+  await page.fill("#question", "chair");
+  await answered(page, "chair");
+  assert.ok(await page.locator("#facts").isHidden());
+  const { y, height } = await page.locator("#answers .card").first().boundingBox();
+  assert.ok(y + height <= 844, `${y + height}`);
+}, { behaviour: { words: ["mirror", "window", "dog", "pallet", "chair", "excavator", "pipe", "table", "bookshelf", "floor", "bench", "log"].map((word) => ({ word, n_things: 3 })) }, options: { ...PHONE, isMobile: true } }));
+
 test("a photo given to the page is found by the robot: the page stands there, and lays it over", () => opened(async (page, service) => {
   await drawn(page);
   const photo = { name: "here.png", mimeType: "image/png", buffer: await page.screenshot() };

@@ -1,7 +1,7 @@
 // What is said of an answer: how sure it is, how large, how far and in which direction, and what people copy of it.
 
 import { boxOf } from "./drawing/marks";
-import type { Answer, Vector } from "./network";
+import type { Answer, Goal, Vector } from "./network";
 
 export type Strength = "strong" | "likely" | "weak";
 
@@ -23,7 +23,7 @@ export function strengthOf({ score, id }: Answer, threshold: number | null): Str
 export interface Viewpoint {
   at: Vector;
   /** Whose it is. */
-  from: "the robot" | "here";
+  from: "the robot" | "this view";
   /** Where it looks, from x towards y; null if that is not known. */
   headingRad: number | null;
   isGeographic: boolean;
@@ -31,7 +31,7 @@ export interface Viewpoint {
 
 export function lengthText(length: number, isMetric: boolean): string {
   if (!isMetric) return length.toPrecision(2);
-  return length >= 1000 ? `${(length / 1000).toFixed(1)} km` : length >= 20 ? `${length.toFixed(0)} m` : length >= 1 ? `${length.toFixed(1)} m` : `${(length * 100).toFixed(0)} cm`;
+  return length >= 1000 ? `${(length / 1000).toFixed(1)} km` : length >= 20 ? `${length.toFixed(0)} m` : length >= 0.995 ? `${length.toFixed(1)} m` : `${(length * 100).toFixed(0)} cm`;
 }
 
 export function whereabouts(to: Vector, { at, from, headingRad, isGeographic }: Viewpoint, isMetric: boolean): string {
@@ -44,24 +44,36 @@ export function whereabouts(to: Vector, { at, from, headingRad, isGeographic }: 
   return `${distance} from ${from}${direction ? `, ${direction}` : ""}`;
 }
 
-/** Breadth, depth and height, in one unit. */
+/** The longer horizontal side, the other one and the height; below 10 cm in centimetres, and 1 at least. */
 export function sizeText(answer: Answer, isMetric: boolean): string {
   const { size } = boxOf(answer);
-  const [factor, unit] = !isMetric ? [1, ""] : Math.max(...size) < 1 ? [100, " cm"] : [1, " m"];
-  const digits = factor === 100 || Math.max(...size) >= 20 ? 0 : 1;
-  return `${size.map((length) => (length * factor).toFixed(digits)).join(" × ")}${unit}`;
+  const sides = [Math.max(size[0], size[1]), Math.min(size[0], size[1]), size[2]];
+  if (!isMetric) return sides.map((length) => length.toPrecision(2)).join(" × ");
+  const isSmall = Math.max(...sides) < 1;
+  const texts = sides.map((length) => (isSmall || length < 0.1 ? [String(Math.max(Math.round(length * 100), 1)), "cm"] : [length.toFixed(length >= 20 ? 0 : 1), "m"]));
+  // A unit stands where the next side has another.
+  return texts.map(([text, unit], i) => (texts[i + 1]?.[1] === unit ? text : `${text} ${unit}`)).join(" × ");
 }
 
 export const metres = (v: number[]) => `${v.map((x) => x.toFixed(2)).join(", ")} m`;
 
-/** What the copy buttons put on the clipboard. */
-export function copies(answer: Answer, question: string): Record<string, string> {
+/**
+ * What the copy buttons put on the clipboard. `query`: the question's parameters. Robots drive to goals: one is
+ * sent to `place`, where it can stand, and without that no goal but a point.
+ */
+export function copies(answer: Answer, query: string, place: Goal | null): Record<string, string> {
   const [x, y, z] = answer.position_in_world.map((v) => v.toFixed(3));
-  const pose = `{header: {frame_id: world}, pose: {position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {w: 1.0}}}`;
   return {
     World: `${x}, ${y}, ${z}`,
     ...(answer.geographic ? { "Lat, lon": `${answer.geographic.latitude_deg.toFixed(7)}, ${answer.geographic.longitude_deg.toFixed(7)}` } : {}),
-    curl: `curl '${location.origin}/v1/query?text=${encodeURIComponent(question)}'`,
-    ROS: `ros2 topic pub --once /goal_pose geometry_msgs/msg/PoseStamped '${pose}'`,
+    ...(query ? { curl: `curl '${location.origin}/v1/query?${query}'` } : {}),
+    ROS: place ? `ros2 topic pub --once /goal_pose geometry_msgs/msg/PoseStamped '${poseOf(place)}'`
+      : `ros2 topic pub --once /clicked_point geometry_msgs/msg/PointStamped '{header: {frame_id: world}, point: {x: ${x}, y: ${y}, z: ${z}}}'`,
   };
+}
+
+function poseOf({ position_in_world, yaw_rad }: Goal): string {
+  const [x, y, z] = position_in_world.map((v) => v.toFixed(3));
+  const orientation = `{z: ${Math.sin(yaw_rad / 2).toFixed(4)}, w: ${Math.cos(yaw_rad / 2).toFixed(4)}}`;
+  return `{header: {frame_id: world}, pose: {position: {x: ${x}, y: ${y}, z: ${z}}, orientation: ${orientation}}}`;
 }

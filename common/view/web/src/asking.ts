@@ -1,12 +1,12 @@
 // Questions and what comes of them: the scene lit, the answers' cards and boxes, one of them chosen.
 
 import { OPACITY, strengthOf, type Viewpoint } from "./answers";
-import { type Asked, openCard, photoOf, showCards, showPhoto } from "./cards";
-import { clustersOf } from "./clusters";
+import { type Asked, openCard, photoOf, placeCards, showCards, showPhoto } from "./cards";
+import { clustersOf, topScore, voxelOf } from "./clusters";
 import type { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Answers, type Description, fetchAnswers, fetchScores, parseQuestion, type Photo } from "./network";
-import { panel, say, showLegend, showSecond } from "./panel";
+import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, parseQuestion, type Photo } from "./network";
+import { offer, panel, say, showLegend, showSecond } from "./panel";
 import { pictureOf } from "./photos";
 import type { PlacesToStand } from "./places";
 import { remember, type State, writeState } from "./state";
@@ -14,11 +14,30 @@ import { remember, type State, writeState } from "./state";
 /** Where things were found, Gaussians are lit from this share of the range of scores, or a lower threshold. */
 const SHARE_OF_RANGE = 0.75;
 
+function bestLevel({ byCell }: Scores): number {
+  let best = 0;
+  for (const levels of byCell.values()) for (const level of levels) best = Math.max(best, level);
+  return best;
+}
+
 const levelOf = (score: number, range: Scores) => Math.min(255, Math.max(1, Math.round(((score - range.min) / (range.max - range.min || 1)) * 255)));
+
+/** Words of a relation or a comparison, which robots understand ("docs/api.md"). */
+const RELATION = /(^|\s)(on|under|underneath|beneath|below|above|over|in|inside|within|near|close to|by|at|beside|next to|between|left of|right of|in front of|before|behind|nearest|closest|farthest|furthest|largest|biggest|smallest)\s/i;
 
 interface Found {
   scores: Scores;
   reply: Answers;
+}
+
+/** Why nothing was found. */
+function noneText({ thing, best, isOfPoints, threshold, none, isBelowThreshold, isPlain }: Answers): string {
+  if (isPlain && isBelowThreshold && threshold !== null) {
+    // Of points few may reach it, too few for a group.
+    const found = best === null ? "" : best < threshold ? `best ${isOfPoints ? "point " : ""}${best.toFixed(2)}, ` : "but for a few points, ";
+    return `Nothing here is like “${thing}” (${found}found from ${threshold.toFixed(2)}).`;
+  }
+  return `Not found. ${(none ?? "").replace(/\d+\.\d{4,}/g, (number) => Number(number).toFixed(3))}`;
 }
 
 /** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. */
@@ -39,7 +58,7 @@ export class Asking {
 
   /** `viewpoint` is from where distances are said now; `onOther` is called when the service has another generation. */
   constructor(private readonly state: State, private readonly drawing: Drawing, private readonly places: PlacesToStand,
-    private readonly description: () => Description, private readonly viewpoint: () => Viewpoint, private readonly onOther: () => void, private readonly report: (error: unknown) => void) {}
+    private readonly description: () => Description, private readonly viewpoint: (ofCamera?: boolean) => Viewpoint, private readonly onOther: () => void, private readonly report: (error: unknown) => void) {}
 
   colour(level: number): void {
     this.drawing.cells.colour(this.scores && { scores: this.scores, threshold: level }, this.second);
@@ -59,15 +78,41 @@ export class Asking {
   private async fetchBoth(line: string, signal: AbortSignal): Promise<Found | null> {
     const question = parseQuestion(line);
     if (!question.text) return null;
-    const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal)]);
+    const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal, this.askers())]);
     // The scores of "mug on the table" are those of mugs.
     const scores = reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal);
     if (reply.answers.length === 0 && reply.isPlain && reply.threshold !== null) {
-      const diagonalM = this.drawing.extent.box.min.distanceTo(this.drawing.extent.box.max);
-      reply.answers = clustersOf(this.drawing.cells.all(), scores, reply.threshold, diagonalM);
-      for (const answer of reply.answers) answer.evidence = this.photoBySight(answer);
+      reply.answers = this.groupsOf(scores, reply.threshold);
+      // A store's page says no best score of things.
+      if (reply.best === null) [reply.best, reply.isOfPoints] = [scores.min + (bestLevel(scores) / 255) * (scores.max - scores.min), true];
     }
     return { scores, reply };
+  }
+
+  private groupsOf(scores: Scores, threshold: number): Answer[] {
+    const answers = clustersOf(this.drawing.cells.all(), scores, threshold, voxelOf(this.description()));
+    for (const answer of answers) answer.evidence = this.photoBySight(answer);
+    return answers;
+  }
+
+  /** The robot, or where none is known to look anywhere the one who looks at the page. */
+  private askers(): Asker[] {
+    return [this.viewpoint(), this.viewpoint(true)];
+  }
+
+  /** Shows what is most like the question, though less than what counts as found. */
+  private showNearest({ scores, reply }: Found): void {
+    const threshold = topScore(this.drawing.cells.all(), scores);
+    if (threshold === null) return;
+    this.show({ scores, reply: { ...reply, answers: this.groupsOf(scores, threshold), isNearest: true } }, null);
+    this.light(levelOf(threshold, scores));
+  }
+
+  /** Says distances from where the camera, or the robot, is now. */
+  moved(): void {
+    if (!this.asked) return;
+    this.asked.viewpoint = this.viewpoint();
+    placeCards(this.answers, this.asked);
   }
 
   /** A photo that sees a group, the one that shows it largest. */
@@ -108,7 +153,7 @@ export class Asking {
     const { threshold } = this.state;
     this.colour(first && this.scores ? (threshold === null ? levelFrom(first) : levelOf(threshold, first.scores)) : 0);
     this.answers = first?.reply.answers ?? [];
-    this.asked = first && { thing: first.reply.thing, threshold: first.reply.threshold, viewpoint: this.viewpoint(), description: this.description() };
+    this.asked = first && { thing: first.reply.thing, query: first.reply.query, threshold: first.reply.threshold, viewpoint: this.viewpoint(), description: this.description() };
     if (this.asked) showCards(this.answers, this.asked, (index) => this.choose(index === this.chosen ? null : index));
     else panel.answers.replaceChildren();
     this.choose(null);
@@ -116,9 +161,15 @@ export class Asking {
     const n = this.answers.length;
     const isGroups = n > 0 && this.answers.every(({ id }) => !id);
     const groups = n === 1 ? "1 place matches, which is not marked as an object." : `${n} places match, none marked as an object.`;
-    const found = n === 0 ? `Not found. ${first.reply.none ?? ""}` : isGroups ? groups : `${n} found`;
+    const { reply } = first;
+    const isUnlike = n === 0 && reply.isPlain && reply.isBelowThreshold;
+    const found = n === 0 ? noneText(reply) : reply.isNearest ? `The nearest to “${reply.thing}”, all below ${reply.threshold?.toFixed(2)}` : isGroups ? groups : `${n} found`;
     const askedAs = Object.entries(first.reply.askedAs).map(([word, asked]) => `${word}: asked as ${asked}`);
-    say([...askedAs, found].join(" · "));
+    const seenFrom = reply.seenFrom ? `seen from ${reply.seenFrom}` : "";
+    const isRelation = this.description().program !== "slag-edge" && RELATION.test(parseQuestion(this.state.question).text);
+    const notUnderstood = isRelation ? "Robots answer relations; this page looks for the words as they are." : "";
+    say([...askedAs, found, seenFrom, notUnderstood].filter(Boolean).join(" · ").replaceAll(". · ", ". "));
+    if (isUnlike) offer("Show the nearest anyway", () => this.showNearest(first));
   }
 
   choose(index: number | null): void {
@@ -129,7 +180,7 @@ export class Asking {
     const answer = this.chosen === null ? null : this.answers[this.chosen];
     this.leavePhoto();
     this.photoOpened++;
-    if (asked) openCard(this.answers, this.chosen, asked);
+    if (asked) openCard(this.answers, this.chosen, asked, () => this.places.best);
     else panel.details.hidden = true;
     void this.places.ask(answer, this.description());
     if (!answer) return;
@@ -141,7 +192,7 @@ export class Asking {
   /** Shows one object that was clicked, as if it had been asked for. */
   showObject(object: Answer): void {
     this.answers = [{ ...object, score: object.score ?? 0 }];
-    this.asked = { thing: object.names?.[0]?.name ?? "Unnamed object", threshold: null, viewpoint: this.viewpoint(), description: this.description() };
+    this.asked = { thing: object.names?.[0]?.name ?? "Unnamed object", query: "", threshold: null, viewpoint: this.viewpoint(), description: this.description() };
     showCards(this.answers, this.asked, (index) => this.choose(index === this.chosen ? null : index));
     say("");
     this.choose(0);

@@ -9,6 +9,8 @@ import { crop, photoWithBox, thumbnail } from "./photos";
 export interface Asked {
   /** What the answers are. */
   thing: string;
+  /** The question as parameters of an address; empty if none was asked. */
+  query: string;
   threshold: number | null;
   viewpoint: Viewpoint;
   description: Description;
@@ -47,21 +49,29 @@ export function showCards(answers: Answer[], asked: Asked, onChoose: (index: num
     const card = button("", () => onChoose(index));
     card.className = "card";
     card.setAttribute("aria-expanded", "false");
-    const number = make("span", String(index + 1), "crop none");
+    const frame = make("span", "", "frame");
+    frame.append(make("span", String(index + 1), "number"));
     const text = make("span");
     const { metric } = asked.description;
-    text.append(make("b", asked.thing), make("small", whereabouts(answer.position_in_world, asked.viewpoint, metric)), make("small", sizeText(answer, metric)));
+    text.append(make("b", asked.thing), make("small", whereabouts(answer.position_in_world, asked.viewpoint, metric), "where"), make("small", sizeText(answer, metric)));
     const strength = strengthOf(answer, asked.threshold);
-    card.append(number, text, make("span", strength, `strength ${strength}`));
+    card.append(frame, text, make("span", strength, `strength ${strength}`));
     const item = make("li");
     item.append(card);
-    pictureOf(answer, asked.description)?.then((picture) => number.replaceWith(picture), () => {});
+    pictureOf(answer, asked.description)?.then((picture) => frame.prepend(picture), () => {});
     return item;
   }));
 }
 
-/** Opens a card, or none. */
-export function openCard(answers: Answer[], chosen: number | null, asked: Asked): void {
+/** Says again where the answers are: the viewpoint is another. */
+export function placeCards(answers: Answer[], { viewpoint, description }: Asked): void {
+  panel.answers.querySelectorAll(".where").forEach((where, index) => {
+    if (answers[index]) where.textContent = whereabouts(answers[index].position_in_world, viewpoint, description.metric);
+  });
+}
+
+/** Opens a card, or none. `place`: where it is best to stand, as far as that is known by then. */
+export function openCard(answers: Answer[], chosen: number | null, asked: Asked, place: () => Goal | null): void {
   [...panel.answers.children].forEach((item, index) => {
     item.classList.toggle("chosen", index === chosen);
     item.querySelector(".card")?.setAttribute("aria-expanded", String(index === chosen));
@@ -72,7 +82,7 @@ export function openCard(answers: Answer[], chosen: number | null, asked: Asked)
   if (!answer || chosen === null) return void panel.aside.append(panel.details);
   const item = panel.answers.children[chosen];
   item.append(panel.details);
-  panel.details.append(facts(answer, asked), copying(answer, asked.thing));
+  panel.details.append(facts(answer, asked), copying(() => copies(answer, asked.query, place())));
   item.scrollIntoView({ block: "nearest" });
 }
 
@@ -95,7 +105,7 @@ function facts(answer: Answer, { description, threshold }: Asked): HTMLDListElem
 }
 
 /** Buttons that copy; without a clipboard, which browsers give over HTTPS and on this machine only, the text is shown. */
-function copying(answer: Answer, question: string): HTMLElement {
+function copying(texts: () => Record<string, string>): HTMLElement {
   const row = make("div", "Copy", "copies");
   const show = (text: string) => {
     row.querySelector("textarea")?.remove();
@@ -105,8 +115,9 @@ function copying(answer: Answer, question: string): HTMLElement {
     row.append(shown);
     shown.select();
   };
-  for (const [name, text] of Object.entries(copies(answer, question))) {
+  for (const name of Object.keys(texts())) {
     const copy = button(name, () => {
+      const text = texts()[name];
       (navigator.clipboard?.writeText(text) ?? Promise.reject(new Error("no clipboard"))).then(() => {
         copy.textContent = "Copied";
         setTimeout(() => (copy.textContent = name), 1500);

@@ -2,14 +2,14 @@
 
 import { centreOf } from "./drawing/pick";
 import type { CellGaussians, Scores } from "./messages";
-import type { Answer, Vector } from "./network";
+import type { Answer, Description, Vector } from "./network";
 
 /** The robot's own. */
 const MIN_COUNT = 10;
-const VOXEL_M = 0.25;
+const METRIC_VOXEL_M = 0.25;
+/** Along a cell, where units are not metres. */
+const VOXELS_PER_CELL = 64;
 const MAX_CLUSTERS = 20;
-/** Voxels are at most so many along the scene's diagonal, or groups of a survey fall apart. */
-const MAX_ALONG = 400;
 
 interface Voxel {
   points: Vector[];
@@ -17,9 +17,31 @@ interface Voxel {
   isTaken: boolean;
 }
 
+const middleOf = (values: number[]) => values.sort((a, b) => a - b)[Math.floor(values.length / 2)] ?? 0;
+
+/** Edge of the voxels, the robot's own. */
+export function voxelOf({ metric, cells }: Description): number {
+  if (metric) return METRIC_VOXEL_M;
+  return middleOf(cells.map(({ box_m: { min, max } }) => middleOf(min.map((low, i) => max[i] - low)))) / VOXELS_PER_CELL || 1;
+}
+
+/** The score that the best thousandth of the Gaussians that are drawn reach, and as many as make a group; null without scores. */
+export function topScore(cells: Iterable<[number, CellGaussians]>, scores: Scores): number | null {
+  const counts = new Uint32Array(256);
+  for (const [cell, { n, step }] of cells) {
+    const levels = scores.byCell.get(cell);
+    for (let i = 0; levels && i < n; i++) counts[levels[i * step]]++;
+  }
+  const most = Math.max(counts.slice(1).reduce((sum, count) => sum + count, 0) / 1000, 5 * MIN_COUNT);
+  for (let level = 255, n = 0; level > 0; level--) {
+    n += counts[level];
+    if (n >= most) return scores.min + (level / 255) * (scores.max - scores.min);
+  }
+  return null;
+}
+
 /** Groups of Gaussians that score at least the threshold, best first. */
-export function clustersOf(cells: Iterable<[number, CellGaussians]>, scores: Scores, threshold: number, diagonalM: number): Answer[] {
-  const edge = Math.max(VOXEL_M, diagonalM / MAX_ALONG);
+export function clustersOf(cells: Iterable<[number, CellGaussians]>, scores: Scores, threshold: number, edge: number): Answer[] {
   const voxels = new Map<string, Voxel>();
   const keyOf = (at: number[]) => at.join(",");
   for (const [cell, gaussians] of cells) {

@@ -56,21 +56,22 @@ function report(error: unknown): void {
 }
 
 /** Distances are from the robot, or where none is from the camera. */
-function viewpoint(): Viewpoint {
+function viewpoint(ofCamera = false): Viewpoint {
   const { position_m, geographic } = description;
-  if (position_m) return { at: position_m, from: "the robot", headingRad: robot.headingRad, isGeographic: geographic };
+  if (position_m && !ofCamera) return { at: position_m, from: "the robot", headingRad: robot.headingRad, isGeographic: geographic };
   const { position, target } = drawing.pose();
-  return { at: position, from: "here", headingRad: Math.atan2(target[1] - position[1], target[0] - position[0]), isGeographic: geographic };
+  return { at: position, from: "this view", headingRad: Math.atan2(target[1] - position[1], target[0] - position[0]), isGeographic: geographic };
 }
 
 function showRobot(isOffline = false): void {
   robot.see(description);
   drawing.showRobot(description, robot.headingRad);
+  asking.moved();
   void robot.show(description, isOffline);
 }
 
 function open(): void {
-  drawing = new Drawing(panel.canvas, panel.labels, description, () => asking.leavePhoto(), (share) => streaming.isComplete && streaming.lower(share), covered);
+  drawing = new Drawing(panel.canvas, panel.labels, description, () => asking.leavePhoto(), () => asking.moved(), (share) => streaming.isComplete && streaming.lower(share), covered);
   const places = new PlacesToStand(drawing);
   asking = new Asking(state, drawing, places, () => description, viewpoint, lookSoon, report);
   changes = new ChangesPanel(drawing, panel.changes);
@@ -129,6 +130,7 @@ function stream(): void {
   void streaming.whole.then(() => {
     document.documentElement.dataset.wholePictureMs ??= performance.now().toFixed(0);
     drawing.measureExtent(isOpening);
+    showRobot();
     facts();
   });
   facts();

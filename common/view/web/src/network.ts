@@ -110,6 +110,17 @@ export interface Answers {
   isPlain: boolean;
   /** What was asked in place of words that the model does not know. */
   askedAs: Record<string, string>;
+  /** Best score of what was not found, if the service says it. */
+  best: number | null;
+  /** Whether that is of a Gaussian. */
+  isOfPoints?: boolean;
+  isBelowThreshold: boolean;
+  /** Whether they do not reach the threshold, and are shown because that was wanted. */
+  isNearest?: boolean;
+  /** The question as parameters of an address. */
+  query: string;
+  /** From where relations were seen, if that counted. */
+  seenFrom: string | null;
 }
 
 export interface Question {
@@ -117,6 +128,19 @@ export interface Question {
   negatives: string[];
 }
 
+/** Who asks: where, and looking where, from x towards y; `from` in words. */
+export interface Asker {
+  at: Vector;
+  headingRad: number | null;
+  from: string;
+}
+
+/** A parameter is missing or wrong. */
+export class Refused extends Error {
+  constructor(detail: string, readonly parameter: string) {
+    super(detail);
+  }
+}
 export class Unauthorized extends Error {}
 export class NotFound extends Error {}
 export class Offline extends Error {}
@@ -148,8 +172,9 @@ async function get(path: string, signal?: AbortSignal, body?: Blob): Promise<Res
   }
   if (response.ok) return response;
   if (response.status === 401) throw new Unauthorized("This service asks for its token.");
-  const problem = (await response.json().catch(() => null)) as { detail?: string } | null;
+  const problem = (await response.json().catch(() => null)) as { detail?: string; parameter?: string } | null;
   const detail = problem?.detail ?? `${path.split("?")[0]}: status ${response.status}`;
+  if (problem?.parameter) throw new Refused(detail, problem.parameter);
   throw response.status === 404 ? new NotFound(detail) : new Error(detail);
 }
 
@@ -250,25 +275,36 @@ export async function fetchGoals(id: string, radiusM: number, signal: AbortSigna
   return { goals: reply.goals, thing: reply.thing?.position_in_world ?? null, none: reply.none };
 }
 
-/** The things that answer a question; from the robot's `/v1/query`, or from `/query` where that is absent. */
-export async function fetchAnswers(question: Question, signal: AbortSignal): Promise<Answers> {
+/**
+ * The things that answer a question. `askers`: tried in turn where a relation depends on who asks ("chair near me"),
+ * and only then: the asker's place changes the order of all answers.
+ */
+export async function fetchAnswers(question: Question, signal: AbortSignal, askers: Asker[]): Promise<Answers> {
   const parameters = parametersOf(question);
-  parameters.set("limit", String(MAX_ANSWERS));
-  try {
-    const [result] = (await (await get(`/v1/query?${parameters}`, signal)).json()).results;
-    return {
-      thing: result.understood?.thing ?? question.text,
-      answers: result.answers,
-      threshold: result.threshold ?? result.parts?.[0]?.threshold ?? null,
-      none: result.none?.detail ?? null,
-      isPlain: !result.understood,
-      askedAs: result.asked_as ?? {},
-    };
-  } catch (error) {
-    if (!(error instanceof NotFound)) throw error;
+  const ask = async () => (await (await get(`/v1/query?${parameters}&limit=${MAX_ANSWERS}`, signal)).json()).results[0];
+  let seenFrom: string | null = null;
+  let result;
+  for (const left = [...askers]; !result;) {
+    try {
+      result = await ask();
+    } catch (error) {
+      const asker = error instanceof Refused && /^(near|heading_rad)$/.test(error.parameter) ? left.shift() : null;
+      if (!asker) throw error;
+      parameters.set("near", asker.at.map((v) => Number(v.toFixed(3))).join(","));
+      if (asker.headingRad !== null) parameters.set("heading_rad", asker.headingRad.toFixed(4));
+      seenFrom = asker.from;
+    }
   }
-  const short = new URLSearchParams({ text: question.text, limit: String(MAX_ANSWERS) });
-  if (question.negatives.length > 0) short.set("negatives", question.negatives.join(","));
-  const reply = await (await get(`/query?${short}`, signal)).json();
-  return { thing: question.text, answers: reply.answers ?? [], threshold: reply.threshold ?? null, none: reply.none?.detail ?? null, isPlain: true, askedAs: reply.asked_as ?? {} };
+  return {
+    thing: result.understood?.thing ?? question.text,
+    answers: result.answers,
+    threshold: result.threshold ?? result.parts?.[0]?.threshold ?? null,
+    none: result.none?.detail ?? null,
+    isPlain: !result.understood,
+    askedAs: result.asked_as ?? {},
+    best: result.none?.best_score ?? null,
+    isBelowThreshold: result.none?.kind === "below-threshold",
+    query: String(parameters),
+    seenFrom,
+  };
 }

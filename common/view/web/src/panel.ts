@@ -54,6 +54,15 @@ export function say(text: string, isError = false): void {
   element("message").classList.toggle("error", isError);
 }
 
+/** Puts a button behind what was said. */
+export function offer(text: string, onClick: () => void): void {
+  const button = document.createElement("button");
+  button.type = "button";
+  button.textContent = text;
+  button.addEventListener("click", onClick);
+  element("message").append(" ", button);
+}
+
 /** Pixels of the scene that the panel covers: at the left, or on phones at the bottom. */
 export function covered(): [number, number] {
   const { right, top, width } = panel.aside.getBoundingClientRect();

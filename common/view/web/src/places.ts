@@ -3,7 +3,7 @@
 import { showPlaces } from "./cards";
 import type { Drawing } from "./drawing/drawing";
 import { ROBOT_RADIUS_M } from "./drawing/marks";
-import { type Answer, type Description, type Goals, fetchGoals } from "./network";
+import { type Answer, type Description, type Goal, type Goals, fetchGoals } from "./network";
 
 const NO_OBJECT = "Places are known for objects; this answer is a group of Gaussians.";
 
@@ -34,6 +34,11 @@ export class PlacesToStand {
       // The scene has no occupancy, or the service is busy or gone: the service's own words say which.
       if (!signal.aborted) showPlaces([], error instanceof Error ? error.message : String(error), null, () => {});
     }
+  }
+
+  /** The place that was chosen, else the best one. */
+  get best(): Goal | null {
+    return this.found?.goals[this.chosen ?? 0] ?? null;
   }
 
   /** Chooses the place under a point of the canvas, if there is one. */

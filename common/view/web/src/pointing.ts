@@ -68,7 +68,7 @@ export class Pointing {
   }
 
   private measureTo(point: Vector | null): void {
-    if (!point) return;
+    if (!point) return say("Nothing there: click on a surface.");
     this.measured = this.measured.length === 1 ? [this.measured[0], point] : [point];
     const [a, b] = this.measured;
     const text = b ? lengthText(Math.hypot(...a.map((v, i) => v - b[i])), this.description().metric) : "from here";

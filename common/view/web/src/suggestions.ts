@@ -32,7 +32,7 @@ export function suggest(line: string, history: string[], words: Word[]): Suggest
   const starts = [{ start: line.startsWith("-") ? "-" : "", part: typed.replace(/^-/, "") }, { start, part: last.toLowerCase() }];
   for (const [matches, isAllowed] of [
     [(word: string, part: string) => word.startsWith(part), true],
-    [(word: string, part: string) => word.includes(part), typed !== ""],
+    [(word: string, part: string) => /[\s-]/.test(word) && word.replaceAll("-", " ").includes(` ${part}`), typed !== ""],
   ] as [(word: string, part: string) => boolean, boolean][]) {
     if (!isAllowed) continue;
     for (const { start: kept, part } of starts) {

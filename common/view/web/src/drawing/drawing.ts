@@ -20,6 +20,8 @@ const NEAR_PX = 14;
 const BACKGROUNDS: Record<Theme, number> = { dark: 0x14181d, light: 0xeceff2, contrast: 0x000000 };
 /** Points by which the extent is measured. */
 const N_POINTS = 20_000;
+/** Cameras of photos nearer than this would fill the picture with their lines. */
+const NEAR_EYE_M = 1;
 /** Share of the light by which a photo sees a thing, through haze. */
 const LEAST_LIGHT = 0.3;
 /** Photos that are tried for one that nothing hides. */
@@ -57,12 +59,14 @@ export class Drawing {
   private shown: [Answer[], number[], number | null] = [[], [], null];
   private robotSeen = "";
   private isDirty = true;
+  /** Where the camera was when it stood still. */
+  private stood = "";
   private readonly frames: Frames;
   private waiting: (() => void)[] = [];
 
-  /** `onSlow` is told which share of the Gaussians would be drawn fast enough; `covered` what lies over the picture. */
+  /** `onStill` is called when the camera stops elsewhere; `onSlow` is told which share of the Gaussians would be drawn fast enough; `covered` what lies over the picture. */
   constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, private readonly description: Description,
-    onLeavePhoto: () => void, onSlow: (share: number) => void, private readonly covered: () => [number, number]) {
+    onLeavePhoto: () => void, private readonly onStill: () => void, onSlow: (share: number) => void, private readonly covered: () => [number, number]) {
     this.frames = new Frames(onSlow);
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
@@ -207,7 +211,10 @@ export class Drawing {
     // What is free and narrower than the photo shows all of its width.
     const halfHeight = Math.max(photo.height_px, photo.width_px / this.camera.aspect) / 2;
     const fieldOfViewDeg = (Math.atan(halfHeight / photo.focal_px) * 360) / Math.PI;
-    this.camera.standAt(this.local(photo.position_m), rotation, fieldOfViewDeg, Math.max(this.radiusM * 0.2, 0.5));
+    // It turns around what is in the middle, and the scale is of that.
+    const along = new THREE.Vector3(0, 0, 1).applyQuaternion(new THREE.Quaternion(...photo.rotation_xyzw)).toArray() as Vector;
+    const seen = this.cells.pick(photo.position_m, along, 1 / this.camera.focalPx);
+    this.camera.standAt(this.local(photo.position_m), rotation, fieldOfViewDeg, seen?.distanceM ?? Math.max(this.radiusM * 0.2, 0.5));
     this.redraw();
   }
 
@@ -230,10 +237,12 @@ export class Drawing {
 
   showRobot(description: Description, headingRad: number | null): void {
     // Every poll says where it is; a picture is drawn again only if that is news.
-    const seen = JSON.stringify([description.position_m, description.fetched, headingRad]);
+    // A ring around all of the scene is a line through every picture.
+    const fetched = description.fetched && description.fetched.radius_m < this.radiusM ? description.fetched : undefined;
+    const seen = JSON.stringify([description.position_m, fetched, headingRad]);
     if (seen === this.robotSeen) return;
     this.robotSeen = seen;
-    this.marks.showRobot(description, headingRad, this.up);
+    this.marks.showRobot({ ...description, fetched }, headingRad, this.up);
     const { position_m } = description;
     this.labelled.robot = position_m ? [{ text: "Robot", at: new THREE.Vector3(...position_m).add(this.up).toArray() as Vector, kind: "robot" }] : [];
     this.writeLabels();
@@ -289,14 +298,25 @@ export class Drawing {
 
   private step(nowMs: number): void {
     if (this.camera.step(nowMs)) this.redraw();
+    this.noticeStill();
     this.frames.count(nowMs, this.camera.isMoving && this.isDirty);
     if (!this.isDirty) return;
     this.isDirty = false;
+    if (this.marks.photos.visible) this.marks.hidePhotosNear(this.pose().position, this.description.metric ? NEAR_EYE_M : this.radiusM / 20);
     this.renderer.render(this.scene, this.camera.camera);
     this.placeLabels();
     const forward = this.camera.controls.target.clone().sub(this.camera.camera.position);
     this.hud.show(forward, forward.length() / this.camera.focalPx);
     for (const then of this.waiting.splice(0)) then();
+  }
+
+  private noticeStill(): void {
+    if (this.camera.isMoving) return;
+    const { position, target } = this.pose();
+    const stands = [...position, ...target].join(",");
+    if (stands === this.stood) return;
+    this.stood = stands;
+    this.onStill();
   }
 
   private get labelsNow(): Label[] {

@@ -12,6 +12,10 @@ const ROBOT_COLOUR = 0x4fd1a5;
 /** Of the robot that is drawn, and asked for places to stand: `/v1/goal`'s own default. */
 export const ROBOT_RADIUS_M = 0.3;
 
+const MAX_FRUSTA = 2000;
+/** Four lines from its tip and four around its base. */
+const POINTS_OF_FRUSTUM = 16;
+
 /** A thing that changed, as it is listed and drawn. */
 export interface Change {
   kind: "appeared" | "went" | "moved";
@@ -45,6 +49,8 @@ export class Marks {
   readonly robot = new THREE.Group();
   readonly changes = new THREE.Group();
   private readonly measured = new THREE.Group();
+  private photoPlaces: Vector[] = [];
+  private photosNear: boolean[] = [];
 
   constructor(parent: THREE.Object3D) {
     this.photos.visible = this.cells.visible = false;
@@ -128,7 +134,9 @@ export class Marks {
   showPhotos(photos: Photo[], lengthM: number): void {
     disposeAll(this.photos);
     const points: THREE.Vector3[] = [];
-    for (const photo of photos.slice(0, 2000)) {
+    this.photosNear = [];
+    this.photoPlaces = photos.slice(0, MAX_FRUSTA).map((photo) => photo.position_m);
+    for (const photo of photos.slice(0, MAX_FRUSTA)) {
       const place = new THREE.Vector3(...photo.position_m);
       const rotation = new THREE.Quaternion(...photo.rotation_xyzw);
       const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) =>
@@ -137,6 +145,22 @@ export class Marks {
       corners.forEach((corner, i) => points.push(place, corner, corner, corners[(i + 1) % 4]));
     }
     this.photos.add(new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0x6fbf8b, transparent: true })));
+  }
+
+  /** Leaves out the cameras that are this near to the eye. */
+  hidePhotosNear(eye: Vector, leastM: number): void {
+    const lines = this.photos.children[0];
+    if (!(lines instanceof THREE.LineSegments)) return;
+    const near = this.photoPlaces.map((place) => Math.hypot(...place.map((v, k) => v - eye[k])) < leastM);
+    // A new index is a new buffer on the GPU.
+    if (near.every((isNear, i) => isNear === this.photosNear[i])) return;
+    this.photosNear = near;
+    const index: number[] = [];
+    near.forEach((isNear, i) => {
+      for (let k = 0; k < POINTS_OF_FRUSTUM && !isNear; k++) index.push(i * POINTS_OF_FRUSTUM + k);
+    });
+    lines.geometry.dispose();
+    lines.geometry.setIndex(index);
   }
 
   /** A cone that points where the robot heads, a post and a ring; and a ring around what it fetched. */
