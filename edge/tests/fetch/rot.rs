@@ -72,7 +72,8 @@ fn whatever_is_lost_is_put_back() {
     let current = robot.cache.current().expect("readable").expect("fetched");
     let mut paths = vec![robot.cache.current_path(), robot.cache.manifest_path(current.manifest_hash)];
     paths.extend(current.shards().map(|hash| robot.cache.shard_path(hash)));
-    let faults: [(&str, fn(&Path)); 5] = [
+    type Put = fn(&Path);
+    let faults: [(&str, Put); 5] = [
         ("nothing", |_| {}),
         ("an empty file", |path| fs_err::write(path, b"").expect("written")),
         ("another file", |path| fs_err::write(path, b"{}").expect("written")),
