@@ -30,7 +30,7 @@ pub(super) fn root_folder(store: &Path) -> PathBuf {
 pub(super) fn read(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
     let path = key_path(store, role);
     let what = match KeyFile::read(&path)? {
-        KeyFile::Key(key) => return Ok(key),
+        KeyFile::Key(key) => return Ok(*key),
         KeyFile::Missing => "it is missing",
         KeyFile::Damaged => DAMAGED,
     };
@@ -83,7 +83,7 @@ fn before_root(error: StoreError) -> StoreError {
 /// Reads all keys of root in a folder, by name; none if the folder is not there.
 pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
     let read = |path: PathBuf| match KeyFile::read(&path)? {
-        KeyFile::Key(key) => Ok(Some(key)),
+        KeyFile::Key(key) => Ok(Some(*key)),
         KeyFile::Missing => Ok(None),
         KeyFile::Damaged => Err(damaged(path)),
     };
@@ -95,7 +95,7 @@ pub(super) fn read_sound(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
     let mut keys = Vec::new();
     for path in files_of_keys(folder)? {
         match KeyFile::read(&path)? {
-            KeyFile::Key(key) => keys.push(key),
+            KeyFile::Key(key) => keys.push(*key),
             KeyFile::Missing => {}
             KeyFile::Damaged => tracing::warn!("{}", damaged(path)),
         }
@@ -152,7 +152,7 @@ fn key_path(store: &Path, role: &str) -> PathBuf {
 
 fn read_or_make(path: &Path) -> Result<SigningKey, StoreError> {
     match KeyFile::read(path)? {
-        KeyFile::Key(key) => return Ok(key),
+        KeyFile::Key(key) => return Ok(*key),
         KeyFile::Missing => {}
         KeyFile::Damaged => return Err(damaged(path.to_owned())),
     }
@@ -176,7 +176,7 @@ fn damaged(path: PathBuf) -> StoreError {
 
 /// What a file has in which a key should be.
 enum KeyFile {
-    Key(SigningKey),
+    Key(Box<SigningKey>),
     Missing,
     Damaged,
 }
@@ -194,6 +194,6 @@ impl KeyFile {
             read => read?,
         };
         let secret: Option<Hash32> = text.trim_end().parse().ok();
-        Ok(secret.map_or(Self::Damaged, |secret| Self::Key(SigningKey::from_bytes(&secret.0))))
+        Ok(secret.map_or(Self::Damaged, |secret| Self::Key(Box::new(SigningKey::from_bytes(&secret.0)))))
     }
 }
