@@ -74,7 +74,7 @@ fn an_encode_heals_a_store_from_kept_views() {
     run(&mut encoder(&["query", "blue", "--store", text(&store), "--models", "colours"]));
 
     // Kept views rot: one is cut, one is gone, and a byte of a third's contributions shows when they are read.
-    let mut kept: Vec<PathBuf> = files(&store.join("job/views")).into_keys().collect();
+    let mut kept = files_below(&store.join("job/views"));
     kept.retain(|path| path.extension().is_some_and(|extension| extension == "contributions"));
     let bytes = fs_err::read(&kept[0]).expect("there");
     fs_err::write(&kept[0], &bytes[..bytes.len() / 2]).expect("written");
