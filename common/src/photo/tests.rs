@@ -53,8 +53,8 @@ fn what_inflates_before_the_pixels_is_bounded() {
     };
     let bomb = with_profile(64 << 20);
     assert!(bomb.len() < 100_000, "{}", bomb.len());
-    assert!(matches!(opened(&bomb), Err(PhotoError::Head)));
-    assert!(matches!(head(Cursor::new(&bomb)).map(drop), Err(PhotoError::Head)));
+    let mut decoder = open(Cursor::new(&bomb)).expect("a photo without its profile");
+    assert_eq!(decoder.icc_profile().expect("read"), None);
     let mut decoder = open(Cursor::new(with_profile(2 << 20))).expect("a large profile");
     let profile = decoder.icc_profile().expect("read").expect("there");
     assert!((2 << 20..(2 << 20) + 258).contains(&profile.len()), "{}", profile.len());
