@@ -39,7 +39,7 @@ fn at(path: &Path) -> impl Fn(io::Error) -> io::Error {
 
 /// Opens a file of the cache to read. What else stands at its place is refused: a pipe keeps its reader waiting,
 /// perhaps for ever.
-pub(super) fn open(path: &Path) -> io::Result<File> {
+fn open(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.read(true);
     #[cfg(unix)]
@@ -190,7 +190,7 @@ impl Files for DiskFiles {
     }
 
     fn map(&self, path: &Path) -> io::Result<FileBytes> {
-        mmap::map(path)
+        mmap::map(&open(path)?, path)
     }
 
     fn stat(&self, path: &Path) -> io::Result<Option<Stat>> {

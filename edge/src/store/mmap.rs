@@ -1,12 +1,11 @@
 //! Read-only memory maps: the only module of this crate with unsafe code.
 
+use std::fs::File;
 use std::io;
 use std::ops::Deref;
 use std::path::Path;
 
 use slag_common::container::AlignedBytes;
-
-use super::files;
 
 /// The bytes of an immutable file, aligned for every column type.
 #[derive(Debug)]
@@ -27,13 +26,12 @@ impl Deref for FileBytes {
     }
 }
 
-/// Maps a file read-only.
+/// Maps a file that is opened to read. `path`: its, for errors.
 ///
 /// The file must not change any more: shards never do once they are renamed into place, and a staged file is
 /// mapped only after its last write, by the process that holds the cache's lock.
 #[expect(unsafe_code, reason = "mapping a file is unsafe by nature; every other module is safe")]
-pub fn map(path: &Path) -> io::Result<FileBytes> {
-    let file = files::open(path)?;
+pub fn map(file: &File, path: &Path) -> io::Result<FileBytes> {
     // Not every system can map an empty file.
     if file.metadata()?.len() == 0 {
         return Ok(FileBytes::Read(AlignedBytes::default()));
@@ -42,7 +40,7 @@ pub fn map(path: &Path) -> io::Result<FileBytes> {
     // name, old names are only unlinked, and an unlinked file stays readable while mapped), so the bytes
     // behind the shared slice do not change. Another program could still truncate the file in place: access
     // to the lost pages then raises SIGBUS, which ends the process.
-    let map = unsafe { memmap2::Mmap::map(&file) };
+    let map = unsafe { memmap2::Mmap::map(file) };
     map.map(FileBytes::Mapped)
         .map_err(|e| io::Error::new(e.kind(), format!("mapping {}: {e}", path.display())))
 }
