@@ -14,6 +14,8 @@ mod embedded {
     pub const TOKENIZER: &[u8] = include_bytes!("../embedded/tokenizer.json");
     /// The nouns that the models learnt, one a line.
     pub const NOUNS: &str = include_str!("../embedded/nouns.txt");
+    /// The words that they learnt for several nouns, one a line.
+    pub const KINDS: &str = include_str!("../embedded/kinds.txt");
 }
 
 use crate::{
@@ -213,8 +215,10 @@ impl ModelDir {
                 let model = files.open(&text.file, embedded::TEXT)?;
                 let tokenizer = files.open(&text.tokenizer, embedded::TOKENIZER)?;
                 let encoder = OnnxTextEncoder::open(name, dim, [&model, &tokenizer], text, centre, options)?;
-                let is_embedded = matches!(files, Files::Embedded);
-                Box::new(encoder.with_nouns(is_embedded.then(|| embedded::NOUNS.lines())))
+                Box::new(match files {
+                    Files::Embedded => encoder.with_words(embedded::NOUNS.lines(), embedded::KINDS.lines()),
+                    _ => encoder,
+                })
             }
             TextDescription::Phrases(text) => {
                 let (phrases, vectors) = (files.on_disk(&text.file)?, files.on_disk(&text.vectors)?);

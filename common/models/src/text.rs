@@ -149,11 +149,16 @@ impl OnnxTextEncoder {
         }
     }
 
-    /// Says which words the model knows; of one without, that it knows them all.
-    pub(crate) fn with_nouns<'a>(self, words: Option<impl Iterator<Item = &'a str>>) -> Self {
-        let nouns: Option<Vec<String>> = words.map(|words| words.map(str::to_owned).collect());
-        let known = nouns.clone().map(|nouns| Arc::new(KnownPhrases::new(nouns, false)));
-        Self { nouns, known, ..self }
+    /// Says which words the model knows: `nouns` name things, `kinds` several sorts of things. Otherwise it knows all.
+    pub(crate) fn with_words<'a>(
+        self,
+        nouns: impl Iterator<Item = &'a str>,
+        kinds: impl Iterator<Item = &'a str>,
+    ) -> Self {
+        let nouns: Vec<String> = nouns.map(str::to_owned).collect();
+        let words = nouns.iter().cloned().chain(kinds.map(str::to_owned));
+        let known = Arc::new(KnownPhrases::new(words, false));
+        Self { nouns: Some(nouns), known: Some(known), ..self }
     }
 
     /// Runs the model on token ids; returns its vector, `[dim]`.

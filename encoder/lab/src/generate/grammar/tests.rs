@@ -1,5 +1,7 @@
 //! Object files: parsing, errors, and the built-in files.
 
+use slag_models::{ModelDir, SessionOptions};
+
 use super::*;
 
 fn parse(text: &str) -> Result<Noun, String> {
@@ -67,6 +69,25 @@ fn built_in_objects_are_sound() {
             let hung = noun.found.iter().any(|(_, place)| *place == Place::Hung);
             assert!(hung || low.z.abs() < 0.06, "{} {seed}: lowest at {}", noun.name, low.z);
             assert!(size.max_element() < 13.0 && size.max_element() > 0.05, "{} {seed}: {size}", noun.name);
+        }
+    }
+}
+
+/// No word that the embedded model learnt is asked as one that means fewer things: `container` is no ship's.
+#[test]
+fn the_model_is_asked_with_words_that_mean_as_much() {
+    let of = |word: &str| -> Vec<&str> {
+        let is_called = |noun: &&Noun| {
+            noun.name == word || [&noun.words, &noun.kinds].iter().any(|w| w.iter().any(|w| w == word))
+        };
+        NOUNS.iter().filter(is_called).map(|noun| noun.name.as_str()).collect()
+    };
+    let session = SessionOptions::new(slag_test_support::onnx_runtime());
+    let encoder = ModelDir::embedded().expect("it reads").text_encoder(&session).expect("it opens");
+    let known = encoder.known_phrases().expect("it knows some words");
+    for word in NOUNS.iter().flat_map(|noun| noun.words.iter().chain(&noun.kinds)) {
+        if let Some(asked) = known.asked_as(word) {
+            assert!(of(word).iter().all(|noun| of(&asked).contains(noun)), "{word} is asked as {asked}");
         }
     }
 }
