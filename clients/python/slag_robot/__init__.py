@@ -115,9 +115,19 @@ def _pairs(near: Optional[Point], parameters: Mapping[str, Any]) -> list[tuple[s
 def _is_loopback(url: str) -> bool:
     host = urllib.parse.urlsplit(url).hostname or ""
     try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+        address = ipaddress.ip_address(host)
     except ValueError:
-        return False
+        return host == "localhost"
+    address = getattr(address, "ipv4_mapped", None) or address
+    # Who connects to no address in particular reaches this machine.
+    return address.is_loopback or address.is_unspecified
+
+
+def _same(before: Optional[int], now: int) -> int:
+    """Returns the generation of all pages: ids of one mean nothing in another."""
+    if before not in (None, now):
+        raise RuntimeError(f"generation {before} became {now}; ask again from the start")
+    return now
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
@@ -129,6 +139,12 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
 _LONGEST_SHOWN = 200
 """Characters of an answer that an error shows."""
+_LONGEST_ANSWER = 64 << 20
+"""Bytes of an answer that are read: ten thousand answers are 10 MB."""
+_LONGEST_LINE = 1 << 20
+"""Bytes of a line of events."""
+_MOST_LINES = 100
+"""Lines of an event."""
 
 
 def _shown(text: bytes) -> str:
@@ -149,13 +165,19 @@ def _retry_after_secs(value: Optional[str]) -> Optional[float]:
         return None
 
 
-def _whole(reply: Any) -> bytes:
-    """Reads a body to its end, or to where it broke off."""
+def _read_body(reply: Any) -> tuple[bytes, bool]:
+    """Reads a body to its end, to where it broke off, or as far as one is read; returns whether it is whole."""
+    body = b""
     try:
-        body: bytes = reply.read()
+        while len(body) < _LONGEST_ANSWER:
+            piece = reply.read(_LONGEST_ANSWER - len(body))
+            if not piece:
+                # What was announced and did not come.
+                return body, not reply.length
+            body += piece
+        return body, not reply.read(1)
     except http.client.IncompleteRead as broken:
-        body = broken.partial
-    return body
+        return body + broken.partial, False
 
 
 def _no_answer(reply: Any, expected: str, text: bytes) -> SlagError:
@@ -212,18 +234,18 @@ class Robot:
         generation: Optional[int] = None
         while offset is not None:
             reply = self.ask(texts=[text], limit=page, offset=offset, **request)
-            if generation not in (None, reply.generation):
-                raise RuntimeError(f"generation {generation} became {reply.generation}; ask again from the start")
-            generation = reply.generation
+            generation = _same(generation, reply.generation)
             yield from reply.results[0].answers
             offset = reply.results[0].next_offset
 
     def objects(self, near: Optional[Sequence[float]] = None, **parameters: Any) -> Iterator[dict[str, Any]]:
         """Yields the things on board, page by page: near, radius, sort, min_size, limit as `GET /v1/objects` takes
-        them."""
+        them; stops with an error if the generation changes meanwhile."""
+        generation: Optional[int] = None
         while True:
             query = urllib.parse.urlencode(_pairs(near, parameters))
-            page = self._send("/v1/objects?" + query, members=("objects", "next_after"))
+            page = self._send("/v1/objects?" + query, members=("generation", "objects", "next_after"))
+            generation = _same(generation, page["generation"])
             yield from page["objects"]
             if page["next_after"] is None:
                 return
@@ -237,9 +259,9 @@ class Robot:
     def thumbnail(self, id: str) -> bytes:
         """Returns the small picture of one thing on board, a JPEG file; balanced and exact shards have them."""
         with self._open(f"/v1/objects/{urllib.parse.quote(id, safe='')}/thumbnail", None, self.timeout_secs) as reply:
-            picture = _whole(reply)
-            if reply.headers.get_content_type() != "image/jpeg":
-                raise _no_answer(reply, "a JPEG file", picture)
+            picture, is_whole = _read_body(reply)
+            if reply.headers.get_content_type() != "image/jpeg" or not is_whole:
+                raise _no_answer(reply, "a whole JPEG file", picture)
         return picture
 
     def map(self) -> dict[str, Any]:
@@ -277,11 +299,11 @@ class Robot:
         with self._open("/v1/events", None, timeout_secs) as stream:
             if stream.headers.get_content_type() != "text/event-stream":
                 raise _no_answer(stream, "events", stream.read(4 * _LONGEST_SHOWN))
-            for line in stream:
+            for line in iter(lambda: stream.readline(_LONGEST_LINE), b""):
                 text = line.decode(errors="replace").rstrip("\r\n")
                 if text.startswith("event:"):
                     name = text[6:].strip()
-                elif text.startswith("data:"):
+                elif text.startswith("data:") and len(data) < _MOST_LINES:
                     data.append(text[5:].strip())
                 elif not text and data:
                     try:
@@ -294,7 +316,7 @@ class Robot:
     def _send(self, path: str, body: Optional[Mapping[str, Any]] = None, members: Sequence[str] = ()) -> Any:
         """Returns the answer, an object with these members."""
         with self._open(path, body, self.timeout_secs) as reply:
-            text = _whole(reply)
+            text, _ = _read_body(reply)
             try:
                 answer = json.loads(text)
             except (RecursionError, ValueError):
@@ -316,7 +338,7 @@ class Robot:
             return self._opener.open(request, timeout=timeout_secs)
         except urllib.error.HTTPError as error:
             with error:
-                text = _whole(error)
+                text, _ = _read_body(error)
             try:
                 problem = json.loads(text)
             except (RecursionError, ValueError):

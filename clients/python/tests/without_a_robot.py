@@ -13,7 +13,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from slag_robot import Robot, SlagError, _retry_after_secs  # noqa: E402
+import slag_robot  # noqa: E402
+from slag_robot import Robot, SlagError, _is_loopback, _retry_after_secs  # noqa: E402
 
 ASKED: list[tuple[str, str]] = []
 TOKENS: list[str | None] = []
@@ -88,6 +89,19 @@ def what_is_no_answer_is_an_error(robot: Robot) -> None:
     assert "no robot" in error_of(robot.map).detail, "what came is shown"
     ANSWERS.append((200, {"Content-Length": "9"}, b'{"a"'))
     assert "4 bytes" in error_of(robot.map).detail, "it broke off"
+    ANSWERS.append((200, {"Content-Length": "9", "Content-Type": "image/jpeg"}, b"\xff\xd8"))
+    assert "a whole JPEG file" in error_of(lambda: robot.thumbnail("o1")).detail, "it broke off"
+    longest, slag_robot._LONGEST_ANSWER = slag_robot._LONGEST_ANSWER, 1000
+    ANSWERS.append((200, {}, b'{"a": "' + b" " * 5000 + b'"}'))
+    assert "1000 bytes" in error_of(robot.map).detail, "not all is read"
+    slag_robot._LONGEST_ANSWER = longest
+    for generation, after in [(7, '"o1"'), (8, "null")]:
+        ANSWERS.append((200, {}, b'{"generation": %d, "objects": [], "next_after": %s}' % (generation, after.encode())))
+    try:
+        list(robot.objects())
+        raise AssertionError("pages of two generations are no list")
+    except RuntimeError as error:
+        assert "generation 7 became 8" in str(error), error
     ANSWERS.append((200, {}, b'{"other": 1}'))
     assert "objects, next_after" in error_of(lambda: list(robot.objects())).detail
     ANSWERS.append((200, {"Content-Type": "text/event-stream"}, b"data: {no\n\n"))
@@ -140,6 +154,9 @@ def main() -> None:
         except ValueError:
             continue
         raise AssertionError(wrong)
+    here = ["http://LOCALHOST:1", "http://127.9.9.9", "http://[::1]:7", "http://0.0.0.0:7", "http://[::ffff:127.0.0.1]:7"]
+    there = ["http://10.0.0.1", "http://localhost.example", "http://[fe80::1]", "http://[::ffff:10.0.0.1]"]
+    assert [_is_loopback(url) for url in here + there] == [True] * len(here) + [False] * len(there)
     # Another machine is asked through the proxy of the environment.
     ASKED.clear()
     try:
