@@ -428,6 +428,7 @@ impl<'a> ViewStages<'a> {
 
     fn write(&self, view: &View, lifted: &Lifted, secs: f32) -> Result<(), EncodeError> {
         let record = ViewRecord { raster_width_px: lifted.raster_width_px, secs };
+        self.tools.sink.check_unchanged(view, self.tools.segmenter)?;
         self.tools.sink.keep(view, &lifted.contributions, &lifted.outlines, record)?;
         self.context.progress.advance(1);
         Ok(())
