@@ -1,6 +1,7 @@
 //! The encoder's tests, but for one that needs a process of its own.
 
 mod embed;
+mod encode;
 mod graph;
 mod ingest;
 mod lift_extremes;

@@ -3,7 +3,6 @@
 use clap::Args;
 
 use crate::encode::{EncodeSettings, Masks, Preset, RasterWidth, Regions, ViewOrder, ViewsLimit};
-use crate::raster::WeightKind;
 
 /// The choices, each the preset's where its flag is absent.
 #[derive(Clone, Debug, Default, Args)]
@@ -18,9 +17,6 @@ pub(crate) struct ChoiceArgs {
     /// preset's].
     #[arg(long, value_enum, help_heading = "Speed and accuracy", hide_short_help = true)]
     regions: Option<Regions>,
-    /// Weight that is summed; `falloff` is the paper's formula as printed [default: the preset's].
-    #[arg(long, value_enum, help_heading = "Speed and accuracy", hide_short_help = true)]
-    weights: Option<WeightKind>,
     /// Number or share of the views to use: the first ones of --view-order [default: the preset's].
     #[arg(long, value_name = "N|P%", value_parser = parse_views_limit, help_heading = "Speed and accuracy")]
     views_limit: Option<ViewsLimit>,
@@ -84,7 +80,6 @@ impl ChoiceArgs {
         self.preset.apply(settings);
         let EncodeSettings { view, aggregation, cells, run, .. } = settings;
         set(&mut view.regions, &self.regions);
-        set(&mut view.weights, &self.weights);
         set(&mut view.min_mask_px, &self.min_mask_px);
         set(&mut view.raster_width, &self.raster_width);
         set(&mut view.masks, &self.mask_levels.map(|n_levels| Masks::Auto { n_levels }));

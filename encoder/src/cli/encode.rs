@@ -274,7 +274,8 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     #[cfg(not(feature = "fleet"))]
     let summary = encode::encode(&settings, &engines, progress, cancel.as_ref())?;
     let lines = lines(&settings, &summary, expected.as_ref());
-    let next = if json { String::new() } else { next::of_store(&settings.output.store).unwrap_or_default() };
+    let next = || next::of_store(&settings.output.store, &args.input).unwrap_or_default();
+    let next = if json { String::new() } else { next() };
     print(json, &summary, lines + &next)?;
     warn_of_expiry(&settings.output.store);
     if let (Some(path), Some(recorder)) = (&args.report, &recorder) {

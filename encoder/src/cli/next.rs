@@ -12,6 +12,7 @@ use slag_common::manifest::CellRecord;
 use slag_common::shard::{HEADER_END_BYTES, ShardHeader};
 
 use super::common::InputArgs;
+use crate::ingest::{Activated, FrameChoice};
 use crate::store::StoreReader;
 use crate::store::metadata::MetadataReader;
 
@@ -20,11 +21,13 @@ const STRAY_SHARE: f64 = 0.02;
 const PORT: u16 = 7733;
 
 /// Returns the lines of a published store: extent, `query` and `serve` here, `trust` and `fetch` on the robot.
-pub(super) fn of_store(store: &Path) -> Result<String> {
+pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
     let here = shell_word(store);
+    // The page knows no --activated.
+    let shown = if input.activated == Activated::default() { of_input(input) } else { String::new() };
     let mut lines = String::from("\nnext\n");
     writeln!(lines, "  slag-encoder query --store {here} \"chair\"")?;
-    writeln!(lines, "  slag-encoder view --store {here}")?;
+    writeln!(lines, "  slag-encoder view --store {here}{shown}")?;
     writeln!(lines, "  slag-encoder serve --store {here} --listen 0.0.0.0:{PORT}")?;
     Ok(lines + &of_robot(store, &format!("http://0.0.0.0:{PORT}"))?)
 }
@@ -58,12 +61,31 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
 }
 
 pub(super) fn of_check(input: &InputArgs) -> String {
-    let views = input.views.as_ref().map_or(String::new(), |path| format!(" --views {}", shell_word(path)));
-    let images = input.images.as_ref().map_or(String::new(), |dir| format!(" --images {}", shell_word(dir)));
-    format!(
-        "\nnext\n  slag-encoder encode --scene {}{views}{images} --store STORE\n",
-        shell_word(&input.scene)
-    )
+    let every = input.every.map_or(String::new(), |n| format!(" --every {n}"));
+    let activated = match input.activated {
+        Activated { scales: false, opacities: false } => "",
+        Activated { scales: true, opacities: false } => " --activated scales",
+        Activated { scales: false, opacities: true } => " --activated opacities",
+        Activated { scales: true, opacities: true } => " --activated scales,opacities",
+    };
+    format!("\nnext\n  slag-encoder encode{}{every}{activated} --store STORE\n", of_input(input))
+}
+
+/// Returns the flags of splat, poses, photos and their frame.
+fn of_input(input: &InputArgs) -> String {
+    let frame = match &input.splat_frame {
+        FrameChoice::Auto => None,
+        FrameChoice::None => Some(Path::new("none")),
+        FrameChoice::File(path) => Some(&**path),
+    };
+    let paths = [
+        ("scene", Some(&*input.scene)),
+        ("views", input.views.as_deref()),
+        ("images", input.images.as_deref()),
+        ("splat-frame", frame.filter(|_| input.views.is_some())),
+    ];
+    let flag = |(name, path): (&str, Option<&Path>)| Some(format!(" --{name} {}", shell_word(path?)));
+    paths.into_iter().filter_map(flag).collect()
 }
 
 /// Returns the box around the means of a cell, which large Gaussians do not reach beyond, by the head of one of its
@@ -122,7 +144,10 @@ fn shell_word(path: &Path) -> String {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+
     use super::*;
+    use crate::cli::{Cli, Command};
 
     /// By hand: two cells side by side, and a stray one far away with a hundredth of the Gaussians.
     #[test]
@@ -131,6 +156,18 @@ mod tests {
         let (extent, at) = extent_and_place(&[cell(0.0, 500.0), cell(2.0, 480.0), cell(900.0, 9.0)]);
         assert_eq!((extent.min, extent.max), (DVec3::ZERO, DVec3::new(4.0, 3.0, 1.0)));
         assert_eq!(at, DVec3::new(1.0, 1.5, 0.5));
+    }
+
+    /// What was given is said again: the next command needs it, too.
+    #[test]
+    fn lines_repeat_the_inputs() {
+        let line = "slag-encoder check --scene a.ply --views b --images c --splat-frame none --every 3 --activated scales";
+        let parsed = Cli::try_parse_from(line.split(' ')).expect("flags");
+        let Command::Check(args) = parsed.command else { panic!("check") };
+        let inputs = "--scene a.ply --views b --images c --splat-frame none";
+        assert_eq!(of_input(&args.input), format!(" {inputs}"));
+        let expected = format!("encode {inputs} --every 3 --activated scales --store STORE");
+        assert!(of_check(&args.input).contains(&expected), "{}", of_check(&args.input));
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use serde_json::{Value, json};
+use slag_common::objects::public_id;
 use slag_common::shard::Profile;
 use slag_common::splat::{self, ReadOptions, ply};
 use slag_common::{Gaussians, durable, files, npy};
@@ -14,7 +15,7 @@ use slag_models::words_to_find;
 use super::common::{Exit, ModelArgs, print, profile_parser, text_encoder_of};
 use crate::query::{self, Hit};
 use crate::store::StoreReader;
-use crate::view::Things;
+use crate::view::{Found, Things};
 
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-encoder query --store STORE \"fire extinguisher\"\n\
@@ -41,7 +42,8 @@ pub struct QueryArgs {
     /// Scores as a robot with shards of this profile does [default: the field in full precision].
     #[arg(long, value_name = "NAME", value_parser = profile_parser())]
     pub profile: Option<Profile>,
-    /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).
+    /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence). Alone, it lists no
+    /// things.
     #[arg(long, value_name = "FILE")]
     pub scores: Option<PathBuf>,
     /// Writes the Gaussians that match as a PLY, best first: with --scene a splat, else points with position,
@@ -72,7 +74,9 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     if let Some(path) = &args.scores {
         npy::write_file(path, &[scores.cosines.len()], &scores.cosines)?;
     }
-    let hits = query::located(&reader, &scores, &scores.best(args.limit as usize))?;
+    let lists = args.scores.is_none() || args.ply.is_some() || args.scene.is_some();
+    let n_listed = if lists { args.limit as usize } else { 0 };
+    let hits = query::located(&reader, &scores, &scores.best(n_listed))?;
     let scene = args.scene.as_deref().map(|path| read_scene(path, &reader, &hits)).transpose()?;
     let matching = scores.matching(threshold);
     if let Some(path) = &args.ply {
@@ -81,9 +85,12 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     }
     let n_matching = matching.len();
     let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
-    let things = Things::open(&reader)?;
+    let things = match lists {
+        true => Things::open(&reader, |_| {})?,
+        false => Things::default(),
+    };
     let least = args.threshold.unwrap_or_else(|| things.threshold(manifest, false));
-    let things = things.matching(manifest, &[vector], least, args.limit as usize);
+    let things = things.matching(&[vector], least, n_listed);
     let mut lines = asked_as.as_ref().map_or(String::new(), |asked| format!("{words}: asked as {asked}\n"));
     lines.extend(things.iter().map(of_thing));
     lines += &format!("{n_matching} of {n_scored} Gaussians reach {threshold:.3}\n");
@@ -94,25 +101,19 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
                 &format!("the best: {}--threshold {:.2} shows such\n", of_hit(best), best.cosine - 0.005);
         }
     }
+    let answers: Vec<Value> = things.iter().zip(1..).map(|(of, rank)| of.answer(manifest, rank)).collect();
     let value = json!({
         "text": args.text, "asked_as": asked_as, "threshold": threshold, "n_matching": n_matching, "n_scored": n_scored, "best": hits,
-        "things": things,
+        "things": answers,
     });
     print(json, &value, lines)?;
     Ok(Exit::Done)
 }
 
-/// `thing`: an answer as the page reads it.
-fn of_thing(thing: &Value) -> String {
-    let number = |at: &Value| at.as_f64().unwrap_or_default();
-    let place: Vec<String> =
-        (0..3).map(|axis| format!("{:.2}", number(&thing["position_in_world"][axis]))).collect();
-    let edge =
-        |axis: usize| number(&thing["box_max_in_world"][axis]) - number(&thing["box_min_in_world"][axis]);
-    let size = [0, 1, 2].map(edge).map(|edge| format!("{edge:.2}")).join(" x ");
-    let (score, id) = (number(&thing["score"]), thing["id"].as_str().unwrap_or_default());
-    let photo = thing["evidence"]["photo"].as_str().unwrap_or_default();
-    format!("{score:.3}  {id}  at {}, {size}, in {photo}\n", place.join(" "))
+fn of_thing(Found { score, record, photo, .. }: &Found) -> String {
+    let (at, size) = (record.position(), record.bounds().size());
+    let (id, place) = (public_id(record.id), format!("{:.2} {:.2} {:.2}", at.x, at.y, at.z));
+    format!("{score:.3}  {id}  at {place}, {:.2} x {:.2} x {:.2}, in {photo}\n", size.x, size.y, size.z)
 }
 
 fn of_hit(hit: &Hit) -> String {

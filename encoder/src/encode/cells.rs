@@ -15,9 +15,10 @@ use super::error::EncodeError;
 use super::inputs;
 use super::plan::Plan;
 use super::report::{Phase, ViewsReport};
-use super::sink::ViewRecord;
+use super::sink::{ViewRecord, ViewSink};
 use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
+use crate::ingest;
 use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::{PendingRefinement, Refinement};
@@ -96,7 +97,7 @@ pub(super) fn build_cells(
     if let Some(found) = &mut objects
         && settings.cells.shards.have_appearance()
     {
-        found.thumbnails = thumbnails(&found.objects, views, context)?;
+        found.thumbnails = thumbnails(plan, &found.objects, views, context)?;
     }
     let extras = put_extras(plan, &table, context)?;
     context.begin_phase(Phase::Cells);
@@ -176,11 +177,17 @@ fn refine(
 
 /// Cuts a small picture of each object.
 fn thumbnails(
+    plan: &Plan<'_>,
     objects: &[Object],
     views: &DoneViews<'_>,
     context: &RunContext<'_>,
 ) -> Result<Vec<Vec<u8>>, EncodeError> {
-    let cut = || objects::cut_thumbnails(objects, &views.used, context.progress, context.cancel);
+    let load = |view: &View| {
+        let photo = ingest::load_image(view)?.image;
+        plan.job.check_unchanged(view, plan.segmenter.as_ref())?;
+        Ok::<_, EncodeError>(photo)
+    };
+    let cut = || objects::cut_thumbnails(objects, &views.used, load, context.progress, context.cancel);
     let (thumbnails, fault) = context.time("thumbnails", || context.install(cut));
     if context.is_cancelled() {
         return Err(ContributionError::Cancelled.into());

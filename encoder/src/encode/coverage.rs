@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::masks::{NO_REGION, RegionMap};
-use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
+use crate::raster::{LoadedScene, RasterError, RasterView};
 
 /// Width of the raster, pixels: a Gaussian that is smaller than a pixel there is smaller than any mask.
 const WIDTH_PX: u32 = 192;
@@ -162,7 +162,7 @@ fn weights(scene: &dyn LoadedScene, view: &RasterView, stride: u32) -> Result<Ve
     let intrinsics = intrinsics.scaled_to_width(WIDTH_PX.min(intrinsics.width_px));
     let view = RasterView { camera_from_world: view.camera_from_world, intrinsics };
     let inner = inner(intrinsics.width_px, intrinsics.height_px);
-    let weights = scene.weights(&view, &inner, WeightKind::Blend)?.entries;
+    let weights = scene.weights(&view, &inner)?.entries;
     let counted = weights.into_iter().filter(|entry| entry.gaussian.is_multiple_of(stride));
     Ok(counted.map(|entry| (entry.gaussian / stride, entry.weight)).collect())
 }

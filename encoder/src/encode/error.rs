@@ -87,6 +87,10 @@ pub enum EncodeError {
     NoGaussians { path: PathBuf, n_gaussians: usize },
     #[error("view {view} has no pose: {reason}; remove it from the poses, or leave out --strict")]
     NoPose { view: String, reason: String },
+    #[error(
+        "view {view}: its photo or masks changed after the encode began; leave the files alone, and encode again"
+    )]
+    Changed { view: String },
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
@@ -99,7 +103,9 @@ impl EncodeError {
     /// Returns whether the error lies in one view's input, so that the other views may go on.
     pub(crate) fn is_of_one_view(&self) -> bool {
         match self {
-            Self::Ingest(_) | Self::Contributions(ContributionError::TooManyRegions { .. }) => true,
+            Self::Ingest(_)
+            | Self::Changed { .. }
+            | Self::Contributions(ContributionError::TooManyRegions { .. }) => true,
             Self::Segment(error) => !matches!(error, SegmentError::Model(_)),
             Self::Embed { source, .. } => source.is_of_crops(),
             _ => false,

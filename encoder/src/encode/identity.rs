@@ -78,18 +78,24 @@ pub(super) fn identities(
     let scene = hash_scene(&inputs.scene);
     let cells = inputs.split.deciding(settings.cells.limits);
     let of_scene = hash_of(&scene_identity(&settings.view, cells, engines, segmenter, rasterizer, scene))?;
-    let of_view = |view: &View| -> Result<Hash32, EncodeError> {
-        hash_of(&ViewIdentity {
-            of_scene,
-            name: &view.name,
-            photo: ingest::hash_file(&view.image_path).ok(),
-            masks: segmenter.identity_of_view(view)?,
-            intrinsics: view.intrinsics,
-            camera_from_world: view.camera_from_world,
-        })
-    };
-    let of_view = inputs.views.par_iter().map(of_view).collect::<Result<_, _>>()?;
-    Ok(Identities { of_scene, of_view })
+    let of_view = inputs.views.par_iter().map(|view| of_view(of_scene, view, segmenter));
+    Ok(Identities { of_scene, of_view: of_view.collect::<Result<_, _>>()? })
+}
+
+/// Returns the hash of everything on which the contributions of a view depend, as its files are now.
+pub(super) fn of_view(
+    of_scene: Hash32,
+    view: &View,
+    segmenter: &dyn Segmenter,
+) -> Result<Hash32, EncodeError> {
+    hash_of(&ViewIdentity {
+        of_scene,
+        name: &view.name,
+        photo: ingest::hash_file(&view.image_path).ok(),
+        masks: segmenter.identity_of_view(view)?,
+        intrinsics: view.intrinsics,
+        camera_from_world: view.camera_from_world,
+    })
 }
 
 /// Returns the hash of everything on which the contributions of all views depend, done by a fleet.

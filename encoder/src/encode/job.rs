@@ -9,10 +9,12 @@ use slag_common::container::ContainerError;
 use slag_common::{Hash32, View, durable};
 
 use super::error::EncodeError;
+use super::identity;
 use super::settings::Restart;
 use super::sink::{ViewRecord, ViewSink};
 use crate::lift::photos::{self, MaskOutline};
 use crate::lift::{ContributionError, ContributionFile, ViewContributions};
+use crate::segment::Segmenter;
 use crate::store::Store;
 
 const TREE: &str = "job";
@@ -53,7 +55,6 @@ pub(crate) fn job_status(db: &sled::Db) -> Result<Option<JobStatus>, EncodeError
 pub(crate) struct Job {
     records: sled::Tree,
     folder: PathBuf,
-    #[cfg_attr(not(feature = "fleet"), expect(dead_code, reason = "for a fleet"))]
     of_scene: Hash32,
     /// The identity of each view of this encode, by name.
     id_of_view: BTreeMap<String, Hash32>,
@@ -312,6 +313,15 @@ impl Job {
 impl ViewSink for Job {
     fn n_at_once(&self) -> usize {
         1
+    }
+
+    /// As both were read by now, they had the content that the identity names where they have it still.
+    fn check_unchanged(&self, view: &View, segmenter: &dyn Segmenter) -> Result<(), EncodeError> {
+        let now = identity::of_view(self.of_scene, view, segmenter)?;
+        match now == self.id_of_view[&view.name] {
+            true => Ok(()),
+            false => Err(EncodeError::Changed { view: view.name.clone() }),
+        }
     }
 
     /// The files come first, then the record that marks the view as done.

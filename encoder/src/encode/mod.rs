@@ -115,6 +115,7 @@ fn encode_into(
 ) -> Result<EncodeSummary, EncodeError> {
     // First of all, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.output.store)?;
+    store.check_keys()?;
     if let Some(planned) = &settings.inputs.planned {
         drawings::make(settings, planned, engines, context)?;
     }

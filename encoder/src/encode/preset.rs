@@ -67,7 +67,6 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
-    use crate::raster::WeightKind;
     use crate::segment::{SamLevels, ScoreFilter};
 
     fn settings(preset: Preset) -> EncodeSettings {
@@ -100,10 +99,7 @@ mod tests {
     fn paper_has_the_papers_settings() {
         let paper = settings(Preset::Paper);
         let view = &paper.view;
-        assert_eq!(
-            (view.regions, view.weights, paper.aggregation),
-            (Regions::Crops, WeightKind::Blend, Aggregation::default())
-        );
+        assert_eq!((view.regions, paper.aggregation), (Regions::Crops, Aggregation::default()));
         assert_eq!(
             (paper.cells.objects, view.min_mask_px, view.merges_slivers, view.raster_width),
             (false, 1, false, RasterWidth::Px(648))

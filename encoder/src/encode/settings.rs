@@ -14,7 +14,6 @@ use crate::codebook::basis::MAX_COMPONENTS;
 use crate::ingest::{Activated, FrameChoice};
 use crate::lift::Aggregation;
 use crate::occupancy::OccupancySettings;
-use crate::raster::WeightKind;
 use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
 use crate::viewpoints::ViewpointSettings;
@@ -73,7 +72,6 @@ pub struct ViewSettings {
     pub min_mask_px: u32,
     /// Width at which weights are rasterised.
     pub(crate) raster_width: RasterWidth,
-    pub weights: WeightKind,
     /// Whether slivers between masks join their neighbours.
     pub(crate) merges_slivers: bool,
     #[serde(default, skip_serializing_if = "Regions::are_masks")]
@@ -271,7 +269,6 @@ impl EncodeSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
                 min_mask_px: 200,
                 raster_width: RasterWidth::Photo,
-                weights: WeightKind::Blend,
                 merges_slivers: true,
                 regions: Regions::Masks,
             },

@@ -6,6 +6,7 @@ use slag_common::View;
 use super::error::EncodeError;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
+use crate::segment::Segmenter;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ViewRecord {
@@ -26,6 +27,11 @@ pub(crate) trait PhotoSource: Sync {
 /// Keeps what a view leaves.
 pub(crate) trait ViewSink: Sync {
     fn n_at_once(&self) -> usize;
+
+    /// Refuses a view whose photo or masks are others than planned; those that come by their hash cannot be.
+    fn check_unchanged(&self, _view: &View, _segmenter: &dyn Segmenter) -> Result<(), EncodeError> {
+        Ok(())
+    }
 
     /// Keeps a view's contributions and the outlines of its masks; on return they survive a power cut.
     fn keep(

@@ -415,9 +415,9 @@ impl<'a> ViewStages<'a> {
     /// Rasterises what each Gaussian contributes to each region.
     fn lift(&self, view: &View, Embedded { vectors, partition }: Embedded) -> Result<Lifted, EncodeError> {
         let Partition { raster_view, regions, masks_of_region, outlines } = partition;
-        let ViewTools { engines, settings, scene, split, .. } = self.tools;
+        let ViewTools { engines, scene, split, .. } = self.tools;
         let weights = scene
-            .weights(&raster_view, &regions, settings.weights)
+            .weights(&raster_view, &regions)
             .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
         let n_unrepresentable = weights.counters.unusable.saturating_sub(split.n_rejected);
         self.n_unrepresentable.fetch_max(n_unrepresentable, Ordering::Relaxed);
@@ -428,6 +428,7 @@ impl<'a> ViewStages<'a> {
 
     fn write(&self, view: &View, lifted: &Lifted, secs: f32) -> Result<(), EncodeError> {
         let record = ViewRecord { raster_width_px: lifted.raster_width_px, secs };
+        self.tools.sink.check_unchanged(view, self.tools.segmenter)?;
         self.tools.sink.keep(view, &lifted.contributions, &lifted.outlines, record)?;
         self.context.progress.advance(1);
         Ok(())

@@ -14,7 +14,7 @@ use super::executor::{Executor, ViewsRun};
 use super::inputs::Inputs;
 use super::plan::Plan;
 use super::report::{Phase, SkippedView, StageReport};
-use super::sink::ViewRecord;
+use super::sink::{ViewRecord, ViewSink};
 use crate::landmarks;
 use crate::occupancy::{self, SceneOccupancy};
 use crate::shard;
@@ -111,6 +111,7 @@ pub(super) fn find_landmarks(
         let observed = context.time("landmarks", || context.install(observe));
         let failed = |source| EncodeError::Landmarks { view: view.name.clone(), source };
         mapping.push(observed.map_err(failed)?);
+        plan.job.check_unchanged(view, plan.segmenter.as_ref())?;
         context.progress.advance(1);
     }
     context.progress.end();

@@ -13,7 +13,7 @@ use super::error::FleetError;
 use super::objects;
 use crate::blobs::Bucket;
 use crate::encode::Masks;
-use crate::encode::fleet_parts::{Plan, RunContext};
+use crate::encode::fleet_parts::{Plan, RunContext, ViewSink};
 use crate::ingest;
 use crate::segment;
 
@@ -58,6 +58,7 @@ pub(super) fn upload(
             intrinsics: view.intrinsics,
             camera_from_world: view.camera_from_world,
         };
+        plan.job.check_unchanged(view, plan.segmenter.as_ref())?;
         Ok((cost, planned))
     };
     let mut views: Vec<(u64, PlannedView)> =

@@ -11,7 +11,6 @@ use slag_common::View;
 use slag_common::objects::MAX_THUMBNAIL_BYTES;
 
 use super::object::Object;
-use crate::ingest::{self, IngestError};
 use crate::progress::Progress;
 
 /// Longest edge.
@@ -26,26 +25,27 @@ type Cuts = Vec<(usize, Vec<u8>)>;
 
 /// Cuts a JPEG thumbnail for each object, `[n]`: empty if its photo is unreadable or the run was cancelled. Returns
 /// the first error, too. `views`: sorted by name.
-pub(crate) fn cut(
+pub(crate) fn cut<E: Send>(
     objects: &[Object],
     views: &[&View],
+    load: impl Fn(&View) -> Result<RgbImage, E> + Sync,
     progress: &dyn Progress,
     cancel: &AtomicBool,
-) -> (Vec<Vec<u8>>, Option<IngestError>) {
+) -> (Vec<Vec<u8>>, Option<E>) {
     let mut of_photo: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
     (0..objects.len()).for_each(|object| of_photo.entry(&objects[object].photo).or_default().push(object));
     progress.begin("thumbnails", "photo", of_photo.len() as u64, 0);
     let cut_all = |(name, objects_here): (&str, Vec<usize>)| {
         let found = views.binary_search_by(|view| view.name.as_str().cmp(name)).ok();
         let Some(view) = found.filter(|_| !cancel.load(Ordering::Relaxed)) else { return Ok(Vec::new()) };
-        let photo = ingest::load_image(views[view]).map(|loaded| loaded.image);
+        let photo = load(views[view]);
         progress.advance(1);
         let cut = |photo: RgbImage| {
             objects_here.iter().map(|object| (*object, jpeg(&photo, objects[*object].photo_box_px))).collect()
         };
         photo.map(cut)
     };
-    let cuts: Vec<Result<Cuts, IngestError>> = of_photo.into_par_iter().map(cut_all).collect();
+    let cuts: Vec<Result<Cuts, E>> = of_photo.into_par_iter().map(cut_all).collect();
     progress.end();
     let (mut thumbnails, mut fault) = (vec![Vec::new(); objects.len()], None);
     for cuts in cuts {

@@ -26,8 +26,6 @@ const WEIGHTS_STRIDE = WORKGROUP_SIZE + WORKGROUP_SIZE / RUN + 1u;
 const N_SUMS = 2048u;
 const NO_SLOT = 0xffffu;
 const PIXEL_BITS = 8u;
-// Whether weights are falloffs, not shares of a pixel.
-override IS_FALLOFF: bool = false;
 const NO_REGION_KEY = (1u << REGION_BITS) - 1u;
 
 var<workgroup> pixel_keys: array<u32, WORKGROUP_SIZE>;
@@ -154,10 +152,9 @@ fn sum_regions(
                 let alpha = min(g.opacity * falloff, MAX_ALPHA);
                 let counts = is_live && u * u + v * v <= g.reach2 && alpha >= MIN_ALPHA;
                 let next = transmittance * (1.0 - alpha);
-                let is_summed = counts && (IS_FALLOFF || next > MIN_TRANSMITTANCE);
-                let weight = select(alpha * transmittance, falloff, IS_FALLOFF);
-                weights[i * WEIGHTS_STRIDE + thread + thread / RUN] = select(0.0, weight, is_summed);
-                transmittance = select(transmittance, next, is_summed && !IS_FALLOFF);
+                let is_summed = counts && next > MIN_TRANSMITTANCE;
+                weights[i * WEIGHTS_STRIDE + thread + thread / RUN] = select(0.0, alpha * transmittance, is_summed);
+                transmittance = select(transmittance, next, is_summed);
                 is_live = is_live && (is_summed || !counts);
             }
             if was_live && !is_live {

@@ -6,7 +6,7 @@ use slag_math::simd::InstructionSet;
 use slag_raster::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
 use slag_raster::{Buckets, Lanes, ScreenGaussian, TileRect, Tiles, WeightSink, concat, walk_tile};
 
-use super::rasterizer::{RegionWeight, WeightKind};
+use super::rasterizer::RegionWeight;
 use crate::masks::{NO_REGION, RegionMap};
 
 /// Units of a fixed-point weight per pixel.
@@ -36,7 +36,6 @@ pub(crate) fn tile_contributions(
     visible: &[ScreenGaussian],
     tiles: &Tiles,
     regions: &RegionMap,
-    kind: WeightKind,
     instructions: InstructionSet,
 ) -> Vec<Buckets<TileContribution>> {
     let (width_px, height_px) = (tiles.width_px as usize, tiles.height_px as usize);
@@ -52,7 +51,7 @@ pub(crate) fn tile_contributions(
                 .filter_map(|(column, members)| {
                     let rect = TileRect::new(column, row, width_px, height_px);
                     let mut sink = RegionSink::new(regions, rect)?;
-                    walk_tile(instructions, visible, members, rect, kind == WeightKind::Blend, &mut sink);
+                    walk_tile(instructions, visible, members, rect, true, &mut sink);
                     Some(sink.contributions)
                 })
                 .collect();
@@ -260,8 +259,7 @@ mod tests {
         let (visible, tiles) = scene(200);
         let contributions_of = |regions: RegionMap| {
             let mut sums = BTreeMap::<u32, (u64, u64)>::new();
-            let rows =
-                tile_contributions(&visible, &tiles, &regions, WeightKind::Blend, InstructionSet::widest());
+            let rows = tile_contributions(&visible, &tiles, &regions, InstructionSet::widest());
             for of_tile in rows.iter().flat_map(Buckets::iter).flatten() {
                 let (fixed, n_parts) = sums.entry(of_tile.member).or_default();
                 *fixed += of_tile.fixed;
@@ -291,16 +289,14 @@ mod tests {
         let colours: Vec<[f32; 3]> =
             visible.iter().map(|g| [0.1, 0.5, 0.01 * (g.gaussian % 99) as f32]).collect();
         let on = |instructions: InstructionSet| {
-            let of_maps = maps.each_ref().map(|map| {
-                [WeightKind::Blend, WeightKind::Falloff].map(|kind| {
-                    merge(&visible, &tile_contributions(&visible, &tiles, map, kind, instructions))
-                })
-            });
+            let of_maps = maps
+                .each_ref()
+                .map(|map| merge(&visible, &tile_contributions(&visible, &tiles, map, instructions)));
             (of_maps, draw(instructions, &visible, &colours, &tiles, [0.2; 3]))
         };
         let portable = on(InstructionSet::Portable);
-        assert!(portable.0[2][0].len() > 10_000);
-        assert!(portable.0[0][1].iter().any(|entry| entry.gaussian as usize > RANGE));
+        assert!(portable.0[2].len() > 10_000);
+        assert!(portable.0[0].iter().any(|entry| entry.gaussian as usize > RANGE));
         for set in InstructionSet::available() {
             assert!(on(*set) == portable, "{}", set.name());
         }

@@ -5,7 +5,7 @@ use slag_math::simd::InstructionSet;
 use slag_raster::{Drawing, PreparedScene, RasterView, ViewCounters, bin, check_scene, check_view};
 
 use super::contributions::{merge, tile_contributions};
-use super::rasterizer::{LoadedScene, RasterError, Rasterizer, ViewWeights, WeightKind};
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer, ViewWeights};
 use crate::masks::{NO_REGION, RegionMap};
 use crate::memory::{MemoryPlan, Phase};
 
@@ -37,18 +37,13 @@ struct CpuScene<'s> {
 }
 
 impl LoadedScene for CpuScene<'_> {
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
+    fn weights(&self, view: &RasterView, regions: &RegionMap) -> Result<ViewWeights, RasterError> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
         let projection = self.prepared.project(view);
         let visible = &projection.visible;
         let tiles = bin(visible, &view.intrinsics);
-        let by_tile = tile_contributions(visible, &tiles, regions, kind, self.instructions);
+        let by_tile = tile_contributions(visible, &tiles, regions, self.instructions);
         let entries = merge(visible, &by_tile);
         Ok(ViewWeights { entries, counters: ViewCounters::of(&projection, &tiles) })
     }

@@ -10,7 +10,7 @@ use slag_raster::{Drawing, RasterView};
 
 use super::cpu::CpuRasterizer;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
-use super::rasterizer::{GpuSlots, LoadedScene, RasterError, Rasterizer, ViewWeights, WeightKind};
+use super::rasterizer::{GpuSlots, LoadedScene, RasterError, Rasterizer, ViewWeights};
 use crate::lanes::Lanes;
 use crate::masks::RegionMap;
 
@@ -218,13 +218,8 @@ impl SharedScene<'_> {
 }
 
 impl LoadedScene for SharedScene<'_> {
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
-        self.run(|scene| scene.weights(view, regions, kind))
+    fn weights(&self, view: &RasterView, regions: &RegionMap) -> Result<ViewWeights, RasterError> {
+        self.run(|scene| scene.weights(view, regions))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

@@ -17,5 +17,5 @@ mod rasterizer;
 pub use cpu::CpuRasterizer;
 pub(crate) use cpu::reserve;
 pub(crate) use rasterizer::GpuSlots;
-pub use rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights, WeightKind};
+pub use rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
 pub use slag_raster::{Drawing, InputError, RasterView, constants, pinhole};

@@ -36,9 +36,8 @@ pub trait Rasterizer: Send + Sync {
         scene: &Gaussians,
         view: &RasterView,
         regions: &RegionMap,
-        kind: WeightKind,
     ) -> Result<ViewWeights, RasterError> {
-        self.load(scene)?.weights(view, regions, kind)
+        self.load(scene)?.weights(view, regions)
     }
 
     /// Draws one view of a scene; see [`LoadedScene::draw`].
@@ -58,12 +57,7 @@ pub trait LoadedScene: Send + Sync {
     ///
     /// Pixels of [`NO_REGION`](crate::masks::NO_REGION) are blended but not recorded. The same input gives the
     /// same bits for any number of threads.
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError>;
+    fn weights(&self, view: &RasterView, regions: &RegionMap) -> Result<ViewWeights, RasterError>;
 
     /// Draws the scene over a background colour, in the colour space of its training.
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
@@ -94,17 +88,8 @@ pub enum RasterError {
     Region { pixel: usize, found: u32, n_regions: u32 },
 }
 
-/// Quantity that is summed over the pixels of a region.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, clap::ValueEnum)]
-pub enum WeightKind {
-    /// `alpha * T`: the Gaussian's contribution to the picture, attenuated by the Gaussians in front of it.
-    Blend,
-    /// `exp(-d' S^-1 d / 2)`, as printed in the paper: without opacity and occlusion. The footprint still ends
-    /// where alpha falls below 1/255.
-    Falloff,
-}
-
-/// Contribution of a Gaussian to a region: its weight summed over the pixels.
+/// Contribution of a Gaussian to a region: `alpha * T`, its part of a pixel attenuated by the Gaussians in front of
+/// it, summed over the pixels.
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Zeroable)]
 pub struct RegionWeight {
     pub gaussian: u32,

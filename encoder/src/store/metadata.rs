@@ -296,6 +296,15 @@ impl Metadata {
         self.sign_all(&targets, now_unix_secs).map(drop)
     }
 
+    /// Checks that the next publication can be signed: hours of work come before it.
+    pub(crate) fn check_keys(&self) -> Result<(), StoreError> {
+        match self.newest_root()? {
+            Some(_) => roles::ONLINE.into_iter().try_for_each(|role| self.key(role).map(drop)),
+            None if self.is_begun()? => Err(StoreError::RootLost { path: self.path("1.root.json") }),
+            None => roles::check_before_root(&self.store),
+        }
+    }
+
     /// Signs the timestamp anew, and the rest before half of its time is over, or where it is damaged or missing.
     /// Needs the root's key never.
     ///

@@ -69,6 +69,14 @@ pub(super) fn make_all(
     Ok((Root { consistent_snapshot: true, keys, roles }, root_keys))
 }
 
+/// Checks the keys that lie there before the first root.
+pub(super) fn check_before_root(store: &Path) -> Result<(), StoreError> {
+    read_folder(&root_folder(store)).map_err(before_root)?;
+    let is_damaged = |role: &&str| matches!(KeyFile::read(&key_path(store, role)), Ok(KeyFile::Damaged));
+    let damaged_key = ONLINE.into_iter().find(is_damaged).map(|role| damaged(key_path(store, role)));
+    damaged_key.map_or(Ok(()), |error| Err(before_root(error)))
+}
+
 /// Keys that no root names yet may be made anew.
 fn before_root(error: StoreError) -> StoreError {
     match error {

@@ -133,6 +133,11 @@ impl Store {
         Ok(self.catalogue.last_generation()?.map_or(1, |current| current.saturating_add(1)))
     }
 
+    /// Checks that the keys are there that sign the next generation.
+    pub(crate) fn check_keys(&self) -> Result<(), StoreError> {
+        Metadata::open(&self.dir)?.check_keys()
+    }
+
     /// Signs a manifest and makes it, with the objects it lists, the current one; returns its hash.
     ///
     /// `extras`: objects by name that this generation needs but robots do not fetch (readers find them

@@ -35,11 +35,12 @@ pub(crate) struct Things {
 }
 
 impl Things {
-    /// Finds the things of a published store.
-    pub(crate) fn open(reader: &StoreReader) -> Result<Self, ViewError> {
+    /// Finds the things of a published store in the smallest shard of each cell. `look`: is shown these, too.
+    pub(crate) fn open(reader: &StoreReader, mut look: impl FnMut(&StoredShard)) -> Result<Self, ViewError> {
         let mut things = Self::default();
         for cell in &reader.manifest().cells {
             if let Some(shard) = smallest_shard(reader, cell)? {
+                look(&shard);
                 things.add(cell, shard);
             }
         }
@@ -47,7 +48,7 @@ impl Things {
     }
 
     /// Adds the objects of the next cell's smallest shard.
-    pub(super) fn add(&mut self, cell: &CellRecord, shard: StoredShard) {
+    fn add(&mut self, cell: &CellRecord, shard: StoredShard) {
         let Some(objects) = shard.objects() else { return };
         let have_thumbnails = objects.thumbnails.is_some() || cell.shards.len() > 1;
         let (score_mean, score_spread) = (objects.header.score_mean, objects.header.score_spread);
@@ -112,7 +113,9 @@ impl Things {
         limit: usize,
     ) -> Value {
         let threshold = self.threshold(manifest, vectors.len() > 1);
-        let answers = self.matching(manifest, vectors, threshold, limit);
+        let found = self.matching(vectors, threshold, limit);
+        let answers: Vec<Value> =
+            found.iter().zip(1..).map(|(found, rank)| found.answer(manifest, rank)).collect();
         let none = answers.is_empty().then(|| {
             let (kind, detail) = match self.shards.is_empty() {
                 true => {
@@ -129,13 +132,7 @@ impl Things {
     }
 
     /// Returns the things that reach a score, best first.
-    pub(crate) fn matching(
-        &self,
-        manifest: &Manifest,
-        vectors: &[Vec<f32>],
-        threshold: f32,
-        limit: usize,
-    ) -> Vec<Value> {
+    pub(crate) fn matching(&self, vectors: &[Vec<f32>], threshold: f32, limit: usize) -> Vec<Found> {
         let mut found: Vec<Found> = Vec::new();
         for ThingsHere { shard, numbers, have_thumbnails } in &self.shards {
             let Some(objects) = shard.objects() else { continue };
@@ -151,27 +148,32 @@ impl Things {
         }
         found.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.record.id.cmp(&b.record.id)));
         found.truncate(limit);
-        found.iter().zip(1..).map(|(found, rank)| answer(manifest, rank, found)).collect()
+        found
     }
 }
 
-struct Found {
-    score: f32,
-    record: ObjectRecord,
-    photo: String,
+/// A thing that matches.
+pub(crate) struct Found {
+    pub(crate) score: f32,
+    pub(crate) record: ObjectRecord,
+    pub(crate) photo: String,
     has_thumbnail: bool,
 }
 
-fn answer(manifest: &Manifest, rank: usize, Found { score, record, photo, has_thumbnail }: &Found) -> Value {
-    let (position, bounds) = (record.position(), record.bounds());
-    let mut answer = json!({
-        "rank": rank, "id": public_id(record.id), "frame": "world", "generation": manifest.generation,
-        "position_in_world": position, "box_min_in_world": bounds.min, "box_max_in_world": bounds.max,
-        "score": score, "n_gaussians": record.n_gaussians,
-        "evidence": { "photo": photo, "box_px": record.photo_box_px, "has_thumbnail": has_thumbnail },
-    });
-    if let Some(geo) = manifest.geo_reference {
-        answer["geographic"] = json!(geo.geographic_from_world(position));
+impl Found {
+    /// Returns the answer as the page reads it.
+    pub(crate) fn answer(&self, manifest: &Manifest, rank: usize) -> Value {
+        let Self { score, record, photo, has_thumbnail } = self;
+        let (position, bounds) = (record.position(), record.bounds());
+        let mut answer = json!({
+            "rank": rank, "id": public_id(record.id), "frame": "world", "generation": manifest.generation,
+            "position_in_world": position, "box_min_in_world": bounds.min, "box_max_in_world": bounds.max,
+            "score": score, "n_gaussians": record.n_gaussians,
+            "evidence": { "photo": photo, "box_px": record.photo_box_px, "has_thumbnail": has_thumbnail },
+        });
+        if let Some(geo) = manifest.geo_reference {
+            answer["geographic"] = json!(geo.geographic_from_world(position));
+        }
+        answer
     }
-    answer
 }

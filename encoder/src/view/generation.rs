@@ -31,12 +31,8 @@ enum Scored {
 
 impl Generation {
     pub(super) fn open(reader: StoreReader, splat: Option<&Splat>) -> Result<Self, ViewError> {
-        let (mut things, mut photos) = (Things::default(), Vec::new());
-        for cell in &reader.manifest().cells {
-            let Some(shard) = smallest_shard(&reader, cell)? else { continue };
-            photos.extend(photos_of(&shard));
-            things.add(cell, shard);
-        }
+        let mut photos = Vec::new();
+        let things = Things::open(&reader, |shard| photos.extend(photos_of(shard)))?;
         let Some(splat) = splat else { return Ok(Self { reader, things, photos, scored: Scored::Shards }) };
         let manifest = reader.manifest();
         let (expected, found) = (manifest.n_gaussians + manifest.n_rejected, splat.scene.len());

@@ -12,7 +12,7 @@ mod shards;
 mod splat;
 mod viewer;
 
-pub(crate) use answers::Things;
+pub(crate) use answers::{Found, Things};
 pub(crate) use routes::router;
 pub(crate) use splat::Splat;
 pub(crate) use viewer::{OpenText, Viewed, Viewer, up_of};

@@ -6,7 +6,7 @@ use slag_common::Intrinsics;
 use super::plan::{SceneKind, Verdict};
 use super::space::{Space, WIDTH};
 use crate::masks::RegionMap;
-use crate::raster::{self, LoadedScene, RasterError, RasterView, RegionWeight, WeightKind};
+use crate::raster::{self, LoadedScene, RasterError, RasterView, RegionWeight};
 
 const SIZE_PX: [u32; 2] = [40, 30];
 /// Tangent of half the horizontal field of view, 60 degrees: that of a phone's main camera.
@@ -63,7 +63,7 @@ pub(super) fn look(
     let regions = RegionMap { width_px, height_px, region_of_pixel: (0..n_px).collect(), n_regions: n_px };
     let intrinsics = pinhole(width_px, height_px);
     let view = RasterView { camera_from_world: camera, intrinsics };
-    let weights = loaded.weights(&view, &regions, WeightKind::Blend)?;
+    let weights = loaded.weights(&view, &regions)?;
     let eye = camera.inverse().translation;
     let (mut large, mut total) = (0.0, 0.0);
     let mut seen = Vec::new();

@@ -3,12 +3,12 @@
 use glam::DVec3;
 use slag_common::{Distortion, Gaussians};
 use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::{Drawing, InputError, RasterError, RasterView, ViewWeights, WeightKind};
+use slag_encoder::raster::{Drawing, InputError, RasterError, RasterView, ViewWeights};
 
 use super::backends::{Backend, backends};
 use super::oracle;
 use super::scenes::{random_regions, random_scene, random_view};
-use super::table::{Case, KINDS, Row};
+use super::table::{Case, Row};
 use slag_math::random::Random;
 
 const SIZES_PX: [(u32, u32); 7] = [(1, 1), (16, 16), (17, 15), (5, 40), (33, 31), (64, 48), (70, 3)];
@@ -39,18 +39,12 @@ fn drawings_are_those_of_brute_force() {
             let n_px = (width * height) as usize;
             let (mut rgb, mut alpha, mut depth) = (vec![DVec3::ZERO; n_px], vec![0.0; n_px], vec![0.0; n_px]);
             let mut is_on_a_cut = vec![false; n_px];
-            oracle::each_weight(
-                &scene,
-                &view,
-                WeightKind::Blend,
-                *cut_tolerance,
-                |gaussian, pixel, weight| {
-                    rgb[pixel] += weight.value * oracle::colour(&scene, gaussian.index, &view);
-                    alpha[pixel] += weight.value;
-                    depth[pixel] += weight.value * gaussian.depth;
-                    is_on_a_cut[pixel] |= weight.high - weight.low > 1e-3 * weight.high;
-                },
-            );
+            oracle::each_weight(&scene, &view, *cut_tolerance, |gaussian, pixel, weight| {
+                rgb[pixel] += weight.value * oracle::colour(&scene, gaussian.index, &view);
+                alpha[pixel] += weight.value;
+                depth[pixel] += weight.value * gaussian.depth;
+                is_on_a_cut[pixel] |= weight.high - weight.low > 1e-3 * weight.high;
+            });
             let n_on_a_cut = is_on_a_cut.iter().filter(|is| **is).count();
             assert!(!keeps_order || n_on_a_cut * 10 <= n_px, "{width}x{height}");
             for pixel in (0..n_px).filter(|pixel| !is_on_a_cut[*pixel]) {
@@ -75,16 +69,16 @@ fn the_number_of_threads_does_not_change_a_bit() {
         let view = random_view(random, 150, 130);
         let scene = random_scene(random, if *is_software_gpu { 3_000 } else { 20_000 }, &view, 1);
         let regions = random_regions(random, &view, 300);
-        let with_threads = |n| -> (Vec<ViewWeights>, Drawing) {
+        let with_threads = |n| -> (ViewWeights, Drawing) {
             rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(|| {
                 (
-                    KINDS.map(|kind| rasterizer.weights(&scene, &view, &regions, kind).unwrap()).into(),
+                    rasterizer.weights(&scene, &view, &regions).unwrap(),
                     rasterizer.draw(&scene, &view, [0.5; 3]).unwrap(),
                 )
             })
         };
         let one = with_threads(1);
-        assert!(one.0[0].entries.len() > 1000);
+        assert!(one.0.entries.len() > 1000);
         assert_eq!(one, with_threads(2));
         assert_eq!(one, with_threads(5));
     }
@@ -100,12 +94,7 @@ fn nothing_to_see_is_no_error() {
         let world_from_camera = view.camera_from_world.inverse();
         behind.means_in_world.fill(world_from_camera.transform_point3(DVec3::new(0.1, 0.0, -4.0)));
         for scene in [Gaussians::default(), behind] {
-            for kind in KINDS {
-                assert_eq!(
-                    rasterizer.weights(&scene, &view, &regions, kind).unwrap(),
-                    ViewWeights::default()
-                );
-            }
+            assert_eq!(rasterizer.weights(&scene, &view, &regions).unwrap(), ViewWeights::default());
             let drawing = rasterizer.draw(&scene, &view, [0.25; 3]).unwrap();
             assert!(drawing.rgb.iter().all(|&c| c == 0.25));
             assert!(drawing.depth.iter().chain(&drawing.coverage).all(|&v| v == 0.0));
@@ -121,8 +110,7 @@ fn broken_coefficients_cost_a_colour() {
         let view = random_view(random, 40, 40);
         let mut scene = random_scene(random, 100, &view, 1);
         let regions = random_regions(random, &view, 3);
-        let weights =
-            |scene: &Gaussians| rasterizer.weights(scene, &view, &regions, WeightKind::Blend).unwrap();
+        let weights = |scene: &Gaussians| rasterizer.weights(scene, &view, &regions).unwrap();
         let expected = weights(&scene);
         scene.sh_rest[9 * 50] = f32::NAN;
         assert_eq!(weights(&scene), expected);
@@ -139,7 +127,7 @@ fn contradictions_are_errors() {
         let scene = random_scene(random, 5, &view, 1);
         let regions = random_regions(random, &view, 3);
         let error = |scene: &Gaussians, view: &RasterView, regions: &RegionMap| {
-            rasterizer.weights(scene, view, regions, WeightKind::Blend).unwrap_err()
+            rasterizer.weights(scene, view, regions).unwrap_err()
         };
         let of_input = |error: RasterError| match error {
             RasterError::Input(error) => error,

@@ -12,8 +12,7 @@ use slag_encoder::check::{
 use slag_encoder::ingest::IngestError;
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::{
-    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, WeightKind,
-    pinhole,
+    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, pinhole,
 };
 
 use super::fixtures::{needs_shared, photo, read_splat, shared, shrunk};
@@ -314,13 +313,8 @@ struct Counting {
 struct CountingScene<'s>(Box<dyn LoadedScene + 's>, &'s Counting);
 
 impl LoadedScene for CountingScene<'_> {
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
-        self.0.weights(view, regions, kind)
+    fn weights(&self, view: &RasterView, regions: &RegionMap) -> Result<ViewWeights, RasterError> {
+        self.0.weights(view, regions)
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

@@ -5,7 +5,7 @@ use slag_common::Gaussians;
 use slag_common::splat::{self, ReadOptions};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::constants::{MAX_IMAGE_PX, SUM_FRACTION_BITS};
-use slag_encoder::raster::{RasterView, RegionWeight, WeightKind};
+use slag_encoder::raster::{RasterView, RegionWeight};
 
 use super::backends::{Backend, backends};
 use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
@@ -280,7 +280,7 @@ fn sums_over_many_pixels() {
             println!("left to the nightly checks: {name}");
             continue;
         }
-        let found = rasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
+        let found = rasterizer.weights(&scene, &view, &regions).unwrap();
         if !keeps_order {
             // Wider than the squares that f32 holds.
             assert_eq!((found.counters.unusable, found.entries.len()), (3, 0));

@@ -3,9 +3,7 @@
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::devices::{DeviceChoice, DeviceError, Devices};
 use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, adapters};
-use slag_encoder::raster::{
-    CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, WeightKind,
-};
+use slag_encoder::raster::{CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights};
 
 use super::backends::gpu_is_expected;
 use super::scenes::{random_regions, random_scene, random_view};
@@ -22,7 +20,7 @@ fn open(options: GpuOptions) -> Option<GpuRasterizer> {
 }
 
 fn weights(scene: &dyn LoadedScene, view: &RasterView, regions: &RegionMap) -> ViewWeights {
-    scene.weights(view, regions, WeightKind::Blend).unwrap()
+    scene.weights(view, regions).unwrap()
 }
 
 /// The second view is as large as the buffers that the first left behind; later ones are larger.
@@ -79,11 +77,11 @@ fn too_much_for_a_device_is_an_error_and_falls_to_the_cpu() {
     let view = random_view(random, 60, 16);
     let scene = random_scene(random, 2000, &view, 0);
     let regions = random_regions(random, &view, 3);
-    let error = tiny.weights(&scene, &view, &regions, WeightKind::Blend).unwrap_err();
+    let error = tiny.weights(&scene, &view, &regions).unwrap_err();
     assert!(matches!(error, RasterError::DeviceCapacity { .. }), "{error}");
     let devices = Devices::of(vec![tiny], 2);
-    let found = devices.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
-    assert_eq!(found, CpuRasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap());
+    let found = devices.weights(&scene, &view, &regions).unwrap();
+    assert_eq!(found, CpuRasterizer.weights(&scene, &view, &regions).unwrap());
 }
 
 #[test]
@@ -117,13 +115,13 @@ fn earlier_views_change_no_bit() {
     let loaded = gpu.load(&scene).unwrap();
     for n_regions in [3, 1, 600, 40] {
         let regions = random_regions(random, &view, n_regions);
-        let expected = gpu.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
+        let expected = gpu.weights(&scene, &view, &regions).unwrap();
         assert!(weights(loaded.as_ref(), &view, &regions) == expected, "{n_regions} regions");
     }
     // More regions than a device can number.
     let mut many = random_regions(random, &view, 3);
     many.n_regions = 1 << 16;
-    let error = gpu.weights(&scene, &view, &many, WeightKind::Blend).unwrap_err();
+    let error = gpu.weights(&scene, &view, &many).unwrap_err();
     assert!(matches!(error, RasterError::DeviceCapacity { .. }), "{error}");
 }
 
@@ -135,10 +133,8 @@ fn a_lost_device_loses_no_view() {
     let views: Vec<RasterView> = (0..6).map(|_| random_view(random, 50, 40)).collect();
     let scene = random_scene(random, 1500, &views[0], 0);
     let regions = random_regions(random, &views[0], 12);
-    let expected: Vec<ViewWeights> = views
-        .iter()
-        .map(|view| CpuRasterizer.weights(&scene, view, &regions, WeightKind::Blend).unwrap())
-        .collect();
+    let expected: Vec<ViewWeights> =
+        views.iter().map(|view| CpuRasterizer.weights(&scene, view, &regions).unwrap()).collect();
     let devices = Devices::of(vec![a, b], 1);
     let loaded = devices.load(&scene).unwrap();
     let all = || {

@@ -2,23 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use slag_common::Gaussians;
-use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::{RasterView, Rasterizer, ViewWeights, WeightKind};
+use slag_encoder::raster::ViewWeights;
 
 use super::backends::{Backend, backends};
 use super::fixtures::{Npz, needs_shared, points, view, widened};
 
 type Sums = BTreeMap<(u32, u32), f64>;
-
-fn weights(
-    rasterizer: &dyn Rasterizer,
-    scene: &Gaussians,
-    view: &RasterView,
-    regions: &RegionMap,
-) -> ViewWeights {
-    rasterizer.weights(scene, view, regions, WeightKind::Blend).unwrap()
-}
 
 fn sums(found: &ViewWeights) -> Sums {
     let keys: Vec<_> = found.entries.iter().map(|e| (e.gaussian, e.region)).collect();
@@ -58,7 +47,7 @@ fn garden_weights_are_those_of_the_float64_reference() {
         let labels = npz.array::<f64>(&format!("label_sum64_{v}"));
         for Backend { name, rasterizer, keeps_order, .. } in backends() {
             let view = view(&widened(&poses[v * 16..][..16]), camera);
-            let result = weights(&**rasterizer, &scene, &view, &regions);
+            let result = rasterizer.weights(&scene, &view, &regions).unwrap();
             let found = sums(&result);
             let differences = differences(&found, &expected);
             let relative_l1 = differences.values().sum::<f64>() / expected.values().sum::<f64>();
@@ -119,7 +108,7 @@ fn extremes_are_those_of_the_float64_reference_also_500_km_from_the_origin() {
         let expected =
             recorded(&mut npz, &format!("{frame}_k"), &format!("{frame}_l"), &format!("{frame}_w_ref64"));
         for Backend { name, rasterizer, bound_factor, .. } in backends() {
-            let found = sums(&weights(&**rasterizer, &scene, &view(&pose, camera), &regions));
+            let found = sums(&rasterizer.weights(&scene, &view(&pose, camera), &regions).unwrap());
             let differences = differences(&found, &expected);
             for (group, group_name) in GROUPS.iter().enumerate() {
                 let of_group = differences.iter().filter(|d| usize::from(groups[d.0.0 as usize]) == group);

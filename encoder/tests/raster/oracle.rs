@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use slag_common::Gaussians;
 use slag_encoder::masks::{NO_REGION, RegionMap};
-use slag_encoder::raster::{RasterView, WeightKind};
+use slag_encoder::raster::RasterView;
 
 pub struct Projected {
     pub index: usize,
@@ -98,13 +98,12 @@ impl std::ops::AddAssign for Truth {
     }
 }
 
-/// Calls `f(Gaussian, pixel, blending weight or falloff)` for each Gaussian that counts at a pixel.
+/// Calls `f(Gaussian, pixel, weight)` for each Gaussian that counts at a pixel.
 ///
 /// `cut_tolerance`: the relative error of alpha within which a pixel may fall on either side of a cut.
 pub fn each_weight(
     scene: &Gaussians,
     view: &RasterView,
-    kind: WeightKind,
     cut_tolerance: f64,
     mut f: impl FnMut(&Projected, usize, Truth),
 ) {
@@ -123,11 +122,6 @@ pub fn each_weight(
                 continue;
             }
             let gate = |counts: bool, value: f64| if counts { value } else { 0.0 };
-            if kind == WeightKind::Falloff {
-                let (value, low) = (gate(counts, falloff), gate(counts_low, falloff));
-                f(gaussian, pixel, Truth { value, low, high: falloff, sensitivity: falloff });
-                continue;
-            }
             let own_sensitivity = light.sensitivity + 1.0;
             light.sensitivity += alpha / (1.0 - alpha);
             let slack = cut_tolerance * light.sensitivity;
@@ -162,15 +156,9 @@ pub fn each_weight(
 pub type Sums = BTreeMap<(u32, u32), Truth>;
 
 /// Returns the sums of [`each_weight`] over regions.
-pub fn weights(
-    scene: &Gaussians,
-    view: &RasterView,
-    regions: &RegionMap,
-    kind: WeightKind,
-    cut_tolerance: f64,
-) -> Sums {
+pub fn weights(scene: &Gaussians, view: &RasterView, regions: &RegionMap, cut_tolerance: f64) -> Sums {
     let mut sums = Sums::new();
-    each_weight(scene, view, kind, cut_tolerance, |gaussian, pixel, weight| {
+    each_weight(scene, view, cut_tolerance, |gaussian, pixel, weight| {
         let region = regions.region_of_pixel[pixel];
         if region != NO_REGION {
             *sums.entry((gaussian.index as u32, region)).or_default() += weight;

@@ -3,12 +3,12 @@
 use glam::DVec3;
 use slag_common::Gaussians;
 use slag_common::splat::{self, ReadOptions};
-use slag_encoder::raster::{RasterView, WeightKind};
+use slag_encoder::raster::RasterView;
 
 use super::backends::{Backend, backends};
 use super::extremes::read_ply;
 use super::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
-use super::table::{Case, KINDS, Row};
+use super::table::{Case, Row};
 use slag_math::random::Random;
 
 type Edit = Box<dyn Fn(&mut Gaussians, usize)>;
@@ -57,26 +57,19 @@ fn values_that_are_no_numbers() {
     without.opacities[victim] = 0.0;
     let poisons = poisons();
     for Backend { name, rasterizer, .. } in backends() {
-        for kind in KINDS {
-            let weights = |scene: &Gaussians| rasterizer.weights(scene, &view, &regions, kind).unwrap();
-            let expected = weights(&without);
-            assert_eq!(expected.counters.unusable, 0);
-            assert_ne!(expected.entries, weights(&scene).entries, "the victim must be seen");
-            for (what, poison) in &poisons {
-                let mut poisoned = scene.clone();
-                poison(&mut poisoned, victim);
-                let found = weights(&poisoned);
-                assert_eq!(found.counters.unusable, 1, "{name}: {what}");
-                assert_eq!(found.entries, expected.entries, "{name}: {what}");
-                if kind == WeightKind::Blend {
-                    let drawing = rasterizer.draw(&poisoned, &view, [0.0; 3]).unwrap();
-                    assert_eq!(drawing.counters.unusable, 1);
-                    assert!(
-                        drawing.rgb.iter().chain(&drawing.depth).all(|v| v.is_finite()),
-                        "{name}: {what}"
-                    );
-                }
-            }
+        let weights = |scene: &Gaussians| rasterizer.weights(scene, &view, &regions).unwrap();
+        let expected = weights(&without);
+        assert_eq!(expected.counters.unusable, 0);
+        assert_ne!(expected.entries, weights(&scene).entries, "the victim must be seen");
+        for (what, poison) in &poisons {
+            let mut poisoned = scene.clone();
+            poison(&mut poisoned, victim);
+            let found = weights(&poisoned);
+            assert_eq!(found.counters.unusable, 1, "{name}: {what}");
+            assert_eq!(found.entries, expected.entries, "{name}: {what}");
+            let drawing = rasterizer.draw(&poisoned, &view, [0.0; 3]).unwrap();
+            assert_eq!(drawing.counters.unusable, 1);
+            assert!(drawing.rgb.iter().chain(&drawing.depth).all(|v| v.is_finite()), "{name}: {what}");
         }
         println!(
             "| no numbers | {} fields and values | {name} | rejected and counted, others bit-equal |",
@@ -107,7 +100,7 @@ fn numbers_beyond_the_arithmetic() {
         *beyond.means_in_world.last_mut().unwrap() = mean;
     }
     for Backend { name, rasterizer, .. } in backends() {
-        let weights = |scene| rasterizer.weights(scene, &view, &regions, WeightKind::Blend).unwrap();
+        let weights = |scene| rasterizer.weights(scene, &view, &regions).unwrap();
         let found = weights(&beyond);
         assert!(found.counters.unusable >= 1, "{name}");
         assert_eq!(found.entries, weights(&scene).entries, "{name}");

@@ -4,12 +4,10 @@ use std::collections::BTreeMap;
 
 use slag_common::Gaussians;
 use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::{RasterView, ViewWeights, WeightKind};
+use slag_encoder::raster::{RasterView, ViewWeights};
 
 use super::backends::{Backend, backends};
 use super::oracle;
-
-pub const KINDS: [WeightKind; 2] = [WeightKind::Blend, WeightKind::Falloff];
 
 /// Rows with Gaussians at equal depths or on a cut, where the last bit of f32 decides.
 const ROWS_OF_TIES: [&str; 3] = ["pile", "on the cuts", "rotations"];
@@ -52,31 +50,28 @@ impl Row {
             let (mut apart, mut on_a_cut_px, mut whole_px, mut n_sums) = (0.0_f64, 0.0, 0.0, 0);
             for (i, case) in cases.iter().enumerate().step_by(backend.case_step(cases.len())) {
                 let (scene, view) = case.exact.as_ref().map_or((&case.scene, &case.view), |(s, v)| (s, v));
-                for (k, kind) in KINDS.into_iter().enumerate() {
-                    let expected = oracle::weights(scene, view, &case.regions, kind, backend.cut_tolerance);
-                    let found =
-                        backend.rasterizer.weights(&case.scene, &case.view, &case.regions, kind).unwrap();
-                    assert_eq!(found.counters.unusable, case.n_unusable, "{} case {i}", self.name);
-                    let found = by_pair(&found);
-                    if b == 0 {
-                        of_first.push(found.clone());
-                    }
-                    let first = &of_first[i * KINDS.len() + k];
-                    for key in found.keys().chain(first.keys()).chain(expected.keys()) {
-                        let truth = expected.get(key).copied().unwrap_or_default();
-                        let unit_px = truth.sensitivity.max(self.unit_px);
-                        let value = weight(&found, key);
-                        let error = truth.distance(value) / unit_px;
-                        if error > worst {
-                            (worst, place) = (error, format!("case {i}, {kind:?}, {key:?}"));
-                        }
-                        let difference = (value - weight(first, key)).abs() - (truth.high - truth.low);
-                        apart = apart.max(difference / unit_px);
-                    }
-                    on_a_cut_px += expected.values().map(|t| t.high - t.low).sum::<f64>();
-                    whole_px += expected.values().map(|t| t.value).sum::<f64>();
-                    n_sums += expected.len();
+                let expected = oracle::weights(scene, view, &case.regions, backend.cut_tolerance);
+                let found = backend.rasterizer.weights(&case.scene, &case.view, &case.regions).unwrap();
+                assert_eq!(found.counters.unusable, case.n_unusable, "{} case {i}", self.name);
+                let found = by_pair(&found);
+                if b == 0 {
+                    of_first.push(found.clone());
                 }
+                let first = &of_first[i];
+                for key in found.keys().chain(first.keys()).chain(expected.keys()) {
+                    let truth = expected.get(key).copied().unwrap_or_default();
+                    let unit_px = truth.sensitivity.max(self.unit_px);
+                    let value = weight(&found, key);
+                    let error = truth.distance(value) / unit_px;
+                    if error > worst {
+                        (worst, place) = (error, format!("case {i}, {key:?}"));
+                    }
+                    let difference = (value - weight(first, key)).abs() - (truth.high - truth.low);
+                    apart = apart.max(difference / unit_px);
+                }
+                on_a_cut_px += expected.values().map(|t| t.high - t.low).sum::<f64>();
+                whole_px += expected.values().map(|t| t.value).sum::<f64>();
+                n_sums += expected.len();
             }
             let Backend { name, bound_factor, .. } = backend;
             let (claimed, on_a_cut) = (self.claimed * bound_factor, on_a_cut_px / whole_px);

@@ -15,7 +15,7 @@ use slag_encoder::masks::RegionMap;
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::devices::{DeviceChoice, Devices};
 use slag_encoder::raster::gpu::GpuOptions;
-use slag_encoder::raster::{RasterError, RasterView, Rasterizer, ViewWeights, WeightKind};
+use slag_encoder::raster::{RasterError, RasterView, Rasterizer, ViewWeights};
 
 use crate::harness::{Machine, Times, timed_ms};
 use crate::table::Table;
@@ -138,7 +138,7 @@ fn measure(
         let (ready, load_ms) = timed_ms(|| rasterizer.load(&scene.gaussians));
         let ready = ready?;
         // Warms up and gives the counts.
-        let views = scene.views.iter().map(|view| ready.weights(view, regions, WeightKind::Blend));
+        let views = scene.views.iter().map(|view| ready.weights(view, regions));
         results.push(views.collect::<Result<Vec<_>, _>>()?);
         loaded.push((ready, load_ms));
     }
@@ -146,7 +146,7 @@ fn measure(
     for turn in 0..n_repeats as usize {
         let view = &scene.views[turn % scene.views.len()];
         for ((device, _), timings) in loaded.iter().zip(&mut timings) {
-            let (result, ms) = timed_ms(|| device.weights(view, regions, WeightKind::Blend));
+            let (result, ms) = timed_ms(|| device.weights(view, regions));
             result?;
             timings.push(ms);
         }

@@ -28,7 +28,7 @@ use slag_raster::{Drawing, RasterView, ViewCounters, check_scene, check_view, co
 pub(crate) use super::adapter::AdapterReport;
 pub use super::adapter::{GpuOptions, Precision};
 use super::cpu::{CpuRasterizer, check_regions};
-use super::rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights, WeightKind};
+use super::rasterizer::{LoadedScene, RasterError, Rasterizer, RegionWeight, ViewWeights};
 use crate::masks::RegionMap;
 use buffers::{REGION_BYTES, Size};
 pub(crate) use device::Adapter;
@@ -392,12 +392,7 @@ const MAX_SIZE_OF_F32_PX: u32 = 1 << 23;
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
 impl LoadedScene for GpuScene<'_> {
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
+    fn weights(&self, view: &RasterView, regions: &RegionMap) -> Result<ViewWeights, RasterError> {
         check_view(view)?;
         self.check_size(view)?;
         check_regions(regions, &view.intrinsics)?;
@@ -415,8 +410,7 @@ impl LoadedScene for GpuScene<'_> {
                 true => entries.extend(found.iter().map(|sum| sum.weight(sum.fixed()))),
                 false => sums.extend(found),
             };
-            let regions_and_kind = (&regions.region_of_pixel[rows.px], regions.n_regions, kind);
-            workspace.contributions(band, regions_and_kind, &mut take)
+            workspace.contributions(band, &regions.region_of_pixel[rows.px], regions.n_regions, &mut take)
         })?;
         sums.sort_unstable_by_key(|sum| (sum.gaussian, sum.region));
         entries.extend(

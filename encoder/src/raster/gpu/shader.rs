@@ -10,7 +10,6 @@ use slag_raster::constants::{
 use slag_raster::{EXP_OF_MINUS_C, MAX_POWER};
 
 use crate::raster::adapter::Precision;
-use crate::raster::rasterizer::WeightKind;
 
 /// Threads of a workgroup, equal to the pixels of a tile.
 pub(crate) const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
@@ -155,8 +154,7 @@ pub(crate) struct Kernels {
     pub(crate) write_pairs: wgpu::ComputePipeline,
     pub(crate) find_ranges: wgpu::ComputePipeline,
     pub(crate) order_tiles: wgpu::ComputePipeline,
-    /// One for each [`WeightKind`].
-    pub(crate) sum_regions: [wgpu::ComputePipeline; 2],
+    pub(crate) sum_regions: wgpu::ComputePipeline,
     pub(crate) count_heads: wgpu::ComputePipeline,
     pub(crate) add_up: wgpu::ComputePipeline,
     pub draw: wgpu::ComputePipeline,
@@ -164,7 +162,7 @@ pub(crate) struct Kernels {
 
 impl Kernels {
     pub fn new(device: &wgpu::Device, precision: Precision) -> Self {
-        let with_constants = |stage: &str, entry: &str, constants: &[(&str, f64)]| {
+        let kernel = |stage: &str, entry: &str| {
             let descriptor = wgpu::ShaderModuleDescriptor {
                 label: Some(stage),
                 source: wgpu::ShaderSource::Wgsl(Cow::Owned(module_text(stage, precision))),
@@ -185,14 +183,13 @@ impl Kernels {
                 module: &module,
                 entry_point: Some(entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
-                    constants,
+                    constants: &[],
                     // All shaders write workgroup memory before they read it.
                     zero_initialize_workgroup_memory: false,
                 },
                 cache: None,
             })
         };
-        let kernel = |stage: &str, entry: &str| with_constants(stage, entry, &[]);
         Self {
             count_visible: kernel("project", "count_visible"),
             write_visible: kernel("project", "write_visible"),
@@ -203,10 +200,7 @@ impl Kernels {
             write_pairs: kernel("bin", "write_pairs"),
             find_ranges: kernel("bin", "find_ranges"),
             order_tiles: kernel("bin", "order_tiles"),
-            sum_regions: [WeightKind::Blend, WeightKind::Falloff].map(|kind| {
-                let is_falloff = f64::from(u8::from(kind == WeightKind::Falloff));
-                with_constants("blend", "sum_regions", &[("IS_FALLOFF", is_falloff)])
-            }),
+            sum_regions: kernel("blend", "sum_regions"),
             count_heads: kernel("compact", "count_heads"),
             add_up: kernel("compact", "add_up"),
             draw: kernel("draw", "draw"),

@@ -9,7 +9,6 @@ use super::device::Device;
 use super::jobs::{DIGIT_BITS, JOB_STRIDE_BYTES, Scan, SortKey, dispatch_offset, part, sort_job};
 use super::layout::{Chunk, ScanJob, SceneGaussian};
 use super::shader::{Counter, NONE, WORKGROUP_SIZE};
-use crate::raster::rasterizer::WeightKind;
 
 pub(crate) struct Stages {
     pub buffers: Buffers,
@@ -174,13 +173,12 @@ impl Stages {
         dispatch(pass, kernel, group, [1, 1]);
     }
 
-    /// Blends all tiles and sums their weights of this kind over regions.
+    /// Blends all tiles and sums their weights over regions.
     pub(crate) fn blend(
         &mut self,
         device: &Device,
         pass: &mut wgpu::ComputePass<'_>,
         (columns, rows): (u32, u32),
-        kind: WeightKind,
     ) {
         let bound = [
             &self.buffers.view,
@@ -193,9 +191,8 @@ impl Stages {
             &self.buffers.tile_order,
         ]
         .map(whole);
-        let kernel = &device.kernels.sum_regions[kind as usize];
-        let group =
-            cached(&mut self.groups, ("sum_regions", kind as u32), || bind(device, kernel, &number(&bound)));
+        let kernel = &device.kernels.sum_regions;
+        let group = cached(&mut self.groups, ("sum_regions", 0), || bind(device, kernel, &number(&bound)));
         dispatch(pass, kernel, group, [columns, rows]);
         self.scan(device, pass, Scan::Entries);
     }

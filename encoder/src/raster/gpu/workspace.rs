@@ -10,7 +10,7 @@ use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
 use super::layout::{Background, Capacities, RegionSum, ViewBlock};
 use super::shader::{Counter, Counts};
 use super::stages::{SceneChunk, Stages, bind, dispatch, number, whole};
-use crate::raster::rasterizer::{RasterError, WeightKind};
+use crate::raster::rasterizer::RasterError;
 
 /// Size of a drawn pixel, bytes.
 pub(crate) const PIXEL_BYTES: u64 = 20;
@@ -62,7 +62,8 @@ impl Workspace {
     pub fn contributions(
         &mut self,
         band: &Band<'_>,
-        (regions, n_regions, kind): (&[u32], u32, WeightKind),
+        regions: &[u32],
+        n_regions: u32,
         take: &mut dyn FnMut(&[RegionSum]),
     ) -> Result<Counts, RasterError> {
         let device = band.device;
@@ -70,7 +71,7 @@ impl Workspace {
         let mut encoder = self.bin(band, regions)?;
         let [columns, rows] = band.tiles();
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        self.stages.blend(device, &mut pass, (columns, rows), kind);
+        self.stages.blend(device, &mut pass, (columns, rows));
         drop(pass);
         let mut pass = encoder.begin_compute_pass(&Default::default());
         let bits = bits_of(self.capacities.visible) + self.region_bits;
