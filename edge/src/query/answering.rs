@@ -143,8 +143,8 @@ fn related(
     let Answering { scene, request, .. } = *answering;
     let has_up = scene.manifest.metric || scene.manifest.geo_reference.is_some();
     if !has_up && needs_up(phrase) {
-        let expected =
-            "a relation that does not depend on up (near, in, between): this scene's up is not known";
+        let expected = "near, in or between, as this scene's up is not known; where its world has z up and metres, \
+                        encode it with --metric";
         return Err(RequestError::new("phrases", &phrase.thing, expected).into());
     }
     let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
