@@ -173,6 +173,38 @@ test("keys: the list of them, measuring, hovering, and the opening view again", 
   assert.notDeepEqual((await cameraOf(page))[0], before);
 }, { fragment: `camera=${CAMERA}` }));
 
+const MANY = Array.from({ length: 30 }, (_, i) => ({ word: `thing ${i}`, n_things: 30 - i }));
+
+test("an arrow leads to what is out of view, a chip lists all that is on board", () => opened(async (page) => {
+  await drawn(page);
+  const chips = page.locator("#chips button");
+  assert.equal(await chips.first().innerText(), "all30");
+  await chips.first().click();
+  assert.deepEqual([await chips.count(), await chips.last().innerText()], [30, "thing 291"]);
+  // It looks at the chair, then away from it, by half a turn to the left.
+  await page.fill("#question", "chair");
+  await answered(page, "chair");
+  const label = page.locator("#labels .answer");
+  await label.waitFor();
+  assert.ok(!(await label.getAttribute("class")).includes("beyond"));
+  await page.locator("#canvas").focus();
+  await page.keyboard.down("ArrowLeft");
+  await page.locator("#labels .answer.beyond").waitFor();
+  await page.keyboard.up("ArrowLeft");
+  const { x, width } = await label.boundingBox();
+  assert.ok(x + width > WIDTH - 30 && x + width <= WIDTH, `the right edge: ${x} + ${width}`);
+}, { behaviour: { words: MANY }, fragment: `camera=${CAMERA}` }));
+
+/** A floor, and a terrace 2 m above it. */
+const STEPPED = [THINGS[0], { name: "terrace", min: [4, -4, 1.9], max: [12, 4, 2], n: [64, 64, 1] }];
+
+test("heights are over the ground that lies below, which need not be level", () => opened(async (page) => {
+  await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined);
+  await page.mouse.move(...project([8, 0, 1.95], [8, -8, 6], [8, 0, 2]));
+  await page.locator("#hover").waitFor();
+  assert.match(await page.locator("#hover").innerText(), /^\d cm above ground$/);
+}, { behaviour: { things: STEPPED }, fragment: "camera=8,-8,6,8,0,2" }));
+
 test("a pointer meets large Gaussians anywhere on them, and measuring says where there is nothing", () => opened(async (page) => {
   await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined);
   const at = (point) => page.mouse.click(...project(point));

@@ -3,6 +3,7 @@
 import { OPACITY, strengthOf, type Viewpoint } from "./answers";
 import { type Asked, openCard, photoOf, placeCards, showCards, showPhoto } from "./cards";
 import { clustersOf, topScore, voxelOf } from "./clusters";
+import type { Question } from "./drawing/cells";
 import type { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
 import { type Answer, type Answers, type Asker, type Description, fetchAnswers, fetchScores, parseQuestion, type Photo } from "./network";
@@ -13,6 +14,8 @@ import { remember, type State, writeState } from "./state";
 
 /** Where things were found, Gaussians are lit from this share of the range of scores, or a lower threshold. */
 const SHARE_OF_RANGE = 0.75;
+/** Objects below this share of the threshold are weak: groups answer in their place where they are surer, as on robots. */
+const SURE = 1.15;
 
 function bestLevel({ byCell }: Scores): number {
   let best = 0;
@@ -40,16 +43,21 @@ function noneText({ thing, best, isOfPoints, threshold, none, isBelowThreshold, 
   return `Not found. ${(none ?? "").replace(/\d+\.\d{4,}/g, (number) => Number(number).toFixed(3))}`;
 }
 
-/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found. */
-function levelFrom({ scores, reply: { threshold, answers } }: Found): number {
+/** A thing's Gaussians at edges and in shade score below the average of its masks, by which it is found; outside of answers floors do. */
+function levelsFrom({ scores, reply: { threshold, answers } }: Found): { threshold: number; outside: number; answers: Answer[] } {
   const high = scores.min + SHARE_OF_RANGE * (scores.max - scores.min);
-  return levelOf(answers.some(({ id }) => id) ? Math.min(threshold ?? high, high) : (threshold ?? high), scores);
+  const things = answers.filter(({ id }) => id);
+  const outside = levelOf(threshold ?? high, scores);
+  return { threshold: things.length > 0 ? Math.min(outside, levelOf(high, scores)) : outside, outside, answers: things };
 }
+
+/** As robots judge it: the first answer's score as a share of the threshold. */
+const surenessOf = ([first]: Answer[], threshold: number) => (first ? first.score / Math.max(threshold, Number.MIN_VALUE) : -Infinity);
 
 export class Asking {
   private scores: Scores | null = null;
   /** Of the second question, and its level of threshold. */
-  private second: { scores: Scores; threshold: number } | null = null;
+  private second: Question | null = null;
   private answers: Answer[] = [];
   private asked: Asked | null = null;
   private chosen: number | null = null;
@@ -60,8 +68,9 @@ export class Asking {
   constructor(private readonly state: State, private readonly drawing: Drawing, private readonly places: PlacesToStand,
     private readonly description: () => Description, private readonly viewpoint: (ofCamera?: boolean) => Viewpoint, private readonly onOther: () => void, private readonly report: (error: unknown) => void) {}
 
-  colour(level: number): void {
-    this.drawing.cells.colour(this.scores && { scores: this.scores, threshold: level }, this.second);
+  /** `outside`: the level from which Gaussians outside of the things are lit. */
+  colour(level: number, outside = level, answers: Answer[] = []): void {
+    this.drawing.cells.colour(this.scores && { scores: this.scores, threshold: level, outside, answers }, this.second);
     showLegend(this.scores, level);
     this.drawing.redraw();
   }
@@ -81,8 +90,10 @@ export class Asking {
     const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal, this.askers())]);
     // The scores of "mug on the table" are those of mugs.
     const scores = reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal);
-    if (reply.answers.length === 0 && reply.isPlain && reply.threshold !== null) {
-      reply.answers = this.groupsOf(scores, reply.threshold);
+    const [sureness, isStore] = [surenessOf(reply.answers, reply.threshold ?? 0), this.description().program !== "slag-edge"];
+    if (reply.isPlain && reply.threshold !== null && (reply.answers.length === 0 || (isStore && sureness < SURE))) {
+      const groups = this.groupsOf(scores, reply.threshold);
+      if (surenessOf(groups, reply.threshold) > sureness) reply.answers = groups;
       // A store's page says no best score of things.
       if (reply.best === null) [reply.best, reply.isOfPoints] = [scores.min + (bestLevel(scores) / 255) * (scores.max - scores.min), true];
     }
@@ -148,10 +159,13 @@ export class Asking {
     const lit = (found: Found | null) => (found && found.reply.answers.length > 0 ? found : null);
     this.scores = lit(first)?.scores ?? null;
     const second = lit(beside);
-    this.second = second && { scores: second.scores, threshold: levelFrom(second) };
+    this.second = second && { scores: second.scores, ...levelsFrom(second) };
     showSecond(beside && `${beside.reply.thing}: ${beside.reply.answers.length || "not"} found`);
     const { threshold } = this.state;
-    this.colour(first && this.scores ? (threshold === null ? levelFrom(first) : levelOf(threshold, first.scores)) : 0);
+    const levels = first && levelsFrom(first);
+    if (!first || !levels || !this.scores) this.colour(0);
+    else if (threshold === null) this.colour(levels.threshold, levels.outside, levels.answers);
+    else this.colour(levelOf(threshold, first.scores));
     this.answers = first?.reply.answers ?? [];
     this.asked = first && { thing: first.reply.thing, query: first.reply.query, threshold: first.reply.threshold, viewpoint: this.viewpoint(), description: this.description() };
     if (this.asked) showCards(this.answers, this.asked, (index) => this.choose(index === this.chosen ? null : index));

@@ -50,18 +50,27 @@ function noteOf(nThings: number): string {
   return nThings === 0 ? "" : String(nThings);
 }
 
-/** Chips of what is on board, each with its number. */
+/** Chips of what is on board, each with its number; the first one shows all. */
 export function showChips(chips: HTMLElement, words: Word[], onChoose: (word: string) => void): void {
-  chips.replaceChildren(...words.filter(({ n_things }) => n_things > 0).slice(0, MAX_CHIPS).map(({ word, n_things }) => {
+  const onBoard = words.filter(({ n_things }) => n_things > 0);
+  const chipOf = (text: string, note: string, onClick: () => void) => {
     const chip = document.createElement("button");
     chip.type = "button";
-    chip.textContent = word;
+    chip.textContent = text;
     const number = document.createElement("small");
-    number.textContent = String(n_things);
+    number.textContent = note;
     chip.append(number);
-    chip.addEventListener("click", () => onChoose(word));
+    chip.addEventListener("click", onClick);
     return chip;
-  }));
+  };
+  const show = (shown: Word[]) => shown.map(({ word, n_things }) => chipOf(word, String(n_things), () => onChoose(word)));
+  const isAll = onBoard.length <= MAX_CHIPS || chips.classList.contains("all");
+  const more = chipOf("all", String(onBoard.length), () => {
+    chips.classList.add("all");
+    showChips(chips, words, onChoose);
+    chips.querySelector("button")?.focus();
+  });
+  chips.replaceChildren(...(isAll ? show(onBoard) : [more, ...show(onBoard.slice(0, MAX_CHIPS))]));
 }
 
 export class Combobox {

@@ -3,14 +3,42 @@
 import { PackedSplats, RgbaArray, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import type { CellGaussians, Scores } from "../messages";
-import type { Vector } from "../network";
+import type { Answer, Vector } from "../network";
+import { boxOf } from "./marks";
 import { centreOf, type Hit, pick } from "./pick";
 import { type Lit, colourByScore, type Palette } from "./ramp";
 
-/** A question's scores, and the level from which they are lit. */
+/** A question's scores, and the level from which they are lit: in the boxes of its answers, and elsewhere. */
 export interface Question {
   scores: Scores;
   threshold: number;
+  outside: number;
+  answers: Answer[];
+}
+
+/** A thing's own Gaussians reach so much out of its box. */
+const ROOM = 1.1;
+
+/** Levels of a cell's Gaussians, 0 where they are lit in boxes alone and lie in none. */
+function litOf({ threshold, outside, answers }: Question, levels: Uint8Array, gaussians: CellGaussians): Uint8Array {
+  if (outside <= threshold) return levels;
+  const boxes = answers.map((answer) => {
+    const { centre, size, rotation } = boxOf(answer);
+    return { centre: new THREE.Vector3(...centre), half: new THREE.Vector3(...size).multiplyScalar(ROOM / 2), turn: rotation.clone().invert() };
+  });
+  const lit = levels.slice();
+  const [centre, point]: [Vector, THREE.Vector3] = [[0, 0, 0], new THREE.Vector3()];
+  for (let i = 0; i < gaussians.n; i++) {
+    const level = levels[i * gaussians.step];
+    if (level < threshold || level >= outside) continue;
+    centreOf(gaussians, i, centre);
+    const isIn = boxes.some((box) => {
+      point.set(...centre).sub(box.centre).applyQuaternion(box.turn);
+      return Math.abs(point.x) <= box.half.x && Math.abs(point.y) <= box.half.y && Math.abs(point.z) <= box.half.z;
+    });
+    if (!isIn) lit[i * gaussians.step] = 0;
+  }
+  return lit;
 }
 
 interface Drawn {
@@ -126,7 +154,7 @@ export class Cells {
     const lit = (question: Question | null): Lit | null => {
       const found = question?.scores.byCell.get(cell);
       const isOfCell = found && Math.ceil(found.length / gaussians.step) === gaussians.n;
-      return question && isOfCell ? { levels: found, threshold: question.threshold } : null;
+      return question && isOfCell ? { levels: litOf(question, found, gaussians), threshold: question.threshold } : null;
     };
     drawn.rgba ??= new RgbaArray({ array: new Uint8Array(gaussians.packed.length), count: gaussians.n });
     const array = drawn.rgba.array;

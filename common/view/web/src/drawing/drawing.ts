@@ -9,12 +9,14 @@ import { Cells } from "./cells";
 import { Frames } from "./frames";
 import { Hud } from "./hud";
 import { boxOf, type Change, Marks, seenBy } from "./marks";
-import { type Extent, extentOf, openingPose, pointsOfCells } from "./opening";
+import { type Extent, extentOf, Ground, openingPose, pointsOfCells } from "./opening";
 import { lightAlong } from "./pick";
 import { Places } from "./places";
 import { PALETTES } from "./ramp";
 
 const MAX_LABELS = 9;
+/** Arrows to what is out of view stand so far from the edge. */
+const MARGIN_PX = 26;
 /** Largest distance between a click and the mark it means. */
 const NEAR_PX = 14;
 const BACKGROUNDS: Record<Theme, number> = { dark: 0x14181d, light: 0xeceff2, contrast: 0x000000 };
@@ -45,6 +47,7 @@ export class Drawing {
   /** Side of a square of the grid. */
   stepM = 1;
   extent: Extent;
+  private ground: Ground | null = null;
   private readonly renderer: THREE.WebGLRenderer;
   private readonly scene = new THREE.Scene();
   /**
@@ -114,6 +117,7 @@ export class Drawing {
   /** Measures the scene again by the Gaussians that are drawn, and looks from there unless a person moved on. */
   measureExtent(isOpening: boolean): void {
     this.extent = extentOf(this.cells.points(N_POINTS), this.up) ?? this.extent;
+    this.ground = null;
     this.showGround();
     if (isOpening && !this.camera.wasMoved) this.showOpening(true);
     this.redraw();
@@ -176,7 +180,10 @@ export class Drawing {
   surfaceAt(xPx: number, yPx: number): { point: Vector; heightM: number; score: number | null } | null {
     const { origin, direction } = this.rayAt(xPx, yPx).ray;
     const hit = this.cells.pick(origin.clone().sub(this.world.position).toArray() as Vector, direction.toArray() as Vector, 1 / this.camera.focalPx);
-    return hit && { point: hit.point, heightM: this.up.dot(new THREE.Vector3(...hit.point)) - this.extent.groundM, score: hit.score };
+    if (!hit) return null;
+    const point = new THREE.Vector3(...hit.point);
+    this.ground ??= new Ground(this.cells.points(N_POINTS), this.extent, this.up);
+    return { point: hit.point, heightM: this.up.dot(point) - this.ground.under(point), score: hit.score };
   }
 
   /** The photo that shows an answer largest with nothing in between, and where in it. */
@@ -269,6 +276,20 @@ export class Drawing {
     return Math.abs(z) > 1 ? null : [((x + 1) / 2) * this.canvas.clientWidth, ((1 - y) / 2) * this.canvas.clientHeight];
   }
 
+  /** Where the free part of the picture ends towards a point out of it, and in which direction that is; null within it. */
+  private edgeTowards(point: Vector): { at: [number, number]; angleRad: number } | null {
+    const { clientWidth, clientHeight } = this.canvas;
+    const [left, bottom] = this.covered();
+    const middle = [(left + clientWidth) / 2, (clientHeight - bottom) / 2];
+    const half = [(clientWidth - left) / 2 - MARGIN_PX, (clientHeight - bottom) / 2 - MARGIN_PX];
+    const pixel = this.pixelOf(point);
+    const seen = this.local(point).applyMatrix4(this.camera.camera.matrixWorldInverse);
+    const [x, y] = pixel ? [pixel[0] - middle[0], pixel[1] - middle[1]] : [seen.x, -seen.y];
+    const share = Math.max(Math.abs(x) / half[0], Math.abs(y) / half[1]) || 1;
+    if (pixel && share <= 1) return null;
+    return { at: [middle[0] + x / share, middle[1] + y / share], angleRad: Math.atan2(y, x) };
+  }
+
   /** Index of the point of the world that is drawn within a few pixels of a point of the canvas. */
   private nearest(points: Vector[], xPx: number, yPx: number): number | null {
     const distances = points.map((place) => {
@@ -333,14 +354,18 @@ export class Drawing {
     this.redraw();
   }
 
-  /** Puts labels over their points; one that would cover an earlier one is left out. */
+  /** Puts labels over their points, or those of answers out of view where one has to turn; one that would cover an earlier one is left out. */
   private placeLabels(): void {
     const taken: [number, number, number][] = [];
     this.labelsNow.forEach(({ at, kind }, i) => {
       const label = this.labels.children[i] as HTMLElement;
-      const pixel = this.pixelOf(at);
-      const isHidden = (kind === "answer" || kind === "chosen") && !this.marks.boxes.visible;
-      const [xPx, yPx] = pixel ? [pixel[0] - label.offsetWidth / 2, pixel[1] - 24] : [0, 0];
+      const isAnswer = kind === "answer" || kind === "chosen";
+      const edge = isAnswer ? this.edgeTowards(at) : null;
+      label.classList.toggle("beyond", edge !== null);
+      if (edge) label.style.setProperty("--towards", `${edge.angleRad}rad`);
+      const pixel = edge?.at ?? this.pixelOf(at);
+      const isHidden = isAnswer && !this.marks.boxes.visible;
+      const [xPx, yPx] = pixel ? [pixel[0] - label.offsetWidth / 2, pixel[1] - (edge ? 10 : 24)] : [0, 0];
       const isCovering = taken.some(([x, y, width]) => x < xPx + label.offsetWidth + 4 && xPx < x + width + 4 && Math.abs(y - yPx) < 24);
       label.style.visibility = !pixel || isCovering || isHidden ? "hidden" : "visible";
       label.style.transform = `translate(${xPx}px, ${yPx}px)`;

@@ -61,6 +61,42 @@ export function extentOf(points: Float64Array, up: THREE.Vector3): Extent | null
   return { box, groundM: low + ((level + 0.5) * (high - low)) / 60 };
 }
 
+/** Squares in which the ground is measured: a fortieth of the scene, and two around each. */
+const [SQUARES, LEAST_SQUARE, LARGEST_SQUARE_M] = [40, 0.5, 2.5];
+/** Share of what lies around a place that is below its ground. */
+const BELOW_GROUND = 0.1;
+
+/** The height of the ground by place: it need not be level. */
+export class Ground {
+  private readonly heights = new Map<string, number[]>();
+  private readonly side: number;
+  private readonly axes: [THREE.Vector3, THREE.Vector3];
+
+  constructor(points: Float64Array, private readonly extent: Extent, up: THREE.Vector3) {
+    const turn = new THREE.Quaternion().setFromUnitVectors(new THREE.Vector3(0, 0, 1), up);
+    this.axes = [new THREE.Vector3(1, 0, 0).applyQuaternion(turn), new THREE.Vector3(0, 1, 0).applyQuaternion(turn)];
+    this.side = Math.min(Math.max(extent.box.getSize(new THREE.Vector3()).length() / SQUARES, LEAST_SQUARE), LARGEST_SQUARE_M);
+    const point = new THREE.Vector3();
+    for (let i = 0; i < points.length; i += 3) {
+      point.fromArray(points, i);
+      const key = this.squareOf(point).join(",");
+      const heights = this.heights.get(key);
+      if (heights) heights.push(point.dot(up));
+      else this.heights.set(key, [point.dot(up)]);
+    }
+  }
+
+  private squareOf(point: THREE.Vector3): [number, number] {
+    return this.axes.map((axis) => Math.floor(point.dot(axis) / this.side)) as [number, number];
+  }
+
+  under(point: THREE.Vector3): number {
+    const [x, y] = this.squareOf(point);
+    const around = Array.from({ length: 9 }, (_, i) => this.heights.get(`${x + (i % 3) - 1},${y + Math.floor(i / 3) - 1}`) ?? []).flat();
+    return around.length === 0 ? this.extent.groundM : around.sort((a, b) => a - b)[Math.floor(BELOW_GROUND * around.length)];
+  }
+}
+
 interface Candidate {
   position: THREE.Vector3;
   forward: THREE.Vector3;
