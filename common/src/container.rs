@@ -210,7 +210,7 @@ impl Layout {
     }
 }
 
-/// Returns where a section lies by the first bytes of a file, of which nothing is checked.
+/// Returns the byte range of a section from the start of a file; nothing is validated.
 pub(crate) fn section_by_start(start: &[u8], magic: [u8; 8], id: u32) -> Option<Range<usize>> {
     let rows = start.get(PREAMBLE_BYTES..)?.chunks_exact(SECTION_ROW_BYTES);
     let n_sections = read_u32(start, 12).min(MAX_SECTIONS) as usize;

@@ -104,7 +104,7 @@ impl From<ureq::Error> for DownloadFailure {
     }
 }
 
-/// What to do about a failure of TLS, by what rustls says of it.
+/// Advice on TLS failures, each by a part of rustls's message.
 const TLS_ADVICE: [(&str, &str); 8] = [
     ("UnknownIssuer", "give the authority that vouches for the server with --ca FILE"),
     (

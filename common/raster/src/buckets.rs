@@ -91,7 +91,7 @@ pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
 mod tests {
     use super::*;
 
-    /// By hand; then more than 2^32 items, of which only the places are computed.
+    /// By hand; then more than 2^32 items, without the items.
     #[test]
     fn buckets_start_where_those_before_end() {
         let spans = [(0, 1), (1, 3), (3, 3)];

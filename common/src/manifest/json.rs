@@ -12,7 +12,7 @@ pub enum ManifestError {
         "the manifest has {len_bytes} bytes, expected at most {MAX_BYTES}: this is not a slag manifest; check the address"
     )]
     TooLong { len_bytes: u64 },
-    /// Its version can be read, and is another.
+    /// Written by another version.
     #[error(
         "the manifest has version {found}, expected {VERSION}; use a robot program and an encoder of matching versions"
     )]
@@ -20,7 +20,7 @@ pub enum ManifestError {
     /// No JSON, or members are missing.
     #[error("the manifest is damaged: {what}; fetch again, or encode again where it is published")]
     Damaged { what: String },
-    /// All members are there, but not as this version knows them.
+    /// No member is missing, but one has another type or value than this version expects.
     #[error(
         "the text is not a manifest of version {VERSION}: {what}; use a robot program and an encoder of matching versions"
     )]
@@ -32,7 +32,7 @@ impl Manifest {
         serde_json::to_vec(self).expect("a manifest has no map with other keys than strings")
     }
 
-    /// Reads the JSON text. Whose it is, the metadata says that names it as a target.
+    /// Reads the JSON text. The signed metadata that lists it as a target proves whose it is.
     pub fn parse(bytes: &[u8]) -> Result<Self, ManifestError> {
         if bytes.len() as u64 > MAX_BYTES {
             return Err(ManifestError::TooLong { len_bytes: bytes.len() as u64 });

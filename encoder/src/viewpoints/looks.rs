@@ -23,7 +23,7 @@ const LARGE_PX: f64 = 24.0 / 640.0 * SIZE_PX[0] as f64;
 const MIN_WEIGHT: f32 = 0.02;
 /// Sides from which a Gaussian can be seen, around the vertical.
 const N_SIDES: usize = 8;
-/// Bytes of what a candidate shows: eight a Gaussian, of which a pixel shows few.
+/// Bytes of what a candidate shows: eight a Gaussian, about three Gaussians a pixel.
 pub(super) const LOOK_BYTES: u64 = 8 * 3 * (SIZE_PX[0] * SIZE_PX[1]) as u64;
 
 pub(super) struct Look {
