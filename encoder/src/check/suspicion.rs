@@ -1,5 +1,6 @@
 //! What the data alone say against the inputs, without a drawing.
 
+use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 
 use glam::DVec3;
@@ -53,7 +54,22 @@ pub fn suspicions(scene: &Gaussians, views: &[View]) -> Vec<Suspicion> {
         Suspicion { text, mistake: Some(Mistake::Frame(frame)) }
     }));
     found.extend(intrinsics(&views.iter().map(|view| view.intrinsics).collect::<Vec<_>>()));
+    found.extend(repeated(views).map(of_text));
     found
+}
+
+/// Says that most photos have a pose that others have, too, as where poses were never found.
+fn repeated(views: &[View]) -> Option<String> {
+    let mut n_of_pose: BTreeMap<[u64; 12], usize> = BTreeMap::new();
+    for view in views {
+        // Zeros of both signs are one.
+        *n_of_pose.entry(view.camera_from_world.to_cols_array().map(|x| (x + 0.0).to_bits())).or_default() +=
+            1;
+    }
+    let n: usize = n_of_pose.values().filter(|n| **n > 1).sum();
+    let advice = "different photos from one place say little, and poses that were not found look so";
+    (views.len() > 2 && 2 * n > views.len())
+        .then(|| format!("{n} of {} photos have exactly the pose of another: {advice}", views.len()))
 }
 
 /// Says which Gaussians show nothing, or less than they should.

@@ -239,6 +239,20 @@ fn intrinsics_of_no_camera_are_suspected() {
     );
 }
 
+/// Photos whose poses were never found have all the same one; a pair from a tripod is nothing.
+#[test]
+fn poses_that_repeat_are_suspected() {
+    let mut views = views(&FROM);
+    let scene = slag_common::Gaussians::balls(views.iter().map(View::position_in_world).collect(), 0.1);
+    let scene = scene.select(&[0, 1, 2, 3, 4, 5, 0, 1, 2, 3]);
+    views[1].camera_from_world = views[0].camera_from_world;
+    assert_eq!(suspicions(&scene, &views), []);
+    let n = views.len();
+    views.iter_mut().for_each(|view| view.camera_from_world = DAffine3::IDENTITY);
+    let (found, words) = (suspicions(&scene, &views), format!("{n} of {n} photos have exactly the pose"));
+    assert!(found.iter().any(|suspicion| suspicion.text.contains(&words)), "{found:?}");
+}
+
 #[test]
 fn a_splat_of_a_few_gaussians_is_suspected() {
     let said = |n: usize| {
