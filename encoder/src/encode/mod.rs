@@ -42,7 +42,7 @@ use std::sync::atomic::AtomicBool;
 
 use crate::lift::ContributionError;
 use crate::progress::Progress;
-use crate::store::Store;
+use crate::store::{Store, StoreError};
 use context::RunContext;
 use executor::Executor;
 
@@ -98,7 +98,10 @@ pub(crate) fn encode_by(
     let folder = &settings.output.store;
     let is_new = !folder.exists();
     let context = RunContext::new(settings.run.threads, progress, cancel)?;
-    let encoded = encode_into(executor, settings, engines, &context);
+    let encoded = encode_into(executor, settings, engines, &context).map_err(|error| match error {
+        EncodeError::Records(cause) => StoreError::Records { path: folder.join("db"), cause }.into(),
+        error => error,
+    });
     let is_begun = || ["job", "drawn", "manifest"].iter().any(|name| folder.join(name).exists());
     if encoded.is_err() && is_new && folder.exists() && !is_begun() {
         // What was refused before any work leaves no empty store behind.
