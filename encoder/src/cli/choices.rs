@@ -31,7 +31,7 @@ pub(crate) struct ChoiceArgs {
     view_order: Option<ViewOrder>,
     /// Number of scales at which the built-in segmenter looks, coarsest first [default: the preset's].
     #[arg(long, value_name = "N", help_heading = "Speed and accuracy", hide_short_help = true)]
-    mask_levels: Option<usize>,
+    pub(super) mask_levels: Option<usize>,
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX", help_heading = "Speed and accuracy", hide_short_help = true)]
     min_mask_px: Option<u32>,

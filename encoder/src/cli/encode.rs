@@ -117,9 +117,9 @@ pub struct EncodeArgs {
     /// Most Gaussians in a cell.
     #[arg(long, value_name = "N", default_value_t = MAX_CELL_GAUSSIANS as u32, value_parser = clap::value_parser!(u32).range(1..=MAX_CELL_GAUSSIANS as i64), help_heading = "Output", hide_short_help = true)]
     cell_gaussians: u32,
-    /// Largest width of a cell, metres, in metric scenes.
-    #[arg(long, value_name = "M", default_value_t = DEFAULT_CELL_WIDTH_M, help_heading = "Output", hide_short_help = true)]
-    cell_width_m: f64,
+    /// Largest width of a cell, metres, in metric scenes [default: 25].
+    #[arg(long, value_name = "M", help_heading = "Output", hide_short_help = true)]
+    cell_width_m: Option<f64>,
     /// Shards to make.
     #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL, value_parser = profile_parser(), help_heading = "Output")]
     profiles: Vec<Profile>,
@@ -217,7 +217,12 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     }
     let EncodeSettings { cells, output, .. } = &mut settings;
     cells.limits.max_gaussians = args.cell_gaussians as usize;
-    cells.limits.max_width = metric.then_some(args.cell_width_m);
+    if !metric && args.cell_width_m.is_some() {
+        return Err(anyhow!(
+            "--cell-width-m is in metres, which world units are not known to be; give --metric if they are"
+        ));
+    }
+    cells.limits.max_width = metric.then(|| args.cell_width_m.unwrap_or(DEFAULT_CELL_WIDTH_M));
     cells.shards.profiles = args.profiles.clone();
     if let Some(error) = args.position_error {
         cells.limits.position_error = PositionError::Within(error);
@@ -241,6 +246,17 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
 /// Returns where masks come from, if not from the embedded model.
 fn masks(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<Option<Masks>> {
     let ignore_ids = || args.ignore_mask_ids.clone();
+    let (own, other) = (!["auto", "graph"].contains(&args.masks.as_str()), args.sam.segmenter.is_some());
+    if !own && !args.ignore_mask_ids.is_empty() {
+        return Err(anyhow!(
+            "--ignore-mask-ids is for masks of your own; give these with --masks, or leave it out"
+        ));
+    }
+    if (args.masks != "auto" || other) && args.choices.mask_levels.is_some() {
+        return Err(anyhow!(
+            "--mask-levels is for the embedded model of masks; leave it out, or --masks and --segmenter"
+        ));
+    }
     match (args.masks.as_str(), args.sam.masks(&choices.preset.sam())?) {
         ("auto", of_sam) => Ok(of_sam),
         ("graph", None) => Ok(Some(Masks::Graph)),
@@ -349,44 +365,44 @@ pub(crate) struct SamArgs {
     #[arg(long, value_name = "NAME|DIR", help_heading = "Models")]
     segmenter: Option<PathBuf>,
     /// Points along each side of the grid of prompts: 8, 16, 32, 64 [default: the preset's].
-    #[arg(long, value_name = "N",
+    #[arg(long, requires = "segmenter", value_name = "N",
         value_parser = clap::value_parser!(u32).range(1..=256), help_heading = "Speed and accuracy", hide_short_help = true)]
     points_per_side: Option<u32>,
     /// Points per run of the model: more are faster on GPUs and take more memory.
-    #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_batch,
+    #[arg(long, requires = "segmenter", value_name = "N", default_value_t = SamSettings::default().points_per_batch,
         value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
     sam_points_per_batch: u32,
     /// Least IoU that the model predicts for a mask, 0 to 1 [default: the preset's].
-    #[arg(long, value_name = "IOU", value_parser = parse_f32_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", value_parser = parse_f32_ratio, hide_short_help = true)]
     sam_predicted_iou: Option<f32>,
     /// Least IoU of a mask with itself under a higher and a lower threshold, 0 to 1 [default: the preset's].
-    #[arg(long, value_name = "IOU", value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", value_parser = parse_ratio, hide_short_help = true)]
     sam_stability: Option<f64>,
     /// Distance of those thresholds from 0, logits.
-    #[arg(long, value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset, hide_short_help = true)]
     sam_stability_offset: f32,
     /// IoU of boxes from which two masks are the same.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
     sam_box_nms: f64,
     /// IoU of pixels from which two masks are the same; 1 compares boxes only.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
     sam_mask_nms: f64,
     /// Layers of crops, to find small things: layer i segments 4^i crops besides the whole image [default: the
     /// preset's].
-    #[arg(long, value_name = "N",
+    #[arg(long, requires = "segmenter", value_name = "N",
         value_parser = clap::value_parser!(u32).range(0..=4), hide_short_help = true)]
     sam_crop_layers: Option<u32>,
     /// IoU of boxes from which masks of two crops are the same.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio, hide_short_help = true)]
     sam_crop_nms: f64,
     /// Fills holes and drops islands of masks with fewer pixels [default: the preset's].
-    #[arg(long, value_name = "PX", hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "PX", hide_short_help = true)]
     sam_min_region_px: Option<u32>,
     /// Which of the three masks of each prompt are used [default: the preset's].
-    #[arg(long, value_enum, hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_enum, hide_short_help = true)]
     sam_levels: Option<SamLevels>,
     /// Threads within the model; masks may depend on their number in the last bits [default: all cores].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
+    #[arg(long, requires = "segmenter", value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024), hide_short_help = true)]
     sam_threads: Option<u32>,
 }
 
@@ -475,6 +491,32 @@ mod tests {
         assert_eq!((name(&[]), name(&["--name", "hall"])), ("yard".to_owned(), "hall".to_owned()));
         fs_err::write(folder.join("manifest"), "{").expect("damages");
         assert_eq!(name(&[]), "yard");
+    }
+
+    /// A flag that would have no effect is refused, and what it is for is said.
+    #[test]
+    fn no_flag_is_given_in_vain() {
+        let refused = |flags: &str| {
+            let line = format!("slag-encoder encode --scene a --views b --store c {flags}");
+            let parsed = Cli::try_parse_from(line.split(' ')).map_err(|error| error.to_string())?;
+            let Command::Encode(args) = parsed.command else { panic!("encode") };
+            settings(&args, &args.choices).map(drop).map_err(|error| error.to_string())
+        };
+        for (flags, what) in [
+            ("--cell-width-m 5", "give --metric"),
+            ("--ignore-mask-ids 3", "masks of your own"),
+            ("--masks graph --ignore-mask-ids 3", "masks of your own"),
+            ("--masks own --mask-levels 2", "embedded model"),
+            ("--points-per-side 8", "--segmenter"),
+            ("--sam-box-nms 0.5", "--segmenter"),
+            ("--sam-levels whole", "--segmenter"),
+        ] {
+            let error = refused(flags).expect_err(flags);
+            assert!(error.contains(what), "{flags}: {error}");
+        }
+        for flags in ["--cell-width-m 5 --metric", "--masks own --ignore-mask-ids 3", "--mask-levels 2"] {
+            refused(flags).expect(flags);
+        }
     }
 
     #[test]
