@@ -5,10 +5,10 @@ use std::{num::NonZeroUsize, time::Instant};
 use image::{Rgb, RgbImage};
 use slag_encoder::{
     embed::{EmbedError, crop, embed_masks},
-    masks::{BoxPx, Mask, masks_of_labels},
+    masks::{Bits, BoxPx, Mask, masks_of_labels},
 };
 use slag_models::{Crop, ImageEncoder, InferenceError, ModelDir, SessionOptions};
-use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
+use slag_test_support::{memory_of, needs_shared, onnx_runtime, shared, workspace_root};
 
 struct Labelled {
     photo: RgbImage,
@@ -57,7 +57,7 @@ fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
     let mut encoder = model.image_encoder(&SessionOptions::new(library)).expect("it loads");
     let masks: Vec<Mask> = masks.into_iter().map(|(_, mask)| mask).collect();
     let start = Instant::now();
-    let together = embed_masks(&photo, &masks, &mut *encoder, None).expect("it embeds");
+    let together = embed_masks(&photo, &masks, None, &mut *encoder, None).expect("it embeds");
     let seconds = start.elapsed().as_secs_f64();
     println!("{} crops: {:.0} crops/s on one thread", masks.len(), masks.len() as f64 / seconds);
     assert_eq!(together.len(), masks.len() * 512);
@@ -66,9 +66,9 @@ fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
         let alone = encoder.encode(&[crop]).expect("it encodes");
         assert!(alone == together[i * 512..][..512], "mask {i}");
     }
-    let threes = embed_masks(&photo, &masks, &mut *encoder, NonZeroUsize::new(3));
+    let threes = embed_masks(&photo, &masks, None, &mut *encoder, NonZeroUsize::new(3));
     assert!(threes.expect("it embeds") == together);
-    let none = embed_masks(&photo, &[], &mut *encoder, None);
+    let none = embed_masks(&photo, &[], None, &mut *encoder, None);
     assert_eq!(none.expect("nothing to do"), Vec::<f32>::new());
 }
 
@@ -101,7 +101,7 @@ fn batches_are_bounded_by_count_and_by_pixels() {
     masks.extend((0..3).map(|_| rectangle(0, 0, 3000, 3000)));
     masks.push(rectangle(2999, 2999, 3000, 3000));
     let mut recorder = Recorder { batches: Vec::new() };
-    let vectors = embed_masks(&photo, &masks, &mut recorder, None).expect("it embeds");
+    let vectors = embed_masks(&photo, &masks, None, &mut recorder, None).expect("it embeds");
     // 4 by count; a small one and 2 of 9 million pixels; the rest.
     assert_eq!(recorder.batches, [4, 3, 2]);
     let expected: Vec<f32> =
@@ -109,20 +109,36 @@ fn batches_are_bounded_by_count_and_by_pixels() {
     assert_eq!(vectors, expected);
 }
 
+/// Squares of 64 masks: a batch of four is held at a time, beside the crop that is being cut.
+#[test]
+fn squares_are_held_a_batch_at_a_time() {
+    let photo = RgbImage::new(400, 300);
+    let masks: Vec<Mask> = (0..64).map(|i| rectangle(i, i, i + 200, i + 200)).collect();
+    let preprocess = ModelDir::embedded().expect("opens").preprocess().expect("squares");
+    let mut recorder = Recorder { batches: Vec::new() };
+    let (vectors, taken) = memory_of(|| embed_masks(&photo, &masks, Some(&preprocess), &mut recorder, None));
+    let square_px = preprocess.size_px() as usize;
+    assert_eq!(vectors.expect("it embeds"), [square_px as f32; 128]);
+    assert_eq!(recorder.batches, [4; 16]);
+    // Three colours and the mask, by both sides; twice the crop while it is cut and resized.
+    let most_bytes = 4 * 5 * square_px.pow(2) + 4 * 4 * 200 * 200 + 4096 * 4;
+    assert!(taken.peak_bytes < most_bytes, "{taken:?}, {most_bytes}");
+}
+
 #[test]
 fn masks_that_do_not_fit_are_named() {
     let photo = RgbImage::new(10, 8);
     let beyond = rectangle(5, 5, 11, 8);
     let mut short = rectangle(0, 0, 4, 4);
-    short.inside.pop();
+    short.inside = Bits::of(true, 15);
     let mut empty = rectangle(0, 0, 4, 4);
-    empty.inside.fill(false);
+    empty.inside = Bits::of(false, 16);
     let mut reversed = rectangle(0, 0, 4, 4);
     reversed.box_px = BoxPx { x0: 4, y0: 0, x1: 0, y1: 4 };
     for bad in [beyond, short, empty, reversed] {
         let masks = [rectangle(0, 0, 10, 8), bad];
         let mut recorder = Recorder { batches: Vec::new() };
-        let error = embed_masks(&photo, &masks, &mut recorder, None).expect_err("it must be refused");
+        let error = embed_masks(&photo, &masks, None, &mut recorder, None).expect_err("it must be refused");
         assert!(matches!(error, EmbedError::Mask { index: 1, .. }), "{error}");
         assert!(error.to_string().contains("10x8"), "{error}");
     }

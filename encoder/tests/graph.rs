@@ -22,8 +22,8 @@ fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> V
     let input = SegmentInput { view: &view, image, valid, undistorter: None, depth, pool: None };
     let masks = GraphSegmenter::default().segment(&input).unwrap();
     for mask in &masks {
-        let n_inside = mask.inside.iter().filter(|inside| **inside).count();
-        assert_eq!((n_inside, mask.inside.len()), (mask.area_px as usize, box_area(mask)));
+        let n_inside = mask.inside.count();
+        assert_eq!((n_inside, mask.inside.n_px()), (mask.area_px as usize, box_area(mask)));
         assert!(mask.box_px.x1 <= width_px && mask.box_px.y1 <= height_px);
     }
     masks

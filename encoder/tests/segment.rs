@@ -314,7 +314,7 @@ fn house_masks_have_the_pixels_that_the_scene_states() {
             image::open(scene.join("gt/masks").join(&view.name).with_extension("png")).unwrap().into_luma8();
         for mask in given.load(&input).unwrap().unwrap() {
             // The id, which a mask does not carry, is that of any of its pixels.
-            let first = mask.inside.iter().position(|inside| *inside).unwrap() as u32;
+            let first = mask.inside.iter().position(|inside| inside).unwrap() as u32;
             let (x, y) = (first % mask.box_px.width_px(), first / mask.box_px.width_px());
             let id = u32::from(png.get_pixel(mask.box_px.x0 + x, mask.box_px.y0 + y).0[0]);
             *found_px.entry(id).or_insert(0) += u64::from(mask.area_px);

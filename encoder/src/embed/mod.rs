@@ -73,22 +73,36 @@ impl PatchUse {
 /// Largest number of pixels in a batch of crops; large crops fill a batch before the encoder's preferred number.
 const MAX_BATCH_PIXELS: u64 = 1 << 24;
 
+/// Crops in a batch of an encoder on the processor, at most, unless model.toml asks for more.
+const BATCH: u64 = 32;
+
+/// Returns the bytes of the crops that [`embed_masks`] holds of a photo of so many pixels: a batch, and one that is
+/// being cut.
+pub(crate) fn batch_bytes(squares: Option<&Preprocess>, photo_px: u64) -> u64 {
+    let batch_px = match squares {
+        Some(preprocess) => BATCH * u64::from(preprocess.size_px()).pow(2),
+        None => MAX_BATCH_PIXELS.min(BATCH * photo_px),
+    };
+    // Three colours, and whether it is inside the mask.
+    4 * (batch_px + photo_px)
+}
+
 /// Crops the image to the bounding box of a mask; pixels outside the mask become white.
 ///
 /// Returns `None` if the mask does not fit the image or is empty.
 pub fn crop(image: &RgbImage, mask: &Mask) -> Option<Crop> {
     let BoxPx { x0, y0, x1, y1 } = mask.box_px;
     let fits = x0 < x1 && y0 < y1 && x1 <= image.width() && y1 <= image.height();
-    if !fits || !mask.inside.contains(&true) {
+    if !fits || mask.inside.count() == 0 {
         return None;
     }
     let mut pixels = imageops::crop_imm(image, x0, y0, x1 - x0, y1 - y0).to_image();
-    if u64::from(x1 - x0) * u64::from(y1 - y0) != mask.inside.len() as u64 {
+    if u64::from(x1 - x0) * u64::from(y1 - y0) != mask.inside.n_px() as u64 {
         return None;
     }
-    let outside = pixels.pixels_mut().zip(&mask.inside).filter(|(_, inside)| !**inside);
+    let outside = pixels.pixels_mut().zip(mask.inside.iter()).filter(|(_, inside)| !*inside);
     outside.for_each(|(pixel, _)| *pixel = Rgb([255; 3]));
-    Crop::new(pixels, mask.inside.clone())
+    Crop::new(pixels, mask.inside.iter().collect())
 }
 
 /// Returns the crop of mask `index`, or the error.
@@ -96,7 +110,7 @@ fn crop_of(image: &RgbImage, (index, mask): (usize, &Mask)) -> Result<Crop, Embe
     crop(image, mask).ok_or_else(|| EmbedError::Mask {
         index,
         box_px: mask.box_px,
-        n_inside: mask.inside.iter().filter(|&&inside| inside).count(),
+        n_inside: mask.inside.count(),
         width_px: image.width(),
         height_px: image.height(),
     })
@@ -121,14 +135,15 @@ pub(crate) fn embed_crops(
     })
 }
 
-/// Returns a unit vector per mask, `[masks][dim]`.
+/// Returns a unit vector per mask, `[masks][dim]`. `squares`: how crops become the encoder's squares, if they do.
 ///
 /// `batch`: crops given to the encoder at once, its own preference if `None`. Batches depend on the masks
 /// alone, so that models whose vectors vary with the batch (8-bit ones with scales found at run time)
-/// give the same ones on every machine. Memory: one batch of crops, 48 MiB of pixels or one crop.
+/// give the same ones on every machine. Memory: see [`batch_bytes`].
 pub fn embed_masks(
     image: &RgbImage,
     masks: &[Mask],
+    squares: Option<&Preprocess>,
     encoder: &mut dyn ImageEncoder,
     batch: Option<NonZeroUsize>,
 ) -> Result<Vec<f32>, EmbedError> {
@@ -138,8 +153,13 @@ pub fn embed_masks(
     let mut n_pixels = 0;
     for (index, mask) in masks.iter().enumerate() {
         let crop = crop_of(image, (index, mask))?;
-        n_pixels += mask.inside.len() as u64;
-        crops.push(crop);
+        match squares {
+            Some(preprocess) => crops.push(Crop::whole(preprocess.square(crop.image()))),
+            None => {
+                n_pixels += mask.inside.n_px() as u64;
+                crops.push(crop);
+            }
+        }
         if crops.len() >= batch || n_pixels >= MAX_BATCH_PIXELS || index + 1 == masks.len() {
             vectors.extend(embed_crops(&crops, index + 1 - crops.len(), encoder)?);
             crops.clear();

@@ -22,10 +22,12 @@ use crate::{check, ingest};
 const MIN_VISIBLE_ONE_IN: usize = 20;
 
 /// Bytes that a pixel of a photo takes while it is worked on: three as read and three without distortion, one for
-/// whether the lens shows it, four each for its depth and its segment.
-const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
-/// Of these, while it waits: its colours, whether the lens shows it, its depth.
-const WAITING_BYTES_PER_PX: u64 = 3 + 1 + 4;
+/// whether the lens shows it, four each for its depth and its segment, and its masks.
+const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4 + MASK_BYTES_PER_PX;
+/// Of these, while it waits: its colours, whether the lens shows it, its depth, its masks.
+const WAITING_BYTES_PER_PX: u64 = 3 + 1 + 4 + MASK_BYTES_PER_PX;
+/// A bit for each pixel in the box of a mask: of 32 masks as large as the photo, or of hundreds as they are.
+const MASK_BYTES_PER_PX: u64 = 4;
 
 pub(crate) struct Inputs {
     pub(crate) scene: Gaussians,
@@ -110,6 +112,17 @@ pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], n_in_work:
     let waiting_px: u64 = rest.iter().take(n_under_way.saturating_sub(n_in_work)).sum();
     memory.reserve(Phase::Views, "photos in work", in_work.iter().sum::<u64>() * PHOTO_BYTES_PER_PX);
     memory.reserve(Phase::Views, "photos that wait", waiting_px * WAITING_BYTES_PER_PX);
+}
+
+/// Reserves the crops of the largest photos that threads work on. `crops_bytes`: by the pixels of the photo.
+pub(super) fn reserve_crops(
+    memory: &mut MemoryPlan,
+    views: &[View],
+    n_in_work: usize,
+    crops_bytes: impl Fn(u64) -> u64,
+) {
+    let bytes = areas_px(views).into_iter().take(n_in_work).map(crops_bytes).sum();
+    memory.reserve(Phase::Views, "crops in work", bytes);
 }
 
 /// Reserves the largest photos that threads cut thumbnails from.
@@ -229,7 +242,7 @@ mod tests {
     }
 
     /// By hand: a photo of 400 x 300 pixels, whose file is absent, and two of 40 x 30, which their headers say, of
-    /// the same camera. Two are worked on, 15 bytes a pixel; of two more that may wait there is one, 8 bytes a
+    /// the same camera. Two are worked on, 19 bytes a pixel; of two more that may wait there is one, 12 bytes a
     /// pixel.
     #[test]
     fn photos_are_reserved_by_their_files_in_work_and_waiting() {
@@ -246,6 +259,6 @@ mod tests {
         let mut memory = MemoryPlan::new(0);
         reserve_photos(&mut memory, &["a.png", "b.png", "c.png"].map(view), 2, 4);
         let refused = memory.rest(0).expect_err("nothing fits");
-        assert_eq!(refused.needed_bytes, 15 * (400 * 300 + 40 * 30) + 8 * 40 * 30);
+        assert_eq!(refused.needed_bytes, 19 * (400 * 300 + 40 * 30) + 12 * 40 * 30);
     }
 }

@@ -18,7 +18,6 @@ use super::report::LostViews;
 use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSettings};
 use super::view::ViewTools;
 use crate::cells::CellSplit;
-use crate::embed::SharedEncoders;
 use crate::ground::{self, Standing};
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
@@ -119,7 +118,7 @@ impl Plan<'_> {
     /// Reserves what depends on segmenter and views.
     fn reserve_views(&mut self) -> Result<(), EncodeError> {
         let mut memory = self.memory.clone();
-        self.view_tools().reserve_photos(&mut memory, &self.inputs.views);
+        self.view_tools().reserve(&mut memory, &self.inputs.views);
         memory.rest(0)?;
         self.memory = memory;
         Ok(())
@@ -180,11 +179,6 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {
         objects::reserve(&mut memory, n_gaussians, settings.aggregation.has_fine_superpoints());
-    }
-    if let (false, Some(preprocess)) = (engines.session.is_on_cpu(), engines.models.preprocess()) {
-        // A byte a channel, and one for the mask.
-        let square_bytes = 4 * u64::from(preprocess.size_px()).pow(2);
-        SharedEncoders::reserve(&mut memory, &settings.run.gpus, square_bytes);
     }
     memory
 }

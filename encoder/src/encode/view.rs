@@ -110,9 +110,9 @@ struct Cropped {
 }
 
 enum Crops {
-    /// Squares of the model's size.
+    /// Squares of the model's size, for GPUs that take those of several views at once.
     Squares(Vec<Crop>),
-    /// For a model that takes crops of any size: they are cut from the photo a batch at a time.
+    /// They are cut from the photo a batch at a time.
     Uncut(Arc<RgbImage>, Vec<Mask>),
 }
 
@@ -172,19 +172,28 @@ impl ViewTools<'_> {
         stages
     }
 
-    /// Returns whether photos are kept until their crops are embedded.
-    fn embeds_photos(&self) -> bool {
-        let models = self.engines.models;
+    /// Reserves the photos on their way, with masks and crops.
+    pub(crate) fn reserve(&self, memory: &mut MemoryPlan, views: &[View]) {
+        let Engines { models, session, .. } = self.engines;
+        let preprocess = models.preprocess();
+        let on_gpus = preprocess.as_ref().filter(|_| !session.is_on_cpu());
         let wants_patches = self.settings.regions != Regions::Crops && models.patches_per_side().is_some();
-        models.preprocess().is_none() || wants_patches
-    }
-
-    pub(crate) fn reserve_photos(&self, memory: &mut MemoryPlan, views: &[View]) {
         let stages = self.stages();
         let at = |name| stages.iter().position(|stage| stage.name == name).unwrap_or(0);
-        let last = at(if self.embeds_photos() { "embed" } else { "crop" });
+        // Until their crops are cut, or embedded.
+        let last = at(if on_gpus.is_none() || wants_patches { "embed" } else { "crop" });
         let n_under_way = pipeline::most_under_way(&stages, at("decode")..=last, self.n_threads);
         inputs::reserve_photos(memory, views, self.n_threads, n_under_way);
+        let crops_bytes = |photo_px: u64| match on_gpus {
+            // One that is being cut.
+            Some(_) => 4 * photo_px,
+            None => embed::batch_bytes(preprocess.as_ref(), photo_px),
+        };
+        inputs::reserve_crops(memory, views, self.n_threads, crops_bytes);
+        if let Some(preprocess) = on_gpus {
+            // A byte a channel, and one for the mask.
+            SharedEncoders::reserve(memory, self.gpus, 4 * u64::from(preprocess.size_px()).pow(2));
+        }
     }
 }
 
@@ -315,12 +324,12 @@ impl<'a> ViewStages<'a> {
             of
         });
         let photo = Arc::new(loaded.image);
-        let crops = match &self.preprocess {
-            Some(preprocess) => Crops::Squares(
+        let crops = match (&self.preprocess, &self.encoders) {
+            (Some(preprocess), Encoders::Shared(_)) => Crops::Squares(
                 embed::squares(&photo, &masks, preprocess)
                     .map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?,
             ),
-            None => Crops::Uncut(Arc::clone(&photo), masks),
+            _ => Crops::Uncut(Arc::clone(&photo), masks),
         };
         let patches = patches.map(|uses| (photo, uses));
         Ok(Cropped { crops, windows, patches, partition })
@@ -382,7 +391,9 @@ impl<'a> ViewStages<'a> {
                 self.with_encoder(|encoder| embed::embed_crops(&crops, 0, encoder))?.map_err(failed)?
             }
             (_, Crops::Uncut(photo, masks)) => self
-                .with_encoder(|encoder| embed::embed_masks(&photo, &masks, encoder, None))?
+                .with_encoder(|encoder| {
+                    embed::embed_masks(&photo, &masks, self.preprocess.as_ref(), encoder, None)
+                })?
                 .map_err(failed)?,
         };
         if let Some((photo, patches)) = patches {

@@ -16,7 +16,7 @@ use super::plan::Plan;
 use super::report::{Phase, SkippedView, StageReport};
 use super::sink::{ViewRecord, ViewSink};
 use crate::landmarks;
-use crate::occupancy::{self, SceneOccupancy};
+use crate::occupancy::{self, OccupancyError, SceneOccupancy};
 use crate::shard;
 
 /// The views of a run, done or left out.
@@ -82,10 +82,17 @@ pub(super) fn look_around(
     let Some(settings) = plan.settings.cells.occupancy else { return Ok(None) };
     context.begin_phase(Phase::Occupancy);
     let Inputs { scene, split, .. } = plan.inputs;
-    let find = || occupancy::find(scene, split, plan.scene.as_ref(), &views.used, settings, context.cancel);
+    let drawn = plan.scene.as_ref();
+    let memory = plan.memory.clone();
+    let find = || occupancy::find(scene, split, drawn, &views.used, settings, memory, context.cancel);
     let found = context.time("occupancy", || context.install(find));
     let found = found
-        .map_err(|(at, source)| EncodeError::Raster { view: views.used[at].name.clone(), source })?
+        .map_err(|error| match error {
+            OccupancyError::Memory(error) => error.into(),
+            OccupancyError::View(at, source) => {
+                EncodeError::Raster { view: views.used[at].name.clone(), source }
+            }
+        })?
         .ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })?;
     Ok(Some(found))
 }

@@ -99,7 +99,7 @@ impl Prepared {
         CellSplit::reserve(&mut memory, self.scene.len());
         ground::reserve(&mut memory, self.scene.len());
         raster::reserve(&mut memory, self.scene.len());
-        tools.reserve_photos(&mut memory, &self.views);
+        tools.reserve(&mut memory, &self.views);
         memory.rest(0)?;
         Ok(())
     }

@@ -31,6 +31,8 @@ const MAX_PATCH: [f64; 2] = [0.125, 0.35];
 const SAMPLE: usize = 1 << 22;
 /// Standard deviations of a Gaussian that it reaches; with 1 what stands close together is one thing.
 const REACH: f64 = 0.5;
+/// Gaussians that are looked at before their parts are told.
+const AT_ONCE: usize = 1 << 16;
 /// Bits of a voxel's coordinate.
 const BITS: u32 = 21;
 
@@ -116,13 +118,15 @@ impl Standing {
             let is_standing = things.voxel_of(point).is_some_and(|voxel| things.of(voxel).is_some());
             (is_standing, !is_standing && things.is_roofed(point))
         };
-        let lie: Vec<(bool, bool)> = scene.means_in_world.par_iter().map(lies).collect();
         let mut found = vec![Footprint::NONE; n_parts];
-        for ((mean, (is_standing, is_roofed)), part) in scene.means_in_world.iter().zip(lie).zip(part_of) {
-            let Some(of_part) = found.get_mut(*part as usize) else { continue };
-            let at = (things.upright_from_world * *mean).truncate();
-            let (n_standing, n_roofed) = (u32::from(is_standing), u32::from(is_roofed));
-            *of_part = of_part.with(Footprint { n: 1, n_standing, n_roofed, low: at, high: at });
+        for (means, part_of) in scene.means_in_world.chunks(AT_ONCE).zip(part_of.chunks(AT_ONCE)) {
+            let lie: Vec<(bool, bool)> = means.par_iter().map(lies).collect();
+            for ((mean, (is_standing, is_roofed)), part) in means.iter().zip(lie).zip(part_of) {
+                let Some(of_part) = found.get_mut(*part as usize) else { continue };
+                let at = (things.upright_from_world * *mean).truncate();
+                let (n_standing, n_roofed) = (u32::from(is_standing), u32::from(is_roofed));
+                *of_part = of_part.with(Footprint { n: 1, n_standing, n_roofed, low: at, high: at });
+            }
         }
         found
     }

@@ -45,8 +45,8 @@ impl MaskOutline {
         };
         let may_be_cut = valid.is_some() || x0 == 0 || y0 == 0 || x1 >= width_px || y1 >= height_px;
         let rows = if may_be_cut { y0..y1 } else { 0..0 };
-        let pixels = rows.flat_map(|y| (x0..x1).map(move |x| (x, y))).zip(&mask.inside);
-        let cut_px = pixels.filter(|(_, inside)| **inside).map(|((x, y), _)| n_cut(x, y) as u32).sum();
+        let pixels = rows.flat_map(|y| (x0..x1).map(move |x| (x, y))).zip(mask.inside.iter());
+        let cut_px = pixels.filter(|(_, inside)| *inside).map(|((x, y), _)| n_cut(x, y) as u32).sum();
         Self { box_px: [x0, y0, x1, y1], cut_px, level: mask.level.into() }
     }
 

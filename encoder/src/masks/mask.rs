@@ -1,5 +1,7 @@
 //! One mask of an image.
 
+use super::bits::Bits;
+
 /// Label of a pixel outside all masks, in [`RegionMap::region_of_pixel`](super::RegionMap::region_of_pixel) and in label images.
 pub const NO_REGION: u32 = u32::MAX;
 
@@ -31,7 +33,7 @@ impl BoxPx {
 pub struct Mask {
     pub box_px: BoxPx,
     /// Membership, row-major within the box.
-    pub inside: Vec<bool>,
+    pub inside: Bits,
     pub area_px: u32,
     /// Coarseness, if the segmenter has several levels: 0 is the coarsest (whole objects); or [`Mask::FILLER`].
     pub level: u8,
@@ -47,7 +49,7 @@ impl Mask {
     /// Makes a mask of all pixels of a box, with level 0.
     pub fn whole(box_px: BoxPx) -> Self {
         let area_px = box_px.width_px() * box_px.height_px();
-        Self { box_px, inside: vec![true; area_px as usize], area_px, level: 0 }
+        Self { box_px, inside: Bits::of(true, area_px as usize), area_px, level: 0 }
     }
 
     /// Makes a mask of those pixels of a box that are inside, with level 0.
@@ -55,8 +57,8 @@ impl Mask {
     pub(crate) fn within(box_px: BoxPx, is_inside: impl Fn(u32, u32) -> bool) -> Self {
         let BoxPx { x0, y0, x1, y1 } = box_px;
         let pixels = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y)));
-        let inside: Vec<bool> = pixels.map(|(x, y)| is_inside(x, y)).collect();
-        let area_px = inside.iter().filter(|inside| **inside).count() as u32;
+        let inside: Bits = pixels.map(|(x, y)| is_inside(x, y)).collect();
+        let area_px = inside.count() as u32;
         Self { box_px, inside, area_px, level: 0 }
     }
 
@@ -64,19 +66,19 @@ impl Mask {
         let BoxPx { x0, y0, x1, y1 } = self.box_px;
         (x0..x1).contains(&x)
             && (y0..y1).contains(&y)
-            && self.inside[(y - y0) as usize * self.box_px.width_px() as usize + (x - x0) as usize]
+            && self.inside.get((y - y0) as usize * self.box_px.width_px() as usize + (x - x0) as usize)
     }
 }
 
 /// Converts a label image into one mask per label except [`NO_REGION`], in ascending order of the labels.
 ///
 /// `labels`: row-major, `width_px` per row, each below `n_labels` or [`NO_REGION`]. Returns `None` if the boxes of
-/// all masks together exceed `limit_bytes`.
+/// all masks together exceed `limit_px`.
 pub fn masks_of_labels(
     labels: &[u32],
     width_px: u32,
     n_labels: usize,
-    limit_bytes: u64,
+    limit_px: u64,
 ) -> Option<Vec<(u32, Mask)>> {
     let empty = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
     let mut boxes = vec![(empty, 0_u32); n_labels];
@@ -91,16 +93,16 @@ pub fn masks_of_labels(
             *area_px += 1;
         }
     }
-    let box_bytes = |b: &BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
-    let total_bytes: u64 = boxes.iter().filter(|(_, area)| *area > 0).map(|(b, _)| box_bytes(b)).sum();
-    if total_bytes > limit_bytes {
+    let box_area_px = |b: &BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
+    let total_px: u64 = boxes.iter().filter(|(_, area)| *area > 0).map(|(b, _)| box_area_px(b)).sum();
+    if total_px > limit_px {
         return None;
     }
     let mut slot_of_label = vec![usize::MAX; n_labels];
     let mut masks = Vec::new();
     for ((box_px, area_px), label) in boxes.into_iter().zip(0_u32..).filter(|((_, area), _)| *area > 0) {
         slot_of_label[label as usize] = masks.len();
-        let inside = vec![false; box_bytes(&box_px) as usize];
+        let inside = Bits::of(false, box_area_px(&box_px) as usize);
         masks.push((label, Mask { box_px, inside, area_px, level: 0 }));
     }
     for (row, y) in rows() {
@@ -108,7 +110,7 @@ pub fn masks_of_labels(
             let mask = &mut masks[slot_of_label[*label as usize]].1;
             let at = (y - mask.box_px.y0) as usize * mask.box_px.width_px() as usize
                 + (x - mask.box_px.x0) as usize;
-            mask.inside[at] = true;
+            mask.inside.set(at, true);
         }
     }
     Some(masks)

@@ -37,9 +37,10 @@ pub fn shares(mask: &Mask, per_side: u32, width_px: u32, height_px: u32) -> Vec<
     let BoxPx { x0, y0, x1, y1 } = mask.box_px;
     let columns: Vec<usize> = (x0..x1).map(|x| patch(x, width_px)).collect();
     let mut counts = BTreeMap::<usize, u32>::new();
-    for (y, row) in (y0..y1).zip(mask.inside.chunks_exact(columns.len().max(1))) {
+    let mut inside = mask.inside.iter();
+    for y in y0..y1 {
         let first = patch(y, height_px) * per_side as usize;
-        for (column, _) in columns.iter().zip(row).filter(|(_, inside)| **inside) {
+        for (column, _) in columns.iter().zip(inside.by_ref()).filter(|(_, inside)| *inside) {
             *counts.entry(first + column).or_default() += 1;
         }
     }
@@ -115,7 +116,7 @@ mod tests {
             let patches = patch_masks(per_side, width, height);
             let mut seen = vec![0; (width * height) as usize];
             for (index, mask) in &patches {
-                assert_eq!(mask.area_px as usize, mask.inside.len());
+                assert_eq!(mask.area_px as usize, mask.inside.n_px());
                 for y in mask.box_px.y0..mask.box_px.y1 {
                     for x in mask.box_px.x0..mask.box_px.x1 {
                         let of = |at: u32, edge: u32| {

@@ -264,7 +264,7 @@ fn for_each_pixel(mask: &Mask, columns: &[u32], rows: &[u32], mut visit: impl Fn
     for row in in_rows {
         let start = (rows[row] - box_px.y0) as usize * box_px.width_px() as usize;
         for column in in_columns.clone() {
-            if mask.inside[start + (columns[column] - box_px.x0) as usize] {
+            if mask.inside.get(start + (columns[column] - box_px.x0) as usize) {
                 visit(row * columns.len() + column);
             }
         }

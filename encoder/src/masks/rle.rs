@@ -6,6 +6,7 @@
 
 use serde::Serialize;
 
+use super::bits::Bits;
 use super::mask::{BoxPx, Mask};
 
 /// Most digits of a number with 32 bits and a sign, at 5 bits per digit.
@@ -117,17 +118,17 @@ impl Rle {
 
     /// Decodes to a mask of level 0; `None` if the mask is empty.
     ///
-    /// Allocates one byte per pixel of the bounding box, which [`Rle::box_px`] returns beforehand.
+    /// Allocates one bit per pixel of the bounding box, which [`Rle::box_px`] returns beforehand.
     pub fn to_mask(&self) -> Option<Mask> {
         let box_px = self.box_px()?;
         let width = box_px.width_px() as usize;
-        let mut inside = vec![false; width * box_px.height_px() as usize];
+        let mut inside = Bits::of(false, width * box_px.height_px() as usize);
         let mut area_px = 0;
         for (start, len) in self.runs_inside() {
             for pixel in start..start + len {
                 let x = (pixel / u64::from(self.height_px)) as u32 - box_px.x0;
                 let y = (pixel % u64::from(self.height_px)) as u32 - box_px.y0;
-                inside[y as usize * width + x as usize] = true;
+                inside.set(y as usize * width + x as usize, true);
             }
             area_px += len as u32;
         }

@@ -20,6 +20,10 @@ pub enum Phase {
     Always,
     /// While views are worked on.
     Views,
+    /// While free and occupied places are found.
+    Occupancy,
+    /// While photos are searched for landmarks.
+    Landmarks,
     /// While superpoints are found.
     Superpoints,
     /// While objects are found.
@@ -30,7 +34,17 @@ pub enum Phase {
     Cells,
 }
 
-const PHASES: [Phase; 5] = [Phase::Views, Phase::Superpoints, Phase::Objects, Phase::Refine, Phase::Cells];
+/// Those that come before the contributions of all views are opened first.
+const PHASES: [Phase; 7] = [
+    Phase::Views,
+    Phase::Occupancy,
+    Phase::Landmarks,
+    Phase::Superpoints,
+    Phase::Objects,
+    Phase::Refine,
+    Phase::Cells,
+];
+const N_BEFORE_MERGE: usize = 3;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reservation {
@@ -63,6 +77,8 @@ impl fmt::Display for MemoryError {
         let or_else = match (is_before_views, phase) {
             (true, Phase::Views) => " or lower --threads",
             (true, Phase::Cells) => " or lower --cell-gaussians",
+            (true, Phase::Occupancy) => " or give --occupancy larger voxels",
+            (true, Phase::Landmarks) => " or leave --locate out",
             _ => "",
         };
         let parts = parts.iter().map(|part| format!("{} for {}", part.len_bytes, part.purpose));
@@ -74,8 +90,8 @@ impl fmt::Display for MemoryError {
 
 /// The reservations of a run, within a budget.
 ///
-/// The plan covers the scene, the photos in work, cells, codebooks, objects, superpoints, mask vectors and
-/// contributions. It does not cover models: ONNX Runtime states no bound.
+/// The plan covers the scene, the photos in work with their masks and crops, places, landmarks, cells, codebooks,
+/// objects, superpoints, mask vectors and contributions. It does not cover models: ONNX Runtime states no bound.
 #[derive(Clone, Debug)]
 pub struct MemoryPlan {
     available_bytes: u64,
@@ -112,7 +128,7 @@ impl MemoryPlan {
 
     /// Returns the bytes that the most expensive phase leaves for the contributions that are read at a time.
     pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
-        let phases = &PHASES[usize::from(!self.is_before_views)..];
+        let phases = &PHASES[if self.is_before_views { 0 } else { N_BEFORE_MERGE }..];
         let most = phases.iter().copied().max_by_key(|phase| self.reserved_bytes(*phase));
         let most = most.unwrap_or(Phase::Always);
         let needed_bytes = self.reserved_bytes(most).saturating_add(contributions_bytes);

@@ -117,17 +117,31 @@ impl Ellipsoid {
     }
 }
 
+impl Ellipsoid {
+    /// Returns the tiles that the box reaches along each axis.
+    fn reached(&self) -> Option<Reached> {
+        Some([self.tiles(0)?, self.tiles(1)?, self.tiles(2)?])
+    }
+}
+
+type Reached = [RangeInclusive<i32>; 3];
+
+/// Returns the bytes that the lists of [`occupied`] take at most, but for the blocks that it returns.
+pub(super) fn working_bytes(scene: &Gaussians, usable: &[u32], lattice: Lattice) -> u64 {
+    let n_tiles = |index: &u32| {
+        let reached = Ellipsoid::new(scene, *index as usize, lattice).and_then(|of| of.reached());
+        reached.map_or(0, |reached| reached.iter().map(|along| along.clone().count() as u64).product())
+    };
+    let n_pairs: u64 = usable.par_iter().map(n_tiles).sum();
+    // Lists double when they are full.
+    (usable.len() * size_of::<Option<Reached>>()) as u64 + n_pairs * 2 * size_of::<u32>() as u64
+}
+
 /// Finds the occupied voxels. `usable`: the Gaussians to take, ascending. The result does not depend on threads: a
 /// tile belongs to one, and adds its Gaussians in their order.
 pub(super) fn occupied(scene: &Gaussians, usable: &[u32], lattice: Lattice) -> Occupied {
     let ellipsoid = |index: &u32| Ellipsoid::new(scene, *index as usize, lattice);
-    let reached: Vec<Option<[RangeInclusive<i32>; 3]>> = usable
-        .par_iter()
-        .map(|index| {
-            let ellipsoid = ellipsoid(index)?;
-            Some([ellipsoid.tiles(0)?, ellipsoid.tiles(1)?, ellipsoid.tiles(2)?])
-        })
-        .collect();
+    let reached: Vec<Option<Reached>> = usable.par_iter().map(|index| ellipsoid(index)?.reached()).collect();
     let n_background = reached.iter().filter(|tiles| tiles.is_none()).count();
     let mut of_tile: BTreeMap<[i32; 3], Vec<u32>> = BTreeMap::new();
     for (index, tiles) in usable.iter().zip(reached) {

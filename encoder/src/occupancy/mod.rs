@@ -18,9 +18,10 @@ use slag_common::occupancy::{Block, BuiltOccupancy};
 use slag_common::{Gaussians, View};
 
 use crate::cells::{CellSplit, NO_CELL};
-use crate::memory::{MemoryPlan, Phase};
+use crate::memory::{MemoryError, MemoryPlan, Phase};
 use crate::raster::{LoadedScene, RasterError, RasterView};
 use lattice::Lattice;
+use seen::Candidate;
 
 pub use density::MIN_OPACITY;
 pub(crate) use seen::MIN_VIEWS;
@@ -57,25 +58,46 @@ impl SceneOccupancy {
     }
 }
 
-/// Finds the free and occupied places of a scene from its Gaussians and the views that look at it; `None` if
-/// cancelled.
-///
-/// # Errors
-/// A view cannot be drawn: its index in `views`, and the cause.
-pub fn find(
+/// Bytes for each place that is looked at: with what was seen there, and twice as a block, in a list of all and in that
+/// of its cell.
+const BYTES_PER_CANDIDATE: u64 = (size_of::<Candidate>() + 2 * size_of::<Block>()) as u64;
+
+pub(crate) enum OccupancyError {
+    Memory(MemoryError),
+    /// A view, by its index, cannot be drawn.
+    View(usize, RasterError),
+}
+
+impl From<MemoryError> for OccupancyError {
+    fn from(error: MemoryError) -> Self {
+        Self::Memory(error)
+    }
+}
+
+/// Finds the free and occupied places of a scene from its Gaussians and the views that look at it, within `memory`;
+/// `None` if cancelled.
+pub(crate) fn find(
     gaussians: &Gaussians,
     split: &CellSplit,
     scene: &dyn LoadedScene,
     views: &[&View],
     settings: OccupancySettings,
+    mut memory: MemoryPlan,
     cancel: &AtomicBool,
-) -> Result<Option<SceneOccupancy>, (usize, RasterError)> {
+) -> Result<Option<SceneOccupancy>, OccupancyError> {
     let start = std::time::Instant::now();
     let lattice = Lattice { voxel: settings.voxel_m };
     let in_cells = (0u32..).zip(&split.cell_of_gaussian).filter(|(_, cell)| **cell != NO_CELL);
     let usable: Vec<u32> = in_cells.map(|(index, _)| index).collect();
+    let lists_bytes = density::working_bytes(gaussians, &usable, lattice);
+    memory.reserve(Phase::Occupancy, "the voxels of each Gaussian", lists_bytes);
+    memory.rest(0)?;
     let occupied = density::occupied(gaussians, &usable, lattice);
-    let mut candidates = seen::candidates(&occupied.blocks, lattice);
+    let n_candidates = seen::candidates(&occupied.blocks, lattice).count() as u64;
+    memory.reserve(Phase::Occupancy, "places that may be free", n_candidates * BYTES_PER_CANDIDATE);
+    memory.rest(0)?;
+    let mut candidates: Vec<Candidate> = Vec::with_capacity(n_candidates as usize);
+    candidates.extend(seen::candidates(&occupied.blocks, lattice));
     for (at, view) in views.iter().enumerate() {
         if cancel.load(Ordering::Relaxed) {
             return Ok(None);
@@ -83,7 +105,7 @@ pub fn find(
         let width_px = seen::DEPTH_WIDTH_PX.min(view.intrinsics.width_px);
         let intrinsics = view.intrinsics.without_distortion().scaled_to_width(width_px);
         let view = RasterView { camera_from_world: view.camera_from_world, intrinsics };
-        let drawing = scene.draw(&view, [0.0; 3]).map_err(|source| (at, source))?;
+        let drawing = scene.draw(&view, [0.0; 3]).map_err(|source| OccupancyError::View(at, source))?;
         seen::Depth::new(view, &drawing).look(lattice, &mut candidates);
     }
     let blocks: Vec<Block> = candidates

@@ -31,19 +31,17 @@ pub(super) struct Candidate {
     pub(super) seen: u64,
 }
 
-/// Returns the blocks with an occupied voxel and those above them up to the headroom, by place. `occupied`: by
-/// place.
-pub(super) fn candidates(occupied: &[(BlockAt, u64)], lattice: Lattice) -> Vec<Candidate> {
+/// Yields the blocks with an occupied voxel and those above them up to the headroom, by place. `occupied`: by place.
+pub(super) fn candidates(occupied: &[(BlockAt, u64)], lattice: Lattice) -> impl Iterator<Item = Candidate> {
     let above = (HEADROOM / lattice.block()).ceil() as i32;
-    let mut all: Vec<Candidate> = Vec::new();
-    for ((at, mask), next) in occupied.iter().zip(occupied.iter().skip(1).map(Some).chain([None])) {
+    let with_next = occupied.iter().zip(occupied.iter().skip(1).map(Some).chain([None]));
+    with_next.flat_map(move |((at, mask), next)| {
         let block = |z: i32, occupied| Candidate { at: [at[0], at[1], z], occupied, once: 0, seen: 0 };
-        all.push(block(at[2], *mask));
         // Blocks of a column follow each other.
         let limit = next.filter(|(next, _)| next[..2] == at[..2]).map_or(i32::MAX, |(next, _)| next[2]);
-        all.extend((at[2] + 1..limit.min(at[2] + above + 1)).map(|z| block(z, 0)));
-    }
-    all
+        let higher = at[2] + 1..limit.min(at[2] + above + 1);
+        std::iter::once(block(at[2], *mask)).chain(higher.map(move |z| block(z, 0)))
+    })
 }
 
 /// A depth picture: how far each pixel looks.

@@ -23,7 +23,7 @@ use super::colour::{distance, lab_of, smooth};
 use super::segmenter::{SegmentError, SegmentInput, Segmenter};
 use super::support;
 use crate::masks::regions::nearest;
-use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
+use crate::masks::{Bits, BoxPx, Mask, NO_REGION, masks_of_labels};
 
 /// Steps of an edge weight per unit of L*a*b* distance; 16 bits then exceed the distance from black to white.
 const WEIGHT_STEPS: f32 = 200.0;
@@ -495,13 +495,13 @@ fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
     };
     let ((x0, x1), (y0, y1)) =
         (range(columns, mask.box_px.x0, mask.box_px.x1), range(rows, mask.box_px.y0, mask.box_px.y1));
-    let mut inside = Vec::with_capacity((x1 - x0) as usize * (y1 - y0) as usize);
-    for row in &rows[y0 as usize..y1 as usize] {
+    let of_row = |row: &u32| {
         let start = (row - mask.box_px.y0) as usize * mask.box_px.width_px() as usize;
         let columns = &columns[x0 as usize..x1 as usize];
-        inside.extend(columns.iter().map(|column| mask.inside[start + (column - mask.box_px.x0) as usize]));
-    }
-    let area_px = inside.iter().filter(|inside| **inside).count() as u32;
+        columns.iter().map(move |column| mask.inside.get(start + (column - mask.box_px.x0) as usize))
+    };
+    let inside: Bits = rows[y0 as usize..y1 as usize].iter().flat_map(of_row).collect();
+    let area_px = inside.count() as u32;
     (area_px > 0).then_some(Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside, area_px, level: mask.level })
 }
 
@@ -516,9 +516,7 @@ mod tests {
         let raster = Raster { width_px: 100, height_px: 100, lab, depth_m: None, valid };
         let is_compact = |x0: u32, y0: u32, side: u32, is_inside: &dyn Fn(u32, u32) -> bool| {
             let box_px = BoxPx { x0, y0, x1: x0 + side, y1: y0 + side };
-            let inside: Vec<bool> = (0..side * side).map(|at| is_inside(at % side, at / side)).collect();
-            let area_px = inside.iter().filter(|inside| **inside).count() as u32;
-            raster.is_compact(&Mask { box_px, inside, area_px, level: 0 })
+            raster.is_compact(&Mask::within(box_px, |x, y| is_inside(x - x0, y - y0)))
         };
         let disc = |x: u32, y: u32| x.abs_diff(8).pow(2) + y.abs_diff(8).pow(2) <= 64;
         assert!(is_compact(40, 40, 17, &disc));

@@ -98,7 +98,8 @@ fn take_out(mask: &mut Mask, other: &Mask) {
     for y in rows {
         for x in columns.clone().filter(|x| other.contains(*x, y)) {
             let at = (y - mask.box_px.y0) * mask.box_px.width_px() + x - mask.box_px.x0;
-            mask.area_px -= u32::from(std::mem::take(&mut mask.inside[at as usize]));
+            mask.area_px -= u32::from(mask.inside.get(at as usize));
+            mask.inside.set(at as usize, false);
         }
     }
 }

@@ -210,11 +210,11 @@ fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) 
     let width = photo.image.width();
     let thing_of = |mask: &Mask| {
         let mut n_px = vec![0_u32; photo.unhidden_px.len()];
-        for (row, y) in mask.inside.chunks(mask.box_px.width_px() as usize).zip(mask.box_px.y0..) {
-            for (_, x) in row.iter().zip(mask.box_px.x0..).filter(|(inside, _)| **inside) {
-                let thing = photo.thing_of_pixel[(y * width + x) as usize];
-                n_px.get_mut(usize::from(thing)).into_iter().for_each(|n| *n += 1);
-            }
+        let BoxPx { x0, y0, x1, y1 } = mask.box_px;
+        let pixels = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y)));
+        for ((x, y), _) in pixels.zip(mask.inside.iter()).filter(|(_, inside)| *inside) {
+            let thing = photo.thing_of_pixel[(y * width + x) as usize];
+            n_px.get_mut(usize::from(thing)).into_iter().for_each(|n| *n += 1);
         }
         let (n, thing) = things.iter().map(|(thing, _)| (n_px[*thing as usize], *thing)).max()?;
         let whole = things.iter().find(|(of, _)| *of == thing)?.1.area_px;
@@ -233,7 +233,7 @@ fn cut_mask(mask: &Mask, random: &mut Xorshift) -> Mask {
         (f64::from(x) / f64::from(width) - 0.5) * nx + (f64::from(y) / f64::from(height) - 0.5) * ny
     };
     let limit = random.between(0.0, 0.35);
-    let kept = |x: u32, y: u32| mask.inside[(y * width + x) as usize] && along(x, y) < limit;
+    let kept = |x: u32, y: u32| mask.inside.get((y * width + x) as usize) && along(x, y) < limit;
     let places = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let labels: Vec<u32> = places.map(|(x, y)| if kept(x, y) { 0 } else { NO_REGION }).collect();
     let piece = masks_of_labels(&labels, width, 1, u64::MAX).and_then(|mut masks| masks.pop());

@@ -100,7 +100,8 @@ fn places_above_surfaces_are_looked_at() {
     }
     let expected: BTreeSet<BlockAt> =
         occupied.keys().flat_map(|at| (0..=6).map(|up| [at[0], at[1], at[2] + up])).collect();
-    let found = candidates(&occupied.clone().into_iter().collect::<Vec<_>>(), LATTICE);
+    let blocks: Vec<(BlockAt, u64)> = occupied.clone().into_iter().collect();
+    let found: Vec<Candidate> = candidates(&blocks, LATTICE).collect();
     assert!(found.is_sorted_by(|a, b| a.at < b.at), "each once, by place");
     assert_eq!(found.iter().map(|of| of.at).collect::<BTreeSet<_>>(), expected);
     for of in &found {

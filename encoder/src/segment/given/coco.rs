@@ -10,7 +10,7 @@ use slag_common::files;
 use crate::ingest::Undistorter;
 use crate::masks::regions::partition;
 use crate::masks::rle::{Rle, RleError};
-use crate::masks::{BoxPx, Mask, NO_REGION};
+use crate::masks::{Bits, BoxPx, Mask, NO_REGION};
 use crate::segment::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput};
 
 /// Masks of each image by file name, with their indices in the file.
@@ -193,7 +193,7 @@ pub(super) fn undistorted(
     }
     let mut ideal: Vec<Mask> = masks
         .iter()
-        .map(|mask| Mask { box_px: empty, inside: Vec::new(), area_px: 0, level: mask.level })
+        .map(|mask| Mask { box_px: empty, inside: Bits::default(), area_px: 0, level: mask.level })
         .collect();
     for ((box_px, area_px), members) in boxes.iter().zip(&masks_of_region).filter(|((_, area), _)| *area > 0)
     {
@@ -204,13 +204,13 @@ pub(super) fn undistorted(
         }
     }
     for mask in ideal.iter_mut().filter(|mask| mask.area_px > 0) {
-        mask.inside = vec![false; mask.box_px.width_px() as usize * mask.box_px.height_px() as usize];
+        mask.inside = Bits::of(false, mask.box_px.width_px() as usize * mask.box_px.height_px() as usize);
     }
     for (region, x, y) in covered() {
         for member in &masks_of_region[region] {
             let mask = &mut ideal[*member as usize];
             let row = (y - mask.box_px.y0) as usize * mask.box_px.width_px() as usize;
-            mask.inside[row + (x - mask.box_px.x0) as usize] = true;
+            mask.inside.set(row + (x - mask.box_px.x0) as usize, true);
         }
     }
     ideal.retain(|mask| mask.area_px > 0);

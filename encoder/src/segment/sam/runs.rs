@@ -2,7 +2,7 @@
 
 use slag_math::union_find::{Numbering, UnionFind};
 
-use crate::masks::{BoxPx, Mask};
+use crate::masks::{Bits, BoxPx, Mask};
 
 /// Pixels `x0 <= x < x1` of row `y`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,10 +38,10 @@ impl RunMask {
     pub(super) fn to_mask(&self, level: u8) -> Mask {
         let BoxPx { x0, y0, .. } = self.box_px;
         let width = self.box_px.width_px() as usize;
-        let mut inside = vec![false; width * self.box_px.height_px() as usize];
+        let mut inside = Bits::of(false, width * self.box_px.height_px() as usize);
         for run in &self.runs {
             let start = (run.y - y0) as usize * width;
-            inside[start + (run.x0 - x0) as usize..start + (run.x1 - x0) as usize].fill(true);
+            (run.x0..run.x1).for_each(|x| inside.set(start + (x - x0) as usize, true));
         }
         Mask { box_px: self.box_px, inside, area_px: self.area_px, level }
     }

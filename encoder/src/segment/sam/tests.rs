@@ -400,9 +400,8 @@ fn rough_masks_equal_a_plain_recomputation() {
         assert!((cut.stability - n_above(1.0) / n_above(-1.0)).abs() < 1e-3, "{n}: {}", cut.stability);
         let mask = cut.mask.to_mask(0);
         let mut inside = vec![false; values.len()];
-        for (y, row) in mask.inside.chunks_exact(mask.box_px.width_px() as usize).enumerate() {
-            let start = (mask.box_px.y0 as usize + y) * 300 + mask.box_px.x0 as usize;
-            inside[start..start + row.len()].copy_from_slice(row);
+        for (at, inside) in inside.iter_mut().enumerate() {
+            *inside = mask.contains(at as u32 % 300, at as u32 / 300);
         }
         for (at, (inside, value)) in inside.iter().zip(&values).enumerate() {
             assert!(*inside == (*value > 0.0) || value.abs() < 1e-4, "{n}: pixel {at} has {value}");
