@@ -10,8 +10,6 @@ folder=${1:-dist}
 [ "$folder" != dev ] || folder=debug
 # After `test.sh` they are there; alone, cargo would build them again, with the features of fewer packages.
 [ -n "${SLAG_PROGRAMS_ARE_BUILT:-}" ] || cargo build --locked --bin slag-encoder --bin slag-lab --bin slag-edge
-# An emulated program cannot start itself anew, as it does to set this.
-export ORT_DISABLE_TELEMETRY=1
 arm() {
     qemu-aarch64-static -L /usr/aarch64-linux-gnu "target/aarch64-unknown-linux-gnu/$folder/slag-edge" "$@"
 }

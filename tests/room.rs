@@ -117,7 +117,7 @@ fn the_robots_service_answers() {
 fn odd_views_are_counted_not_fatal() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let (room, masks, store) = (dir.path().join("room"), dir.path().join("masks"), dir.path().join("store"));
-    copy_dir(&generated(&["--n-views", "5"]), &room);
+    copy_dir(&generated(&["--n-views", "8"]), &room);
     let (views, images) = (room.join("transforms.json"), room.join("images"));
     let mut poses = read_json(&views);
     // A camera 1,000 m up that looks up: nothing is in view.
@@ -131,9 +131,11 @@ fn odd_views_are_counted_not_fatal() {
     ids.save(masks.join("0004.png")).expect("writes");
     ids.put_pixel(5, 5, image::Luma([9]));
     ids.save(masks.join("0000.png")).expect("writes");
-    // 0002: a cut photo; 0003: no photo.
+    // 0002 and 0005 to 0007: cut photos; 0003: no photo.
     let photo = fs_err::read(images.join("0002.png")).expect("reads");
-    fs_err::write(images.join("0002.png"), &photo[..photo.len() / 2]).expect("writes");
+    for cut in ["0002.png", "0005.png", "0006.png", "0007.png"] {
+        fs_err::write(images.join(cut), &photo[..photo.len() / 2]).expect("writes");
+    }
     fs_err::remove_file(images.join("0003.png")).expect("removes");
 
     let encode = |flag: &str| {
@@ -151,8 +153,20 @@ fn odd_views_are_counted_not_fatal() {
     }
     let skipped = summary["skipped_views"].as_array().expect("a list");
     let skipped: Vec<&Value> = skipped.iter().map(|skipped| &skipped["view"]).collect();
-    assert_eq!(skipped, ["0002.png", "0003.png"]);
+    assert_eq!(skipped, ["0002.png", "0003.png", "0005.png", "0006.png", "0007.png"]);
     assert!(summary["n_without_evidence"].as_u64() < summary["n_gaussians"].as_u64());
+    assert_eq!(summary["encoder_before"], Value::Null);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("1 more views are left out") && !said.contains("view 0007.png"), "{said}");
+
+    // Other models: robots need the new text model, and the summary names the encoder before.
+    let output = encode("--restart").args(["--models", "colours"]).output().expect("starts");
+    let (again, said) = (
+        serde_json::from_slice::<Value>(&output.stdout).expect("JSON"),
+        String::from_utf8_lossy(&output.stderr),
+    );
+    assert_eq!(again["encoder_before"], "slag-embedded-1", "{said}");
+    assert!(said.contains("published with ") && said.contains("started with --models colours"), "{said}");
 }
 
 /// Ctrl-C ends an encode with code 130 and a state that the next one resumes, to the same shards as without.

@@ -142,7 +142,6 @@ mod tests {
     }
 
     /// The link, and who may read, stay.
-    #[cfg(unix)]
     #[test]
     fn links_and_devices_are_written_through() {
         let dir = tempfile::tempdir().expect("a temporary folder");

@@ -189,10 +189,16 @@ fn run(
         tracing::error!("the text model panicked");
         drop(reply);
         let Some(reopen) = &mut reopen else { return };
+        // Its end and its start may panic as it did.
+        let mut broken = Some(encoder);
         encoder = loop {
-            match reopen() {
-                Ok(encoder) => break encoder,
-                Err(error) => tracing::error!("the text model does not open again: {error}"),
+            match catch_unwind(AssertUnwindSafe(|| {
+                drop(broken.take());
+                reopen()
+            })) {
+                Ok(Ok(encoder)) => break encoder,
+                Ok(Err(error)) => tracing::error!("the text model does not open again: {error}"),
+                Err(_) => tracing::error!("the text model panicked as it was opened again"),
             }
             // Those who ask in the pause are refused when their jobs are dropped.
             match jobs.recv_timeout(REOPEN_PAUSE) {
@@ -324,20 +330,23 @@ mod tests {
         }
     }
 
-    /// A model that panics is opened again; meanwhile it is not alive.
+    /// A model that panics is opened again, also where opening it panics at first; meanwhile it is not alive.
     #[test]
     fn a_dead_model_is_opened_again() {
-        let (opens, opened) = sync_channel::<()>(2);
+        let (opens, opened) = sync_channel::<bool>(2);
         let reopen: Reopen = Box::new(move || {
-            // Only once it is told to.
-            opened.recv().expect("told");
+            assert!(opened.recv().expect("told"), "it does not open");
             Ok(Box::new(Axes::new(2)))
         });
         let encoder = Box::new(Axes::new(2));
         let service = TextService::start_with(Axes::info(2), encoder, Some(reopen)).expect("a thread");
         assert!(matches!(service.encode("panic"), Err(TextError::Stopped)));
         assert!(!service.is_alive());
-        opens.send(()).expect("listens");
+        opens.send(false).expect("listens");
+        // Dropped in the pause after that.
+        assert!(matches!(service.encode("1"), Err(TextError::Stopped)));
+        assert!(!service.is_alive());
+        opens.send(true).expect("listens");
         assert!(service.encode("1").is_ok() && service.is_alive());
     }
 

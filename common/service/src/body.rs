@@ -9,12 +9,19 @@ use axum::body::{Body, Bytes};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use hyper::body::{Body as _, Frame, Incoming, SizeHint};
 use tokio::runtime::Handle;
+use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::problem::Problem;
 
 /// Most bytes of a body that are read for nothing: one just beyond the longest body in JSON, 1 MiB, is read whole.
 const DRAINED_BYTES: usize = 2 << 20;
+/// Bytes of a body that are read whatever else is read.
+const SHORT_BYTES: usize = 64 << 10;
+/// Room of all longer bodies together, of requests in progress too: four photos of the longest kind.
+pub(crate) const ROOM_BYTES: usize = 128 << 20;
+/// Pause after which there may be room again.
+const RETRY_SECS: u32 = 1;
 /// Longest time for that.
 const DRAIN_TIME: Duration = Duration::from_secs(1);
 
@@ -100,11 +107,49 @@ impl Drop for TimedBody {
     }
 }
 
-/// Reads a whole body of at most `max_bytes`.
+/// A body, and the room that it takes.
+struct Held {
+    bytes: Vec<u8>,
+    room: Option<SemaphorePermit<'static>>,
+}
+
+impl AsRef<[u8]> for Held {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+impl Held {
+    /// Makes space for `len` bytes of at most `max`. Returns whether there is room.
+    fn grow(&mut self, len: usize, max: usize, all: &'static Semaphore) -> bool {
+        if len <= self.bytes.capacity() {
+            return true;
+        }
+        let capacity = len.max(2 * self.bytes.capacity()).min(max);
+        let taken = self.room.as_ref().map_or(0, SemaphorePermit::num_permits);
+        if capacity > SHORT_BYTES {
+            let wanted = u32::try_from(capacity - taken).unwrap_or(u32::MAX);
+            let Ok(more) = all.try_acquire_many(wanted) else { return false };
+            match &mut self.room {
+                Some(room) => room.merge(more),
+                none => *none = Some(more),
+            }
+        }
+        self.bytes.reserve_exact(capacity - self.bytes.len());
+        true
+    }
+}
+
+/// Reads a whole body of at most `max_bytes`. `all`: room for long bodies; this one's stays taken until it is dropped.
 ///
 /// # Errors
-/// 413 if it is longer, 408 if it was not complete in time, 400 if it broke off. Each ends the connection.
-pub(crate) async fn read(mut body: Body, max_bytes: usize) -> Result<Bytes, Problem> {
+/// 413 if it is longer, 408 if it was not complete in time, 400 if it broke off, 503 if there is no room. Each ends
+/// the connection.
+pub(crate) async fn read(
+    mut body: Body,
+    max_bytes: usize,
+    all: &'static Semaphore,
+) -> Result<Bytes, Problem> {
     let ends = |problem: Problem| problem.with_header(header::CONNECTION, HeaderValue::from_static("close"));
     let too_long = || {
         let detail =
@@ -114,7 +159,7 @@ pub(crate) async fn read(mut body: Body, max_bytes: usize) -> Result<Bytes, Prob
     if body.size_hint().lower() > max_bytes as u64 {
         return Err(too_long());
     }
-    let mut whole = Vec::new();
+    let mut whole = Held { bytes: Vec::new(), room: None };
     while let Some(frame) = poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await {
         let frame = frame.map_err(|error| match too_slow(&error) {
             Some(slow) => ends(Problem::new(
@@ -131,12 +176,17 @@ pub(crate) async fn read(mut body: Body, max_bytes: usize) -> Result<Bytes, Prob
             )),
         })?;
         let Ok(bytes) = frame.into_data() else { continue };
-        if whole.len() + bytes.len() > max_bytes {
+        let len = whole.bytes.len() + bytes.len();
+        if len > max_bytes {
             return Err(too_long());
         }
-        whole.extend_from_slice(&bytes);
+        if !whole.grow(len, max_bytes, all) {
+            let detail = "the bodies of other requests in progress fill the room for them; ask again";
+            return Err(ends(Problem::overloaded(detail, RETRY_SECS)));
+        }
+        whole.bytes.extend_from_slice(&bytes);
     }
-    Ok(whole.into())
+    Ok(Bytes::from_owner(whole))
 }
 
 fn too_slow(error: &axum::Error) -> Option<TooSlow> {
@@ -179,4 +229,34 @@ pub(crate) fn check_encoding(headers: &HeaderMap) -> Result<(), Problem> {
 fn unsupported(detail: String) -> Problem {
     let status = StatusCode::UNSUPPORTED_MEDIA_TYPE;
     Problem::new(status, "unsupported-media-type", "Unsupported media type", detail)
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::response::IntoResponse;
+
+    use super::*;
+
+    /// Many clients each send a body of the longest kind: what is held of all together is bounded, and short ones are
+    /// read all the same.
+    #[tokio::test]
+    async fn bodies_have_room_for_some_at_a_time() {
+        static ROOM: Semaphore = Semaphore::const_new(1 << 20);
+        let of = async |len: usize| read(Body::from(vec![7; len]), 400 << 10, &ROOM).await;
+        let mut held = Vec::new();
+        let refused = loop {
+            match of(400 << 10).await {
+                Ok(body) => held.push(body),
+                Err(refused) => break refused,
+            }
+            assert!(held.len() <= 2, "more than there is room for");
+        };
+        assert!(held.len() == 2 && held.iter().all(|body| body.len() == 400 << 10));
+        assert_eq!(refused.into_response().status(), StatusCode::SERVICE_UNAVAILABLE);
+        assert!(of(SHORT_BYTES).await.is_ok());
+        held.pop();
+        assert!(of(400 << 10).await.is_ok());
+        drop(held);
+        assert_eq!(ROOM.available_permits(), 1 << 20, "all is given back");
+    }
 }

@@ -2,7 +2,7 @@
 //! deadline.
 
 use std::io;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use axum::Router;
 use axum::body::Body;
@@ -149,6 +149,7 @@ async fn converse(
     };
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
+        .auto_date_header(is_of_a_date(SystemTime::now()))
         .keep_alive(!is_reserved)
         .header_read_timeout(at_most(limits.head_timeout))
         .max_buf_size(limits.head_bytes)
@@ -161,6 +162,14 @@ async fn converse(
         }
         () = permit.ended() => tracing::debug!("a connection made room for another"),
     }
+}
+
+/// The first second after the year 9999.
+const YEAR_10000_UNIX_SECS: u64 = 253_402_300_800;
+
+/// Returns whether the header Date can name a time; hyper panics on others.
+fn is_of_a_date(now: SystemTime) -> bool {
+    now.duration_since(UNIX_EPOCH).is_ok_and(|since| since.as_secs() < YEAR_10000_UNIX_SECS)
 }
 
 #[cfg(test)]

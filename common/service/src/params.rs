@@ -21,6 +21,9 @@ use crate::replies::{SchemaOf, Taken};
 /// Longest name of an unknown parameter that is repeated to the client.
 const MAX_NAME_CHARS: usize = 40;
 
+/// What text in a URL is.
+const UTF8: &str = "text in UTF-8 where %XX stand for its bytes";
+
 /// A part of a request that is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{parameter}: found {found}, expected {expected}")]
@@ -97,8 +100,7 @@ impl<S: Send + Sync> FromRequestParts<S> for PathText {
         let refused = |rejection: PathRejection| match &rejection {
             PathRejection::FailedToDeserializePathParams(failed) => match failed.kind() {
                 ErrorKind::InvalidUtf8InPathParam { key } => {
-                    RequestError::new(key, parts.uri.path(), "text in UTF-8 where %XX stand for its bytes")
-                        .into()
+                    RequestError::new(key, parts.uri.path(), UTF8).into()
                 }
                 kind => Problem::internal(kind),
             },
@@ -121,9 +123,8 @@ impl<T: DeserializeOwned> Params<T> {
         match pairs.iter().find(|(name, _)| !reader.known.contains(&name.as_str())) {
             None => Ok(read),
             Some((name, value)) => {
-                let name: String = name.chars().take(MAX_NAME_CHARS).collect();
                 let expected = format!("one of {}", reader.known.join(", "));
-                Err(RequestError::new(&name.escape_debug().to_string(), value, expected))
+                Err(RequestError::new(&shown(name), value, expected))
             }
         }
     }
@@ -131,8 +132,20 @@ impl<T: DeserializeOwned> Params<T> {
     pub fn parse(uri: &axum::http::Uri) -> Result<T, RequestError> {
         let pairs = Query::<Vec<(String, String)>>::try_from_uri(uri);
         let refused = |text: String| RequestError::new("query string", &text, "name=value pairs");
-        Self::read(&pairs.map_err(|e| refused(e.body_text()))?)
+        let pairs = pairs.map_err(|e| refused(e.body_text()))?.0;
+        // What stands for bytes that are no text.
+        let is_lost =
+            |(name, value): &&(String, String)| name.contains('\u{FFFD}') || value.contains('\u{FFFD}');
+        match pairs.iter().find(is_lost) {
+            None => Self::read(&pairs),
+            Some((name, value)) => Err(RequestError::new(&shown(name), value, UTF8)),
+        }
     }
+}
+
+/// Returns an unknown name as it is repeated to the client.
+fn shown(name: &str) -> String {
+    name.chars().take(MAX_NAME_CHARS).collect::<String>().escape_debug().to_string()
 }
 
 impl<S: Sync, T: DeserializeOwned> FromRequestParts<S> for Params<T> {

@@ -11,6 +11,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get, post};
 use schemars::{JsonSchema, SchemaGenerator};
 use serde_json::{Map, Value};
+use tokio::sync::Semaphore;
 
 use crate::body;
 use crate::params::RequestError;
@@ -212,6 +213,9 @@ async fn no_query(request: Request, next: Next) -> Response {
     }
 }
 
+/// Room for long bodies in this process.
+static LONG_BODIES: Semaphore = Semaphore::const_new(body::ROOM_BYTES);
+
 /// Hands a request on with its body read.
 async fn whole_body(
     media_types: &'static [&'static str],
@@ -223,7 +227,7 @@ async fn whole_body(
     let is_taken =
         body::check_type(&head.headers, media_types).and_then(|()| body::check_encoding(&head.headers));
     let checked = match is_taken {
-        Ok(()) => body::read(body, max_bytes).await,
+        Ok(()) => body::read(body, max_bytes, &LONG_BODIES).await,
         Err(problem) => Err(problem),
     };
     match checked {

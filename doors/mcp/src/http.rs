@@ -13,6 +13,10 @@ use crate::Tools;
 use crate::locate::MAX_MESSAGE_BYTES;
 
 pub const PATH: &str = "/mcp";
+/// Open connections, and those of one peer: a message of the longest kind for each is 0.5 GB. One beyond them makes
+/// room for the next.
+const N_CONNECTIONS: usize = 32;
+const N_PER_PEER: usize = 24;
 
 /// Serves until `stop` completes.
 ///
@@ -34,7 +38,13 @@ pub async fn serve(
     let sessions = Arc::<NeverSessionManager>::default();
     let service = StreamableHttpService::new(move || Ok(tools.clone()), sessions, config);
     let router = Router::new().route_service(PATH, service);
-    Ok(listener::serve(router, listener, ConnectionLimits::default(), stop).await?)
+    let limits = ConnectionLimits {
+        n_connections: N_CONNECTIONS,
+        n_per_peer: N_PER_PEER,
+        n_reserved: 1,
+        ..ConnectionLimits::default()
+    };
+    Ok(listener::serve(router, listener, limits, stop).await?)
 }
 
 /// Returns the names that requests may be for.
@@ -45,4 +55,37 @@ pub fn hosts(listen: &Listen, given: Vec<String>) -> Vec<String> {
     }
     hosts.extend(given);
     hosts
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use slag_robot::Robot;
+    use slag_service::listen::bind;
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpStream;
+
+    use super::*;
+
+    /// Each may send a message of 16 MB: one client cannot fill the memory with them.
+    #[tokio::test]
+    async fn few_messages_are_held_at_a_time() {
+        let listener = bind(&"127.0.0.1:0".parse().expect("an address")).await.expect("a port");
+        let address = listener.url().expect("bound").replace("http://", "");
+        let tools = Tools::new(Robot::new("http://127.0.0.1:9", None));
+        let serving = tokio::spawn(serve(tools, listener, Vec::new(), std::future::pending()));
+        let mut waiting = Vec::new();
+        for _ in 0..N_PER_PEER + 2 {
+            let mut client = TcpStream::connect(&address).await.expect("listens");
+            client.write_all(b"POST ").await.expect("sends");
+            waiting.push(client);
+        }
+        // The first one beyond the limit ends, long before its head is due.
+        let mut nothing = Vec::new();
+        let ended =
+            tokio::time::timeout(Duration::from_secs(5), waiting[N_PER_PEER].read_to_end(&mut nothing));
+        drop(ended.await.expect("ends"));
+        serving.abort();
+    }
 }

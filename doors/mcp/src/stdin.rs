@@ -6,76 +6,108 @@ use std::task::{Context, Poll, ready};
 
 use tokio::io::{AsyncRead, ReadBuf};
 
-use crate::locate::MAX_PHOTO_CHARS;
+use crate::locate::{MAX_MESSAGE_BYTES, MAX_PHOTO_CHARS};
+
+/// Bytes read at a time.
+const PIECE_BYTES: usize = 8 << 10;
+/// Characters of a text that are never cut: names of members and the message's id are texts too.
+const SHORT_CHARS: usize = 1000;
+/// Bytes of a message from which its texts are cut to that; what is no text has the rest.
+const MAX_TEXT_BYTES: usize = MAX_MESSAGE_BYTES / 8 * 7;
 
 /// Messages, one a line, as they are read; of each text in them the first characters, one more than a photo may have.
 ///
 /// The library drops a line beyond its limit, and the client waits for its answer for ever. So the photo is cut
-/// instead, and the tool says that it is too long.
+/// instead, and the tool says that it is too long. Escapes that stand for signs of ASCII are taken as these: six bytes
+/// for each character of a photo would be more than its limit, of which the tool could not tell.
 #[derive(Debug)]
 pub struct ShortTexts<R> {
     input: R,
     max_chars: usize,
+    max_bytes: usize,
     place: Place,
+    /// What was kept of the input, and how much of that was given.
+    kept: Vec<u8>,
+    n_given: usize,
 }
 
 /// Where in a message the next byte stands.
 #[derive(Debug, Default)]
 struct Place {
     is_in_text: bool,
-    /// Characters of the text so far; an escape is one.
+    /// Characters of the text so far; an escape is one, or half of one beyond U+FFFF.
     n_chars: usize,
+    /// Bytes of the message that were kept.
+    n_bytes: usize,
     is_cut: bool,
-    escape: Escape,
-}
-
-#[derive(Clone, Copy, Debug, Default)]
-enum Escape {
-    #[default]
-    None,
-    /// Behind the backslash.
-    Begun,
-    /// So many hex digits follow.
-    Digits(u8),
+    /// The escape so far.
+    escape: Vec<u8>,
 }
 
 impl<R> ShortTexts<R> {
     pub fn of(input: R) -> Self {
-        Self { input, max_chars: MAX_PHOTO_CHARS + 1, place: Place::default() }
+        Self {
+            input,
+            max_chars: MAX_PHOTO_CHARS + 1,
+            max_bytes: MAX_TEXT_BYTES,
+            place: Place::default(),
+            kept: Vec::new(),
+            n_given: 0,
+        }
+    }
+
+    fn go_on_by(&mut self, byte: u8) {
+        let place = &mut self.place;
+        match (place.is_in_text, byte) {
+            // No text holds it: messages end here.
+            (_, b'\n') => {
+                *place = Place::default();
+                self.kept.push(byte);
+            }
+            (true, _) if !place.escape.is_empty() => {
+                place.escape.push(byte);
+                if place.escape.len() == if place.escape[1] == b'u' { 6 } else { 2 } {
+                    let escape = std::mem::take(&mut place.escape);
+                    let kept = plain(&escape).map_or(escape.clone(), |byte| vec![byte]);
+                    // The second half of a character.
+                    self.keep(&kept, matches!(*escape, [_, _, b'd' | b'D', b'c'..=b'f' | b'C'..=b'F', ..]));
+                }
+            }
+            (true, b'\\') => place.escape.push(byte),
+            (true, byte) if byte != b'"' => self.keep(&[byte], byte & 0xC0 == 0x80),
+            (_, byte) => {
+                if byte == b'"' {
+                    (place.is_in_text, place.n_chars, place.is_cut) = (!place.is_in_text, 0, false);
+                }
+                place.n_bytes += 1;
+                self.kept.push(byte);
+            }
+        }
+    }
+
+    /// Keeps a character of a text, or what continues one, unless the text is cut there.
+    fn keep(&mut self, bytes: &[u8], continues: bool) {
+        let place = &mut self.place;
+        if !continues {
+            let is_full = place.n_bytes >= self.max_bytes && place.n_chars >= SHORT_CHARS;
+            place.is_cut = place.n_chars >= self.max_chars || is_full;
+            place.n_chars += 1;
+        }
+        if !place.is_cut {
+            place.n_bytes += bytes.len();
+            self.kept.extend_from_slice(bytes);
+        }
     }
 }
 
-impl Place {
-    /// Goes on by a byte. Returns whether it stays in the message, of whose texts `max_chars` do.
-    fn keeps(&mut self, byte: u8, max_chars: usize) -> bool {
-        match (self.is_in_text, byte) {
-            // No text holds it: messages end here.
-            (_, b'\n') => *self = Self::default(),
-            (false, b'"') => *self = Self { is_in_text: true, ..Self::default() },
-            (false, _) => {}
-            (true, _) => return self.keeps_in_text(byte, max_chars),
-        }
-        true
-    }
-
-    fn keeps_in_text(&mut self, byte: u8, max_chars: usize) -> bool {
-        let is_continued = byte & 0xC0 == 0x80;
-        if matches!(self.escape, Escape::None) && !is_continued {
-            if byte == b'"' {
-                self.is_in_text = false;
-                return true;
-            }
-            self.is_cut = self.n_chars >= max_chars;
-            self.n_chars += 1;
-        }
-        self.escape = match (self.escape, byte) {
-            (Escape::None, b'\\') => Escape::Begun,
-            (Escape::Begun, b'u') => Escape::Digits(4),
-            (Escape::Digits(n @ 2..), _) => Escape::Digits(n - 1),
-            _ => Escape::None,
-        };
-        !self.is_cut
-    }
+/// Returns the sign of ASCII that an escape stands for, where it can stand for itself.
+fn plain(escape: &[u8]) -> Option<u8> {
+    let byte = match escape {
+        b"\\/" => b'/',
+        [_, b'u', b'0', b'0', digits @ ..] => u8::from_str_radix(str::from_utf8(digits).ok()?, 16).ok()?,
+        _ => return None,
+    };
+    (matches!(byte, b' '..=b'~') && !matches!(byte, b'"' | b'\\')).then_some(byte)
 }
 
 impl<R: AsyncRead + Unpin> AsyncRead for ShortTexts<R> {
@@ -84,25 +116,26 @@ impl<R: AsyncRead + Unpin> AsyncRead for ShortTexts<R> {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        let Self { input, max_chars, place } = self.get_mut();
-        let start = buffer.filled().len();
-        loop {
-            ready!(Pin::new(&mut *input).poll_read(context, buffer))?;
-            let read = &mut buffer.filled_mut()[start..];
-            let n_read = read.len();
-            let mut n_kept = 0;
-            for at in 0..n_read {
-                if place.keeps(read[at], *max_chars) {
-                    read[n_kept] = read[at];
-                    n_kept += 1;
-                }
-            }
-            buffer.set_filled(start + n_kept);
-            // Nothing would be the end of the input, where nothing was read.
-            if n_kept > 0 || n_read == 0 {
+        let this = self.get_mut();
+        // Nothing would be the end of the input, where nothing was read.
+        while this.n_given == this.kept.len() {
+            let mut piece = [0; PIECE_BYTES];
+            let mut piece = ReadBuf::new(&mut piece);
+            ready!(Pin::new(&mut this.input).poll_read(context, &mut piece))?;
+            if piece.filled().is_empty() {
                 return Poll::Ready(Ok(()));
             }
+            this.kept.clear();
+            this.n_given = 0;
+            for byte in piece.filled() {
+                this.go_on_by(*byte);
+            }
         }
+        let rest = &this.kept[this.n_given..];
+        let n = rest.len().min(buffer.remaining());
+        buffer.put_slice(&rest[..n]);
+        this.n_given += n;
+        Poll::Ready(Ok(()))
     }
 }
 
@@ -114,9 +147,9 @@ mod tests {
 
     use super::*;
 
-    /// Reads messages in pieces of some length, and cuts their texts to 50 characters.
-    fn read(messages: &str, piece: usize) -> String {
-        let mut input = ShortTexts { max_chars: 50, ..ShortTexts::of(messages.as_bytes()) };
+    /// Reads messages in pieces of some length, and cuts their texts to some characters, and beyond some bytes.
+    fn read(messages: &str, piece: usize, max_chars: usize, max_bytes: usize) -> String {
+        let mut input = ShortTexts { max_chars, max_bytes, ..ShortTexts::of(messages.as_bytes()) };
         let (mut all, mut piece) = (Vec::new(), vec![0; piece]);
         loop {
             let mut buffer = ReadBuf::new(&mut piece);
@@ -132,12 +165,12 @@ mod tests {
     #[test]
     fn long_texts_are_cut_and_the_rest_stays() {
         let short = r#"{"id":1,"a":["\"\\","\u00e9é",{}]}"#.to_owned() + "\n";
-        for unit in ["A", "é", "\\n", "\\u002b", "\\\""] {
+        for unit in ["A", "é", "\\n", "\\u002b", "\\\"", "😀", "\\ud83d\\ude00"] {
             let long = unit.repeat(300);
             let messages = format!("{{\"photo_base64\":\"{long}\",\"id\":7}}\n{short}");
             for piece in [1, 3, 1000] {
-                assert_eq!(read(&short, piece), short);
-                let found = read(&messages, piece);
+                assert_eq!(read(&short, piece, 50, 9999), short);
+                let found = read(&messages, piece, 50, 9999);
                 let (first, second) = found.split_once('\n').expect("two messages");
                 let first: Value = serde_json::from_str(first).expect("JSON");
                 let n_chars = first["photo_base64"].as_str().map(|text| text.chars().count());
@@ -145,5 +178,22 @@ mod tests {
                 assert_eq!(second, short, "{unit}");
             }
         }
+    }
+
+    /// Whatever its texts are made of, a message stays below the library's limit and is answered: its id is whole.
+    #[test]
+    fn messages_stay_within_their_limit() {
+        let photo_chars = |unit: &str, n_texts: usize| {
+            let long = format!("\"photo_base64\":\"{}\",", unit.repeat(8009)).repeat(n_texts);
+            let found = read(&format!("{{{long}\"id\":\"seven\"}}\n"), 1000, 8001, 14_000);
+            assert!(found.len() < 16_000, "{unit}: {} bytes", found.len());
+            let message: Value = serde_json::from_str(&found).expect("JSON");
+            assert_eq!(message["id"], "seven", "{unit}");
+            message["photo_base64"].as_str().map(|text| text.chars().count())
+        };
+        // A photo of escapes is as long as another one, so the tool says that it is too long.
+        assert_eq!((photo_chars("\\u0041", 1), photo_chars("\\/", 1)), (Some(8001), Some(8001)));
+        assert!(photo_chars("😀", 1) > Some(3000) && photo_chars("\\u00e9", 1) > Some(2000));
+        assert_eq!(photo_chars("A", 3), Some(SHORT_CHARS));
     }
 }

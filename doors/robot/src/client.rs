@@ -1,5 +1,6 @@
 //! Asking a robot.
 
+use std::net::IpAddr;
 use std::time::Duration;
 
 use serde::de::DeserializeOwned;
@@ -180,8 +181,9 @@ pub fn xyz([x, y, z]: [f64; 3]) -> String {
 fn is_loopback(url: &str) -> bool {
     let Ok(uri) = url.parse::<ureq::http::Uri>() else { return false };
     let host = uri.host().unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
-    host.eq_ignore_ascii_case("localhost")
-        || host.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
+    // Who connects to no address in particular reaches this machine.
+    let is_here = |ip: IpAddr| ip.to_canonical().is_loopback() || ip.is_unspecified();
+    host.eq_ignore_ascii_case("localhost") || host.parse().is_ok_and(is_here)
 }
 
 fn texts_of(request: &Value) -> impl Iterator<Item = &str> {
@@ -202,23 +204,12 @@ mod tests {
 
     #[test]
     fn this_machine_is_asked_without_a_proxy() {
-        for url in [
-            "http://127.0.0.1:7734",
-            "http://localhost:1/",
-            "https://[::1]:7",
-            "http://LOCALHOST",
-            "http://127.9.9.9",
-        ] {
-            assert!(is_loopback(url), "{url}");
-        }
-        for url in [
-            "http://10.0.0.1:7734",
-            "http://localhost.example:1",
-            "http://robot",
-            "no url",
-            "http://[fe80::1]",
-        ] {
-            assert!(!is_loopback(url), "{url}");
+        let here = "http://127.0.0.1:7734 http://localhost:1/ https://[::1]:7 http://LOCALHOST http://127.9.9.9 \
+                    http://0.0.0.0:7734 http://[::ffff:127.0.0.1]:7734";
+        let there = "http://10.0.0.1:7734 http://localhost.example:1 http://robot no-url http://[fe80::1] \
+                     http://[::ffff:10.0.0.1]";
+        for (urls, expected) in [(here, true), (there, false)] {
+            assert!(urls.split_whitespace().all(|url| is_loopback(url) == expected), "{urls}");
         }
     }
 

@@ -21,6 +21,9 @@ use crate::store::{EdgeCache, Snapshot, StoreError};
 /// Free space below which a fetch may not fit.
 const LITTLE_BYTES: u64 = 256 << 20;
 
+/// Age of a scene from which the robot's clock is in doubt.
+const LONG_AGO_HOURS: f64 = 24.0 * 365.0;
+
 const EXAMPLES: &str = "Examples:\n\
     \x20 slag-edge doctor\n\
     \x20 slag-edge doctor --json\n\
@@ -177,7 +180,13 @@ fn age(signed_unix_secs: u64, now_unix_secs: u64) -> Finding {
         return Finding::new("age", Verdict::Note, text);
     };
     let hours = secs.saturating_sub(3600) as f64 / 3600.0;
-    Finding::new("age", Verdict::Ok, format!("the store signed it {hours:.1} hours ago"))
+    let text = format!("the store signed it {hours:.1} hours ago");
+    if hours < LONG_AGO_HOURS {
+        return Finding::new("age", Verdict::Ok, text);
+    }
+    let now = format_utc(now_unix_secs);
+    let text = format!("{text}, if this robot's clock is right, which says {now}: fetch again, or set it");
+    Finding::new("age", Verdict::Note, text)
 }
 
 fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
@@ -210,9 +219,9 @@ mod tests {
         }
     }
 
-    /// A clock of robot or store that is wrong is not an age of no hours.
+    /// A clock of robot or store that is wrong is not an age of no hours, nor one of eight thousand years.
     #[test]
-    fn a_signature_of_the_future_is_noted() {
+    fn a_signature_of_another_time_is_noted() {
         let at = |signed: u64| age(signed, 1_800_000_000);
         assert_eq!(at(1_800_000_000 - 5400).text, "the store signed it 1.5 hours ago");
         assert_eq!(at(1_800_000_060).text, "the store signed it 0.0 hours ago");
@@ -222,5 +231,7 @@ mod tests {
             "{}",
             late.text
         );
+        let early = age(1_800_000_000, u64::MAX - 3600);
+        assert!(early.verdict == Verdict::Note && early.text.contains("says 9999-12-31"), "{}", early.text);
     }
 }

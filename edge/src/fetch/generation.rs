@@ -105,7 +105,7 @@ fn write_record(cache: &EdgeCache, record: Record) -> Result<(), FetchError> {
         Some(before) => before.with(record),
         None => record,
     };
-    cache.files().create_dir(&history::dir(cache))?;
+    cache.create_dir(&history::dir(cache))?;
     let mut known = history::generations(cache);
     // Numbers of another scene, and of a store that began anew, say nothing about this one's.
     known.retain(|of| {

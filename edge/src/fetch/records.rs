@@ -81,7 +81,7 @@ impl Records {
         let busy = || RecordsError::Busy { path: cache.dir().to_owned() };
         let lock = Lock::take(cache.dir())?.ok_or_else(busy)?;
         let copies = copies_of(cache);
-        cache.files().create_dir(&copies.dir)?;
+        cache.create_dir(&copies.dir)?;
         let (mut version, record, damage) = match read(cache, &copies)? {
             Read::Nothing => (None, Record::default(), None),
             Read::Record(version, record) => (Some(version), *record, None),
@@ -218,7 +218,9 @@ impl Lock {
     fn take(dir: &Path) -> io::Result<Option<Self>> {
         let path = dir.join("lock");
         fs_err::create_dir_all(dir)?;
-        let file = fs_err::OpenOptions::new().write(true).create(true).truncate(false).open(&path)?;
+        // To read as well: a pipe in its place would keep one that only writes waiting for a reader.
+        let file =
+            fs_err::OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path)?;
         let file = file.into_parts().0;
         let start = Instant::now();
         loop {

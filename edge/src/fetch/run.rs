@@ -63,7 +63,7 @@ impl<'a> Locked<'a> {
         let dirs =
             [cache.dir().into(), cache.dir().join("manifests"), cache.dir().join("shards"), staging(cache)];
         for dir in &dirs {
-            cache.files().create_dir(dir)?;
+            cache.create_dir(dir)?;
         }
         let records = Records::open(cache)?;
         // A killed fetch may have renamed files without syncing their folder.

@@ -42,7 +42,7 @@ pub fn add_root(
     };
     let kept = Kept::from_root(&bytes)?;
     let (sha256, version) = (sha256_hex(&bytes), kept.root_version().unwrap_or(0));
-    cache.files().create_dir(cache.dir())?;
+    cache.create_dir(cache.dir())?;
     let mut records = Records::open(cache)?;
     let is_new = match records.first_root_sha256() {
         Some(held) if held == sha256 => false,

@@ -168,14 +168,17 @@ impl App {
             app.reload_if_stale();
             let done = work(app, &budget);
             match (given, budget.check()) {
-                (Some(given), Err(OverBudget::Time { .. })) if done.is_err() => Err(out_of_time(given)),
+                (Some(given), Err(OverBudget::Time { .. })) => Err(out_of_time(given)),
                 _ => done,
             }
         });
         let late = |_| given.map_or_else(|| timeout(limit), out_of_time);
-        tokio::time::timeout(limit, working).await.map_err(late)?
+        tokio::time::timeout(limit + TO_SAY_SO, working).await.map_err(late)?
     }
 }
+
+/// Time in which work that has spent its own says so, and what to ask for instead.
+const TO_SAY_SO: Duration = Duration::from_millis(100);
 
 /// Time for a request and for sending its answer, besides that for the query.
 const STALL_BEYOND_QUERY: Duration = Duration::from_secs(50);

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Found, Reason, Searched, Whole};
 use super::cluster::{Cluster, Clusters, Grouping, cluster};
-use super::objects::{self, FoundObject};
+use super::objects::{self, FoundObject, ScoredObjects};
 use super::oriented::Extent;
 use super::rank::{Order, Ranked};
 use super::reason::{self, BestObject};
@@ -135,7 +135,8 @@ impl Answering<'_> {
         let calibration = objects::calibration(scene.objects);
         let threshold = scale.threshold(request, manifest, calibration);
         let of_score = scale.to_score(threshold.0);
-        let found = objects::matching(scene, &scored.scores, of_score, region, request.min_count);
+        let objects = ScoredObjects { scene, scores: &scored.scores, region, min_count: request.min_count };
+        let found = objects.reaching(of_score);
         let n_matching = found.iter().map(|object| object.n_gaussians).sum();
         let key = |object: &FoundObject<'_>| (scale.shown(object.score), object.extent().position_in_world);
         let order = Order::new(scale.base(calibration), manifest, request);
@@ -152,7 +153,7 @@ impl Answering<'_> {
         let empty = self.empty((text, AnswerKind::Objects), scale, threshold);
         let area_fetched = empty.searched.area_fetched;
         let reason = || {
-            let best = objects::best_in(scene, &scored.scores, region).map(|best| BestObject {
+            let best = ScoredObjects { min_count: 1, ..objects }.best().map(|best| BestObject {
                 score: scale.shown(best.score),
                 reaches: best.score >= of_score,
                 position_in_world: best.extent().position_in_world,

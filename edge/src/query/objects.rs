@@ -57,47 +57,48 @@ pub fn best(scores: &[f32]) -> Option<usize> {
     (0..scores.len()).reduce(|best, object| if scores[object] > scores[best] { object } else { best })
 }
 
-/// Returns the objects that reach a threshold and have at least `min_count` Gaussians, and at least one, in a
-/// region; by id.
-pub fn matching<'a>(
-    scene: &Scene<'a>,
-    scores: &[f32],
-    threshold: f32,
-    region: &Region,
-    min_count: u64,
-) -> Vec<FoundObject<'a>> {
-    let reaching = (0..scores.len()).filter(|object| scores[*object] >= threshold);
-    reaching.filter_map(|object| found(scene, scores, object, region, min_count)).collect()
+/// A scene's objects with the scores of a question, of which those count that have at least `min_count` Gaussians, and
+/// at least one, in a region.
+#[derive(Clone, Copy)]
+pub struct ScoredObjects<'s, 'a> {
+    pub scene: &'s Scene<'a>,
+    pub scores: &'s [f32],
+    pub region: &'s Region,
+    pub min_count: u64,
 }
 
-/// Returns the object with the best score of those with a Gaussian in a region, the first among equals.
-pub fn best_in<'a>(scene: &Scene<'a>, scores: &[f32], region: &Region) -> Option<FoundObject<'a>> {
-    let mut best: Option<usize> = None;
-    for (object, score) in scores.iter().enumerate() {
-        if best.is_none_or(|best| *score > scores[best]) && in_region(scene, object, region, 1) {
-            best = Some(object);
+impl<'a> ScoredObjects<'_, 'a> {
+    /// Returns those that reach a threshold, by id.
+    pub fn reaching(&self, threshold: f32) -> Vec<FoundObject<'a>> {
+        let reaching = (0..self.scores.len()).filter(|object| self.scores[*object] >= threshold);
+        reaching.filter_map(|object| self.found(object)).collect()
+    }
+
+    /// Returns the one with the best score, the first among equals.
+    pub fn best(&self) -> Option<FoundObject<'a>> {
+        let mut best: Option<usize> = None;
+        for (object, score) in self.scores.iter().enumerate() {
+            if best.is_none_or(|best| *score > self.scores[best])
+                && in_region(self.scene, object, self.region, self.min_count)
+            {
+                best = Some(object);
+            }
         }
+        self.found(best?)
     }
-    found(scene, scores, best?, region, 1)
-}
 
-fn found<'a>(
-    scene: &Scene<'a>,
-    scores: &[f32],
-    object: usize,
-    region: &Region,
-    min_count: u64,
-) -> Option<FoundObject<'a>> {
-    let (parts, record, score) = (scene.index.parts(object), record(scene, object), scores[object]);
-    let n_gaussians = count_in(scene, object, region);
-    if n_gaussians < min_count.max(1) {
-        return None;
+    fn found(&self, object: usize) -> Option<FoundObject<'a>> {
+        let Self { scene, region, .. } = *self;
+        let (record, n_gaussians) = (record(scene, object), count_in(scene, object, region));
+        if n_gaussians < self.min_count.max(1) {
+            return None;
+        }
+        let cut = (!region.covers(&record.bounds())).then(|| {
+            let parts = scene.index.parts(object).iter();
+            Extent::of(&parts.flat_map(|part| points(scene, *part, region)).collect::<Vec<DVec3>>())
+        });
+        Some(FoundObject { object, record, score: self.scores[object], n_gaussians, cut })
     }
-    let cut = (!region.covers(&record.bounds())).then(|| {
-        let inside: Vec<DVec3> = parts.iter().flat_map(|part| points(scene, *part, region)).collect();
-        Extent::of(&inside)
-    });
-    Some(FoundObject { object, record, score, n_gaussians, cut })
 }
 
 pub fn record<'a>(scene: &Scene<'a>, object: usize) -> &'a ObjectRecord {

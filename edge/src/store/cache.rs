@@ -17,6 +17,9 @@ use super::files::{DiskFiles, Files, Stat};
 /// A longer `current` is damaged (a cell takes about 110 bytes).
 const MAX_CURRENT_BYTES: u64 = 32 << 20;
 
+/// Largest coordinate of a scene, world units.
+const MAX_COORDINATE: f64 = 1e9;
+
 /// The generation pointer: the manifest and shards that answer queries.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -80,6 +83,18 @@ impl EdgeCache {
         &*self.files
     }
 
+    /// Creates a folder of the cache, durably. A file in its place is removed, as a folder in a file's place is; what
+    /// the user named stays, and so do links.
+    pub fn create_dir(&self, dir: &Path) -> io::Result<()> {
+        let made = self.files.create_dir(dir);
+        let is_taken = made.as_ref().is_err_and(|e| e.kind() == io::ErrorKind::AlreadyExists);
+        if !is_taken || dir == self.dir || self.files.stat(dir)?.is_none() {
+            return made;
+        }
+        self.files.remove(dir)?;
+        self.files.create_dir(dir)
+    }
+
     pub fn current_path(&self) -> PathBuf {
         self.dir.join("current")
     }
@@ -110,6 +125,12 @@ impl EdgeCache {
         };
         let current: Current = serde_json::from_slice(&bytes)
             .map_err(|e| StoreError::Current { path: path.clone(), what: e.to_string() })?;
+        let Current { centre_in_world, radius, .. } = &current;
+        let is_place = centre_in_world.abs().max_element() <= MAX_COORDINATE && *radius >= 0.0;
+        if !is_place {
+            let what = format!("it was fetched within {radius} of {centre_in_world}, which is no place");
+            return Err(StoreError::Current { path, what });
+        }
         let ids = || current.cells.iter().map(|cell| cell.cell_id);
         let bad_ids = || current.bad_cells.iter().map(|cell| cell.cell_id);
         if !ids().is_sorted_by(|a, b| a < b) || !bad_ids().is_sorted_by(|a, b| a < b) {

@@ -11,7 +11,7 @@ use super::cache::EdgeCache;
 /// Marks a shard. Without the mark it is found within a day.
 pub fn mark(cache: &EdgeCache, hash: Hash32) {
     let dir = cache.damaged_dir();
-    let marked = cache.files().create_dir(&dir).and_then(|()| {
+    let marked = cache.create_dir(&dir).and_then(|()| {
         let path = dir.join(hash.to_string());
         cache.files().write_from(&path, 0, &[])
     });

@@ -58,7 +58,7 @@ pub fn write(
     container::write(&mut bytes, MAGIC, VERSION, &sections)?;
     let (files, path) = (cache.files(), path(cache, encoder_id));
     let dir = path.parent().unwrap_or(cache.dir());
-    files.create_dir(dir)?;
+    cache.create_dir(dir)?;
     for old in files.list(dir)? {
         files.remove(&dir.join(old))?;
     }

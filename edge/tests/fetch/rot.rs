@@ -64,7 +64,6 @@ fn a_rotten_shard_costs_its_cell_only() {
 
 /// Each file of the generation on board, and what may stand in its place. A reader comes first: it waits for nobody,
 /// and marks what it finds.
-#[cfg(unix)]
 #[test]
 fn whatever_is_lost_is_put_back() {
     let scene = Published::new(1, &[0; 3], 40);
@@ -83,18 +82,35 @@ fn whatever_is_lost_is_put_back() {
             assert!(made.expect("runs").success());
         }),
     ];
+    let heal = |context: &str| {
+        drop(Snapshot::open(&robot.cache));
+        robot.fetch().unwrap_or_else(|e| panic!("{context}: {e}"));
+        let snapshot = Snapshot::open(&robot.cache).unwrap_or_else(|e| panic!("{context}: {e}"));
+        assert_eq!(snapshot.bad_cells, [], "{context}");
+        assert_holds(&snapshot, &scene, 0..3);
+    };
     for path in &paths {
         for (name, put) in faults {
             let context = format!("{name} at {}", path.display());
             fs_err::remove_file(path).expect("there");
             put(path);
-            drop(Snapshot::open(&robot.cache));
-            robot.fetch().unwrap_or_else(|e| panic!("{context}: {e}"));
-            let snapshot = Snapshot::open(&robot.cache).unwrap_or_else(|e| panic!("{context}: {e}"));
-            assert_eq!(snapshot.bad_cells, [], "{context}");
-            assert_holds(&snapshot, &scene, 0..3);
+            heal(&context);
         }
     }
+    // Files in the places of folders: a shard is damaged, and has no place for its mark at first.
+    for name in ["damaged", "history", "manifests", "shards", "staging"] {
+        let folder = robot.cache.dir().join(name);
+        drop(std::fs::remove_dir_all(&folder));
+        fs_err::write(&folder, "").expect("written");
+        if name == "damaged" {
+            flip_unseen(&robot.cache.shard_path(scene.hash(1, Profile::Compact)));
+        }
+        heal(name);
+    }
+    let lock = robot.cache.dir().join("lock");
+    fs_err::remove_file(&lock).expect("there");
+    faults[4].1(&lock);
+    heal("a pipe for a lock");
 }
 
 /// Whichever bit of whichever shards flips: the others answer, and so does a rotten one whose columns are whole

@@ -182,7 +182,6 @@ fn a_key_that_the_root_does_not_name_signs_nothing() {
     );
 }
 
-#[cfg(unix)]
 #[test]
 fn role_keys_are_private() {
     use std::os::unix::fs::PermissionsExt;

@@ -74,10 +74,7 @@ impl Stamp {
 
     fn of(path: &Path) -> io::Result<Self> {
         let metadata = fs_err::metadata(path)?;
-        #[cfg(unix)]
         let inode = std::os::unix::fs::MetadataExt::ino(&metadata);
-        #[cfg(not(unix))]
-        let inode = 0;
         Ok(Self { modified: metadata.modified().ok(), len_bytes: metadata.len(), inode })
     }
 }

@@ -276,7 +276,6 @@ fn publish_until_killed() {
 
 /// SIGKILL at any moment leaves a whole generation, never an older one than was seen before.
 #[test]
-#[cfg(unix)]
 fn killed_writer_leaves_a_whole_generation() {
     let dir = tempfile::tempdir().expect("temporary folder");
     let mut last_generation = 0;

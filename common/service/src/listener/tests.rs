@@ -224,3 +224,12 @@ async fn an_occupied_address_is_an_error_that_names_it() {
         "{refused}"
     );
 }
+
+/// A clock before 1970 or after 9999: answers come without a date.
+#[test]
+fn times_that_no_date_can_name() {
+    let at = |secs: u64| UNIX_EPOCH + Duration::from_secs(secs);
+    let dates =
+        [at(0), at(YEAR_10000_UNIX_SECS - 1), at(YEAR_10000_UNIX_SECS), UNIX_EPOCH - Duration::from_secs(1)];
+    assert_eq!(dates.map(is_of_a_date), [true, true, false, false]);
+}

@@ -68,6 +68,8 @@ fn refusals_name_parameter_value_and_what_was_expected() {
         ("radius=1&even=2&even=4", "even", "4", "one value"),
         ("radius=1&bounds=2", "bounds", "2", known),
         ("radius=1&%1b=2", "\\u{1b}", "2", known),
+        ("radius=1&text=r%ffed", "text", "r\u{FFFD}ed", UTF8),
+        ("radius=1&%ff=2", "\u{FFFD}", "2", UTF8),
     ] {
         let refused = RequestError::new(parameter, found, expected);
         assert_eq!(read(query), Err(refused), "{query}");

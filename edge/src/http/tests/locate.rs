@@ -12,7 +12,7 @@ async fn post(service: &Service, query: &str, kind: &str, photo: Vec<u8>) -> (St
     (status, body)
 }
 
-fn png(width: u32, height: u32) -> Vec<u8> {
+pub(super) fn png(width: u32, height: u32) -> Vec<u8> {
     encoded(&image::RgbImage::new(width, height))
 }
 

@@ -8,7 +8,7 @@ use slag_common::manifest::Manifest;
 
 use super::geometry::Solid;
 use crate::query::cluster::Cluster;
-use crate::query::objects::{self, FoundObject};
+use crate::query::objects::{self, FoundObject, ScoredObjects};
 use crate::query::request::QueryRequest;
 use crate::query::scale::Scale;
 use crate::query::scene::{Scene, alignment, default_voxel};
@@ -137,8 +137,9 @@ fn candidates<'a>(
     let (scale, calibration) = (Scale::of(question), objects::calibration(scene.objects));
     let (threshold, _) = scale.threshold(request, scene.manifest, calibration);
     let everywhere = Region::default();
-    let mut found =
-        objects::matching(scene, &scored.scores, scale.to_score(threshold), &everywhere, request.min_count);
+    let min_count = request.min_count;
+    let objects = ScoredObjects { scene, scores: &scored.scores, region: &everywhere, min_count };
+    let mut found = objects.reaching(scale.to_score(threshold));
     let n_found = found.len();
     found.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.record.id.cmp(&b.record.id)));
     found.truncate(MAX_CANDIDATES);

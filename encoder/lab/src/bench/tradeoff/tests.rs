@@ -151,7 +151,6 @@ fn several_scenes_have_a_mean_and_a_front() {
 
 /// A script records its arguments and prints what the real programs print. The second point reuses the first one's
 /// contributions, a second run measures nothing, and a point without masks in the scene is left out and named.
-#[cfg(unix)]
 #[test]
 fn points_are_measured_once_and_share_contributions() {
     use std::os::unix::fs::PermissionsExt;
