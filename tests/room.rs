@@ -158,7 +158,6 @@ fn odd_views_are_counted_not_fatal() {
     assert_eq!(summary["encoder_before"], Value::Null);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("1 more views are left out") && !said.contains("view 0007.png"), "{said}");
-
     // Other models: robots need the new text model, and the summary names the encoder before.
     let output = encode("--restart").args(["--models", "colours"]).output().expect("starts");
     let (again, said) = (

@@ -13,8 +13,7 @@ use crate::Tools;
 use crate::locate::MAX_MESSAGE_BYTES;
 
 pub const PATH: &str = "/mcp";
-/// Open connections, and those of one peer: a message of the longest kind for each is 0.5 GB. One beyond them makes
-/// room for the next.
+/// Open connections, and those of one peer: messages of the longest kind are 0.5 GB. Others make room for the next.
 const N_CONNECTIONS: usize = 32;
 const N_PER_PEER: usize = 24;
 

@@ -191,7 +191,6 @@ mod tests {
             assert_eq!(message["id"], "seven", "{unit}");
             message["photo_base64"].as_str().map(|text| text.chars().count())
         };
-        // A photo of escapes is as long as another one, so the tool says that it is too long.
         assert_eq!((photo_chars("\\u0041", 1), photo_chars("\\/", 1)), (Some(8001), Some(8001)));
         assert!(photo_chars("😀", 1) > Some(3000) && photo_chars("\\u00e9", 1) > Some(2000));
         assert_eq!(photo_chars("A", 3), Some(SHORT_CHARS));

@@ -225,7 +225,6 @@ async fn an_occupied_address_is_an_error_that_names_it() {
     );
 }
 
-/// A clock before 1970 or after 9999: answers come without a date.
 #[test]
 fn times_that_no_date_can_name() {
     let at = |secs: u64| UNIX_EPOCH + Duration::from_secs(secs);
