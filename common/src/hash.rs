@@ -27,7 +27,8 @@ impl Hash32 {
 
 impl fmt::Display for Hash32 {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&hex::encode(self.0))
+        // `{:.12}` shows the first digits.
+        f.pad(&hex::encode(self.0))
     }
 }
 

@@ -5,7 +5,7 @@ pub enum TufError {
     #[error("{role} metadata: {what}; check that the address is that of a slag-encoder store")]
     Format { role: String, what: String },
     #[error(
-        "{role} metadata: {found} of its keys signed it, expected {threshold}: it was changed, or this is another store than the one that is trusted. If the store was made anew, trust its new root: `slag-edge trust add URL --sha256 HEX --replace`, with the SHA-256 that `slag-encoder keys status` prints there"
+        "{role} metadata: {found} of its keys signed it, expected {threshold}: it was changed, or this is not the store that is trusted. If the store was made anew: `slag-edge trust add URL --sha256 HEX --replace`, with the SHA-256 of its `slag-encoder keys status`"
     )]
     Signatures { role: String, found: usize, threshold: u32 },
     #[error(

@@ -25,7 +25,7 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 pub enum RecordsError {
     #[error("another fetch uses {path}; wait for it or end it", path = path.display())]
     Busy { path: PathBuf },
-    #[error("{path}: both copies of the record of trust are damaged ({what}), so that no store is believed; what is on board keeps answering. Add the store's newest root by hand (`slag-edge trust add --root FILE`): the record is then written anew", path = path.display())]
+    #[error("{path}: both copies of the record of trust are damaged ({what}): no store is believed, what is on board keeps answering; add the store's newest root with `slag-edge trust add --root FILE`", path = path.display())]
     Damaged { path: PathBuf, what: String },
     #[error(
         "the record of trust would take {len_bytes} bytes, the limit is {MAX_CONTENT_BYTES}; publish the scene under a shorter name"

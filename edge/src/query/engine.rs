@@ -38,7 +38,7 @@ pub enum QueryError {
     #[error("no scene is loaded; run `slag-edge fetch`, or see the log if you have fetched one")]
     NoScene,
     #[error(
-        "the text model is {models_name} ({models_id}), but the scene was encoded with {scene_name} ({scene_id}); pass the folder of {scene_name} to --models, publish the scene with `slag-encoder encode --text-model`, or fetch a scene encoded with {models_name}"
+        "the text model is {models_name} ({models_id:.12}), the scene's is {scene_name} ({scene_id:.12}); give that to --models, or publish the scene with `slag-encoder encode --text-model`"
     )]
     EncoderMismatch { models_name: String, models_id: Hash32, scene_name: String, scene_id: Hash32 },
     #[error(transparent)]

@@ -27,7 +27,8 @@ pub enum HubError {
     NotExported { name: String, repository: String, script: String, folder: PathBuf },
     #[error("{name} finds masks in photos, which a robot does not do; pull it with slag-encoder")]
     NoTextSide { name: String },
-    #[error("{url}: {failure}; try again, or place these files by hand: {}", wanted.iter().map(Wanted::to_string).collect::<Vec<_>>().join("; "))]
+    // A line for each file: together they are too long to be read.
+    #[error("{url}: {failure}; try again, or place these files by hand:{}", wanted.iter().map(Wanted::to_string).collect::<String>())]
     Unreachable { url: String, failure: Box<DownloadError>, wanted: Vec<Wanted> },
     #[error("{name} is not pulled yet; run `models pull {name}`, or give the folder of your own model")]
     NotPulled { name: String },
@@ -73,7 +74,7 @@ impl std::fmt::Display for Wanted {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { url, path, sha256 } = self;
         let hash = sha256.map_or("unknown".to_owned(), |sha256| sha256.to_string());
-        write!(f, "{url} as {} (SHA-256 {hash})", path.display())
+        write!(f, "\n  {url}\n    as {} (SHA-256 {hash})", path.display())
     }
 }
 

@@ -243,9 +243,12 @@ fn without_the_hub_the_error_lists_the_files_to_place() {
         let wanted = format!("{} (SHA-256 {})", text.display(), sha256(&server.bytes("onnx/text.onnx")));
         let unknown = format!("{} (SHA-256 unknown)", root.path().join("made/tokenizer.json").display());
         let error = error.to_string();
-        for part in [part, &wanted, &unknown, &format!("{url}/owner/made/resolve/main/onnx/text.onnx as ")] {
+        for part in
+            [part, &wanted, &unknown, &format!("\n  {url}/owner/made/resolve/main/onnx/text.onnx\n    as ")]
+        {
             assert!(error.contains(part), "{error}");
         }
+        assert!(error.lines().all(|line| line.len() < 300), "{error}");
     }
     // Files placed by hand make a pulled model without the hub, and the lock records it.
     for name in ["onnx/vision.onnx", "onnx/text.onnx", "tokenizer.json"] {
