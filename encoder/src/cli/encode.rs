@@ -1,7 +1,8 @@
 //! `encode`: a scene into a store.
 
+use std::ffi::OsStr;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
@@ -104,7 +105,8 @@ pub struct EncodeArgs {
     memory: Option<u64>,
     #[command(flatten)]
     up: UpArgs,
-    /// Name of the scene [default: that of the store's generation, or else of the store's folder].
+    /// Name of the scene [default: that of the store's generation; else of the splat's file or its folders, the first
+    /// that is not the like of point_cloud or results; else of the store's folder].
     #[arg(long, value_name = "NAME", value_parser = parse_name, help_heading = "Output", hide_short_help = true)]
     name: Option<String>,
     /// World units are metres; a geo-reference implies it.
@@ -174,6 +176,36 @@ fn parse_name(text: &str) -> Result<String, String> {
     }
 }
 
+/// What trainers call splats and their folders, whatever they show.
+const NAMES_OF_TRAINERS: [&str; 14] = [
+    "data",
+    "export",
+    "iteration",
+    "meta",
+    "model",
+    "out",
+    "output",
+    "outputs",
+    "ply",
+    "point_cloud",
+    "results",
+    "scene",
+    "splat",
+    "tmp",
+];
+
+/// Returns the name of a splat: of its file, or of the next folder above with a name of its own.
+fn name_of(splat: &Path) -> Option<String> {
+    let path = std::path::absolute(splat).ok()?;
+    let name = |part: &OsStr| Some(part.to_str()?.split('.').next()?.to_owned());
+    let is_own = |name: &String| {
+        let word = name.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches(['_', '-']);
+        !word.is_empty() && !NAMES_OF_TRAINERS.contains(&word.to_lowercase().as_str())
+    };
+    let names = path.ancestors().filter_map(|part| name(part.file_name()?));
+    names.filter(|name| parse_name(name).is_ok()).find(is_own)
+}
+
 /// Returns the settings of the flags, with choices that may be others than those of the flags.
 fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     let input = &args.input;
@@ -234,8 +266,9 @@ fn settings(args: &EncodeArgs, choices: &ChoiceArgs) -> Result<EncodeSettings> {
     cells.landmarks = args.locate;
     // Robots keep to the scene that they know by its name.
     let published_name = || store::scene_name(&args.store);
-    let folder_name = || args.store.file_name().map(|name| name.to_string_lossy().into_owned());
-    let name = args.name.clone().or_else(published_name).or_else(folder_name);
+    let of_splat = || name_of(&input.scene);
+    let of_store = || args.store.file_name().map(|name| name.to_string_lossy().into_owned());
+    let name = args.name.clone().or_else(published_name).or_else(of_splat).or_else(of_store);
     output.scene_name = name.unwrap_or_else(|| "scene".into());
     output.created_unix_secs = now_unix_secs()?;
     output.models = args.models.models.as_deref().map(lasting_name);
@@ -446,8 +479,6 @@ fn parse_offset(text: &str) -> Result<f32, String> {
 
 #[cfg(test)]
 mod tests {
-    use std::ffi::OsStr;
-
     use clap::{CommandFactory, Parser};
 
     use super::*;
@@ -470,13 +501,13 @@ mod tests {
     }
 
     /// A scene that was named once keeps its name, also where its manifest is damaged since; a new one has that of its
-    /// folder.
+    /// splat.
     #[test]
     fn a_scene_keeps_its_name() {
         let dir = tempfile::tempdir().expect("a folder");
-        let folder = dir.path().join("lab");
+        let folder = dir.path().join("store");
         let name = |flags: &[&str]| {
-            let line = ["slag-encoder", "encode", "--scene", "a.ply", "--views", "b", "--store"];
+            let line = ["slag-encoder", "encode", "--scene", "lab.ply", "--views", "b", "--store"];
             let line = line.iter().map(OsStr::new).chain([folder.as_os_str()]);
             let parsed = Cli::try_parse_from(line.chain(flags.iter().map(OsStr::new))).expect("flags");
             let Command::Encode(args) = parsed.command else { panic!("encode") };
@@ -517,6 +548,22 @@ mod tests {
         for flags in ["--cell-width-m 5 --metric", "--masks own --ignore-mask-ids 3", "--mask-levels 2"] {
             refused(flags).expect(flags);
         }
+    }
+
+    /// What trainers write, and where.
+    #[test]
+    fn a_scene_is_called_what_its_splat_is() {
+        for (path, name) in [
+            ("/home/me/yard.ply", "yard"),
+            ("/home/me/yard.compressed.ply", "yard"),
+            ("/home/me/yard/point_cloud.ply", "yard"),
+            ("/home/me/yard/results/ply/point_cloud_29999.ply", "yard"),
+            ("/home/me/Hall 3/out/point_cloud/iteration_30000/point_cloud.ply", "Hall 3"),
+            ("/home/me/export/splat.ply", "me"),
+        ] {
+            assert_eq!(name_of(Path::new(path)).as_deref(), Some(name), "{path}");
+        }
+        assert_eq!(name_of(Path::new("/tmp/7.ply")), None);
     }
 
     #[test]
