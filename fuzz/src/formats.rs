@@ -311,8 +311,8 @@ fn read_masks(path: &Path) -> bool {
 fn check_mask(mask: &Mask) {
     let (at, [width, height]) = (&mask.box_px, MASKED_PX);
     assert!(at.x0 < at.x1 && at.x1 <= width && at.y0 < at.y1 && at.y1 <= height);
-    assert_eq!(mask.inside.len(), (at.width_px() * at.height_px()) as usize);
-    assert_eq!(mask.inside.iter().filter(|inside| **inside).count(), mask.area_px as usize);
+    assert_eq!(mask.inside.n_px(), (at.width_px() * at.height_px()) as usize);
+    assert_eq!(mask.inside.count(), mask.area_px as usize);
 }
 
 pub fn model_toml(data: &[u8]) -> bool {
