@@ -62,30 +62,24 @@ pub trait WeightSink {
 }
 
 /// Blends the Gaussians of a tile and returns the remaining transmittance at each pixel.
-///
-/// Without `occlusion` the weights are falloffs, and the transmittance stays 1.
 pub fn walk_tile(
     instructions: InstructionSet,
     visible: &[ScreenGaussian],
     members: &[u32],
     rect: TileRect,
-    occlusion: bool,
     sink: &mut impl WeightSink,
 ) -> PerPixel<f32> {
-    match occlusion {
-        true => instructions.dispatch(Walk::<_, true> { visible, members, rect, sink }),
-        false => instructions.dispatch(Walk::<_, false> { visible, members, rect, sink }),
-    }
+    instructions.dispatch(Walk { visible, members, rect, sink })
 }
 
-struct Walk<'a, K, const BLEND: bool> {
+struct Walk<'a, K> {
     visible: &'a [ScreenGaussian],
     members: &'a [u32],
     rect: TileRect,
     sink: &'a mut K,
 }
 
-impl<S: Lanes, K: WeightSink, const BLEND: bool> Work<S> for Walk<'_, K, BLEND> {
+impl<S: Lanes, K: WeightSink> Work<S> for Walk<'_, K> {
     type Output = PerPixel<f32>;
 
     #[inline(always)]
@@ -123,7 +117,7 @@ impl<S: Lanes, K: WeightSink, const BLEND: bool> Work<S> for Walk<'_, K, BLEND> 
                     let Some((first, end)) = local.vectors::<S>(y) else { continue };
                     let row: &mut [S::f32s] = cast_slice_mut(&mut transmittance[y]);
                     for (light, v) in row[first..end].iter_mut().zip(first..) {
-                        let weights = local.blend::<S, BLEND>(simd, y, v, light);
+                        let weights = local.blend(simd, y, v, light);
                         sink.add(simd, member, y, v, weights);
                     }
                 }
@@ -205,13 +199,7 @@ impl InTile {
 
     /// Returns the weights in vector `v` of row `y`, and updates the transmittance.
     #[inline(always)]
-    fn blend<S: Simd, const BLEND: bool>(
-        &self,
-        simd: S,
-        y: usize,
-        v: usize,
-        transmittance: &mut S::f32s,
-    ) -> S::f32s {
+    fn blend<S: Simd>(&self, simd: S, y: usize, v: usize, transmittance: &mut S::f32s) -> S::f32s {
         const COLUMNS: [f32; TILE_SIZE_PX] =
             [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
         let splat = |value| simd.splat_f32s(value);
@@ -223,10 +211,6 @@ impl InTile {
         let alpha = simd.min_f32s(simd.mul_f32s(splat(self.opacity), falloff), splat(MAX_ALPHA));
         let counts = simd.greater_than_or_equal_f32s(alpha, splat(MIN_ALPHA));
         let light = *transmittance;
-        if !BLEND {
-            let weighs = simd.and_m32s(counts, simd.greater_than_f32s(light, splat(0.0)));
-            return select(simd, weighs, falloff, splat(0.0));
-        }
         let next = simd.mul_f32s(light, simd.sub_f32s(splat(1.0), alpha));
         let blends = simd.and_m32s(counts, simd.greater_than_f32s(next, splat(MIN_TRANSMITTANCE)));
         let finished = select(simd, counts, simd.min_f32s(light, simd.sub_f32s(splat(0.0), light)), light);

@@ -69,7 +69,7 @@ pub fn draw(
             for (column, members) in tile_row.iter().enumerate() {
                 let rect = TileRect::new(column, row, width_px, height_px);
                 let mut sink = PixelSink::new(visible, colours);
-                let transmittance = walk_tile(instructions, visible, members, rect, true, &mut sink);
+                let transmittance = walk_tile(instructions, visible, members, rect, &mut sink);
                 for (y, light) in transmittance.iter().enumerate().take(rect.height_px) {
                     for (x, &light) in light.iter().enumerate().take(rect.width_px) {
                         let pixel = y * width_px + rect.x_px + x;
