@@ -71,7 +71,7 @@ impl PatchUse {
 }
 
 /// Largest number of pixels in a batch of crops; large crops fill a batch before the encoder's preferred number.
-const MAX_BATCH_PIXELS: u64 = 1 << 24;
+const MAX_BATCH_PIXELS: u64 = 1 << 21;
 
 /// Crops in a batch of an encoder on the processor, at most, unless model.toml asks for more.
 const BATCH: u64 = 32;
