@@ -6,7 +6,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Component, Path, PathBuf};
-use std::time::{Duration, SystemTime};
 
 use fs_err::File;
 
@@ -17,8 +16,6 @@ use super::view_set::{Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::files::{self, NotUtf8};
 
-/// Two forms of a model that were written or copied together differ by less in age.
-const SAME_MODEL: Duration = Duration::from_mins(1);
 /// Longest image name read from a binary file, bytes: Linux's limit for a path.
 const MAX_NAME_BYTES: u64 = 4096;
 /// Bytes of a 2D feature in `images.bin`: x, y (f64) and a point id (u64).
@@ -66,11 +63,11 @@ fn notes(model_dir: &Path, extension: &str, n_views: usize) -> Vec<String> {
     let mut notes = Vec::new();
     let other = if extension == "bin" { "txt" } else { "bin" };
     let [own, other] = [extension, other].map(|extension| model_dir.join(format!("images.{extension}")));
-    let changed = |path: &Path| fs_err::metadata(path).and_then(|metadata| metadata.modified()).ok();
-    let age = |(own, other): (SystemTime, SystemTime)| other.duration_since(own).unwrap_or_default();
-    if changed(&own).zip(changed(&other)).map(age).is_some_and(|age| age > SAME_MODEL) {
+    if other.is_file() {
+        let changed = |path: &Path| fs_err::metadata(path).and_then(|metadata| metadata.modified()).ok();
+        let newer = if changed(&other) > changed(&own) { ", which is newer," } else { "" };
         notes.push(format!(
-            "read {}; {}, which is newer, is ignored: name the file to read it",
+            "read {}; {}{newer} is ignored: name the file to read it",
             own.display(),
             other.display()
         ));
