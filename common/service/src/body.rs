@@ -237,8 +237,7 @@ mod tests {
 
     use super::*;
 
-    /// Many clients each send a body of the longest kind: what is held of all together is bounded, and short ones are
-    /// read all the same.
+    /// When long bodies fill their room, further ones are refused and short ones are still read.
     #[tokio::test]
     async fn bodies_have_room_for_some_at_a_time() {
         static ROOM: Semaphore = Semaphore::const_new(1 << 20);

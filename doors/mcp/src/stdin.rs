@@ -12,7 +12,7 @@ use crate::locate::{MAX_MESSAGE_BYTES, MAX_PHOTO_CHARS};
 const PIECE_BYTES: usize = 8 << 10;
 /// Characters of a text that are never cut: names of members and the message's id are texts too.
 const SHORT_CHARS: usize = 1000;
-/// Bytes of a message from which its texts are cut to that; what is no text has the rest.
+/// Size of a message beyond which its texts are cut to [`SHORT_CHARS`]; the rest is for everything else.
 const MAX_TEXT_BYTES: usize = MAX_MESSAGE_BYTES / 8 * 7;
 
 /// Messages, one a line, as they are read; of each text in them the first characters, one more than a photo may have.

@@ -177,7 +177,7 @@ impl App {
     }
 }
 
-/// Time in which work that has spent its own says so, and what to ask for instead.
+/// Time that work over its budget has to answer with what to ask for instead.
 const TO_SAY_SO: Duration = Duration::from_millis(100);
 
 /// Time for a request and for sending its answer, besides that for the query.

@@ -57,8 +57,8 @@ pub fn best(scores: &[f32]) -> Option<usize> {
     (0..scores.len()).reduce(|best, object| if scores[object] > scores[best] { object } else { best })
 }
 
-/// A scene's objects with the scores of a question, of which those count that have at least `min_count` Gaussians, and
-/// at least one, in a region.
+/// A scene's objects with the scores of a question. Only those with at least `min_count` Gaussians (and at least one) in
+/// the region count.
 #[derive(Clone, Copy)]
 pub struct ScoredObjects<'s, 'a> {
     pub scene: &'s Scene<'a>,

@@ -554,12 +554,12 @@ mod tests {
     #[test]
     fn a_scene_is_called_what_its_splat_is() {
         for (path, name) in [
-            ("/home/me/yard.ply", "yard"),
-            ("/home/me/yard.compressed.ply", "yard"),
-            ("/home/me/yard/point_cloud.ply", "yard"),
-            ("/home/me/yard/results/ply/point_cloud_29999.ply", "yard"),
-            ("/home/me/Hall 3/out/point_cloud/iteration_30000/point_cloud.ply", "Hall 3"),
-            ("/home/me/export/splat.ply", "me"),
+            ("/scans/me/yard.ply", "yard"),
+            ("/scans/me/yard.compressed.ply", "yard"),
+            ("/scans/me/yard/point_cloud.ply", "yard"),
+            ("/scans/me/yard/results/ply/point_cloud_29999.ply", "yard"),
+            ("/scans/me/Hall 3/out/point_cloud/iteration_30000/point_cloud.ply", "Hall 3"),
+            ("/scans/me/export/splat.ply", "me"),
         ] {
             assert_eq!(name_of(Path::new(path)).as_deref(), Some(name), "{path}");
         }
