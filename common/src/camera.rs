@@ -84,8 +84,9 @@ impl Distortion {
         }
     }
 
-    /// Returns whether the tangential terms fold the image over at an ideal normalised point: the determinant of
-    /// the derivative of [`Self::distort`] is not positive, so that another direction has the same pixel.
+    /// Returns whether the tangential terms fold the image over at an ideal normalised point: the derivative of
+    /// [`Self::distort`], which is symmetric, is not positive, so that another direction has the same pixel. Where the
+    /// image is folded twice, along both axes, the determinant alone would be positive again.
     pub fn folds_at(&self, [x, y]: [f64; 2]) -> bool {
         let Self::Brown { k: [k1, k2, k3], p: [p1, p2] } = *self else { return false };
         let r2 = x * x + y * y;
@@ -94,8 +95,8 @@ impl Distortion {
         let xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x;
         let yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x;
         let xy = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
-        let determinant = xx * yy - xy * xy;
-        determinant.is_nan() || determinant <= 0.0
+        let is_positive = xx > 0.0 && xx * yy - xy * xy > 0.0;
+        !is_positive
     }
 
     /// Returns the normalised radius up to which the radial part grows with the radius.

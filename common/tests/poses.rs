@@ -466,6 +466,21 @@ fn a_point_in_camera(view: &View, point_in_world: DVec3) -> DVec3 {
     view.camera_from_world.transform_point3(point_in_world)
 }
 
+/// A mask that is not read, and an angle that says another focal length, are told.
+#[test]
+fn what_transforms_say_in_vain_is_told() {
+    let with = |angle: f64| {
+        let mut masked = frame("b.jpg");
+        masked["mask_path"] = "masks/b.png".into();
+        let json = serde_json::json!({"fl_x": 60, "camera_angle_x": angle, "w": 64, "h": 48, "frames": [frame("a.jpg"), masked]});
+        read_json(json).unwrap().notes
+    };
+    let notes = with(2.0 * (32.0_f64 / 60.0).atan());
+    assert!(notes.len() == 1 && notes[0].starts_with("1 frames have a mask_path"), "{notes:?}");
+    let notes = with(1.6);
+    assert!(notes[1].contains("31.1 px, fl_x says 60.0 px"), "{notes:?}");
+}
+
 /// NeRF's first data sets have only an angle, no extension and no size.
 #[test]
 fn transforms_with_an_angle_and_bare_names() {

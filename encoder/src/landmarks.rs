@@ -4,13 +4,16 @@
 use glam::{DAffine3, DVec2};
 use slag_common::{Intrinsics, View};
 use slag_locate::{
-    Grey, Landmark, MAX_FEATURES, MappingView, Observation, Renderer, Rendering, build, code, features,
+    Grey, Landmark, MAX_FEATURES, MappingView, Observation, Renderer, Rendering,
+    WORKING_BYTES_PER_OBSERVATION, build, code, features,
 };
 
 use crate::ingest::{self, IngestError, LoadedImage};
+use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{LoadedScene, RasterError, RasterView};
 
-/// Landmarks for so many Gaussians: at 24 bytes 1.98 bytes a Gaussian; headers of shards add less than 0.02.
+const BYTES_IN_SHARD: usize = 24;
+/// Landmarks for so many Gaussians: 1.98 bytes a Gaussian; headers of shards add less than 0.02.
 const LANDMARKS: usize = 33;
 const GAUSSIANS: usize = 400;
 /// Widest drawing, pixels: splats show no more of a photo than that.
@@ -41,6 +44,22 @@ impl Renderer for SceneRenderer<'_> {
     }
 }
 
+/// Reserves the features of all photos and what is made of them, and a photo that is looked at with a drawing of its
+/// view; and what shards carry.
+pub(crate) fn reserve(memory: &mut MemoryPlan, n_views: usize, views: &[View], n_gaussians: usize) {
+    let photo_px = views.iter().map(ingest::photo_area_px).max().unwrap_or(0);
+    let per_observation = size_of::<Observation>() + WORKING_BYTES_PER_OBSERVATION;
+    let n_landmarks = (n_gaussians * LANDMARKS / GAUSSIANS).min(n_views * MAX_FEATURES);
+    let lists_bytes = n_views * MAX_FEATURES * per_observation + 2 * n_landmarks * size_of::<Landmark>();
+    memory.reserve(Phase::Landmarks, "features of all photos", lists_bytes as u64);
+    // The photo, its grey, and five numbers for each pixel of the drawing.
+    let photo_bytes = photo_px * (ingest::LOADED_BYTES_PER_PX + 4)
+        + photo_px.min(u64::from(MAX_DRAWING_WIDTH_PX).pow(2)) * 20;
+    let photo_bytes = photo_bytes + slag_locate::working_bytes(photo_px as usize, 1) as u64;
+    memory.reserve(Phase::Landmarks, "a photo that is searched", photo_bytes);
+    memory.reserve(Phase::Always, "landmarks", (n_landmarks * BYTES_IN_SHARD) as u64);
+}
+
 /// Returns the features of a photo that have a place in the scene.
 pub fn observe(scene: &dyn LoadedScene, number: u16, view: &View) -> Result<MappingView, LandmarkError> {
     let LoadedImage { view, image, .. } = ingest::load_image(view)?;
@@ -57,10 +76,14 @@ pub fn observe(scene: &dyn LoadedScene, number: u16, view: &View) -> Result<Mapp
         let point_in_world = slag_locate::point_in_world(&pose, &view.intrinsics, at, depth);
         Some(Observation { at, point_in_world, code: code(&feature.descriptor) })
     };
-    let observations = found.into_iter().filter_map(observation).collect();
+    let mut observations = Vec::with_capacity(found.len());
+    observations.extend(found.into_iter().filter_map(observation));
     Ok(MappingView { view: number, intrinsics: view.intrinsics, camera_from_world: pose, observations })
 }
 
 pub fn landmarks(views: &[MappingView], n_gaussians: usize) -> Vec<Landmark> {
     build(views, n_gaussians * LANDMARKS / GAUSSIANS)
 }
+
+#[cfg(test)]
+mod tests;

@@ -194,6 +194,23 @@ fn id_images_of_the_wrong_kind_or_size_are_refused() {
     assert!(taken.largest_bytes < 100_000, "{taken:?}");
 }
 
+/// As an image program draws a mask with antialiasing: each value between black and white would be a mask of its own.
+#[test]
+fn soft_edges_are_no_ids() {
+    let dir = folder();
+    let ramp: Vec<u8> =
+        (0..48).map(|at| [0, 0, 20 + at, 90 + at, 160 + at, 255, 255, 255][at as usize % 8]).collect();
+    let (gray, eight) = (png::ColorType::Grayscale, png::BitDepth::Eight);
+    write_png(&dir.path().join("left/a.png"), gray, eight, &ramp);
+    let refused = load(dir.path(), &[], None).unwrap_err().to_string();
+    assert!(refused.contains("soft edges: 18 values"), "{refused}");
+    // A black and white image of one mask is cut at half.
+    fs_err::create_dir(dir.path().join("left/a")).unwrap();
+    fs_err::rename(dir.path().join("left/a.png"), dir.path().join("left/a/0.png")).unwrap();
+    let half = mask(8, 6, |x, y| ramp[(y * 8 + x) as usize] >= 128).unwrap();
+    assert_eq!(load(dir.path(), &[], None).unwrap().unwrap(), [half]);
+}
+
 #[test]
 fn run_length_files_of_every_form() {
     let dir = folder();

@@ -1,6 +1,6 @@
 //! Makes a map from the features of the photos of a scene.
 
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
 
 use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
@@ -34,8 +34,8 @@ pub struct MappingView {
     pub observations: Vec<Observation>,
 }
 
-/// An observation of a view, and the observations of other views that show the same point: view, observation.
-type Ranked = (usize, Vec<(usize, usize)>);
+/// Bytes that [`build`] takes for each observation and beside it: whether it is chosen or hidden, its rank, its bin.
+pub const WORKING_BYTES_PER_OBSERVATION: usize = 2 + size_of::<u32>() + size_of::<Binned>();
 
 /// Returns at most `limit` landmarks: of each view, its share of the points that most of its neighbours show, too.
 /// A point that several views show is taken once.
@@ -47,19 +47,25 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
         .collect();
     let mut chosen: Vec<Vec<bool>> = views.iter().map(|view| vec![false; view.observations.len()]).collect();
     let mut hidden = chosen.clone();
-    // By view: observations with the others that show the same point, those with most first.
-    let ranked: Vec<Vec<Ranked>> = (0..views.len())
+    let neighbours = |at: usize| {
+        let mut others: Vec<usize> = (0..views.len()).filter(|other| *other != at).collect();
+        let apart = |other: &usize| middles[at].distance_squared(middles[*other]);
+        others.sort_by(|a, b| apart(a).total_cmp(&apart(b)).then(a.cmp(b)));
+        others.truncate(N_NEIGHBOURS);
+        others
+    };
+    let neighbours: Vec<Vec<usize>> = (0..views.len()).map(neighbours).collect();
+    // The observations of other views that show the same point: view, observation. They are found again where a point
+    // is chosen: kept for all, they would take ten times the memory of the observations.
+    let seen = |at: usize, index: usize| {
+        let (of, finders) = (&views[at].observations[index], &finders);
+        neighbours[at].iter().filter_map(move |other| Some((*other, finders[*other].find(of)?)))
+    };
+    // By view: observations, those that most others show first.
+    let ranked: Vec<Vec<u32>> = (0..views.len())
         .map(|at| {
-            let mut others: Vec<usize> = (0..views.len()).filter(|other| *other != at).collect();
-            let apart = |other: &usize| middles[at].distance_squared(middles[*other]);
-            others.sort_by(|a, b| apart(a).total_cmp(&apart(b)).then(a.cmp(b)));
-            others.truncate(N_NEIGHBOURS);
-            let seen = |observation: &Observation| {
-                let of_view = |other: &usize| Some((*other, finders[*other].find(observation)?));
-                others.iter().filter_map(of_view).collect::<Vec<_>>()
-            };
-            let mut ranked: Vec<_> = views[at].observations.iter().map(seen).enumerate().collect();
-            ranked.sort_by_key(|(index, seen)| (std::cmp::Reverse(seen.len()), *index));
+            let mut ranked: Vec<u32> = (0..views[at].observations.len() as u32).collect();
+            ranked.sort_by_cached_key(|index| (Reverse(seen(at, *index as usize).count()), *index));
             ranked
         })
         .collect();
@@ -72,14 +78,14 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
             if landmarks.len() == limit {
                 return landmarks;
             }
-            while let Some((index, seen)) = ranked[at].get(next[at]) {
+            while let Some(index) = ranked[at].get(next[at]).map(|index| *index as usize) {
                 next[at] += 1;
-                if hidden[at][*index] || chosen[at][*index] {
+                if hidden[at][index] || chosen[at][index] {
                     continue;
                 }
-                chosen[at][*index] = true;
-                seen.iter().for_each(|(other, index)| hidden[*other][*index] = true);
-                let Observation { point_in_world, code, .. } = view.observations[*index];
+                chosen[at][index] = true;
+                seen(at, index).for_each(|(other, index)| hidden[other][index] = true);
+                let Observation { point_in_world, code, .. } = view.observations[index];
                 landmarks.push(Landmark { position_in_world: point_in_world, code, view: view.view });
                 break;
             }
@@ -94,28 +100,35 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
 struct Finder<'a> {
     view: &'a MappingView,
     camera: Pinhole,
-    bins: BTreeMap<(i64, i64), Vec<usize>>,
+    /// Ascending.
+    bins: Vec<Binned>,
 }
 
-fn bin(at: DVec2) -> (i64, i64) {
-    ((at.x / SAME_FEATURE_PX).floor() as i64, (at.y / SAME_FEATURE_PX).floor() as i64)
+/// A bin, and an observation in it.
+type Binned = ([i32; 2], u32);
+
+/// Returns the bin of a pixel. What lies near the camera's plane is seen millions of pixels away, where no feature is.
+fn bin(at: DVec2) -> [i32; 2] {
+    at.to_array().map(|at| (at / SAME_FEATURE_PX).floor().clamp(-1e9, 1e9) as i32)
 }
 
 impl<'a> Finder<'a> {
     fn new(view: &'a MappingView) -> Self {
-        let mut bins: BTreeMap<(i64, i64), Vec<usize>> = BTreeMap::new();
-        for (index, observation) in view.observations.iter().enumerate() {
-            bins.entry(bin(observation.at)).or_default().push(index);
-        }
+        let binned = |(of, index): (&Observation, u32)| (bin(of.at), index);
+        let mut bins: Vec<Binned> = view.observations.iter().zip(0..).map(binned).collect();
+        bins.sort_unstable();
         Self { view, camera: Pinhole::new(&view.intrinsics), bins }
     }
 
     /// Returns the view's feature that shows the point of another view's.
     fn find(&self, of: &Observation) -> Option<usize> {
         let at = self.camera.pixel(self.view.camera_from_world.transform_point3(of.point_in_world))?;
-        let (x, y) = bin(at);
-        let around = (x - 1..=x + 1).flat_map(|x| (y - 1..=y + 1).map(move |y| (x, y)));
-        let near = around.filter_map(|bin| self.bins.get(&bin)).flatten().copied();
+        let [x, y] = bin(at);
+        let column = |x: i32| {
+            let first = self.bins.partition_point(|(bin, _)| *bin < [x, y - 1]);
+            self.bins[first..].iter().take_while(move |(bin, _)| *bin <= [x, y + 1])
+        };
+        let near = (x - 1..=x + 1).flat_map(column).map(|(_, index)| *index as usize);
         let near = near.filter(|index| self.view.observations[*index].at.distance(at) < SAME_FEATURE_PX);
         let alike = near.map(|index| (distance(of.code, self.view.observations[index].code), index));
         alike.min().filter(|(bits, _)| *bits <= SAME_FEATURE_BITS).map(|(_, index)| index)

@@ -18,7 +18,7 @@ mod pose;
 mod ransac;
 mod render;
 
-pub use build::{MappingView, Observation, build};
+pub use build::{MappingView, Observation, WORKING_BYTES_PER_OBSERVATION, build};
 pub use describe::{DIM, Descriptor};
 pub use features::{Feature, MAX_FEATURES, features, working_bytes};
 pub use find::{Located, Outcome, Photo, Prior, Reason, locate};

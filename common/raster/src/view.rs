@@ -3,7 +3,7 @@
 use glam::{DAffine3, DMat3};
 use slag_common::{Distortion, Gaussians, Intrinsics, View};
 
-use crate::constants::MAX_IMAGE_PX;
+use crate::constants::{MAX_IMAGE_PX, MAX_SIDE_PX};
 
 /// A posed pinhole camera at raster resolution.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,7 +29,8 @@ pub enum InputError {
     #[error("spherical harmonics of degree {found}, expected at most 3; convert the scene")]
     ShDegree { found: u8 },
     #[error(
-        "image of {width_px} x {height_px} px, expected 1 to {max} px in total; choose another raster width",
+        "image of {width_px} x {height_px} px, expected 1 to {max} px in total, and sides of at most {MAX_SIDE_PX} px; choose \
+         another raster width",
         max = MAX_IMAGE_PX
     )]
     ImageSize { width_px: u32, height_px: u32 },
@@ -71,7 +72,8 @@ pub fn check_scene(scene: &Gaussians) -> Result<(), InputError> {
 pub fn check_view(view: &RasterView) -> Result<(), InputError> {
     let Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, distortion } =
         view.intrinsics;
-    if !(1..=MAX_IMAGE_PX).contains(&(u64::from(width_px) * u64::from(height_px))) {
+    let n_px = u64::from(width_px) * u64::from(height_px);
+    if !(1..=MAX_IMAGE_PX).contains(&n_px) || width_px.max(height_px) > MAX_SIDE_PX {
         return Err(InputError::ImageSize { width_px, height_px });
     }
     if distortion != Distortion::None {

@@ -1,3 +1,5 @@
+use std::f64::consts::TAU;
+
 use super::*;
 
 const BROWN: Distortion =
@@ -46,6 +48,39 @@ fn the_monotonic_radius_is_where_the_image_folds() {
             Some(r) => assert!((found - r).abs() < 2.0 * step, "{distortion:?}: {found}, scanned {r}"),
             None => assert!(found > 4.9, "{distortion:?}: {found}"),
         }
+    }
+}
+
+/// Tangential terms fold the image along one axis, and farther out along the other, too. Oracle: a dense scan along each
+/// direction for the first place where a numeric derivative stops being positive; nothing beyond it has a place.
+#[test]
+fn nothing_beyond_a_fold_has_a_place() {
+    for p in [[0.1, 0.0], [0.0, -0.2], [0.05, 0.08]] {
+        let lens = Distortion::Brown { k: [-0.01, 0.0, 0.0], p };
+        let mut n_twice_folded = 0;
+        for direction in 0..64 {
+            let (sin, cos) = (f64::from(direction) * TAU / 64.0).sin_cos();
+            let mut is_beyond = false;
+            for step in 1..400 {
+                let r = f64::from(step) * 0.02;
+                let at = [r * cos, r * sin];
+                let across = |axis: usize| {
+                    let moved = |by: f64| {
+                        lens.distort(std::array::from_fn(|a| at[a] + if a == axis { by } else { 0.0 }))
+                    };
+                    let (low, high) = (moved(-1e-6), moved(1e-6));
+                    [0, 1].map(|a| (high[a] - low[a]) / 2e-6)
+                };
+                let (x, y) = (across(0), across(1));
+                let determinant = x[0] * y[1] - x[1] * y[0];
+                is_beyond |= determinant < -1e-6;
+                n_twice_folded += usize::from(is_beyond && determinant > 1e-3);
+                if is_beyond && r < lens.monotonic_radius() {
+                    assert!(lens.folds_at(at), "{p:?}: {at:?}");
+                }
+            }
+        }
+        assert!(n_twice_folded > 0, "{p:?}: the scan must reach a second fold");
     }
 }
 

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DVec3};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
@@ -15,6 +16,9 @@ use super::paths::{PhotoFinder, Stated, parent, parts_of, take_back_shared};
 use super::view_set::{AppliedTransform, Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::files;
+
+/// Largest ratio of a focal length and that of an angle which say the same.
+const MAX_FOCAL_RATIO: f64 = 1.02;
 
 /// Extensions tried, in this order, for a `file_path` without one.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "webp", "PNG", "JPG"];
@@ -46,6 +50,7 @@ struct FrameEntry {
     file_path: String,
     /// NaN, which is no JSON, was replaced by null. `None`: the frame was not placed.
     transform_matrix: Option<Vec<Vec<Option<f64>>>>,
+    mask_path: Option<IgnoredAny>,
     #[serde(flatten)]
     camera: Camera,
 }
@@ -109,8 +114,31 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
             .first()
             .map(|first| format!("{} photos are not where the file says; found {first}", moved.len())),
     );
+    notes.extend(not_read(&transforms, &views));
     let applied = applied(&transforms, &folder).map_err(in_file)?;
     Ok(ViewSet { applied, notes, ..view_set(path, views, PoseSource::Transforms, damaged)? })
+}
+
+/// Says what of the file has no effect, though it was meant to.
+fn not_read(transforms: &Transforms, views: &[View]) -> Vec<String> {
+    let mut found = Vec::new();
+    let n_masked = transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count();
+    if n_masked > 0 {
+        found.push(format!(
+            "{n_masked} frames have a mask_path, which is not read; make transparent in the photos what they hide"
+        ));
+    }
+    let camera = &transforms.camera;
+    let width_px = camera.w.or(views.first().map(|view| view.intrinsics.width_px.into()));
+    if let (Some(angle), Some(stated_px), Some(width_px)) = (camera.camera_angle_x, camera.fl_x, width_px) {
+        let by_angle_px = 0.5 * width_px / (0.5 * angle).tan();
+        if !(1.0 / MAX_FOCAL_RATIO..=MAX_FOCAL_RATIO).contains(&(by_angle_px / stated_px)) {
+            found.push(format!(
+                "camera_angle_x means a focal length of {by_angle_px:.1} px, fl_x says {stated_px:.1} px; fl_x is taken"
+            ));
+        }
+    }
+    found
 }
 
 /// Returns a frame's pose. `image`: its name.

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use slag_common::files;
+use ureq::http::Uri;
 
 use crate::client::Robot;
 
@@ -15,11 +16,17 @@ const MAX_TOKEN_BYTES: u64 = 8192;
 #[derive(Clone, Debug, Args)]
 pub struct RobotArgs {
     /// Address of the robot's `slag-edge serve`.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT")]
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT", value_parser = address)]
     robot: String,
     /// File with the token of the robot's --token-file.
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
+}
+
+fn address(text: &str) -> Result<String, &'static str> {
+    let url = text.parse::<Uri>().ok().filter(|url| matches!(url.scheme_str(), Some("http" | "https")));
+    url.and_then(|url| url.host().map(|_| text.to_owned()))
+        .ok_or("expected http://HOST:PORT or https://HOST:PORT")
 }
 
 impl RobotArgs {

@@ -73,7 +73,12 @@ pub async fn post(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Json<Pa
 
 /// Returns the problem of a body that is no request: what serde says names the member, and the names it may have.
 fn unreadable(error: &serde_json::Error) -> Problem {
-    let (text, expected) = (error.to_string(), "a request as GET /openapi.json describes it");
+    let (mut text, expected) = (error.to_string(), "a request as GET /openapi.json describes it");
+    for (type_in_rust, in_words) in
+        [("usize", "a whole number"), ("u32", "a whole number"), ("f32", "a number"), ("f64", "a number")]
+    {
+        text = text.replace(&format!("expected {type_in_rust}"), &format!("expected {in_words}"));
+    }
     let shown: String = text.chars().take(MAX_REASON_CHARS).collect();
     let dots = if shown.len() < text.len() { "…" } else { "" };
     let problem = Problem::from(RequestError::new("body", &text, expected));

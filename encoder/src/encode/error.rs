@@ -19,7 +19,7 @@ use crate::viewpoints::{DrawError, ViewpointError};
 #[derive(Debug, thiserror::Error)]
 pub enum EncodeError {
     #[error("{setting}: {problem}")]
-    Setting { setting: &'static str, problem: String },
+    Setting { setting: String, problem: String },
     #[error(
         "{model} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out"
     )]

@@ -82,7 +82,7 @@ impl Inputs {
                 "{asked} would take {n} more cells, expected at most {most}; give a larger --position-error, or remove Gaussians far \
                  from the scene"
             );
-            return Err(EncodeError::Setting { setting: "position_error", problem });
+            return Err(EncodeError::Setting { setting: "--position-error".into(), problem });
         }
         let stands = || context.install(|| Standing::find(&scene, &views));
         let standing = Arc::new(context.time("ground", stands));
@@ -98,7 +98,7 @@ fn check_cells(n: usize) -> Result<(), EncodeError> {
         "the scene would have {n} cells or more, expected at most {}; raise --cell-gaussians and --cell-width-m",
         cells::MAX_CELLS
     );
-    Err(EncodeError::Setting { setting: "cells", problem })
+    Err(EncodeError::Setting { setting: "--cell-gaussians".into(), problem })
 }
 
 pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {

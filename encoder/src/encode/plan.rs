@@ -19,6 +19,7 @@ use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSetting
 use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::ground::{self, Standing};
+use crate::landmarks;
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
 use crate::objects;
@@ -179,6 +180,14 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, engines: &Engines<'_>
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {
         objects::reserve(&mut memory, n_gaussians, settings.aggregation.has_fine_superpoints());
+    }
+    if settings.cells.landmarks {
+        landmarks::reserve(
+            &mut memory,
+            settings.run.views_limit.of(inputs.views.len()),
+            &inputs.views,
+            n_gaussians,
+        );
     }
     memory
 }

@@ -23,7 +23,11 @@ pub(crate) struct LeftOut(Vec<SkippedView>);
 impl LeftOut {
     const N_NAMED: usize = 3;
 
-    pub(crate) fn push(&mut self, view: String, reason: String) {
+    pub(crate) fn push(&mut self, view: String, mut reason: String) {
+        // Most errors name their view themselves.
+        if let Some(rest) = reason.strip_prefix(&format!("view {view}: ")) {
+            reason = rest.to_owned();
+        }
         if self.0.len() < Self::N_NAMED {
             tracing::warn!("view {view} is left out: {reason}");
         }

@@ -322,16 +322,16 @@ impl EncodeSettings {
         let has_error = !matches!(limits.position_error, PositionError::Within(error) if !is_positive(error));
         let has_voxels = cells.occupancy.is_none_or(|of| (0.02..=0.5).contains(&of.voxel_m));
         let checks = [
-            ("threads", run.threads > 0, "0 threads; expected at least 1"),
-            ("gpus", !run.gpus.is_empty(), "none; expected at least one number"),
-            ("views_limit", has_share, "expected a share of 0 to 1"),
-            ("masks", has_levels, "expected 1 to 4 levels"),
-            ("raster_width", has_width, "expected 16 to 8192 pixels"),
-            ("max_gaussians", has_gaussians, "expected 1 to 65536 Gaussians a cell"),
-            ("max_width", limits.max_width.is_none_or(is_positive), "expected a finite width above 0"),
-            ("profiles", !cells.shards.profiles.is_empty(), "expected at least one profile"),
+            ("--threads", run.threads > 0, "0 threads; expected at least 1"),
+            ("--gpus", !run.gpus.is_empty(), "none; expected at least one number"),
+            ("--views-limit", has_share, "expected a share of 0 to 1"),
+            ("--mask-levels", has_levels, "expected 1 to 4 levels"),
+            ("--raster-width", has_width, "expected 16 to 8192 pixels"),
+            ("--cell-gaussians", has_gaussians, "expected 1 to 65536 Gaussians a cell"),
+            ("--cell-width-m", limits.max_width.is_none_or(is_positive), "expected a finite width above 0"),
+            ("--profiles", !cells.shards.profiles.is_empty(), "expected at least one profile"),
             (
-                "max_components",
+                "--max-components",
                 has_components,
                 "expected an even number of components, 2 to 128: subspaces come in pairs",
             ),
@@ -340,20 +340,21 @@ impl EncodeSettings {
                 is_even(codebook.max_subspaces),
                 "expected an even number of subspaces, at least 2: two share a byte",
             ),
-            ("compact_error", is_error(codebook.compact_error), "expected a finite error, at least 0"),
+            ("--compact-error", is_error(codebook.compact_error), "expected a finite error, at least 0"),
             ("balanced_error", is_error(codebook.balanced_error), "expected a finite error, at least 0"),
-            ("occupancy", has_voxels, "expected voxels of 0.02 to 0.5 metres"),
+            ("--occupancy", has_voxels, "expected voxels of 0.02 to 0.5 metres"),
             (
-                "occupancy",
+                "--occupancy",
                 cells.occupancy.is_none() || is_metric,
                 "a robot's size is in metres, the scene's units are not known to be; give --metric if they are metres",
             ),
-            ("min_view_share", aggregation.min_view_share <= 1.0, "expected a share of 0 to 1"),
-            ("position_error", has_error, "expected a finite error above 0"),
+            ("--min-view-share", aggregation.min_view_share <= 1.0, "expected a share of 0 to 1"),
+            ("--position-error", has_error, "expected a finite error above 0"),
         ];
-        let refuse = |setting, problem: String| Err(EncodeError::Setting { setting, problem });
+        let refuse =
+            |setting: &str, problem| Err(EncodeError::Setting { setting: setting.to_owned(), problem });
         if let Some((setting, _, problem)) = checks.into_iter().find(|(_, is_valid, _)| !is_valid) {
-            return refuse(setting, problem.into());
+            return refuse(setting, problem);
         }
         // By their serialised form, so that a new field is checked too.
         let fields = serde_json::to_value(aggregation).map_err(std::io::Error::from)?;
@@ -361,7 +362,7 @@ impl EncodeSettings {
             // NaN and infinity are no JSON numbers.
             let is_valid = value.is_boolean() || value.as_f64().is_some_and(|x| (0.0..=1000.0).contains(&x));
             if !is_valid {
-                return refuse("aggregation", format!("{field} is out of its range, 0 to 1000"));
+                return refuse(&format!("--{}", field.replace('_', "-")), "expected 0 to 1000");
             }
         }
         Ok(())
@@ -373,7 +374,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn settings_out_of_range_are_errors_with_a_name() {
+    fn settings_out_of_range_name_their_flag() {
         let refused = |change: &dyn Fn(&mut EncodeSettings)| {
             let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
             settings.validate().expect("the default is valid");
@@ -383,31 +384,33 @@ mod tests {
                 other => panic!("{other:?}"),
             }
         };
-        assert_eq!(refused(&|s| s.run.threads = 0), "threads");
-        assert_eq!(refused(&|s| s.run.views_limit = ViewsLimit::Share(f64::NAN)), "views_limit");
-        assert_eq!(refused(&|s| s.view.masks = Masks::Auto { n_levels: 0 }), "masks");
-        assert_eq!(refused(&|s| s.view.raster_width = RasterWidth::Px(0)), "raster_width");
-        assert_eq!(refused(&|s| s.cells.limits.max_gaussians = 0), "max_gaussians");
-        assert_eq!(refused(&|s| s.cells.limits.max_width = Some(0.0)), "max_width");
-        assert_eq!(refused(&|s| s.cells.shards.profiles.clear()), "profiles");
-        assert_eq!(refused(&|s| s.cells.shards.codebook.max_components = 0), "max_components");
-        assert_eq!(refused(&|s| s.cells.shards.codebook.max_components = 7), "max_components");
-        assert_eq!(refused(&|s| s.cells.shards.codebook.max_components = 130), "max_components");
-        assert_eq!(refused(&|s| s.cells.shards.codebook.max_subspaces = 0), "max_subspaces");
-        assert_eq!(refused(&|s| s.cells.shards.codebook.max_subspaces = 3), "max_subspaces");
-        assert_eq!(refused(&|s| s.cells.shards.codebook.compact_error = -0.1), "compact_error");
-        assert_eq!(refused(&|s| s.cells.shards.codebook.balanced_error = f32::NAN), "balanced_error");
-        assert_eq!(
-            refused(&|s| s.cells.limits.position_error = PositionError::Within(0.0)),
-            "position_error"
-        );
-        assert_eq!(refused(&|s| s.cells.occupancy = Some(OccupancySettings { voxel_m: 0.0 })), "occupancy");
-        let without_unit = |s: &mut EncodeSettings| {
-            s.inputs.metric = false;
-            s.cells.occupancy = Some(OccupancySettings { voxel_m: 0.05 });
-        };
-        assert_eq!(refused(&without_unit), "occupancy");
-        assert_eq!(refused(&|s| s.aggregation.superpoint = f32::INFINITY), "aggregation");
-        assert_eq!(refused(&|s| s.aggregation.min_view_share = 1.5), "min_view_share");
+        type Change = fn(&mut EncodeSettings);
+        let rows: [(&str, Change); 19] = [
+            ("--threads", |s| s.run.threads = 0),
+            ("--views-limit", |s| s.run.views_limit = ViewsLimit::Share(f64::NAN)),
+            ("--mask-levels", |s| s.view.masks = Masks::Auto { n_levels: 0 }),
+            ("--raster-width", |s| s.view.raster_width = RasterWidth::Px(0)),
+            ("--cell-gaussians", |s| s.cells.limits.max_gaussians = 0),
+            ("--cell-width-m", |s| s.cells.limits.max_width = Some(0.0)),
+            ("--profiles", |s| s.cells.shards.profiles.clear()),
+            ("--max-components", |s| s.cells.shards.codebook.max_components = 0),
+            ("--max-components", |s| s.cells.shards.codebook.max_components = 7),
+            ("--max-components", |s| s.cells.shards.codebook.max_components = 130),
+            ("max_subspaces", |s| s.cells.shards.codebook.max_subspaces = 0),
+            ("max_subspaces", |s| s.cells.shards.codebook.max_subspaces = 3),
+            ("--compact-error", |s| s.cells.shards.codebook.compact_error = -0.1),
+            ("balanced_error", |s| s.cells.shards.codebook.balanced_error = f32::NAN),
+            ("--position-error", |s| s.cells.limits.position_error = PositionError::Within(0.0)),
+            ("--occupancy", |s| s.cells.occupancy = Some(OccupancySettings { voxel_m: 0.0 })),
+            ("--occupancy", |s| {
+                s.inputs.metric = false;
+                s.cells.occupancy = Some(OccupancySettings { voxel_m: 0.05 });
+            }),
+            ("--superpoint", |s| s.aggregation.superpoint = f32::INFINITY),
+            ("--min-view-share", |s| s.aggregation.min_view_share = 1.5),
+        ];
+        for (flag, change) in rows {
+            assert_eq!(refused(&change), flag);
+        }
     }
 }

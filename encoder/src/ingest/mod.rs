@@ -23,7 +23,7 @@ pub use undistort::Undistorter;
 const MAX_DOWNSCALE: u32 = 64;
 /// Bytes that a pixel takes while its photo is loaded: eight as read (16 bits, transparent), three as colours; three
 /// without distortion, once the first are gone, and its place before.
-const LOADED_BYTES_PER_PX: u64 = 11;
+pub(crate) const LOADED_BYTES_PER_PX: u64 = 11;
 
 #[derive(Clone, Debug)]
 pub struct LoadedImage {

@@ -117,6 +117,11 @@ pub enum SegmentError {
     },
     #[error("{}: found {found} pixels, expected ids; write a PNG with up to 16 bits of gray, or with a palette", path.display())]
     NotIds { path: PathBuf, found: &'static str },
+    #[error(
+        "{}: soft edges: {n} values between black and white lie only where they meet, expected an id for each mask; write black \
+         where a pixel is outside, white where it is inside, nothing between", path.display()
+    )]
+    SoftEdges { path: PathBuf, n: usize },
     #[error("{}: {what}; {advice}", path.display())]
     StandIn { path: PathBuf, what: &'static str, advice: &'static str },
     #[error(
@@ -163,11 +168,11 @@ pub enum SegmentError {
     #[error(transparent)]
     Model(Box<SessionError>),
     #[error(
-        "view {view:?}: the mask model's output is not finite; run it with --provider cpu, or give another"
+        "view {view}: the mask model's output is not finite; run it with --provider cpu, or give another"
     )]
     NotFinite { view: String },
     #[error(
-        "view {view:?}: the masks found exceed {limit_bytes} bytes; lower --points-per-side, or raise \
+        "view {view}: the masks found exceed {limit_bytes} bytes; lower --points-per-side, or raise \
          --sam-predicted-iou and --sam-stability"
     )]
     TooManyMasks { view: String, limit_bytes: u64 },

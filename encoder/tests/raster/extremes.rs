@@ -1,10 +1,10 @@
 //! Geometry and opacity at the extremes: rows of the table in docs/numerics.md, each against float64.
 
 use glam::{DAffine3, DVec3};
-use slag_common::Gaussians;
 use slag_common::splat::{self, ReadOptions};
+use slag_common::{Gaussians, pinhole};
 use slag_encoder::masks::RegionMap;
-use slag_encoder::raster::constants::{MAX_IMAGE_PX, SUM_FRACTION_BITS};
+use slag_encoder::raster::constants::{MAX_IMAGE_PX, MAX_SIDE_PX, SUM_FRACTION_BITS};
 use slag_encoder::raster::{RasterView, RegionWeight};
 
 use super::backends::{Backend, backends};
@@ -244,7 +244,7 @@ fn focal_lengths() {
 
 #[test]
 fn image_sizes() {
-    let sizes_px = [[1, 1], [8192, 1], [8192, 5], [1, 8192], [3, 8192]];
+    let sizes_px = [[1, 1], [8192, 5], [1, 8192], [MAX_SIDE_PX, 1], [2, MAX_SIDE_PX]];
     let of_size = |size_px| {
         cases(3, size_px, [4000.0; 2], |scene, view, random| {
             for _ in 0..20 {
@@ -256,8 +256,16 @@ fn image_sizes() {
         })
     };
     let cases: Vec<Case> = sizes_px.into_iter().flat_map(of_size).collect();
-    Row { name: "image sizes", range: "1x1, 8192x1, 8192x5, 1x8192, 3x8192 px", claimed: 1e-5, unit_px: 1.0 }
-        .check(&cases);
+    let range = "1x1, 8192x5, 1x8192, 65535x1, 2x65535 px";
+    Row { name: "image sizes", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
+    for size_px in [[MAX_SIDE_PX + 1, 1], [1, 1 << 24]] {
+        let Case { scene, regions, view, .. } = &cases[0];
+        let view = RasterView { intrinsics: pinhole(size_px, 4000.0), ..*view };
+        for Backend { name, rasterizer, .. } in backends() {
+            let refused = rasterizer.weights(scene, &view, regions).expect_err("too long").to_string();
+            assert!(refused.contains("sides of at most 65535 px"), "{name}: {refused}");
+        }
+    }
 }
 
 /// Closed form: a very wide Gaussian adds its opacity at every pixel, and the one behind it the rest. An f32

@@ -304,6 +304,9 @@ async fn wrong_requests_are_refused_by_name() {
     let detail = body["detail"].as_str().expect("text");
     assert!(detail.starts_with("body: unknown field `colour`, expected one of `texts`"), "{detail}");
     assert!(detail.contains("`near`") && detail.len() < 400, "{detail}");
+    let (_, _, body) = post(&service, &json!({"texts": ["0"], "limit": "ten"})).await;
+    let detail = body["detail"].as_str().expect("text");
+    assert!(detail.contains("expected a whole number"), "{detail}");
     // A negative may have a comma.
     let (_, _, reply) = post(&service, &json!({"texts": ["0"], "negatives": ["1 red, 2 blue"]})).await;
     assert_eq!(reply["results"][0]["negatives"], json!(["1 red, 2 blue"]), "{reply}");

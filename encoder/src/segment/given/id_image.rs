@@ -11,6 +11,29 @@ use crate::segment::segmenter::{SegmentError, SegmentInput};
 /// Memory that the PNG decoder may use beyond the pixels.
 const PNG_OVERHEAD_BYTES: usize = 1 << 20;
 
+/// Values between black and white in an image of one mask with soft edges, at least.
+const MIN_SOFT: usize = 8;
+const WHITE: u32 = 255;
+
+/// Returns the number of values between black and white of a mask with soft edges, which was drawn or resized with
+/// antialiasing; `None` for ids. Ids have places of their own: a pixel whose neighbours all have its id.
+pub(super) fn n_soft(ids: &[u32], width: usize) -> Option<usize> {
+    let mut is_found = [false; WHITE as usize + 1];
+    ids.iter().for_each(|id| is_found[(*id).min(WHITE) as usize] = true);
+    let n = is_found[1..WHITE as usize].iter().filter(|is_found| **is_found).count();
+    let has_white_alone = is_found[0] && ids.iter().max() == Some(&WHITE);
+    if n < MIN_SOFT || !has_white_alone {
+        return None;
+    }
+    let between = || ids.iter().enumerate().filter(|(_, id)| (1..WHITE).contains(*id));
+    let is_inside = |(at, id): &(usize, &u32)| {
+        let neighbours = [at.wrapping_sub(width), at.wrapping_sub(1), at + 1, at + width];
+        neighbours.iter().all(|at| ids.get(*at) == Some(*id))
+    };
+    // The tails of a blur are flat here and there.
+    (10 * between().filter(is_inside).count() < between().count()).then_some(n)
+}
+
 /// Reads the ids of a PNG of the photo's size, row-major; with a palette, the ids are its indices.
 pub(super) fn read_ids(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>, SegmentError> {
     let failed = |source| SegmentError::Png { path: path.to_owned(), source };

@@ -129,8 +129,13 @@ impl GivenMasks {
         is_binary: bool,
     ) -> Result<Vec<Mask>, SegmentError> {
         let mut labels = id_image::read_ids(path, input)?;
+        if let (false, Some(n)) = (is_binary, id_image::n_soft(&labels, input.image.width() as usize)) {
+            return Err(SegmentError::SoftEdges { path: path.to_owned(), n });
+        }
+        // With soft edges, what is inside by half.
+        let darkest = labels.iter().max().filter(|_| is_binary).map_or(1, |white| white / 2 + 1);
         for label in &mut labels {
-            if *label == 0 || !is_binary && self.ignore_ids.contains(label) {
+            if *label < darkest || !is_binary && self.ignore_ids.contains(label) {
                 *label = NO_REGION;
             } else if is_binary {
                 *label = 0;
