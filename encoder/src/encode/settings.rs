@@ -351,8 +351,9 @@ impl EncodeSettings {
             ("--min-view-share", aggregation.min_view_share <= 1.0, "expected a share of 0 to 1"),
             ("--position-error", has_error, "expected a finite error above 0"),
         ];
-        let refuse =
-            |setting: &str, problem| Err(EncodeError::Setting { setting: setting.to_owned(), problem });
+        let refuse = |setting: &str, problem: &str| {
+            Err(EncodeError::Setting { setting: setting.into(), problem: problem.into() })
+        };
         if let Some((setting, _, problem)) = checks.into_iter().find(|(_, is_valid, _)| !is_valid) {
             return refuse(setting, problem);
         }

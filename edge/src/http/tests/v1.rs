@@ -184,18 +184,19 @@ async fn relations_are_answered_and_say_what_failed() {
     }
 }
 
-/// The room with a lamp (axis 2) on the table that is no object, and with the mug on the floor as two objects that
-/// touch.
+/// The room with a lamp (axis 2) on the table that is no object, and with the mug on the floor as three objects in a row,
+/// the last of which touches the others.
 fn room_in_pieces() -> [BuiltShard; 1] {
     let pieces = [
         (lattice([50, 40, 75], [60, 50, 88], [4, 4, 4], 0), Some((1, 0))),
         (lattice([300, 40, 0], [310, 50, 13], [4, 4, 4], 0), Some((2, 0))),
-        (lattice([312, 40, 0], [322, 50, 13], [4, 4, 4], 0), Some((4, 0))),
+        (lattice([324, 40, 0], [334, 50, 13], [4, 4, 4], 0), Some((4, 0))),
+        (lattice([312, 40, 0], [322, 50, 13], [4, 4, 4], 0), Some((5, 0))),
         (lattice([0, 0, 0], [160, 90, 74], [9, 7, 6], 1), Some((3, 1))),
         (lattice([120, 40, 75], [130, 50, 105], [4, 4, 6], 2), None),
     ];
     let (mut members, mut objects, mut end) = (vec![Vec::new(); 3], Vec::new(), 0);
-    for (axis, piece) in [0, 0, 0, 1, 2].into_iter().zip(&pieces) {
+    for (axis, piece) in [0, 0, 0, 0, 1, 2].into_iter().zip(&pieces) {
         let n = piece.0.len() as u32;
         members[axis].extend(piece.0.iter().cloned());
         if let Some((id, axis)) = piece.1 {

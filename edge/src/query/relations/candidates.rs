@@ -7,6 +7,7 @@ use serde::Serialize;
 use slag_common::manifest::Manifest;
 
 use super::geometry::Solid;
+use super::rank::SURE;
 use crate::query::cluster::Cluster;
 use crate::query::objects::{self, FoundObject, ScoredObjects};
 use crate::query::request::QueryRequest;
@@ -19,15 +20,20 @@ const MAX_CANDIDATES: usize = 256;
 
 /// Metres by which a piece may stick out of the thing that it is a piece of.
 const PIECE_SLACK_M: f64 = 0.1;
+/// Distance, in metres, up to which things of the same words are pieces of one.
+const TOUCHES_M: f64 = 0.05;
+/// The same for a thing above another, such as the back of a chair above its seat.
+const ABOVE_M: f64 = 0.25;
 /// Default voxels in a metre of a metric scene; in others as many stand for a metre.
 const VOXELS_PER_METRE: f64 = 4.0;
 
-/// What may be meant. Candidates that lie inside a better one of the same words are pieces of it, and are left out:
-/// they must not be counted, or compared with it.
+/// What may be meant. Pieces of a better candidate of the same words are left out: they must not be counted, or
+/// compared with it.
 pub struct Candidate<'a> {
     pub of: CandidateOf<'a>,
     /// Its public id.
     pub id: String,
+    /// With its pieces.
     pub solid: Solid,
     pub score: f32,
     /// From 0, the score of what has nothing to do with the words, to 1, the best score on board.
@@ -169,16 +175,31 @@ fn confidence(score: f32, best: f32, base: f32) -> f64 {
     (f64::from(score - base) / margin).clamp(0.0, 1.0)
 }
 
-/// Leaves out candidates, best first, that are pieces of better ones.
+/// Leaves out candidates, best first, that are pieces of better ones: those inside one, and those that touch one or lie
+/// close above or below it, which grows by them, because masks split some things and relations are of whole ones.
 fn whole<'a>(candidates: impl IntoIterator<Item = Candidate<'a>>, metre: f64) -> Vec<Candidate<'a>> {
-    let mut whole: Vec<Candidate<'a>> = Vec::new();
-    for candidate in candidates {
-        let is_piece = |of: &Candidate<'_>| candidate.solid.is_piece_of(&of.solid, PIECE_SLACK_M * metre);
-        if !whole.iter().any(is_piece) {
-            whole.push(candidate);
+    let mut things: Vec<Candidate<'a>> = Vec::new();
+    for piece in candidates {
+        let is_inside = |of: &Candidate<'_>| piece.solid.is_piece_of(&of.solid, PIECE_SLACK_M * metre);
+        if things.iter().any(is_inside) {
+            continue;
         }
+        let touches = |of: &Candidate<'_>| {
+            let is_close = piece.solid.horizontal_gap(&of.solid) <= TOUCHES_M * metre
+                && -piece.solid.shared_height(&of.solid) <= ABOVE_M * metre;
+            is_close && piece.confidence >= SURE * of.confidence
+        };
+        let Some(first) = things.iter().position(touches) else {
+            things.push(piece);
+            continue;
+        };
+        let mut whole = things[first].solid.joined(&piece.solid);
+        for other in things.extract_if(first + 1.., |of| touches(of)) {
+            whole = whole.joined(&other.solid);
+        }
+        things[first].solid = whole;
     }
-    whole
+    things
 }
 
 /// Returns a metre in world units; in a scene that is not metric, what stands for one.

@@ -11,11 +11,7 @@ use crate::query::answers::ReasonKind;
 
 /// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not
 /// win over a sure one.
-const SURE: f64 = 0.65;
-/// Distance, in metres, up to which things of the same words are pieces of one.
-const TOUCHES_M: f64 = 0.05;
-/// The same for a thing above another, such as the back of a chair above its seat.
-const ABOVE_M: f64 = 0.25;
+pub(super) const SURE: f64 = 0.65;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
@@ -197,25 +193,6 @@ impl<'b> Measure<'_, 'b> {
         Ok(found.map(anchor).collect())
     }
 
-    /// Merges pieces that touch or are close above each other, because masks split some things and picks compare
-    /// whole ones. `found`: best first.
-    /// Returns the best piece of each thing, with the box around all its pieces.
-    fn joined(&self, all: &[Candidate<'_>], found: Vec<Related>) -> Vec<(Related, Solid)> {
-        let mut joined: Vec<(Related, Solid)> = Vec::new();
-        for related in found {
-            let solid = all[related.candidate].solid;
-            let is_piece = |of: &Solid| {
-                let above_m = -solid.shared_height(of) / self.metre;
-                solid.horizontal_gap(of) <= TOUCHES_M * self.metre && above_m <= ABOVE_M
-            };
-            match joined.iter_mut().find(|(_, of)| is_piece(of)) {
-                Some((_, whole)) => *whole = whole.joined(&solid),
-                None => joined.push((related, solid)),
-            }
-        }
-        joined
-    }
-
     fn picked(&self, phrase: &Phrase, pick: &Pick, mut found: Vec<Related>) -> Result<Vec<Related>, Miss> {
         let all = self.things.of(&phrase.thing);
         let from = match (&pick.from, pick.by.is_distance()) {
@@ -230,23 +207,20 @@ impl<'b> Measure<'_, 'b> {
         found.retain(|related| {
             origin.is_none_or(|origin| origin.id.as_ref() != Some(&all[related.candidate].id))
         });
-        let mut found = self.joined(all, found);
-        let key = |solid: &Solid| match (pick.by, origin) {
-            (By::Largest, _) => -solid.volume(),
-            (By::Smallest, _) => solid.volume(),
-            (By::Nearest, Some(origin)) => solid.gap(&origin.solid),
-            (By::Farthest, Some(origin)) => -solid.gap(&origin.solid),
+        let key = |of: &Related| match (pick.by, &all[of.candidate].solid, origin) {
+            (By::Largest, solid, _) => -solid.volume(),
+            (By::Smallest, solid, _) => solid.volume(),
+            (By::Nearest, solid, Some(origin)) => solid.gap(&origin.solid),
+            (By::Farthest, solid, Some(origin)) => -solid.gap(&origin.solid),
             _ => 0.0,
         };
-        found.sort_by(|(a, of_a), (b, of_b)| {
-            key(of_a).total_cmp(&key(of_b)).then(a.candidate.cmp(&b.candidate))
-        });
+        found.sort_by(|a, b| key(a).total_cmp(&key(b)).then(a.candidate.cmp(&b.candidate)));
         let n = found.len();
         if n < pick.n {
             let detail = format!("{} was asked for, but {n} fit", nth(pick.n, &phrase.thing));
             return Err(Miss::new(ReasonKind::TooFew, &phrase.thing, detail));
         }
-        let (mut chosen, _) = found.swap_remove(pick.n - 1);
+        let mut chosen = found.swap_remove(pick.n - 1);
         chosen.to.extend(origin.map(|origin| origin.witness.clone()));
         Ok(vec![chosen])
     }
