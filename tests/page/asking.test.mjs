@@ -39,14 +39,14 @@ test("a thing's places to stand are drawn on the ground with their directions, a
   assert.deepEqual(await cameraOf(page), [GOALS[1].sensor_in_world, [1.2, 0.8, 0.5]]);
 }, { isLookedAt: true, behaviour: { goal: "reached" }, fragment: `q=chair&camera=${CAMERA}` }));
 
-for (const [goal, said] of [["unreachable", "None: unreachable."], ["not-visible", "None: not visible."], ["no-occupancy", "encode it with --occupancy"]]) {
-  test(`a plain message where there is no place to stand: ${goal}`, () => opened(async (page) => {
+for (const [goal, said, id = "o1"] of [["unreachable", "None: unreachable."], ["not-visible", "None: not visible."], ["no-occupancy", "encode it with --occupancy"], ["reached", "a group of Gaussians", "15-6129"]]) {
+  test(`a plain message where there is no place to stand: ${goal} ${id}`, () => opened(async (page) => {
     await drawn(page);
     await answered(page, "chair");
     await page.locator("#answers .card").click();
     await page.locator("#places").getByText(said).waitFor();
     assert.equal(await page.locator("#places button").count(), 0);
-  }, { behaviour: { goal }, fragment: "q=chair", expected: /409/ }));
+  }, { behaviour: { goal, id }, fragment: "q=chair", expected: /409/ }));
 }
 
 test("keys choose a suggestion, and screen readers are told which", () => opened(async (page) => {

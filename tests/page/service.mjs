@@ -92,7 +92,7 @@ function scoresMessage(things, text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", id: "o1", things: THINGS, known: THINGS, none: null, threshold: 0.5, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], fetchedM: 0.8, photos: [], evidence: null, fails: false, ageSecs: 7200, ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -145,7 +145,7 @@ export async function startService(behaviour = {}) {
         ...(support ? { degree: 0.93, related_to: [{ thing: support, position_in_world: [0, 0, 0], score: 0.7 }] } : {}),
         geographic: { latitude_deg: 48.1, longitude_deg: 11.5, height_m: 520 },
         ...(behaviour.evidence ? { evidence: behaviour.evidence } : {}),
-        id: "o1", score: 0.86, n_gaussians: 1536, position_in_world: thing.min.map((low, i) => (low + thing.max[i]) / 2),
+        id: behaviour.id, score: 0.86, n_gaussians: 1536, position_in_world: thing.min.map((low, i) => (low + thing.max[i]) / 2),
         box_min_in_world: thing.min, box_max_in_world: thing.max,
       }] : [];
       const none = thing ? null : behaviour.none ?? { kind: "nothing-there", detail: "nothing found", thing: null };

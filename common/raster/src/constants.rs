@@ -24,8 +24,7 @@ pub const REACH2_MARGIN: f64 = 2e-4;
 pub const MAX_VARIANCE_PX2: f64 = 1e24;
 /// Most pixels of one view (16k x 16k).
 pub const MAX_IMAGE_PX: u64 = 1 << 28;
-/// Longest side of a view, pixels: that of the largest JPEG. Beyond 2^23, places between pixels are no longer exact in
-/// `f32`.
-pub const MAX_SIDE_PX: u32 = 65_535;
+/// Longest side of a view, pixels. With longer ones the errors of a GPU without doubles exceed 1e-3.
+pub const MAX_SIDE_PX: u32 = 32_768;
 /// Fraction bits of the fixed-point weights that are summed over tiles.
 pub const SUM_FRACTION_BITS: i32 = 32;

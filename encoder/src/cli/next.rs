@@ -26,7 +26,7 @@ pub(super) fn of_store(store: &Path, input: &InputArgs) -> Result<String> {
     // The page knows no --activated.
     let shown = if input.activated == Activated::default() { of_input(input) } else { String::new() };
     let mut lines = String::from("\nnext\n");
-    writeln!(lines, "  slag-encoder query --store {here} \"chair\"")?;
+    writeln!(lines, "  slag-encoder query --store {here} {}", example(&StoreReader::open(store)?))?;
     writeln!(lines, "  slag-encoder view --store {here}{shown}")?;
     writeln!(lines, "  slag-encoder serve --store {here} --listen 0.0.0.0:{PORT}")?;
     Ok(lines + &of_robot(store, &format!("http://0.0.0.0:{PORT}"))?)
@@ -47,7 +47,7 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
     let mut lines = String::from("on the robot\n");
     writeln!(lines, "  slag-edge trust add {base} --sha256 {root}")?;
     writeln!(lines, "  slag-edge fetch --from {base} --at {:.2},{:.2},{:.2} --radius 50", at.x, at.y, at.z)?;
-    writeln!(lines, "  slag-edge query \"chair\"")?;
+    writeln!(lines, "  slag-edge query {}", example(&reader))?;
     writeln!(
         lines,
         "The scene is {:.1} x {:.1} x {:.1} {unit}, from {} to {} without strays.",
@@ -58,6 +58,11 @@ pub(super) fn of_robot(store: &Path, url: &str) -> Result<String> {
         point(extent.max)
     )?;
     Ok(lines)
+}
+
+/// Returns a word to ask for: drones survey yards and streets.
+fn example(reader: &StoreReader) -> &'static str {
+    if reader.manifest().geo_reference.is_some() { "car" } else { "chair" }
 }
 
 pub(super) fn of_check(input: &InputArgs) -> String {

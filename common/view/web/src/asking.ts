@@ -90,6 +90,8 @@ export class Asking {
     const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal, this.askers())]);
     // The scores of "mug on the table" are those of mugs.
     const scores = reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal);
+    // Of groups no service says a photo.
+    for (const answer of reply.answers) answer.evidence ??= this.photoBySight(answer);
     const [sureness, isStore] = [surenessOf(reply.answers, reply.threshold ?? 0), this.description().program !== "slag-edge"];
     if (reply.isPlain && reply.threshold !== null && (reply.answers.length === 0 || (isStore && sureness < SURE))) {
       const groups = this.groupsOf(scores, reply.threshold);

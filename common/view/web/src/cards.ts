@@ -1,7 +1,7 @@
 // Answers as cards; the chosen one opens in place: its photo, its position to copy, places to stand.
 
 import { copies, metres, sizeText, strengthOf, whereabouts, type Viewpoint } from "./answers";
-import type { Answer, Description, Goal, Photo } from "./network";
+import { type Answer, type Description, type Goal, type Photo, isObject } from "./network";
 import { panel } from "./panel";
 import { crop, photoWithBox, thumbnail } from "./photos";
 
@@ -94,7 +94,7 @@ function facts(answer: Answer, { description, threshold }: Asked): HTMLDListElem
   }
   rows.push(["Score", `${answer.score.toFixed(2)}${threshold === null ? "" : `, found from ${threshold.toFixed(2)}`}`]);
   if (answer.names?.length) rows.push(["Names", answer.names.map(({ name, confidence }) => `${name} ${Math.round(confidence * 100)} %`).join(", ")]);
-  if (!answer.id) rows.push(["Kind", "a group of points, not a marked object"]);
+  if (!isObject(answer)) rows.push(["Kind", "a group of points, not a marked object"]);
   if (answer.degree !== undefined) rows.push(["Relation", `holds to ${answer.degree.toFixed(2)}`]);
   for (const other of answer.related_to ?? []) rows.push([`To: ${other.thing}`, metres(other.position_in_world)]);
   if (answer.evidence) rows.push(["Best photo", answer.evidence.photo]);

@@ -59,6 +59,9 @@ export interface Answer {
   related_to?: { thing: string; position_in_world: Vector; score?: number }[];
 }
 
+/** Ids of objects begin with o; those of groups of Gaussians are numbers. */
+export const isObject = ({ id }: Answer): boolean => id?.startsWith("o") ?? false;
+
 /** A thing of a generation. */
 export interface Thing {
   id: string;

@@ -3,7 +3,7 @@
 import { showPlaces } from "./cards";
 import type { Drawing } from "./drawing/drawing";
 import { ROBOT_RADIUS_M } from "./drawing/marks";
-import { type Answer, type Description, type Goal, type Goals, fetchGoals } from "./network";
+import { type Answer, type Description, type Goal, type Goals, fetchGoals, isObject } from "./network";
 
 const NO_OBJECT = "Places are known for objects; this answer is a group of Gaussians.";
 
@@ -23,7 +23,7 @@ export class PlacesToStand {
     this.draw();
     // Only a robot knows where it can stand.
     if (!answer || description.program !== "slag-edge") return;
-    if (!answer.id) return showPlaces([], NO_OBJECT, null, () => {});
+    if (!answer.id || !isObject(answer)) return showPlaces([], NO_OBJECT, null, () => {});
     try {
       const found = await fetchGoals(answer.id, ROBOT_RADIUS_M, signal);
       if (signal.aborted) return;
