@@ -1,6 +1,5 @@
 //! The programs together, as one test program: it is linked once, and its tests share what they encode.
 
-mod api;
 mod cases;
 mod doc_tests;
 mod doors;
@@ -21,7 +20,7 @@ mod python_tuf;
 mod repair;
 mod room;
 mod sam;
-mod schemathesis;
+mod api;
 mod store_bytes;
 mod text_model;
 mod tls;

@@ -231,19 +231,6 @@ fn one_fetch_at_a_time() {
     robot.fetch().expect("free again");
 }
 
-/// A manifest of other content, and a pointer that is not JSON; damaged shards are in `rot`.
-#[test]
-fn damage_on_board_is_found_and_healed() {
-    let scene = Published::new(1, &[0; 3], 100);
-    let (_server, robot) = Robot::fetched(scene.clone());
-    fs_err::write(robot.cache.manifest_path(Hash32::of(&scene.listed)), b"x").expect("written");
-    assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Hash { .. })));
-    fs_err::write(robot.cache.current_path(), b"{").expect("written");
-    assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Current { .. })));
-    robot.fetch().expect("heals");
-    assert_holds(&robot.snapshot(), &scene, 0..3);
-}
-
 /// A shard of another cell or encoder under the right name is refused when it is opened.
 #[test]
 fn a_shard_that_the_manifest_does_not_describe_is_refused() {
