@@ -138,7 +138,7 @@ impl ShortParams {
             return twice("threshold", "min_score");
         }
         if let Some(NegativesText(negatives)) = self.negatives
-            && std::mem::replace(&mut ask.negatives, negatives) != Negatives::None
+            && !std::mem::replace(&mut ask.negatives, negatives).0.is_empty()
         {
             return twice("negatives", "negative");
         }

@@ -279,7 +279,7 @@ fn negatives_make_relevancies() {
     let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
     let ask = |edit: fn(&mut QueryRequest)| {
         let mut answers = ask_about(&yard, std::slice::from_ref(&question), |request, _| {
-            request.negatives = Negatives::Phrases(vec!["other".into()]);
+            request.negatives = Negatives(vec!["other".into()]);
             edit(request);
         });
         answers.remove(0)
@@ -326,7 +326,7 @@ fn relevancies_keep_within_their_bound_and_use_it() {
     let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
     let ask = |built: &[BuiltShard]| {
         let mut answers = ask_about(built, std::slice::from_ref(&question), |request, _| {
-            request.negatives = Negatives::Phrases(vec!["other".into()]);
+            request.negatives = Negatives(vec!["other".into()]);
             (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(0.0));
         });
         answers.remove(0)

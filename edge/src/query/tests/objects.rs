@@ -160,7 +160,7 @@ fn objects_abstain_and_keep_to_the_region() {
     let question =
         Question { negatives: vec![std::sync::Arc::from([0.0f32, 1.0])], ..Question::new([1.0, 0.0]) };
     let answers = ask_about(&scene, &[question], |request, _| {
-        (request.negatives, request.threshold) = (Negatives::Phrases(vec!["other".into()]), Some(0.2));
+        (request.negatives, request.threshold) = (Negatives(vec!["other".into()]), Some(0.2));
     });
     let found = clusters(&answers[0]);
     let expected = crate::score::relevancy(0.8 - 0.9);
