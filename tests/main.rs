@@ -1,5 +1,6 @@
 //! The programs together, as one test program: it is linked once, and its tests share what they encode.
 
+mod api;
 mod cases;
 mod doc_tests;
 mod doors;
@@ -20,7 +21,6 @@ mod python_tuf;
 mod repair;
 mod room;
 mod sam;
-mod api;
 mod store_bytes;
 mod text_model;
 mod tls;

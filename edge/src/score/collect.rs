@@ -187,7 +187,7 @@ impl Cell<'_> {
     ) {
         gather.found.effort.n_rescored += members.len() as u64;
         gather.refine.members.clear();
-        let ShardGather { last, sums, refine, found, .. } = gather;
+        let ShardGather { last, sums, refine, .. } = gather;
         let [first, others @ ..] = &mut last[..] else { return };
         let places = &self.asked.places;
         let tables = &self.scores.projections[places[0]].tables;
