@@ -21,7 +21,6 @@ mod python_tuf;
 mod repair;
 mod room;
 mod sam;
-mod schemathesis;
 mod store_bytes;
 mod text_model;
 mod tls;

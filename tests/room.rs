@@ -1,8 +1,5 @@
 //! The generated room: the demo as a user runs it, reproducible stores, the robot's service.
 
-use std::path::PathBuf;
-use std::process::{Command, Stdio};
-
 use serde_json::{Value, json};
 use slag_tests::*;
 
@@ -33,13 +30,6 @@ fn the_embedded_encoders_tell_things() {
     assert!(report["found"].as_f64() > Some(0.7) && report["found_absent"].as_f64() < Some(0.01));
 }
 
-/// The store that [`stores_are_equal_to_the_byte`] and [`an_interrupted_encode_resumes`] expect.
-fn encoded_at_once() -> PathBuf {
-    made("store", &["with the encoder's own masks"], |store| {
-        run(encode_room(&generated(&ROOM), store).args(["--models", "colours", "--threads", "1"]));
-    })
-}
-
 /// Shards do not depend on threads, the order of views in the poses file, or working memory.
 #[test]
 fn stores_are_equal_to_the_byte() {
@@ -51,9 +41,10 @@ fn stores_are_equal_to_the_byte() {
     frames.reverse();
     frames.swap(0, 4);
     fs_err::write(room.join("transforms.json"), poses.to_string()).expect("writes");
-    let one = content(&encoded_at_once());
+    let (store, alone) = (dir.path().join("store"), dir.path().join("alone"));
+    run(encode_room(&generated(&ROOM), &alone).args(["--models", "colours", "--threads", "1"]));
+    let one = content(&alone);
     assert!(one.len() > 4, "several cells and profiles");
-    let store = dir.path().join("store");
     run(encode_room(&room, &store).args("--models colours --threads 4 --memory 96MiB".split(' ')));
     assert_eq!(content(&store), one);
 }
@@ -166,29 +157,4 @@ fn odd_views_are_counted_not_fatal() {
     );
     assert_eq!(again["encoder_before"], "slag-embedded-1", "{said}");
     assert!(said.contains("published with ") && said.contains("started with --models colours"), "{said}");
-}
-
-/// Ctrl-C ends an encode with code 130 and a state that the next one resumes, to the same shards as without.
-#[test]
-fn an_interrupted_encode_resumes() {
-    let dir = tempfile::tempdir().expect("a temporary folder");
-    let (room, store) = (generated(&ROOM), dir.path().join("store"));
-    let encode = || {
-        let mut command = encode_room(&room, &store);
-        command.args(["--models", "colours", "--threads", "1"]);
-        command
-    };
-    let mut child = encode().stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts");
-    // Once the first view's contributions are on disk, the encode works on the others.
-    let sums = store.join("job/views");
-    while fs_err::read_dir(&sums).map_or(0, Iterator::count) == 0 {
-        assert!(child.try_wait().expect("waits").is_none(), "ended before it could be interrupted");
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
-    refused(&mut encode(), "another slag-encoder");
-    run(Command::new("kill").args(["-INT", &child.id().to_string()]));
-    assert_eq!(child.wait().expect("waits").code(), Some(130));
-    let summary: Value = serde_json::from_slice(&run(&mut encode()).stdout).expect("a summary");
-    assert!(summary["n_views_resumed"].as_u64() > Some(0), "{summary}");
-    assert_eq!(content(&store), content(&encoded_at_once()));
 }

@@ -7,6 +7,8 @@ use slag_common::camera::{Distortion, View};
 use slag_common::poses::{self, Place, PoseError, PoseProblem, PoseSource, ViewSet};
 use slag_test_support::{needs_shared, shared};
 
+use super::scannet::write;
+
 fn largest_difference(a: &View, b: &View) -> f64 {
     let columns = |view: &View| view.camera_from_world.to_cols_array();
     columns(a).iter().zip(columns(b)).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max)
@@ -14,11 +16,7 @@ fn largest_difference(a: &View, b: &View) -> f64 {
 
 fn read_files(files: &[(&str, &[u8])]) -> Result<ViewSet, PoseError> {
     let dir = tempfile::tempdir().unwrap();
-    for (name, bytes) in files {
-        let path = dir.path().join(name);
-        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
-        fs_err::write(path, bytes).unwrap();
-    }
+    files.iter().for_each(|(name, bytes)| write(dir.path(), name, bytes));
     poses::read(dir.path(), None)
 }
 
@@ -280,11 +278,7 @@ fn frames_without_a_valid_pose_are_left_out() {
 #[test]
 fn a_photo_is_that_of_one_view() {
     let dir = tempfile::tempdir().unwrap();
-    let write = |name: &str, text: &str| {
-        let path = dir.path().join(name);
-        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
-        fs_err::write(path, text).unwrap();
-    };
+    let write = |name: &str, text: &str| write(dir.path(), name, text);
     let images = |names: &[&str]| {
         let image = |(id, name): (usize, &&str)| format!("{id} 1 0 0 0 0 0 0 1 {name}\n");
         write("sparse/0/images.txt", &names.iter().enumerate().map(image).collect::<String>());
@@ -337,11 +331,7 @@ fn texts_of_other_encodings_are_read_or_named() {
 #[test]
 fn photos_and_models_are_found_and_choices_are_said() {
     let dir = tempfile::tempdir().unwrap();
-    let write = |name: &str, text: &str| {
-        let path = dir.path().join(name);
-        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
-        fs_err::write(path, text).unwrap();
-    };
+    let write = |name: &str, text: &str| write(dir.path(), name, text);
     let image = |id: u32| format!("{id} 1 0 0 0 0 0 0 1 {id}.JPG\n");
     for (model, ids) in [("sparse/0", 1..3), ("sparse/1", 3..9)] {
         write(&format!("{model}/cameras.txt"), "1 PINHOLE 64 48 50 50 32 24\n");

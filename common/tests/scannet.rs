@@ -11,7 +11,7 @@ const INTRINSICS: &str = "1170.187988 0.000000 647.750000 0.000000\n0.000000 117
                           0.000000 0.000000 1.000000 0.000000\n0.000000 0.000000 0.000000 1.000000\n";
 const LOST: &str = "-inf -inf -inf -inf\n-inf -inf -inf -inf\n-inf -inf -inf -inf\n-inf -inf -inf -inf\n";
 
-fn write(dir: &Path, name: &str, bytes: impl AsRef<[u8]>) {
+pub fn write(dir: &Path, name: &str, bytes: impl AsRef<[u8]>) {
     let path = dir.join(name);
     fs_err::create_dir_all(path.parent().unwrap()).unwrap();
     fs_err::write(path, bytes).unwrap();

@@ -189,7 +189,7 @@ mod tests {
         let bounds = Aabb { min: DVec3::new(-1.0, -5.0, 3.0), max: DVec3::new(4.0, 2.0, 6.0) };
         assert_eq!((query.bounds, query.precision), (Some(bounds), Precision::Centroids));
         assert_eq!(query.kind, Some(AnswerKind::Gaussians));
-        assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
+        assert_eq!(query.negatives, Negatives(vec!["wall".into(), "floor".into()]));
         let Command::Goal(goal) = command("slag-edge goal chair --near 1,-2,0") else { panic!("goal") };
         assert_eq!((goal.robot.radius_m, goal.stand.limit), (0.3, 3));
         let Command::List(list) = command("slag-edge list --near 1,-2,0 --radius 3 --sort area --format csv")

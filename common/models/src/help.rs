@@ -43,15 +43,6 @@ mod tests {
 
     use super::*;
 
-    /// The advice for an unknown flag, `-- -5`, would be a lie.
-    #[test]
-    fn negative_numbers_are_values() {
-        let limit = Arg::new("limit").long("limit").value_parser(clap::value_parser!(u32));
-        let command = layered(Command::new("slag").subcommand(Command::new("below").arg(limit)));
-        let error = command.try_get_matches_from(["slag", "below", "--limit", "-5"]).expect_err("is refused");
-        assert_eq!(error.kind(), clap::error::ErrorKind::ValueValidation, "{error}");
-    }
-
     #[test]
     fn short_help_has_first_sentences_and_all_has_everything() {
         let rare = Arg::new("rare").long("rare").help("Rarely turned.").hide_short_help(true);

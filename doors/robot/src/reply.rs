@@ -37,9 +37,6 @@ pub struct Nothing {
     pub kind: String,
     /// The same in a sentence.
     pub detail: String,
-    /// The part of a phrase that failed.
-    pub thing: Option<String>,
-    pub best_score: Option<f32>,
 }
 
 #[derive(Clone, Debug, Deserialize)]

@@ -9,7 +9,7 @@ use ros2_client::{
     Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, QosProfile, Server,
     ServiceMapping, ServiceTypeName, Subscription,
 };
-use rustdds::DomainParticipantBuilder;
+use rustdds::{DomainParticipantBuilder, Topic};
 use serde::Serialize;
 use serde_json::{Value, json};
 use slag_robot::api::locate;
@@ -278,27 +278,28 @@ fn reliable(depth: usize) -> QosProfile {
         .history(History::KeepLast { depth })
 }
 
+fn topic(node: &mut Node, name: &Name, (package, kind): (&str, &str), qos: &QosProfile) -> Result<Topic> {
+    let topic = node.create_topic(name, MessageTypeName::new(package, kind), qos);
+    topic.map_err(|e| anyhow!("{e}")).with_context(|| format!("topic {name:?}"))
+}
+
 fn publisher<M: Serialize>(
     node: &mut Node,
     name: Name,
-    (package, kind): (&str, &str),
+    kind: (&str, &str),
     qos: &QosProfile,
 ) -> Result<Publisher<M>> {
-    let topic =
-        node.create_topic(&name, MessageTypeName::new(package, kind), qos).map_err(|e| anyhow!("{e}"));
-    let topic = topic.with_context(|| format!("topic {name:?}"))?;
+    let topic = topic(node, &name, kind, qos)?;
     node.create_publisher(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))
 }
 
 fn subscription<M: 'static>(
     node: &mut Node,
     name: Name,
-    (package, kind): (&str, &str),
+    kind: (&str, &str),
     qos: &QosProfile,
 ) -> Result<Subscription<M>> {
-    let topic =
-        node.create_topic(&name, MessageTypeName::new(package, kind), qos).map_err(|e| anyhow!("{e}"));
-    let topic = topic.with_context(|| format!("topic {name:?}"))?;
+    let topic = topic(node, &name, kind, qos)?;
     node.create_subscription(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))
 }
 

@@ -56,7 +56,9 @@ pub fn parse(
     let settings =
         Settings { variable, file, explicit: explicit(&first), asked: asked(&first), root: command.clone() };
     let command = settings.apply(command, &[])?;
-    settings.refuse_unknown(&command)?;
+    if let Some(file) = &settings.file {
+        file.refuse_unknown(&command, &file.table, &mut Vec::new())?;
+    }
     Ok(command.try_get_matches_from(line)?)
 }
 
@@ -170,6 +172,16 @@ fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
     let is_help = |arg: &&Arg| matches!(arg.get_action(), ArgAction::HelpShort | ArgAction::HelpLong);
     let is_named = |arg: &&Arg| arg.get_long().is_some_and(|long| long != FILE_FLAG);
     command.get_arguments().filter(is_named).filter(move |arg| !is_help(arg) && by_hand(arg))
+}
+
+fn with_those_below(command: &Command) -> Vec<&Command> {
+    let mut all = vec![command];
+    let mut at = 0;
+    while let Some(command) = all.get(at) {
+        all.extend(command.get_subcommands());
+        at += 1;
+    }
+    all
 }
 
 /// What the environment or the file gives a flag.
@@ -291,16 +303,11 @@ impl Settings<'_> {
     /// Returns whether the flag of this name of another command takes the values, and needs nothing beside it.
     fn stands_alone(&self, command: &Command, of: &Given) -> bool {
         let long = argument(command, &of.id).and_then(Arg::get_long);
-        let mut waiting = vec![&self.root];
-        while let Some(command) = waiting.pop() {
+        let fits = |arg: &Arg| checked(arg, of.values.clone(), &of.place).is_ok();
+        with_those_below(&self.root).into_iter().any(|command| {
             let mut same = flags(command).filter(|other| other.get_long() == long);
-            let fits = |arg: &Arg| checked(arg, of.values.clone(), &of.place).is_ok();
-            if same.any(|arg| fits(arg) && needs(command, arg, &of.values).is_empty()) {
-                return true;
-            }
-            waiting.extend(command.get_subcommands());
-        }
-        false
+            same.any(|arg| fits(arg) && needs(command, arg, &of.values).is_empty())
+        })
     }
 
     /// Returns what a flag is given: by the environment, else by the file; for its own command, else for all.
@@ -338,15 +345,8 @@ impl Settings<'_> {
     ) -> Result<Option<Given>, ConfigError> {
         let check = |arg: &Arg| checked(arg, texts(arg).map_err(|what| wrong(&place, &what))?, &place);
         let fits_another = || {
-            let mut waiting = vec![&self.root];
-            while let Some(command) = waiting.pop() {
-                let mut same = flags(command).filter(|other| other.get_long() == arg.get_long());
-                if same.any(|other| check(other).is_ok()) {
-                    return true;
-                }
-                waiting.extend(command.get_subcommands());
-            }
-            false
+            let all = with_those_below(&self.root).into_iter().flat_map(flags);
+            all.filter(|other| other.get_long() == arg.get_long()).any(|other| check(other).is_ok())
         };
         match check(arg) {
             Err(_) if !rank.is_own && fits_another() => Ok(None),
@@ -354,14 +354,6 @@ impl Settings<'_> {
                 let values = checked?;
                 Ok(Some(Given { id: arg.get_id().clone(), values, place, rank }))
             }
-        }
-    }
-
-    /// Refuses keys of the file that are no flag of any command.
-    fn refuse_unknown(&self, command: &Command) -> Result<(), ConfigError> {
-        match &self.file {
-            Some(file) => file.refuse_unknown(command, &file.table, &mut Vec::new()),
-            None => Ok(()),
         }
     }
 }
@@ -373,23 +365,16 @@ impl File {
         format!("{}: {}", self.path.display(), key.join("."))
     }
 
+    /// Refuses keys that are no flag of any command.
     fn refuse_unknown<'a>(
         &'a self,
         command: &Command,
         table: &'a Table,
         path: &mut Vec<&'a str>,
     ) -> Result<(), ConfigError> {
-        let names = |command: &Command| -> BTreeSet<String> {
-            flags(command).filter_map(|arg| arg.get_long().map(str::to_owned)).collect()
-        };
-        let mut known = names(command);
-        if path.is_empty() {
-            let mut waiting: Vec<&Command> = command.get_subcommands().collect();
-            while let Some(below) = waiting.pop() {
-                known.extend(names(below));
-                waiting.extend(below.get_subcommands());
-            }
-        }
+        let of = if path.is_empty() { with_those_below(command) } else { vec![command] };
+        let longs = of.into_iter().flat_map(flags).filter_map(Arg::get_long);
+        let known: BTreeSet<String> = longs.map(str::to_owned).collect();
         for (key, value) in table {
             if let (Some(below), Value::Table(table)) = (command.find_subcommand(key), value) {
                 path.push(key);

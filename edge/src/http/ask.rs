@@ -7,7 +7,7 @@ use serde::Deserialize;
 use super::forms::{self, AreaParams, LatLonText, NegativesText, XyzText};
 use crate::query::{
     AnswerKind, Ask, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Format, MAX_GAUSSIANS, MAX_NEGATIVES, MAX_TEXTS,
-    Negatives, RequestError, Words,
+    RequestError, Words,
 };
 use crate::score::{MAX_COORDINATE, Precision};
 
@@ -138,7 +138,7 @@ impl ShortParams {
             return twice("threshold", "min_score");
         }
         if let Some(NegativesText(negatives)) = self.negatives
-            && std::mem::replace(&mut ask.negatives, negatives) != Negatives::None
+            && !std::mem::replace(&mut ask.negatives, negatives).0.is_empty()
         {
             return twice("negatives", "negative");
         }

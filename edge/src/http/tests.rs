@@ -8,9 +8,6 @@ use axum::response::Response;
 use glam::DVec3;
 use serde_json::{Value, json};
 use tempfile::TempDir;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::oneshot;
 use tower::ServiceExt;
 
 use super::router::router;
@@ -430,49 +427,4 @@ async fn positions_are_handed_on_or_refused() {
     let (status, _, body) = say(&app, &"1".repeat(100_000)).await;
     assert_eq!((status.as_u16(), &body["type"]), (413, &"urn:slag:problem:body-too-large".into()));
     assert_eq!(following.status().position, Some(at), "what is refused changes nothing");
-}
-
-/// Serves on a real socket; returns the address, the stop signal, and the server's end.
-async fn serve_for_real(
-    service: &Service,
-) -> (std::net::SocketAddr, oneshot::Sender<()>, tokio::task::JoinHandle<std::io::Result<()>>) {
-    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
-    let address = listener.local_addr().expect("an address");
-    let (stop, stopped) = oneshot::channel();
-    let stopped = async { drop(stopped.await) };
-    (address, stop, tokio::spawn(serve(Arc::clone(&service.app), listener, stopped)))
-}
-
-async fn talk(address: std::net::SocketAddr, request: &str) -> TcpStream {
-    let mut stream = TcpStream::connect(address).await.expect("a connection");
-    stream.write_all(request.as_bytes()).await.expect("sent");
-    stream
-}
-
-async fn rest(mut stream: TcpStream) -> String {
-    let mut text = String::new();
-    soon(stream.read_to_string(&mut text)).await.expect("an answer");
-    text
-}
-
-const ASK_AND_WAIT: &str = "GET /query?text=wait HTTP/1.1\r\nhost: localhost\r\n\r\n";
-
-async fn until_in_flight(service: &Service) {
-    while service.app.permits.available_permits() == service.app.settings.max_queries {
-        tokio::task::yield_now().await;
-    }
-}
-
-#[tokio::test]
-async fn stops_gracefully() {
-    let service = Service::with_chair();
-    let (address, stop, end) = serve_for_real(&service).await;
-    let waiting = talk(address, ASK_AND_WAIT).await;
-    until_in_flight(&service).await;
-    stop.send(()).expect("the server lives");
-    open_gate(&service.gate);
-    let answer = rest(waiting).await;
-    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("\"rank\":1"), "{answer}");
-    soon(end).await.expect("no panic").expect("a clean end");
-    assert!(TcpStream::connect(address).await.is_err());
 }

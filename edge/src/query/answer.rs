@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Found, Reason, Searched, Whole};
+use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Found, Searched, Whole};
 use super::cluster::{Cluster, Clusters, Grouping, cluster};
 use super::objects::{self, FoundObject, ScoredObjects};
 use super::oriented::Extent;
@@ -284,28 +284,20 @@ impl Answering<'_> {
         let (scene, scale) = (self.scene, Scale::of(question));
         let threshold = scale.threshold(self.request, scene.manifest, objects::calibration(scene.objects));
         let answers: Vec<ClusterAnswer> = related.answers.into_iter().map(|(answer, ..)| answer).collect();
-        let best_score = |thing: &str| related.parts.iter().find(|part| part.thing == thing)?.best_score;
-        let reason = related.miss.map(|miss| Reason {
-            kind: miss.kind,
-            seen_share: miss.seen_share,
-            best_score: best_score(&miss.thing),
-            best_position_in_world: None,
-            detail: miss.detail,
-        });
         let empty = self.empty((text, AnswerKind::Objects), scale, threshold);
         let (n_searched, n_matching) = (
             n_with_evidence(scene, &self.request.region),
             answers.iter().map(|answer| answer.n_gaussians).sum(),
         );
         let searched = Searched { n_searched, n_matching, ..empty.searched };
-        Answers { searched, reason, answers: Found::Clusters(answers), ..empty }
+        Answers { searched, reason: related.miss, answers: Found::Clusters(answers), ..empty }
     }
 
     fn empty(&self, asked: (&str, AnswerKind), scale: Scale, threshold: (f32, ThresholdSource)) -> Answers {
         let (manifest, request) = (self.scene.manifest, self.request);
         let bad_cells = bad_cells(self.scene, &request.region);
         let searched = Searched {
-            negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
+            negatives: request.negatives.0.clone(),
             score_kind: scale.0,
             threshold: threshold.0,
             threshold_source: threshold.1,

@@ -119,7 +119,7 @@ fn asked_as(on_board: &OnBoard, asked: &Asked, request: &QueryRequest) -> BTreeM
         Asked::Phrase { phrase, .. } => phrase.things().into_iter().map(str::to_owned).collect(),
         Asked::Vector { .. } => Vec::new(),
     };
-    let negatives = request.negatives.phrases().into_iter().map(str::to_owned);
+    let negatives = request.negatives.0.iter().cloned();
     let asked_as = |thing: String| on_board.text.asked_as(&thing).map(|asked| (thing, asked));
     things.into_iter().chain(negatives).filter_map(asked_as).collect()
 }
@@ -163,8 +163,9 @@ fn related(
     let found = match relations::relate(&things, phrase, viewer.as_ref(), metre) {
         Ok(found) => found,
         Err(mut miss) => {
-            (miss.kind, miss.detail, miss.seen_share) =
-                reason::looked(scene.shards, &request.region, (miss.kind, miss.detail));
+            let part = parts.iter().find(|part| Some(&*part.thing) == miss.thing.as_deref());
+            miss.best_score = part.and_then(|part| part.best_score);
+            reason::add_seen(&mut miss, scene.shards, &request.region);
             return Ok(RelatedAnswers {
                 asked_as: BTreeMap::new(),
                 parts,

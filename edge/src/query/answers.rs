@@ -307,4 +307,24 @@ pub struct Reason {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<[f64; 3]>")]
     pub best_position_in_world: Option<DVec3>,
+    /// Of a phrase: the thing that is missing, or not so placed.
+    #[serde(skip)]
+    pub thing: Option<Box<str>>,
+    /// Of a phrase: greatest degree of the relation among all pairs.
+    #[serde(skip)]
+    pub best_degree: Option<f64>,
+}
+
+impl Reason {
+    pub fn new(kind: ReasonKind, detail: String) -> Self {
+        Self {
+            kind,
+            detail,
+            seen_share: None,
+            best_score: None,
+            best_position_in_world: None,
+            thing: None,
+            best_degree: None,
+        }
+    }
 }

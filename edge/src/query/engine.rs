@@ -118,7 +118,7 @@ impl OnBoard {
     }
 
     pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {
-        let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
+        let negatives = request.negatives.0.iter().map(|phrase| self.text.encode(phrase));
         negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)
     }
 }

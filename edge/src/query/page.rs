@@ -7,9 +7,9 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use slag_api::{FRAME, UNITS};
 
-use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, ReasonKind, Searched};
+use super::answers::{ClusterAnswer, Found, GaussianAnswer, Reason, ReasonKind, Searched};
 use super::relations::{self, Phrase, Witness};
-use super::reply::{Outcome, RelatedAnswers, Reply};
+use super::reply::{Outcome, Reply};
 use super::request::{AnswerKind, Asked};
 use super::scene::unit;
 
@@ -194,13 +194,13 @@ impl<'a> Described<'a> {
                         page.map(|of| Answer::Gaussian(InFrame { frame: FRAME, generation, of })).collect()
                     }
                 };
-                let (searched, none) = (Some(&answers.searched), Nothing::of_plain(answers));
+                let (searched, none) = (Some(&answers.searched), answers.reason.as_ref().map(Nothing::new));
                 Self { kind: answers.kind, searched, none, answers: list, ..page }
             }
             Outcome::Related(related) => {
                 let list = related.answers.iter().skip(offset).take(limit);
                 let list = list.map(|(cluster, degree, to)| thing(cluster, Some(*degree), Some(&**to)));
-                let (parts, none) = (Some(&*related.parts), Nothing::of_related(related));
+                let (parts, none) = (Some(&*related.parts), related.miss.as_ref().map(Nothing::new));
                 Self { parts, none, answers: list.collect(), ..page }
             }
         }
@@ -208,30 +208,15 @@ impl<'a> Described<'a> {
 }
 
 impl<'a> Nothing<'a> {
-    fn of_plain(answers: &'a Answers) -> Option<Self> {
-        let reason = answers.reason.as_ref()?;
-        Some(Self {
+    fn new(reason: &'a Reason) -> Self {
+        Self {
             kind: reason.kind,
             detail: &reason.detail,
             seen_share: reason.seen_share,
-            thing: None,
+            thing: reason.thing.as_deref(),
             best_score: reason.best_score,
-            best_degree: None,
+            best_degree: reason.best_degree,
             best_position_in_world: reason.best_position_in_world,
-        })
-    }
-
-    fn of_related(related: &'a RelatedAnswers) -> Option<Self> {
-        let miss = related.miss.as_ref()?;
-        let part = related.parts.iter().find(|part| part.thing == miss.thing);
-        Some(Self {
-            kind: miss.kind,
-            detail: &miss.detail,
-            seen_share: miss.seen_share,
-            thing: Some(&miss.thing),
-            best_score: part.and_then(|part| part.best_score),
-            best_degree: miss.best_degree,
-            best_position_in_world: None,
-        })
+        }
     }
 }

@@ -31,35 +31,22 @@ fn seen_share(shards: &[ShardView<'_>], region: &Region) -> Option<f64> {
     (n > 0).then(|| n_seen as f64 / n as f64)
 }
 
-/// Returns the kind and the detail of an empty answer, and the share of the region that views saw. Where that is too
-/// little for a no, kind and detail say so.
-pub fn looked(
-    shards: &[ShardView<'_>],
-    region: &Region,
-    (kind, detail): (ReasonKind, String),
-) -> (ReasonKind, String, Option<f64>) {
-    let seen = seen_share(shards, region);
-    match seen.filter(|seen| *seen < MIN_SEEN && kind != ReasonKind::ClustersTooSmall) {
-        None => (kind, detail, seen),
-        Some(share) => {
-            let percent = 100.0 * share;
-            let told =
-                format!("not looked there: photos saw {percent:.0} % of what is on board{region}; {detail}");
-            (ReasonKind::NotLookedThere, told, seen)
-        }
-    }
-}
-
-/// Says in a reason how much views saw, as [`looked`] does.
+/// Says in a reason which share of the region views saw. Where that is too little for a no, kind and detail say so.
 pub fn add_seen(reason: &mut Reason, shards: &[ShardView<'_>], region: &Region) {
-    let told = (reason.kind, std::mem::take(&mut reason.detail));
-    (reason.kind, reason.detail, reason.seen_share) = looked(shards, region, told);
+    reason.seen_share = seen_share(shards, region);
+    let seen = reason.seen_share.filter(|seen| *seen < MIN_SEEN);
+    if let Some(share) = seen.filter(|_| reason.kind != ReasonKind::ClustersTooSmall) {
+        let (percent, detail) = (100.0 * share, &reason.detail);
+        reason.detail =
+            format!("not looked there: photos saw {percent:.0} % of what is on board{region}; {detail}");
+        reason.kind = ReasonKind::NotLookedThere;
+    }
 }
 
 /// `best`: score and position of the best miss.
 fn reason((kind, detail): (ReasonKind, String), best: Option<(f32, DVec3)>) -> Reason {
     let (best_score, best_position_in_world) = best.unzip();
-    Reason { kind, detail, seen_share: None, best_score, best_position_in_world }
+    Reason { best_score, best_position_in_world, ..Reason::new(kind, detail) }
 }
 
 /// The best object in the region asked for.

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use slag_common::manifest::Manifest;
 
-use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer};
-use super::relations::{self, Miss, Witness};
+use super::answers::{Answers, ClusterAnswer, Found, GaussianAnswer, Reason};
+use super::relations::{self, Witness};
 use super::request::QueryRequest;
 use crate::score::Hit;
 use crate::store::Snapshot;
@@ -54,7 +54,7 @@ pub struct RelatedAnswers {
     /// What was asked in place of words that the model does not know.
     pub asked_as: BTreeMap<String, String>,
     pub parts: Vec<relations::Found>,
-    pub miss: Option<Miss>,
+    pub miss: Option<Reason>,
     /// The answers, best first, each with its degree and what it is related to.
     pub answers: Vec<(ClusterAnswer, f64, Vec<Witness>)>,
 }

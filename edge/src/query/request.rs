@@ -49,33 +49,15 @@ impl fmt::Display for AnswerKind {
     }
 }
 
+/// Negative prompts; without any, scores are cosines.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(from = "Vec<String>")]
-pub enum Negatives {
-    /// None: scores are cosines.
-    #[default]
-    None,
-    Canonical,
-    Phrases(Vec<String>),
-}
-
-impl Negatives {
-    pub fn phrases(&self) -> Vec<&str> {
-        match self {
-            Self::None => Vec::new(),
-            Self::Canonical => CANONICAL_NEGATIVES.to_vec(),
-            Self::Phrases(phrases) => phrases.iter().map(String::as_str).collect(),
-        }
-    }
-}
+pub struct Negatives(pub Vec<String>);
 
 impl From<Vec<String>> for Negatives {
     fn from(phrases: Vec<String>) -> Self {
-        match phrases.as_slice() {
-            [] => Self::None,
-            [one] if one == "canonical" => Self::Canonical,
-            _ => Self::Phrases(phrases),
-        }
+        let is_canonical = matches!(&phrases[..], [one] if one == "canonical");
+        Self(if is_canonical { CANONICAL_NEGATIVES.map(str::to_owned).to_vec() } else { phrases })
     }
 }
 
@@ -85,12 +67,11 @@ impl FromStr for Negatives {
     fn from_str(text: &str) -> Result<Self, String> {
         let phrases: Vec<String> = text.split(',').map(|phrase| phrase.trim().to_owned()).collect();
         match text.trim() {
-            "none" => Ok(Self::None),
-            "canonical" => Ok(Self::Canonical),
+            "none" => Ok(Self::default()),
             _ if phrases.iter().any(String::is_empty) || phrases.len() > MAX_NEGATIVES => {
                 Err(format!("none, canonical, or 1 to {MAX_NEGATIVES} phrases A,B,C"))
             }
-            _ => Ok(Self::Phrases(phrases)),
+            _ => Ok(phrases.into()),
         }
     }
 }
@@ -260,7 +241,7 @@ impl QueryRequest {
     pub fn new(text: impl Into<String>) -> Self {
         Self {
             asked: vec![Asked::Text(text.into())],
-            negatives: Negatives::None,
+            negatives: Negatives::default(),
             limit: None,
             paged: false,
             offset: 0,
@@ -318,9 +299,9 @@ impl QueryRequest {
         self.check_texts()?;
         self.asked.iter().try_for_each(|asked| asked.check(self))?;
         self.check_page()?;
-        let (thresholds, expected) = match self.negatives {
-            Negatives::None => (-1.0..=1.0, "a cosine, -1 to 1"),
-            _ => (0.0..=1.0, "a relevancy, 0 to 1, because there are negatives"),
+        let (thresholds, expected) = match self.negatives.0.is_empty() {
+            true => (-1.0..=1.0, "a cosine, -1 to 1"),
+            false => (0.0..=1.0, "a relevancy, 0 to 1, because there are negatives"),
         };
         if let Some(threshold) = self.threshold.filter(|t| !thresholds.contains(t)) {
             return refuse("threshold", &threshold, expected.into());
@@ -347,7 +328,7 @@ impl QueryRequest {
         if !(1..=MAX_TEXTS).contains(&n) {
             return Err(RequestError::new("text", &n_of_them(n), format!("1 to {MAX_TEXTS} texts")));
         }
-        let negatives = self.negatives.phrases();
+        let negatives = &self.negatives.0;
         if negatives.len() > MAX_NEGATIVES {
             let expected = format!("at most {MAX_NEGATIVES} phrases");
             return Err(RequestError::new("negatives", &n_of_them(negatives.len()), expected));
@@ -445,9 +426,10 @@ mod tests {
 
     #[test]
     fn negatives_and_boxes_parse_or_say_what_they_should_be() {
-        assert_eq!("none".parse(), Ok(Negatives::None));
-        assert_eq!(" canonical".parse(), Ok(Negatives::Canonical));
-        let phrases = Negatives::Phrases(vec!["white wall".into(), "floor".into()]);
+        assert_eq!("none".parse(), Ok(Negatives::default()));
+        let canonical = CANONICAL_NEGATIVES.map(str::to_owned).to_vec();
+        assert_eq!(" canonical".parse(), Ok(Negatives(canonical)));
+        let phrases = Negatives(vec!["white wall".into(), "floor".into()]);
         assert_eq!("white wall, floor".parse(), Ok(phrases));
         for bad in ["", ",", "wall,,floor", &["x"; MAX_NEGATIVES + 1].join(",")] {
             assert!(bad.parse::<Negatives>().is_err(), "{bad}");

@@ -11,8 +11,6 @@ use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
 mod budget;
 mod objects;
 
-use objects::scene_of_objects;
-
 /// A cell with a single centroid of `n` Gaussians at a place, 1 cm apart, at a given cosine to axis 0.
 fn thing(cell_id: u32, at: DVec3, n: u16, cosine: f32) -> TestShard {
     let embedding = normalised(vec![cosine, (1.0 - cosine * cosine).sqrt()]);
@@ -281,7 +279,7 @@ fn negatives_make_relevancies() {
     let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
     let ask = |edit: fn(&mut QueryRequest)| {
         let mut answers = ask_about(&yard, std::slice::from_ref(&question), |request, _| {
-            request.negatives = Negatives::Phrases(vec!["other".into()]);
+            request.negatives = Negatives(vec!["other".into()]);
             edit(request);
         });
         answers.remove(0)
@@ -328,7 +326,7 @@ fn relevancies_keep_within_their_bound_and_use_it() {
     let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
     let ask = |built: &[BuiltShard]| {
         let mut answers = ask_about(built, std::slice::from_ref(&question), |request, _| {
-            request.negatives = Negatives::Phrases(vec!["other".into()]);
+            request.negatives = Negatives(vec!["other".into()]);
             (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(0.0));
         });
         answers.remove(0)
@@ -341,32 +339,6 @@ fn relevancies_keep_within_their_bound_and_use_it() {
         let truth = 1.0 / (1.0 + (-10.0 * (angle.cos() - angle.sin())).exp());
         let share = (f64::from(found.score) - truth).abs() / f64::from(answers.searched.score_error_bound);
         assert!((0.9..=1.0).contains(&share), "{share} of {}", answers.searched.score_error_bound);
-    }
-}
-
-/// Several questions asked together are answered as each alone.
-#[test]
-fn batches_answer_as_single_questions_do() {
-    let questions = [Question::new([1.0, 0.0]), Question::new([0.0, 1.0]), Question::new([0.6, 0.8])];
-    for (scene, kind) in [
-        (yard(), Some(AnswerKind::Clusters)),
-        (yard(), Some(AnswerKind::Gaussians)),
-        (scene_of_objects(), Some(AnswerKind::Objects)),
-    ] {
-        let texts = ["thing", "other", "third"].map(str::to_owned);
-        let together = ask_about(&scene, &questions, |request, _| {
-            (request.asked, request.kind, request.limit) =
-                (texts.clone().map(Asked::Text).to_vec(), kind, Some(120));
-        });
-        assert_eq!(together.len(), 3);
-        for ((answers, question), text) in together.iter().zip(&questions).zip(&texts) {
-            let alone = ask_about(&scene, std::slice::from_ref(question), |request, _| {
-                (request.asked, request.kind, request.limit) =
-                    (vec![Asked::Text(text.clone())], kind, Some(120));
-            });
-            assert_eq!(&alone[0], answers);
-            assert!(!answers.answers.is_empty());
-        }
     }
 }
 

@@ -9,7 +9,7 @@ use slag_common::shard::{BLOCK, Residuals, ShardView};
 use super::cell::{Cell, Detail, Measured};
 use super::centroids::{AskedQuestion, combine};
 use super::dot::EmbeddingTimesVector;
-use super::matches::{Effort, Matches, Run};
+use super::matches::{Matches, Run};
 use super::region::Region;
 use super::simd::{BlockSums, FindSums, LastBlock, SomeRowsTimesVector};
 
@@ -34,14 +34,6 @@ pub(super) fn edge_of(bin: usize) -> f32 {
 pub(super) struct Gather {
     /// By index in the slice of shards.
     pub shards: Vec<ShardGather>,
-}
-
-impl Gather {
-    pub(crate) fn effort(&self) -> Effort {
-        let mut effort = Effort::default();
-        self.shards.iter().for_each(|of_shard| effort += of_shard.found.effort);
-        effort
-    }
 }
 
 /// Bounds on the scores to gather.
@@ -195,7 +187,7 @@ impl Cell<'_> {
     ) {
         gather.found.effort.n_rescored += members.len() as u64;
         gather.refine.members.clear();
-        let ShardGather { last, sums, refine, found, .. } = gather;
+        let ShardGather { last, sums, refine, .. } = gather;
         let [first, others @ ..] = &mut last[..] else { return };
         let places = &self.asked.places;
         let tables = &self.scores.projections[places[0]].tables;
@@ -205,7 +197,7 @@ impl Cell<'_> {
         let least = if is_single { least_sum(own, step, tables.most, threshold) } else { Some(0) };
         let Some(least) = least else { return };
         sums.clear();
-        found.effort.n_blocks_read += self.instructions.dispatch(FindSums {
+        self.instructions.dispatch(FindSums {
             columns: residuals.codes.as_chunks::<BLOCK>().0,
             low: &tables.low,
             high: &tables.high,

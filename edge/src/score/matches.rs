@@ -48,7 +48,6 @@ impl Matches {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {
     pub n_rescored: u64,
-    pub n_blocks_read: u64,
     pub n_fine_read: u64,
     pub n_embeddings_read: u64,
 }
@@ -56,7 +55,6 @@ pub struct Effort {
 impl std::ops::AddAssign for Effort {
     fn add_assign(&mut self, other: Self) {
         self.n_rescored += other.n_rescored;
-        self.n_blocks_read += other.n_blocks_read;
         self.n_fine_read += other.n_fine_read;
         self.n_embeddings_read += other.n_embeddings_read;
     }

@@ -19,7 +19,6 @@ mod budget;
 mod cell;
 mod centroids;
 mod collect;
-mod columns;
 mod dot;
 mod matches;
 mod objects;
@@ -31,7 +30,6 @@ mod select;
 mod simd;
 
 pub use budget::{Budget, MAX_COORDINATE, OverBudget, Pool, ScoreError};
-pub use columns::Columns;
 pub use dot::{dot, rounding_bound};
 pub use matches::{Effort, Hit, Matches, Run};
 pub use objects::{ObjectScores, score_objects};

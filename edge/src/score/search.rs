@@ -10,7 +10,7 @@ use super::budget::{Budget, ScoreError};
 use super::cell::Cell;
 use super::centroids::{AskedQuestion, CentroidScores};
 use super::collect::{Cut, ShardGather};
-use super::matches::{Effort, Hit, Matches};
+use super::matches::{Hit, Matches};
 use super::question::{Precision, Question, check};
 use super::region::Region;
 use super::select::AnswerBuffers;
@@ -124,17 +124,10 @@ impl<'a> Search<'a> {
 
     /// Returns the Gaussians with scores at or above a threshold, as far as the shards' data decide.
     pub fn matching(&self, threshold: f32) -> Matches {
-        let mut matches = Matches::default();
-        self.matching_into(threshold, &mut matches);
-        matches
-    }
-
-    /// As [`Search::matching`], into a list that is cleared first.
-    pub fn matching_into(&self, threshold: f32, all: &mut Matches) {
+        let mut all = Matches::default();
         let mut buffers = self.take_buffers();
         let gather = &mut buffers.gather;
         self.asked.collect(gather, Cut { score: threshold, least: threshold }, false);
-        all.clear();
         all.runs.reserve(gather.shards.iter().map(|of_shard| of_shard.found.runs.len()).sum());
         for ShardGather { found, .. } in &gather.shards {
             all.runs.extend_from_slice(&found.runs);
@@ -144,28 +137,16 @@ impl<'a> Search<'a> {
             all.n_shards_below += found.n_shards_below;
         }
         self.put_back(buffers);
+        all
     }
 
     /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from
     /// `near`, then by cell and index. The selection is exact with respect to the scores returned.
     pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
-        let mut hits = Vec::new();
-        self.best_into(limit, threshold, near, &mut hits);
-        hits
-    }
-
-    /// As [`Search::best`], into a list that is cleared first. Returns the work done.
-    pub fn best_into(
-        &self,
-        limit: usize,
-        threshold: f32,
-        near: Option<DVec3>,
-        hits: &mut Vec<Hit>,
-    ) -> Effort {
         let mut buffers = self.take_buffers();
-        let effort = self.asked.best_into(&mut buffers, limit, threshold, near, hits);
+        let hits = self.asked.best(&mut buffers, limit, threshold, near);
         self.put_back(buffers);
-        effort
+        hits
     }
 
     /// Takes the shared buffers, or empty ones while another search of the batch holds them. (A lock held over

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::cell::Cell;
 use super::centroids::AskedQuestion;
 use super::collect::{BINS, Cut, Gather, bin_of, edge_of, runs_inside};
-use super::matches::{Effort, Hit, Run};
+use super::matches::{Hit, Run};
 
 #[derive(Default)]
 pub(super) struct AnswerBuffers {
@@ -31,22 +31,19 @@ struct Part {
 }
 
 impl AskedQuestion<'_> {
-    /// Ranks the `limit` best Gaussians that reach a threshold into `hits`, which is cleared first; see
-    /// [`super::Search::best`].
-    pub(super) fn best_into(
+    /// Returns the `limit` best Gaussians that reach a threshold; see [`super::Search::best`].
+    pub(super) fn best(
         &self,
         buffers: &mut AnswerBuffers,
         limit: usize,
         threshold: f32,
         near: Option<DVec3>,
-        hits: &mut Vec<Hit>,
-    ) -> Effort {
-        hits.clear();
+    ) -> Vec<Hit> {
+        let mut hits = Vec::new();
         if limit == 0 {
-            return Effort::default();
+            return hits;
         }
         let AnswerBuffers { gather, order } = buffers;
-        let mut effort = Effort::default();
         let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
         let cut = if has_detail {
             // Ranks half as many again by centroid scores: members that rank last by their own scores are
@@ -54,15 +51,13 @@ impl AskedQuestion<'_> {
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
             let floor = self.centroid_score_at(order, enough, f32::NEG_INFINITY);
             self.count(gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
-            effort += gather.effort();
             score_reached(gather, limit).map(|score| score.max(threshold))
         } else {
             self.centroid_score_at(order, limit, threshold)
         };
         self.collect(gather, Cut { score: cut.unwrap_or(threshold), least: threshold }, true);
-        effort += gather.effort();
-        self.rank(gather, order, limit, near, hits);
-        effort
+        self.rank(gather, order, limit, near, &mut hits);
+        hits
     }
 
     /// Returns the lowest centroid score that must be included for the members of centroids at or above it to

@@ -1,4 +1,3 @@
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -241,34 +240,6 @@ fn answers_keep_within_the_stated_bound() {
 pub(super) fn random_question(random: &mut Random, dim: usize, n_negatives: usize) -> Question {
     let mut unit = || Arc::from(random.unit_vector(dim));
     Question { vector: unit(), negatives: (0..n_negatives).map(|_| unit()).collect() }
-}
-
-/// Oracle: all stored embeddings scored and sorted in f64. Ranks may swap only within f32 rounding.
-#[test]
-fn the_best_of_noisy_embeddings_are_the_best() {
-    let mut random = Random::new(4);
-    for n_negatives in [0, 4] {
-        let built: Vec<_> = noisy_shards(&mut random, 4, 60, 64).iter().map(|s| s.build(true)).collect();
-        let views = views(&built);
-        for precision in [Precision::Exact, Precision::Centroids] {
-            let question = random_question(&mut random, 64, n_negatives);
-            let mut all = brute_force(&built, &question, Region::default(), precision);
-            all.sort_by(|a, b| b.2.total_cmp(&a.2));
-            let search = Search::new(&views, &question, Region::default(), precision).expect("valid");
-            let scores: BTreeMap<(u32, u32), f64> = all.iter().map(|a| ((a.0, a.1), a.2)).collect();
-            for limit in [1, 10, 500, all.len(), usize::MAX] {
-                let best = search.best(limit, f32::NEG_INFINITY, None);
-                assert_eq!(best.len(), limit.min(all.len()));
-                for (hit, expected) in best.iter().zip(&all) {
-                    let truth = scores[&(hit.shard, hit.index)];
-                    // Centroids are multiplied with the query in 16 bits.
-                    let rounding = if precision == Precision::Centroids { 1e-4 } else { 1e-5 };
-                    assert!((truth - expected.2).abs() < 2.0 * rounding);
-                    assert!((f64::from(hit.score) - truth).abs() < rounding);
-                }
-            }
-        }
-    }
 }
 
 #[test]

@@ -5,7 +5,6 @@ mod faults;
 mod follow;
 mod history;
 mod hostile;
-mod keys;
 mod medium;
 mod partial;
 mod rot;
@@ -14,7 +13,6 @@ pub mod server;
 mod sim;
 mod sync;
 mod trust;
-mod unread;
 
 use std::path::Path;
 use std::sync::Arc;

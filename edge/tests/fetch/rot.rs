@@ -21,7 +21,7 @@ use super::{Robot, assert_holds, at, cells};
 const UNREADABLE: BadCell = BadCell { cell_id: 1, fault: CellFault::Unreadable, old: None };
 
 /// Flips a bit of a file, and leaves its time as it was: no fetch would read it before a day has passed.
-pub fn flip_unseen(path: &Path) {
+fn flip_unseen(path: &Path) {
     let modified = fs_err::metadata(path).expect("there").modified().expect("known");
     let mut bytes = fs_err::read(path).expect("there");
     bytes[600] ^= 1;
@@ -165,11 +165,34 @@ fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
     };
     assert_eq!(steps(6), [0, 1, 2, 0, 1, 2].map(|id| (id, true)));
     flip_unseen(&robot.cache.shard_path(scene.hash(1, Profile::Compact)));
+    assert_eq!(robot.fetch().expect("reads none").downloaded.n_shards, 0);
     assert_eq!(steps(2), [(0, true), (1, false)]);
     let after = Snapshot::open_after(&robot.cache, Some(&snapshot)).expect("the others are whole");
     assert_eq!((cells(&after), &after.bad_cells), (vec![0, 2], &vec![UNREADABLE]));
     assert_eq!(robot.fetch().expect("heals").downloaded.n_shards, 1);
     assert_holds(&robot.snapshot(), &scene, 0..3);
+}
+
+/// A new generation shares the open shards of the one before, except those that were replaced.
+#[test]
+fn open_shards_are_shared_by_generations() {
+    let (server, robot) = Robot::fetched(Published::new(1, &[0; 3], 40));
+    let first = robot.snapshot();
+    let next = Published::new(2, &[0, 7, 0], 40);
+    server.publish(next.clone());
+    assert_eq!(robot.fetch().expect("works").downloaded.n_shards, 1);
+    let second = Snapshot::open_after(&robot.cache, Some(&first)).expect("opens");
+    let is_shared = |at: usize| Arc::ptr_eq(&first.shards[at], &second.shards[at]);
+    assert_eq!([0, 1, 2].map(is_shared), [true, false, true]);
+    assert_holds(&second, &next, 0..3);
+    // A file that was replaced is opened anew, whatever its name says.
+    std::thread::sleep(Duration::from_millis(20));
+    let path = robot.cache.shard_path(second.current.cells[0].hash);
+    let copy = path.with_extension("copy");
+    fs_err::copy(&path, &copy).expect("copied");
+    fs_err::rename(&copy, &path).expect("renamed");
+    let third = Snapshot::open_after(&robot.cache, Some(&second)).expect("opens");
+    assert!(!Arc::ptr_eq(&second.shards[0], &third.shards[0]));
 }
 
 /// A robot in service finds rot by itself and fetches the shard, although nothing else makes a fetch due.

@@ -6,7 +6,7 @@ use slag_common::tuf::{TufError, sha256_hex};
 use slag_edge::fetch::{FetchError, FirstRoot, RecordsError, accepted};
 
 use super::scene::{FIRST, Published, RootKeys};
-use super::server::Server;
+use super::server::{Fault, Server};
 use super::{Robot, assert_holds};
 use slag_test_support::trials;
 
@@ -57,6 +57,28 @@ impl Rotated {
             fs_err::write(path, bytes).expect("written");
         }
     }
+}
+
+#[test]
+fn an_old_state_is_refused_even_if_the_new_one_never_arrived() {
+    let (server, robot) = Robot::fetched(of(2, &[FIRST]));
+    let refuses = |old: u64, newest: u64| {
+        server.publish(of(old, &[FIRST]));
+        match robot.fetch().expect_err("refused") {
+            FetchError::Tuf(TufError::Rollback { seen, offered, .. }) => {
+                assert_eq!((seen, offered), (newest, old));
+            }
+            error => panic!("{error}"),
+        }
+    };
+    refuses(1, 2);
+    server.publish(of(7, &[FIRST]));
+    server.fault_at("objects", Fault::Status(404));
+    assert!(matches!(robot.fetch(), Err(FetchError::Download { .. })));
+    server.faults(|_| Fault::None);
+    refuses(6, 7);
+    server.publish(of(7, &[FIRST]));
+    robot.fetch().expect("accepted");
 }
 
 /// A flipped bit in any file of records neither stops a robot nor brings old keys back.

@@ -125,32 +125,6 @@ fn a_cut_pull_goes_on_where_it_ended() {
 }
 
 #[test]
-fn parts_of_other_files_and_plain_servers_do_no_harm() {
-    let (server, root, hub) = setting();
-    let vision = server.bytes("onnx/vision.onnx");
-    let part = root.path().join("made/onnx/vision.onnx.part");
-    let right = format!("\"{}-{}\"", "onnx/vision.onnx".len(), &sha256(&vision)[..8]);
-    fs_err::create_dir_all(root.path().join("made/onnx")).expect("it is writable");
-    // Another version's part; one without a validator; one that claims to be of this version, but is not.
-    for (etag, n_bytes) in
-        [(Some("\"other\"".to_owned()), 50), (None, 50), (Some(right), 50), (None, 100_000)]
-    {
-        fs_err::write(&part, vec![9; n_bytes]).expect("it is writable");
-        etag.iter()
-            .for_each(|etag| fs_err::write(part.with_extension("etag"), etag).expect("it is writable"));
-        hub.pull("made", Side::Both, true).unwrap_or_else(|e| panic!("{etag:?}: {e}"));
-        assert_eq!(files_below(root.path()).len(), 4, "{etag:?}");
-        fs_err::remove_file(root.path().join("made/onnx/vision.onnx")).expect("it is there");
-    }
-    // A server without validators or ranges: each attempt starts anew, and the pull fails if all break.
-    server.change(|files| (files.is_plain, files.cut_bytes) = (true, 100));
-    let error = hub.pull("made", Side::Both, true).expect_err("it never ends").to_string();
-    assert!(error.contains("disconnected"), "{error}");
-    server.change(|files| files.cut_bytes = usize::MAX);
-    hub.pull("made", Side::Both, true).expect("whole");
-}
-
-#[test]
 fn downloads_with_another_hash_are_discarded() {
     let (server, root, hub) = setting();
     // The hub's hash differs from that of the store's bytes.

@@ -260,28 +260,3 @@ async fn service_of(app: &Arc<App>, uri: &str) -> Response {
     let request = Request::get(uri).body(Body::empty()).expect("a request");
     router(Arc::clone(app)).oneshot(request).await.expect("infallible")
 }
-
-/// Every Gaussian its own cluster, whatever the limit: a refusal names the budget, and what was taken is given
-/// back.
-#[tokio::test]
-async fn a_query_beyond_its_budget_is_refused() {
-    let ask = async |service: &Service| {
-        let (status, _, body) =
-            service.get("/query?text=0&kind=clusters&threshold=-1&min_count=1&voxel=1e-9&limit=1").await;
-        (status.as_u16(), body["type"].clone(), body["detail"].clone())
-    };
-    let of = |query_bytes: u64, all_queries_bytes: u64| {
-        Service::new(Some(&chair(None)), Settings { query_bytes, all_queries_bytes, ..Settings::default() })
-    };
-    let problem = |kind: &str| Value::String(format!("urn:slag:problem:{kind}"));
-    let (status, kind, detail) = ask(&of(3000, 1 << 30)).await;
-    assert_eq!((status, kind), (422, problem("over-budget")));
-    assert!(detail.as_str().is_some_and(|detail| detail.contains("3000 bytes")), "{detail}");
-    let (status, kind, detail) = ask(&of(1 << 30, 3000)).await;
-    assert_eq!((status, kind), (503, problem("overloaded")));
-    assert!(detail.as_str().is_some_and(|detail| detail.contains("3000 bytes")), "{detail}");
-    let enough = of(1 << 20, 1 << 20);
-    for _ in 0..300 {
-        assert_eq!(ask(&enough).await.0, 200, "nothing is left taken");
-    }
-}

@@ -218,17 +218,3 @@ async fn texts_need_the_encoder_of_the_scene() {
     let (status, _, body) = service.get("/v1/changes").await;
     assert_eq!((status, ids(&body, "appeared")), (StatusCode::OK, vec!["o000000000000000a"]), "{body:#}");
 }
-
-/// Whoever only asks for changes sees the generation that a fetch has put in place: the request that finds it has
-/// the service load it.
-#[tokio::test]
-async fn a_fetched_generation_is_found_by_asking_for_changes() {
-    let service = Service::new(Some(&shards(&[6])), Settings::default());
-    remember(service.app.engine.cache());
-    write_cache(service.dir.path(), &shards(&[6, 10]), 2);
-    let mut attempts = service.app.reload_attempts();
-    service.get("/v1/changes").await;
-    soon(attempts.changed()).await.expect("is told");
-    let (_, _, body) = service.get("/v1/changes").await;
-    assert_eq!((&body["to"]["generation"], ids(&body, "appeared")), (&json!(2), vec!["o000000000000000a"]));
-}

@@ -158,15 +158,6 @@ async fn wrong_requests_are_refused() {
 }
 
 #[tokio::test]
-async fn page_is_beside_the_api() {
-    let service = Service::with_chair();
-    let (status, headers, body) = service.get("/view").await;
-    let expected = if slag_view::is_built() { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
-    assert_eq!(status, expected, "{body}");
-    assert!(!slag_view::is_built() || headers.contains_key("content-security-policy"));
-}
-
-#[tokio::test]
 async fn photo_poses_on_board_are_handed_on() {
     let [near, _] = two_cells();
     let (x, z) = (near.view().header.origin_in_world[0], near.view().header.origin_in_world[2]);
@@ -185,26 +176,4 @@ async fn photo_poses_on_board_are_handed_on() {
     let y = near.view().header.origin_in_world[1];
     assert_eq!(photo["position_m"], serde_json::json!([2.0, y, -1.5]));
     assert_eq!((&photo["name"], &photo["has_picture"]), (&"a.jpg".into(), &false.into()));
-}
-
-/// The things of a word are those that the query route answers it with.
-#[tokio::test]
-async fn words_are_counted_as_they_are_answered() {
-    let service = Service::new(Some(&v1::room_with(None)), Settings::default());
-    let (status, _, words) = service.get("/v1/view/words").await;
-    assert_eq!(status, StatusCode::OK);
-    // Two mugs, a table, and nothing of axis 2.
-    let expected = serde_json::json!([
-        { "word": "0", "n_things": 2 }, { "word": "1", "n_things": 1 }, { "word": "2", "n_things": 0 }
-    ]);
-    assert_eq!((&words["words"], &words["complete"]), (&expected, &true.into()));
-    let listed = words["words"].as_array().expect("words");
-    let counts: Vec<u64> = listed.iter().map(|word| word["n_things"].as_u64().expect("a count")).collect();
-    assert!(counts.is_sorted_by(|a, b| a >= b), "{words}");
-    for word in listed {
-        let uri = format!("/v1/query?kind=objects&text={}", word["word"].as_str().expect("a word"));
-        let (_, _, reply) = service.get(&uri).await;
-        let answers = reply["results"][0]["answers"].as_array().expect("answers");
-        assert_eq!(word["n_things"], answers.len(), "{uri}");
-    }
 }

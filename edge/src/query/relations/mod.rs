@@ -12,4 +12,4 @@ pub use candidates::{CandidateOf, ClustersOfThing, Found, Things, metre};
 pub use geometry::{HOLDS, Viewer};
 pub use grammar::{asked_thing, understand};
 pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation};
-pub use rank::{Miss, Related, Witness, relate};
+pub use rank::{Related, Witness, relate};

@@ -86,22 +86,6 @@ impl Relation {
         Self::Behind,
     ];
 
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::On => "on",
-            Self::Under => "under",
-            Self::Above => "above",
-            Self::In => "in",
-            Self::Near => "near",
-            Self::Beside => "beside",
-            Self::Between => "between",
-            Self::LeftOf => "left-of",
-            Self::RightOf => "right-of",
-            Self::InFrontOf => "in-front-of",
-            Self::Behind => "behind",
-        }
-    }
-
     /// Returns whether it depends on where the asker is.
     pub fn is_seen(self) -> bool {
         matches!(self, Self::LeftOf | Self::RightOf | Self::InFrontOf | Self::Behind)
@@ -115,7 +99,8 @@ impl Relation {
 
 impl fmt::Display for Relation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.name().replace('-', " "))
+        let name = serde_json::to_value(self).unwrap_or_default();
+        f.write_str(&name.as_str().unwrap_or_default().replace('-', " "))
     }
 }
 
@@ -230,7 +215,7 @@ impl Phrase {
         if let Some(place) = &self.relation
             && (place.is == Relation::Between) != place.and.is_some()
         {
-            return refuse(place.is.name(), "`and` with between, and only there");
+            return refuse(&place.is.to_string(), "`and` with between, and only there");
         }
         if let Some(pick) = &self.pick {
             if !(1..=MAX_NTH).contains(&pick.n) {

@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::candidates::{Candidate, Things};
 use super::geometry::{self, HOLDS, Solid, Viewer};
 use super::phrase::{By, Phrase, Pick, Place};
-use crate::query::answers::ReasonKind;
+use crate::query::answers::{Reason, ReasonKind};
 
 /// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not
 /// win over a sure one.
@@ -40,26 +40,9 @@ pub struct Witness {
     pub score: Option<f32>,
 }
 
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Miss {
-    /// The part that failed.
-    pub kind: ReasonKind,
-    /// The same in words.
-    pub detail: String,
-    /// Share of the Gaussians on board in the region asked for that a used view saw; absent where there are none.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub seen_share: Option<f64>,
-    /// The thing that is missing, or not so placed.
-    pub thing: String,
-    /// Greatest degree of the relation among all pairs.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub best_degree: Option<f64>,
-}
-
-impl Miss {
-    fn new(kind: ReasonKind, thing: &str, detail: String) -> Self {
-        Self { kind, detail, seen_share: None, thing: thing.to_owned(), best_degree: None }
-    }
+/// Returns the part of a phrase that failed.
+fn miss(kind: ReasonKind, thing: &str, detail: String) -> Reason {
+    Reason { thing: Some(thing.into()), ..Reason::new(kind, detail) }
 }
 
 /// A thing that others are compared with.
@@ -83,11 +66,11 @@ pub fn relate(
     phrase: &Phrase,
     viewer: Option<&Viewer>,
     metre: f64,
-) -> Result<Vec<Related>, Miss> {
+) -> Result<Vec<Related>, Reason> {
     let of = things.of(&phrase.thing);
     let missing = || {
         let detail = format!("nothing {} is in the region asked for", quoted(&phrase.thing));
-        Miss::new(ReasonKind::NotInRegion, &phrase.thing, detail)
+        miss(ReasonKind::NotInRegion, &phrase.thing, detail)
     };
     if !of.is_empty() && !of.iter().any(|candidate| candidate.is_inside) {
         return Err(missing());
@@ -101,11 +84,11 @@ impl<'b> Measure<'_, 'b> {
         &self,
         phrase: &Phrase,
         is_asked_for: impl Fn(&Candidate<'b>) -> bool,
-    ) -> Result<Vec<Related>, Miss> {
+    ) -> Result<Vec<Related>, Reason> {
         let all = self.things.of(&phrase.thing);
         if all.is_empty() {
             let detail = format!("nothing on board is {}", quoted(&phrase.thing));
-            return Err(Miss::new(ReasonKind::NoSuchThing, &phrase.thing, detail));
+            return Err(miss(ReasonKind::NoSuchThing, &phrase.thing, detail));
         }
         let mut found = match &phrase.relation {
             None => (0..all.len()).map(|at| alone(at, &all[at])).collect(),
@@ -116,7 +99,7 @@ impl<'b> Measure<'_, 'b> {
         let described = quoted(&phrase.thing);
         if found.is_empty() {
             let detail = format!("nothing {described} that is so placed is in the region asked for");
-            return Err(Miss::new(ReasonKind::NotInRegion, &phrase.thing, detail));
+            return Err(miss(ReasonKind::NotInRegion, &phrase.thing, detail));
         }
         match &phrase.pick {
             None => Ok(found),
@@ -124,7 +107,7 @@ impl<'b> Measure<'_, 'b> {
         }
     }
 
-    fn placed(&self, phrase: &Phrase, place: &Place) -> Result<Vec<Related>, Miss> {
+    fn placed(&self, phrase: &Phrase, place: &Place) -> Result<Vec<Related>, Reason> {
         let ones = self.anchors(&place.of)?;
         let others = match &place.and {
             Some(other) => Some((other, self.anchors(other)?)),
@@ -164,14 +147,14 @@ impl<'b> Measure<'_, 'b> {
             let and = others.map_or(String::new(), |(other, _)| format!(" and {}", quoted(&other.thing)));
             let (thing, of, is) = (quoted(&phrase.thing), quoted(&place.of.thing), place.is);
             let detail = format!("{thing} and {of}{and} are on board, but no {thing} is {is} {of}{and}");
-            let miss = Miss::new(ReasonKind::NoSuchPair, &phrase.thing, detail);
-            return Err(Miss { best_degree: Some(best_degree), ..miss });
+            let miss = miss(ReasonKind::NoSuchPair, &phrase.thing, detail);
+            return Err(Reason { best_degree: Some(best_degree), ..miss });
         }
         Ok(found)
     }
 
     /// Returns the things that others are compared with.
-    fn anchors(&self, phrase: &Phrase) -> Result<Vec<Anchor>, Miss> {
+    fn anchors(&self, phrase: &Phrase) -> Result<Vec<Anchor>, Reason> {
         if phrase.is_asker() {
             let at = self.viewer.map_or(DVec3::ZERO, |viewer| viewer.position_in_world);
             let witness =
@@ -193,7 +176,7 @@ impl<'b> Measure<'_, 'b> {
         Ok(found.map(anchor).collect())
     }
 
-    fn picked(&self, phrase: &Phrase, pick: &Pick, mut found: Vec<Related>) -> Result<Vec<Related>, Miss> {
+    fn picked(&self, phrase: &Phrase, pick: &Pick, mut found: Vec<Related>) -> Result<Vec<Related>, Reason> {
         let all = self.things.of(&phrase.thing);
         let from = match (&pick.from, pick.by.is_distance()) {
             (Some(from), _) => self.anchors(from)?,
@@ -218,7 +201,7 @@ impl<'b> Measure<'_, 'b> {
         let n = found.len();
         if n < pick.n {
             let detail = format!("{} was asked for, but {n} fit", nth(pick.n, &phrase.thing));
-            return Err(Miss::new(ReasonKind::TooFew, &phrase.thing, detail));
+            return Err(miss(ReasonKind::TooFew, &phrase.thing, detail));
         }
         let mut chosen = found.swap_remove(pick.n - 1);
         chosen.to.extend(origin.map(|origin| origin.witness.clone()));

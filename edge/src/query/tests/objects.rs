@@ -4,7 +4,7 @@ use super::*;
 use crate::testing::TestObject;
 
 /// Cells 3 and 4 share object 21 (30 Gaussians and 12 of 50 in all); cell 4 has object 22 too.
-pub(super) fn scene_of_objects() -> Vec<BuiltShard> {
+fn scene_of_objects() -> Vec<BuiltShard> {
     let [a, b, c] = [[1.0f32, 0.0], [0.6, 0.8], [0.0, 1.0]];
     let object = |id: u64, vectors: [[f32; 2]; 3], runs: &[std::ops::Range<u32>], n_gaussians| TestObject {
         id,
@@ -160,7 +160,7 @@ fn objects_abstain_and_keep_to_the_region() {
     let question =
         Question { negatives: vec![std::sync::Arc::from([0.0f32, 1.0])], ..Question::new([1.0, 0.0]) };
     let answers = ask_about(&scene, &[question], |request, _| {
-        (request.negatives, request.threshold) = (Negatives::Phrases(vec!["other".into()]), Some(0.2));
+        (request.negatives, request.threshold) = (Negatives(vec!["other".into()]), Some(0.2));
     });
     let found = clusters(&answers[0]);
     let expected = crate::score::relevancy(0.8 - 0.9);

@@ -1,6 +1,7 @@
 //! `bench query` and `bench text`: answers of the robot's engine over a cache, from a vector to columns of
 //! Gaussians; and a text model, from words to a vector.
 
+use std::hint::black_box;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
@@ -10,7 +11,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
 use slag_common::shard::{Profile, ShardView};
-use slag_edge::score::{Columns, Hit, Matches, Precision, Question, Region, Scratch, Search};
+use slag_edge::score::{Precision, Question, Region, Scratch, Search};
 use slag_edge::store::{EdgeCache, Snapshot};
 use slag_encoder::cli::common::{ModelArgs, open_models};
 use slag_math::random::Random;
@@ -123,15 +124,16 @@ pub(crate) fn run(args: &QueryArgs) -> Result<QueryReport> {
 
 /// Times both kinds of answers, with buffers that a process keeps between queries.
 fn time(shards: &[ShardView<'_>], questions: &[Question], limit: usize, args: &QueryArgs) -> Result<Timing> {
-    let (mut scratch, mut columns) = (Scratch::default(), Columns::default());
-    let (mut hits, mut matches): (Vec<Hit>, _) = (Vec::new(), Matches::default());
+    let mut scratch = Scratch::default();
+    // An answer has positions.
+    let position = |shard: u32, index: u32| shards[shard as usize].position_in_world(index as usize);
     let n_runs = args.runs as usize;
     let question = |turn: usize| &questions[turn % questions.len()];
     let best = Times::measure(N_WARM_UP, n_runs, |turn| -> Result<()> {
         let search =
             Search::reusing(&mut scratch, shards, question(turn), Region::default(), args.precision)?;
-        search.best_into(limit, f32::NEG_INFINITY, None, &mut hits);
-        columns.set_hits(shards, &hits);
+        let hits = search.best(limit, f32::NEG_INFINITY, None).into_par_iter();
+        black_box(hits.map(|hit| position(hit.shard, hit.index)).collect::<Vec<_>>());
         Ok(())
     })?;
     let last = |question: &Question| -> Result<f32> {
@@ -142,8 +144,9 @@ fn time(shards: &[ShardView<'_>], questions: &[Question], limit: usize, args: &Q
     let threshold = Times::measure(N_WARM_UP, n_runs, |turn| -> Result<()> {
         let search =
             Search::reusing(&mut scratch, shards, question(turn), Region::default(), args.precision)?;
-        search.matching_into(thresholds[turn % thresholds.len()], &mut matches);
-        columns.set_runs(shards, &matches.runs);
+        let runs = search.matching(thresholds[turn % thresholds.len()]).runs.into_par_iter();
+        let positions = runs.flat_map_iter(|run| (run.start..run.end).map(move |at| position(run.shard, at)));
+        black_box(positions.collect::<Vec<_>>());
         Ok(())
     })?;
     Ok(Timing { limit, best, threshold, recall: recall(shards, questions, limit, args.precision)? })
