@@ -1,8 +1,11 @@
 use glam::DVec3;
 use slag_common::pinhole;
-use slag_test_support::memory_of;
+use slag_test_support::{CountingAllocator, memory_of};
 
 use super::*;
+
+#[global_allocator]
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// A row of cameras before a wall of points that all of them see: the lists take no more than is reserved.
 #[test]
