@@ -144,7 +144,6 @@ pub struct Object {
     pub top: Option<Top>,
 }
 
-/// Returns the items of a list, trimmed.
 fn list(text: &str) -> impl Iterator<Item = &str> {
     text.split(',').map(str::trim)
 }

@@ -46,7 +46,6 @@ pub(crate) struct TradeoffReport {
 
 type Cost = fn(&Figures) -> f64;
 
-/// Seconds of the encode, bytes a Gaussian.
 const COSTS: [Cost; 2] = [|f| f.seconds, |f| f.bytes_per_gaussian];
 
 /// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate,

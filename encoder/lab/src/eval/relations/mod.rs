@@ -162,9 +162,6 @@ fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result
     let body = match way {
         Way::Relations => json!({"texts": [question.text], "near": near, "limit": LIMIT}),
         Way::Phrase => json!({"texts": [question.text], "relations": false, "limit": LIMIT}),
-        Way::BestOfPhrase => {
-            json!({"texts": [question.text], "relations": false, "limit": 1, "min_score": -1.0})
-        }
         Way::Noun => json!({"texts": [question.thing], "relations": false, "limit": LIMIT}),
     };
     let mut reply = service.post("/v1/query", &body)?;
@@ -208,17 +205,14 @@ enum Way {
     Relations,
     /// The phrase as one text, with the scene's threshold.
     Phrase,
-    /// The phrase as one text; its best answer, whatever the score.
-    BestOfPhrase,
     /// The noun alone, with the scene's threshold.
     Noun,
 }
 
 impl Way {
-    const ALL: [Self; 4] = [Self::Relations, Self::Phrase, Self::BestOfPhrase, Self::Noun];
+    const ALL: [Self; 3] = [Self::Relations, Self::Phrase, Self::Noun];
 }
 
-/// What came of some questions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 struct Counts {
     n_questions: usize,
