@@ -5,8 +5,8 @@ use rayon::prelude::*;
 use slag_common::shard::ScoreErrors;
 use slag_math::matrix::{Panels, Rows};
 
+use super::cluster::Members;
 use super::measure;
-use super::members::Members;
 
 const CHUNK: usize = 1024;
 

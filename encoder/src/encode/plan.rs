@@ -7,9 +7,9 @@ use std::time::Instant;
 use slag_common::Hash32;
 use slag_models::SessionOptions;
 
+use super::context::Engines;
 use super::context::RunContext;
 use super::coverage::{self, Coverage};
-use super::engines::Engines;
 use super::error::EncodeError;
 use super::identity;
 use super::inputs::{self, Inputs};

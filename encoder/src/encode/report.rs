@@ -42,7 +42,6 @@ impl LeftOut {
 #[derive(Clone, Debug, Serialize)]
 pub struct LostViews {
     pub n_views: usize,
-    /// All this in words.
     pub reason: String,
 }
 

@@ -66,7 +66,6 @@ pub struct Contribution {
     /// The Gaussian, by its index within its cell.
     pub local: u32,
     pub region: u32,
-    /// Its weight, pixels.
     pub weight: f32,
 }
 
@@ -75,7 +74,6 @@ pub struct Contribution {
 #[repr(C)]
 pub(super) struct PackedEntry {
     key: u32,
-    /// Its weight, pixels.
     pub(super) weight: f32,
 }
 

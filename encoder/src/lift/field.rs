@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
 use super::embeddings::{make_unit, write_embeddings};
-use super::part::PartContributions;
+use super::index::PartContributions;
 use super::table::{RegionTable, are_starts};
 
 const MAGIC: [u8; 8] = *b"SLAGFELD";

@@ -90,7 +90,6 @@ pub(super) fn find_among(
 
 /// The masks of each object, and how well each mask shows its object.
 struct Masks {
-    /// The masks of each object, ascending.
     of_object: Vec<Vec<u32>>,
     /// `[n_masks]`: blending weight of all Gaussians under the mask, pixels.
     weights: Vec<f64>,

@@ -63,15 +63,6 @@ fn small_pieces_are_joined_and_unusable_gaussians_have_none() {
     assert!(sizes.iter().all(|size| *size >= 20), "{sizes:?}");
 }
 
-#[test]
-fn threads_do_not_show() {
-    let run = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-        pool.install(|| Superpoints::new(&scene(), &Standing::default(), &SuperpointSettings::default()))
-    };
-    assert_eq!(run(1), run(3));
-}
-
 /// Twelve Gaussians of the ground's colour and direction stay a thing of their own, though superpoints have twenty.
 #[test]
 fn what_stands_on_the_ground_is_no_part_of_it() {
