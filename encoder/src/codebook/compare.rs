@@ -30,7 +30,6 @@ impl Decoder<'_> {
         out
     }
 
-    /// Returns the basis, to multiply components with.
     pub(super) fn panels(&self) -> Panels {
         Panels::new(self.m, self.dim, |c, i| f32::from(self.basis[c * self.dim + i]) * self.steps[c])
     }

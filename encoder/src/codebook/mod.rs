@@ -124,7 +124,6 @@ impl Codebook {
 }
 
 pub struct CodebookResiduals {
-    /// Subspaces and codewords.
     pub code: ResidualCode,
     /// `[K]`.
     pub residual_scales: Vec<f32>,

@@ -44,7 +44,6 @@ pub(super) struct BuiltCells {
     score_sums: [f64; 3],
 }
 
-/// The size of what the views found.
 pub(super) struct Counts {
     pub(super) n_views_without_masks: usize,
     pub(super) n_masks: usize,
@@ -160,7 +159,8 @@ fn refine(
     context.progress.advance(1);
     // From all masks alike, whatever weight they have in the refinement.
     context.begin_phase(Phase::Objects);
-    let find = || context.install(|| objects::find(scene, &pending, score_context));
+    let (views, superpoints) = (pending.table(), pending.superpoints());
+    let find = || context.install(|| objects::find(scene, views, superpoints, score_context));
     let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
     context.progress.advance(1);
     if let Some(found) = &objects {
@@ -175,7 +175,6 @@ fn refine(
     Ok(Refined { table, refinement, objects })
 }
 
-/// Cuts a small picture of each object.
 fn thumbnails(
     plan: &Plan<'_>,
     objects: &[Object],

@@ -115,7 +115,6 @@ pub(super) fn plan<'a>(
 }
 
 impl Plan<'_> {
-    /// Reserves what depends on segmenter and views.
     fn reserve_views(&mut self) -> Result<(), EncodeError> {
         let mut memory = self.memory.clone();
         self.view_tools().reserve(&mut memory, &self.inputs.views);

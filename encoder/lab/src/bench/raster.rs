@@ -57,7 +57,6 @@ type Device = (String, Box<dyn Rasterizer>);
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct RasterReport {
     machine: Machine,
-    /// One per device.
     cases: Vec<RasterCase>,
 }
 

@@ -12,7 +12,6 @@ use slag_encoder::objects::NONE;
 /// Share of an object or a thing that counts as a piece of it.
 const PIECE: f64 = 0.25;
 
-/// Counts of things found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Recall {
     pub(crate) n: usize,

@@ -272,7 +272,6 @@ fn nearest_gaussians(scan: &Scan, scene: &Gaussians) -> Vec<Option<usize>> {
 }
 
 impl ScannetReport {
-    /// Takes the means over scenes.
     pub(super) fn new(scenes: Vec<ScanReport>) -> Self {
         let means_of = |subsets: &dyn Fn(&ScanReport) -> Option<Vec<Subset>>| -> Option<Vec<Subset>> {
             let of_scenes: Vec<Vec<Subset>> = scenes.iter().map(subsets).collect::<Option<_>>()?;

@@ -60,7 +60,6 @@ pub(super) fn check_scene(reader: &StoreReader, n_scene: usize) -> Result<()> {
 }
 
 impl Truth {
-    /// Reads the labels of a scene with `n_gaussians` Gaussians.
     pub(super) fn read(dir: &Path, n_gaussians: usize) -> Result<Self> {
         let (things, background) = read_things(dir)?;
         let path = dir.join("gt/gaussian_instance.npy");

@@ -140,7 +140,6 @@ pub struct Object {
     /// Its colours, the main one first.
     pub colours: Vec<Colour>,
     pub paint: Paint,
-    /// Surface for other things.
     pub top: Option<Top>,
 }
 
@@ -159,7 +158,6 @@ fn exactly<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; 
 }
 
 impl Noun {
-    /// Parses an object file's text.
     fn parse(name: String, text: &str) -> Result<Self, String> {
         let mut noun = Self {
             name,

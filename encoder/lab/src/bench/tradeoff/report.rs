@@ -36,7 +36,6 @@ pub(super) struct Figures {
     pub(super) bytes_per_gaussian: f64,
 }
 
-/// Figures of a measured grid, in the order of scenes and grid.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct TradeoffReport {
     pub(super) machine: Machine,

@@ -86,7 +86,6 @@ pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport
     Ok(GoalReport { scenes, places, road })
 }
 
-/// Judges the places of a scene.
 fn judge(
     dir: &Path,
     layout: &Layout,
@@ -168,10 +167,14 @@ fn objects_of_things(thing_of: &[u16], object_of: &[u32]) -> BTreeMap<u16, u32> 
 enum Verdict {
     /// The thing is no object on board.
     NoObject,
-    /// No pose, for a reason.
     None(String),
     /// A pose, and the truth about it.
-    Pose { clearance_m: f64, is_reached: bool, shown: f64, height_error_m: f64 },
+    Pose {
+        clearance_m: f64,
+        is_reached: bool,
+        shown: f64,
+        height_error_m: f64,
+    },
 }
 
 impl Verdict {

@@ -75,7 +75,6 @@ pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<Relat
     Ok(report)
 }
 
-/// Asks a robot about a scene.
 fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
     let text = fs_err::read(dir.join("scene/gt/instances.json"))?;
     let Instances { instances: things } = serde_json::from_slice(&text)?;
@@ -201,7 +200,6 @@ fn iou(a: &Aabb, b: &Aabb) -> f64 {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 enum Way {
-    /// As relations between things.
     Relations,
     /// The phrase as one text, with the scene's threshold.
     Phrase,
@@ -236,7 +234,6 @@ impl Counts {
     }
 }
 
-/// Figures of one way of asking.
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     /// `None` for all of them.

@@ -25,7 +25,6 @@ pub(super) struct TrueThing {
     pub(super) kinds: Vec<String>,
     /// Smallest corner of its box, metres.
     pub(super) aabb_min: DVec3,
-    /// Largest corner.
     pub(super) aabb_max: DVec3,
     /// Pixels that show it, over all photos.
     pub(super) train_pixels: u64,
