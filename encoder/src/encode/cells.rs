@@ -14,7 +14,7 @@ use super::context::RunContext;
 use super::error::EncodeError;
 use super::inputs;
 use super::plan::Plan;
-use super::report::{Phase, ViewsReport};
+use super::report::ViewsReport;
 use super::sink::{ViewRecord, ViewSink};
 use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
@@ -23,7 +23,7 @@ use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::{PendingRefinement, Refinement};
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable, SceneContributions};
-use crate::memory;
+use crate::memory::Phase;
 use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
@@ -298,7 +298,7 @@ impl Opened {
         let cell_bytes = shard::largest_cell_bytes(split, models.dim()) + index.largest_part_bytes();
         // Cells come second: contributions that are not kept in memory are read six times. But what superpoints
         // and objects took is free again.
-        let rest_bytes = memory.rest_of(memory::Phase::Cells);
+        let rest_bytes = memory.rest_of(Phase::Cells);
         let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
         let n_more =
             (spare_bytes / cell_bytes.max(1)).min(context.workers.shared.current_num_threads() as u64 - 1);

@@ -9,8 +9,8 @@ use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 use slag_models::{ModelDir, SessionOptions};
 
 use super::error::EncodeError;
-use super::report::{Phase, PhaseReport};
-use crate::memory;
+use super::report::PhaseReport;
+use crate::memory::{self, Phase};
 use crate::progress::Progress;
 use crate::raster::Rasterizer;
 

@@ -31,6 +31,7 @@ mod views;
 use std::sync::atomic::AtomicBool;
 
 use crate::lift::ContributionError;
+use crate::memory::Phase;
 use crate::progress::Progress;
 use crate::store::{Store, StoreError};
 use context::RunContext;
@@ -44,7 +45,7 @@ pub use preset::Preset;
 pub use report::EncodeSummary;
 #[cfg(feature = "fleet")]
 pub(crate) use report::SkippedView;
-pub(crate) use report::{GpuReport, Phase, StageReport};
+pub(crate) use report::{GpuReport, StageReport};
 #[cfg(feature = "fleet")]
 pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};

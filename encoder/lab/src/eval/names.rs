@@ -211,10 +211,9 @@ mod tests {
     #[test]
     fn right_names() {
         let thing = |category: &str, words: &[&str]| Thing {
-            id: 1,
             category: category.to_owned(),
             words: words.iter().map(|word| (*word).to_owned()).collect(),
-            train_pixels: 0,
+            ..Thing::default()
         };
         for (name, category) in [
             ("couch", "sofa"),
