@@ -208,6 +208,17 @@ impl Layout {
     ) -> Result<T, ContainerError> {
         Ok(bytemuck::pod_read_unaligned(&bytes[self.column::<T>(id, name, 1)?]))
     }
+
+    /// Returns a copy of the values of a section.
+    pub fn values<T: AnyBitPattern + NoUninit>(
+        &self,
+        bytes: &[u8],
+        id: u32,
+        name: &'static str,
+        expected_len: usize,
+    ) -> Result<Vec<T>, ContainerError> {
+        Ok(bytemuck::pod_collect_to_vec(&bytes[self.column::<T>(id, name, expected_len)?]))
+    }
 }
 
 /// Returns the byte range of a section from the start of a file; nothing is validated.

@@ -151,7 +151,6 @@ fn packed_bits(size: [f64; 3]) -> Option<[u8; 3]> {
 pub struct Cell {
     /// Its Gaussians: indices in the input, along a Morton curve.
     pub gaussians: Vec<u32>,
-    /// Box around the means.
     pub(crate) mean_bounds: Aabb,
     /// Box around the extents, but see [`STRAY_EXTENT`].
     pub bounds: Aabb,

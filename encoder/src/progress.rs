@@ -25,7 +25,6 @@ pub trait Progress: Sync {
 pub struct FoundObject {
     /// Its id, as answers name it.
     pub id: String,
-    /// Where it is, world.
     pub(crate) position_m: DVec3,
     pub bounds: Aabb,
     pub n_gaussians: u32,

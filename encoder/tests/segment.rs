@@ -69,6 +69,9 @@ fn view(name: &str, width_px: u32, height_px: u32) -> View {
     let intrinsics = pinhole([width_px, height_px], 50.0);
     View { name: name.into(), image_path: "none".into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
+fn input<'a>(view: &'a View, image: &'a RgbImage) -> SegmentInput<'a> {
+    SegmentInput { view, image, valid: None, undistorter: None, depth: None, pool: None }
+}
 
 /// Loads the masks of image `left/a.jpg`, 8 x 6 pixels, from a folder.
 fn load(
@@ -77,8 +80,7 @@ fn load(
     undistorter: Option<&Undistorter>,
 ) -> Result<Option<Vec<Mask>>, SegmentError> {
     let (view, image) = (view("left/a.jpg", 8, 6), RgbImage::new(8, 6));
-    let input =
-        SegmentInput { view: &view, image: &image, valid: None, undistorter, depth: None, pool: None };
+    let input = SegmentInput { undistorter, ..input(&view, &image) };
     let given = GivenMasks::open(dir, ignore_ids.to_vec())?;
     let loaded = given.load(&input);
     if let Ok(masks) = &loaded {
@@ -325,11 +327,9 @@ fn house_masks_have_the_pixels_that_the_scene_states() {
     let mut found_px = std::collections::BTreeMap::new();
     let image = RgbImage::new(640, 480);
     for view in &poses::read(&scene, None).unwrap().views {
-        let input =
-            SegmentInput { view, image: &image, valid: None, undistorter: None, depth: None, pool: None };
         let png =
             image::open(scene.join("gt/masks").join(&view.name).with_extension("png")).unwrap().into_luma8();
-        for mask in given.load(&input).unwrap().unwrap() {
+        for mask in given.load(&input(view, &image)).unwrap().unwrap() {
             // The id, which a mask does not carry, is that of any of its pixels.
             let first = mask.inside.iter().position(|inside| inside).unwrap() as u32;
             let (x, y) = (first % mask.box_px.width_px(), first / mask.box_px.width_px());
@@ -511,15 +511,8 @@ fn masks_are_matched_with_their_photos() {
     );
     assert!(check(dir.path(), true).unwrap_err().contains("--strict"));
     let image = RgbImage::new(4, 3);
-    let input = SegmentInput {
-        view: &views[0],
-        image: &image,
-        valid: None,
-        undistorter: None,
-        depth: None,
-        pool: None,
-    };
-    let masks = GivenMasks::open(dir.path(), vec![255]).unwrap().load(&input).unwrap().expect("masks");
+    let given = GivenMasks::open(dir.path(), vec![255]).unwrap();
+    let masks = given.load(&input(&views[0], &image)).unwrap().expect("masks");
     assert_eq!(
         masks.iter().map(|mask| (mask.box_px.x0, mask.box_px.y0)).collect::<Vec<_>>(),
         [(0, 0), (1, 0), (2, 2)]

@@ -297,7 +297,6 @@ pub fn id_image(data: &[u8]) -> bool {
     })
 }
 
-/// Reads the masks of the photo that the seeds have masks of.
 fn read_masks(path: &Path) -> bool {
     let view = seeds::photo("a.jpg", MASKED_PX);
     let image = image::RgbImage::new(MASKED_PX[0], MASKED_PX[1]);
@@ -381,7 +380,6 @@ pub fn geo(data: &[u8]) -> bool {
     })
 }
 
-/// The query string of `/query`.
 pub fn query(data: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(data) else { return false };
     slag_edge::http::parse_query(text).is_ok()

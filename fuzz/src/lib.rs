@@ -33,7 +33,6 @@ targets! {
     services: http_request, v1, tuf;
 }
 
-/// Runs a target by name.
 pub fn run(name: &str, data: &[u8]) -> bool {
     let target = TARGETS.iter().find(|target| target.name == name).expect("a target of that name");
     (target.run)(data)

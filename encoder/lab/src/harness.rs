@@ -56,10 +56,9 @@ pub(crate) fn load_1min() -> Option<f64> {
     fs_err::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
 }
 
-/// Returns the resident memory of a process, or of this one (Linux).
-pub(crate) fn resident_bytes(pid: Option<u32>) -> Option<u64> {
-    let process = pid.map_or_else(|| "self".to_owned(), |pid| pid.to_string());
-    let status = fs_err::read_to_string(format!("/proc/{process}/status")).ok()?;
+/// Returns this process's resident memory (Linux).
+pub(crate) fn resident_bytes() -> Option<u64> {
+    let status = fs_err::read_to_string("/proc/self/status").ok()?;
     Some(field(&status, "VmRSS")?.strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
 }
 

@@ -12,9 +12,8 @@ use anyhow::{Context, Result, bail};
 use serde_json::Value;
 
 #[cfg(feature = "measure")]
-pub(crate) use prepared::{Prepared, agent, fetch_all, flag_value, remove};
+pub(crate) use prepared::{Prepared, fetch_all, flag_value, remove};
 
-/// Returns the path of a program beside this one.
 pub(crate) fn sibling(name: &str) -> Result<PathBuf> {
     let lab = std::env::current_exe().context("cannot find the path of this program")?;
     let path = lab.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX));

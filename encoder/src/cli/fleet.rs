@@ -135,9 +135,6 @@ pub struct WorkerArgs {
     /// Seconds to wait for an encode to begin, and for a sign of life of the machine that began it.
     #[arg(long, value_name = "SECS", default_value = "600", value_parser = parse_period)]
     wait: Duration,
-    /// Goes on to the next encode when one is published.
-    #[arg(long)]
-    stay: bool,
 }
 
 pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
@@ -162,7 +159,6 @@ pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
         folder: args.scratch.clone().unwrap_or_else(std::env::temp_dir),
         segmenter: args.segmenter.as_ref().map(resolve).transpose()?,
         patience: args.wait,
-        stays: args.stay,
     };
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     let devices = Devices::open(&args.device, GpuOptions::default())?;

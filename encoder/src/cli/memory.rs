@@ -17,7 +17,6 @@ pub(crate) fn parse_memory(text: &str) -> Result<u64, String> {
     Ok(bytes)
 }
 
-/// Returns half of the free memory.
 pub(crate) fn default_memory_bytes() -> u64 {
     half_of(free_memory_bytes())
 }

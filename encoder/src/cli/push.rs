@@ -1,7 +1,6 @@
 //! `push`: copies a store into a vector database.
 
 use std::fmt::Write;
-use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use anyhow::Result;
@@ -24,38 +23,11 @@ pub struct QdrantArgs {
     /// Store.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
-    /// Qdrant's gRPC address.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:6334")]
-    pub url: String,
-    /// Collection; created if it does not exist. With `--layout cells`: NAME-cell-ID for each cell.
-    #[arg(long, value_name = "NAME")]
-    pub(crate) collection: String,
-    /// API key.
-    #[arg(long, value_name = "KEY", env = "QDRANT_API_KEY", hide_env_values = true)]
-    pub(crate) api_key: Option<String>,
-    /// Points per request.
-    #[arg(long, value_name = "N", default_value = "256")]
-    pub batch: NonZeroUsize,
-    /// One collection for the scene, or one for each cell.
-    #[arg(long, value_enum, default_value = "one")]
-    pub layout: qdrant::Layout,
-    /// Makes a snapshot of each collection at the end, on the server's disk.
-    #[arg(long)]
-    pub(crate) snapshots: bool,
-    /// Settings of the collections.
     #[command(flatten)]
-    pub index: qdrant::IndexSettings,
+    pub options: qdrant::PushOptions,
 }
 
 pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let options = qdrant::PushOptions {
-        api_key: args.api_key.clone(),
-        n_points_per_batch: args.batch,
-        layout: args.layout,
-        index: args.index,
-        snapshots: args.snapshots,
-        ..qdrant::PushOptions::new(&args.url, &args.collection)
-    };
     // A push keeps its state in the store, so it takes the writer's lock.
     let store = Store::create_or_open(&args.store)?;
     let reader = store.reader()?;
@@ -67,17 +39,19 @@ pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Res
             Some(before) => progress.advance(at.n_points - before),
         }
     };
-    let pushed = runtime()?.block_on(qdrant::push(&reader, store.db(), &options, on_batch, stopped()));
+    let pushed = runtime()?.block_on(qdrant::push(&reader, store.db(), &args.options, on_batch, stopped()));
     progress.end();
     let report = pushed?;
-    print(json, &report, lines(args, &report))?;
+    print(json, &report, lines(&args.options, &report))?;
     Ok(Exit::Done)
 }
 
-fn lines(args: &QdrantArgs, report: &qdrant::PushReport) -> String {
-    let place = match args.layout {
-        qdrant::Layout::One => format!("collection {}", args.collection),
-        qdrant::Layout::Cells => format!("{} collections {}-cell-ID", report.n_collections, args.collection),
+fn lines(options: &qdrant::PushOptions, report: &qdrant::PushReport) -> String {
+    let place = match options.layout {
+        qdrant::Layout::One => format!("collection {}", options.collection),
+        qdrant::Layout::Cells => {
+            format!("{} collections {}-cell-ID", report.n_collections, options.collection)
+        }
     };
     let mut lines = format!(
         "{} points in {place}: {} sent now, {} Gaussians without evidence left out, {} attempts repeated\n",

@@ -24,7 +24,7 @@ const HELD_OUT_STEP: usize = 4;
 const LARGE_BANK: usize = 19 * HELD_OUT_STEP;
 
 /// Texts like the expected queries: `[n][dim]`, unit vectors in the space of the embeddings.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct TextBank {
     pub dim: usize,
     /// `[n][dim]`.
@@ -43,7 +43,7 @@ impl TextBank {
         let dim = encoder.dim();
         let vectors = words.iter().step_by(stride).filter_map(|word| encoder.encode(word).ok());
         let bank = Self { dim, vectors: vectors.flatten().collect() };
-        if bank.len() < MIN_TEXTS { Self::directions(bank.dim) } else { bank }
+        if bank.n_texts() < MIN_TEXTS { Self::directions(bank.dim) } else { bank }
     }
 
     /// Returns unit vectors in pseudo-random directions, isotropic.
@@ -58,18 +58,14 @@ impl TextBank {
         Self { dim, vectors }
     }
 
-    pub fn len(&self) -> usize {
-        self.vectors.len().checked_div(self.dim).unwrap_or(0)
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.vectors.is_empty()
+    pub fn n_texts(&self) -> usize {
+        self.vectors.len() / self.dim
     }
 
     /// Returns whether a text is held out: the codebook is not made for it, so errors of its scores are like those
     /// of texts that nobody has seen.
     pub fn is_held_out(&self, text: usize) -> bool {
-        self.len() >= LARGE_BANK && text % HELD_OUT_STEP == HELD_OUT_STEP - 1
+        self.n_texts() >= LARGE_BANK && text % HELD_OUT_STEP == HELD_OUT_STEP - 1
     }
 }
 
@@ -81,21 +77,18 @@ pub struct ScoreMetric {
 }
 
 impl ScoreMetric {
-    /// Returns the metric of a bank, without the texts that are held out; an isotropic one without texts.
+    /// Returns the metric of a bank, without the texts that are held out.
     pub fn new(dim: usize, bank: &TextBank) -> Self {
-        let mut moments = vec![0.0; dim * dim];
-        if !bank.is_empty() {
-            let texts: Vec<usize> = (0..bank.len()).filter(|text| !bank.is_held_out(*text)).collect();
-            let columns = Panels::new(texts.len(), dim, |text, c| bank.vectors[texts[text] * dim + c]);
-            let transposed: Vec<f32> = (0..dim)
-                .flat_map(|c| texts.iter().map(move |text| (c, text)))
-                .map(|(c, text)| bank.vectors[text * dim + c])
-                .collect();
-            let products = columns.product(Rows::all(&transposed, texts.len()));
-            let scale = (1.0 - ISOTROPIC_SHARE) / texts.len() as f64;
-            moments.iter_mut().zip(products).for_each(|(m, p)| *m = f64::from(p) * scale);
-        }
-        let isotropic = if bank.is_empty() { 1.0 } else { ISOTROPIC_SHARE } / dim as f64;
+        let texts: Vec<usize> = (0..bank.n_texts()).filter(|text| !bank.is_held_out(*text)).collect();
+        let columns = Panels::new(texts.len(), dim, |text, c| bank.vectors[texts[text] * dim + c]);
+        let transposed: Vec<f32> = (0..dim)
+            .flat_map(|c| texts.iter().map(move |text| (c, text)))
+            .map(|(c, text)| bank.vectors[text * dim + c])
+            .collect();
+        let products = columns.product(Rows::all(&transposed, texts.len()));
+        let scale = (1.0 - ISOTROPIC_SHARE) / texts.len() as f64;
+        let mut moments: Vec<f64> = products.into_iter().map(|p| f64::from(p) * scale).collect();
+        let isotropic = ISOTROPIC_SHARE / dim as f64;
         (0..dim).for_each(|i| moments[i * dim + i] += isotropic);
         // The isotropic share keeps every pivot well above the least.
         let factor = cholesky(moments, dim, SmallPivots::Raise(isotropic / 2.0));

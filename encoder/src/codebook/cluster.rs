@@ -1,7 +1,8 @@
 //! Clusters of points, as many as the error requires: each becomes a centroid.
 
-use rayon::prelude::*;
+use std::ops::Range;
 
+use rayon::prelude::*;
 use slag_math::matrix::{Panels, Rows};
 
 /// Rounds of 2-means when a cluster is split; the halves hardly move after the third.
@@ -19,6 +20,33 @@ pub struct Clusters {
     pub codes: Vec<u32>,
     /// `[K][width]`: mean of each cluster's points.
     pub centres: Vec<f32>,
+}
+
+/// Points in the order of their centroids.
+pub(super) struct Members {
+    /// By place in that order: the point.
+    pub(super) order: Vec<u32>,
+    /// `[K + 1]`: first place of each centroid.
+    pub(super) starts: Vec<u32>,
+}
+
+impl Members {
+    pub(super) fn new(codes: &[u32], n_centroids: usize) -> Self {
+        let mut starts = vec![0u32; n_centroids + 1];
+        codes.iter().for_each(|centroid| starts[*centroid as usize + 1] += 1);
+        (0..n_centroids).for_each(|centroid| starts[centroid + 1] += starts[centroid]);
+        let mut next = starts.clone();
+        let mut order = vec![0; codes.len()];
+        for (point, centroid) in codes.iter().enumerate() {
+            order[next[*centroid as usize] as usize] = point as u32;
+            next[*centroid as usize] += 1;
+        }
+        Self { order, starts }
+    }
+
+    pub(super) fn places(&self, centroid: usize) -> Range<usize> {
+        self.starts[centroid] as usize..self.starts[centroid + 1] as usize
+    }
 }
 
 struct Cluster {

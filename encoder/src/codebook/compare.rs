@@ -5,8 +5,8 @@ use rayon::prelude::*;
 use slag_common::shard::ScoreErrors;
 use slag_math::matrix::{Panels, Rows};
 
+use super::cluster::Members;
 use super::measure;
-use super::members::Members;
 
 const CHUNK: usize = 1024;
 
@@ -30,7 +30,6 @@ impl Decoder<'_> {
         out
     }
 
-    /// Returns the basis, to multiply components with.
     pub(super) fn panels(&self) -> Panels {
         Panels::new(self.m, self.dim, |c, i| f32::from(self.basis[c * self.dim + i]) * self.steps[c])
     }

@@ -2,7 +2,6 @@
 
 use slag_common::shard::ScoreErrors;
 
-/// Residuals in 8 bits a component.
 pub struct FineResiduals {
     /// `[m]`.
     pub steps: Vec<f32>,

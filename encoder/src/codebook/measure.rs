@@ -43,14 +43,11 @@ impl<'a> Sample<'a> {
     pub fn new(embeddings: Rows<'_>, order: &[u32], bank: &'a TextBank) -> Self {
         let dim = embeddings.width;
         let stride = order.len().div_ceil(SAMPLE).max(1);
-        let texts = Panels::new(dim, bank.len(), |c, text| bank.vectors[text * dim + c]);
+        let texts = Panels::new(dim, bank.n_texts(), |c, text| bank.vectors[text * dim + c]);
         let chosen: Vec<f32> =
             order.iter().step_by(stride).flat_map(|at| embeddings.get(*at as usize)).copied().collect();
-        let scores = match bank.is_empty() {
-            true => Vec::new(),
-            false => texts.product(Rows::all(&chosen, dim)),
-        };
-        let (spread, moments) = (spread(&scores, bank.len()), ScoreMoments::of(&scores));
+        let scores = texts.product(Rows::all(&chosen, dim));
+        let (spread, moments) = (spread(&scores, bank.n_texts()), ScoreMoments::of(&scores));
         Self { bank, texts, stride, spread, moments }
     }
 
@@ -59,10 +56,10 @@ impl<'a> Sample<'a> {
         place.is_multiple_of(self.stride)
     }
 
-    /// Returns the errors of scores; zeros without texts. `missed`: the sample's embeddings minus their decoded
+    /// Returns the errors of scores; zeros without embeddings. `missed`: the sample's embeddings minus their decoded
     /// form, `[sample][dim]`.
     pub fn errors(&self, missed: &[f32]) -> ScoreErrors {
-        if self.bank.is_empty() || missed.is_empty() {
+        if missed.is_empty() {
             return ScoreErrors { spread: self.spread, ..ScoreErrors::default() };
         }
         let mut errors = self.texts.product(Rows::all(missed, self.bank.dim));
@@ -70,12 +67,12 @@ impl<'a> Sample<'a> {
         let n = errors.len();
         // Gaussian by Gaussian: the sum is the same for any number of threads.
         let mean = errors
-            .chunks(self.bank.len())
+            .chunks(self.bank.n_texts())
             .map(|of_gaussian| of_gaussian.iter().map(|e| f64::from(*e)).sum::<f64>())
             .sum::<f64>()
             / n as f64;
         let max = errors.iter().copied().fold(0.0, f32::max);
-        let likely = likely_error(&errors, self.bank.len(), |text| self.bank.is_held_out(text));
+        let likely = likely_error(&errors, self.bank.n_texts(), |text| self.bank.is_held_out(text));
         ScoreErrors { mean: mean as f32, likely: likely.unwrap_or_default(), max, spread: self.spread }
     }
 }
@@ -105,7 +102,7 @@ pub(crate) fn likely_error(
 
 /// Returns the standard deviation of each column of `[n][n_columns]`, averaged over the columns.
 pub fn spread(scores: &[f32], n_columns: usize) -> f32 {
-    if n_columns == 0 || scores.is_empty() {
+    if scores.is_empty() {
         return 0.0;
     }
     let n = (scores.len() / n_columns) as f64;

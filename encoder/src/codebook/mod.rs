@@ -11,7 +11,6 @@ pub mod cluster;
 mod compare;
 mod fine;
 pub mod measure;
-mod members;
 mod outliers;
 pub(crate) mod residual;
 
@@ -20,10 +19,9 @@ use rayon::prelude::*;
 use slag_common::shard::{self, ScoreErrors};
 
 use basis::{Basis, MAX_COMPONENTS};
-use cluster::Clusters;
+use cluster::{Clusters, Members};
 use compare::{Decoder, Reference};
 use measure::ScoreMoments;
-use members::Members;
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 
@@ -126,7 +124,6 @@ impl Codebook {
 }
 
 pub struct CodebookResiduals {
-    /// Subspaces and codewords.
     pub code: ResidualCode,
     /// `[K]`.
     pub residual_scales: Vec<f32>,

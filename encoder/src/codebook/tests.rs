@@ -195,7 +195,7 @@ fn fine_residuals_decode_to_what_was_measured() {
             max = max.max(error.abs());
         }
     }
-    let mean = sum / (n * score_context.bank.len()) as f64;
+    let mean = sum / (n * score_context.bank.n_texts()) as f64;
     assert!((f64::from(fine.errors.mean) - mean).abs() < 1e-3 * mean + 1e-6, "{:?} {mean}", fine.errors);
     assert!((f64::from(fine.errors.max) - max).abs() < 1e-3 * max + 1e-6, "{:?} {max}", fine.errors);
     assert!(fine.errors.mean * 4.0 < residuals.errors.mean, "{:?} {:?}", fine.errors, residuals.errors);
@@ -211,19 +211,6 @@ fn centroids_follow_the_content_not_the_count() {
     assert_eq!(build(4), 4);
     let many = build(300);
     assert!((250..=360).contains(&many), "{many} centroids for 300 clusters");
-}
-
-#[test]
-fn same_result_for_any_number_of_threads() {
-    let vectors = clustered(3000, 50, 64, 0.5);
-    let score_context = score_context(64, &vectors);
-    let with = |threads| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("starts");
-        let codebook =
-            pool.install(|| build(Rows::all(&vectors, 64), &score_context, &CodebookSettings::default()));
-        (shard_of(&codebook, 64, false).to_vec(), shard_of(&codebook, 64, true).to_vec())
-    };
-    assert!(with(1) == with(3));
 }
 
 /// Cells of a handful of Gaussians: one centroid, which is their mean, and residuals as large as any.
@@ -259,32 +246,6 @@ fn components_are_limited() {
     assert_eq!((few.0, some.0), (2, 8));
     assert!(some.0 < most.0 && most.0 <= 64, "{most:?}");
     assert!(few.1 > some.1 && some.1 > most.1, "{few:?} {some:?} {most:?}");
-}
-
-/// A limit of no subspaces means no residual code.
-#[test]
-fn no_subspaces_make_no_residual_code() {
-    let vectors = clustered(600, 200, 64, 0.4);
-    let score_context = score_context(64, &vectors);
-    for max_subspaces in [0, 1] {
-        let settings = CodebookSettings { max_subspaces, ..CodebookSettings::default() };
-        let codebook = build(Rows::all(&vectors, 64), &score_context, &settings);
-        assert!(codebook.residuals.is_none() && codebook.errors.mean > 0.0, "{max_subspaces}");
-    }
-}
-
-/// Without texts errors cannot be measured, but the codebook and its hard bounds are built.
-#[test]
-fn an_empty_text_bank_measures_no_errors() {
-    let vectors = clustered(600, 200, 64, 0.4);
-    for bank in [TextBank::default(), TextBank { dim: 64, vectors: Vec::new() }] {
-        let metric = ScoreMetric::new(64, &bank);
-        let spread = metric.spread(Rows::all(&vectors, 64));
-        let score_context = ScoreMetricContext { metric, bank, spread };
-        let codebook = build(Rows::all(&vectors, 64), &score_context, &CodebookSettings::default());
-        assert_eq!((codebook.errors.mean, codebook.errors.max, codebook.moments.mean), (0.0, 0.0, 0.0));
-        assert!(codebook.radii.iter().all(|radius| *radius > 0.0) && codebook.residuals.is_some());
-    }
 }
 
 #[test]

@@ -105,7 +105,6 @@ pub fn crop(image: &RgbImage, mask: &Mask) -> Option<Crop> {
     Crop::new(pixels, mask.inside.iter().collect())
 }
 
-/// Returns the crop of mask `index`, or the error.
 fn crop_of(image: &RgbImage, (index, mask): (usize, &Mask)) -> Result<Crop, EmbedError> {
     crop(image, mask).ok_or_else(|| EmbedError::Mask {
         index,

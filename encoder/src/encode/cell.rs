@@ -43,7 +43,6 @@ pub(super) struct CellMaker<'a> {
 
 #[derive(Clone, Copy)]
 pub(super) struct CellsBudget {
-    /// Bytes for the contributions of a group of cells.
     pub(super) group_bytes: u64,
     /// Cells whose embeddings are held at once.
     pub(super) n_at_once: usize,

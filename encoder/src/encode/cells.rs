@@ -14,7 +14,7 @@ use super::context::RunContext;
 use super::error::EncodeError;
 use super::inputs;
 use super::plan::Plan;
-use super::report::{Phase, ViewsReport};
+use super::report::ViewsReport;
 use super::sink::{ViewRecord, ViewSink};
 use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
@@ -23,7 +23,7 @@ use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::{PendingRefinement, Refinement};
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable, SceneContributions};
-use crate::memory;
+use crate::memory::Phase;
 use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
@@ -44,7 +44,6 @@ pub(super) struct BuiltCells {
     score_sums: [f64; 3],
 }
 
-/// The size of what the views found.
 pub(super) struct Counts {
     pub(super) n_views_without_masks: usize,
     pub(super) n_masks: usize,
@@ -160,7 +159,8 @@ fn refine(
     context.progress.advance(1);
     // From all masks alike, whatever weight they have in the refinement.
     context.begin_phase(Phase::Objects);
-    let find = || context.install(|| objects::find(scene, &pending, score_context));
+    let (views, superpoints) = (pending.table(), pending.superpoints());
+    let find = || context.install(|| objects::find(scene, views, superpoints, score_context));
     let objects = settings.cells.objects.then(|| context.time("objects", find)).transpose()?;
     context.progress.advance(1);
     if let Some(found) = &objects {
@@ -175,7 +175,6 @@ fn refine(
     Ok(Refined { table, refinement, objects })
 }
 
-/// Cuts a small picture of each object.
 fn thumbnails(
     plan: &Plan<'_>,
     objects: &[Object],
@@ -299,7 +298,7 @@ impl Opened {
         let cell_bytes = shard::largest_cell_bytes(split, models.dim()) + index.largest_part_bytes();
         // Cells come second: contributions that are not kept in memory are read six times. But what superpoints
         // and objects took is free again.
-        let rest_bytes = memory.rest_of(memory::Phase::Cells);
+        let rest_bytes = memory.rest_of(Phase::Cells);
         let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
         let n_more =
             (spare_bytes / cell_bytes.max(1)).min(context.workers.shared.current_num_threads() as u64 - 1);

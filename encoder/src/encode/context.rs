@@ -6,11 +6,27 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
+use slag_models::{ModelDir, SessionOptions};
 
 use super::error::EncodeError;
-use super::report::{Phase, PhaseReport};
-use crate::memory;
+use super::report::PhaseReport;
+use crate::memory::{self, Phase};
 use crate::progress::Progress;
+use crate::raster::Rasterizer;
+
+/// What does the work of an encode.
+#[derive(Clone, Copy)]
+pub struct Engines<'a> {
+    pub models: &'a ModelDir,
+    pub session: &'a SessionOptions,
+    pub rasterizer: &'a dyn Rasterizer,
+}
+
+impl<'a> Engines<'a> {
+    pub fn new(models: &'a ModelDir, session: &'a SessionOptions, rasterizer: &'a dyn Rasterizer) -> Self {
+        Self { models, session, rasterizer }
+    }
+}
 
 /// The time spent in each stage, added over all threads.
 #[derive(Default)]

@@ -6,8 +6,7 @@ use serde_json::{Value, json};
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Gaussians, Hash32};
 
-use super::context::RunContext;
-use super::engines::Engines;
+use super::context::{Engines, RunContext};
 use super::error::EncodeError;
 use super::settings::EncodeSettings;
 use crate::viewpoints::{self, ViewpointError, ViewpointSettings};

@@ -120,29 +120,20 @@ mod tests {
 
     use super::*;
 
-    /// One view with too many masks must not end the encode of all others, at every resume.
+    /// Too many masks, what overflows in half precision on some photos only, and a crop without pixels or with a vector
+    /// of no length must not end the encode of all others, at every resume; a model that fails on one fails on others.
     #[test]
-    fn too_many_regions_are_one_views_fault() {
-        let error = ContributionError::TooManyRegions { path: PathBuf::new(), found: usize::MAX };
-        assert!(EncodeError::from(error).is_of_one_view());
-    }
-
-    /// Half precision overflows on some photos only.
-    #[test]
-    fn masks_that_are_no_numbers_are_one_views_fault() {
+    fn what_one_view_is_at_fault_for() {
+        let path = PathBuf::new();
+        let many = ContributionError::TooManyRegions { path: path.clone(), found: usize::MAX };
+        assert!(EncodeError::from(many).is_of_one_view());
         assert!(EncodeError::from(SegmentError::NotFinite { view: "a".into() }).is_of_one_view());
-    }
-
-    /// A crop without pixels, or with a vector of no length, is its view's fault; a model that fails on it fails
-    /// on others.
-    #[test]
-    fn a_bad_crop_is_one_views_fault() {
         let of = |cause: InferenceError| {
             let source = EmbedError::Encode { first: 3, last: 3, cause: Box::new(cause) };
             EncodeError::Embed { view: "a".into(), source }.is_of_one_view()
         };
         assert!(of(InferenceError::EmptyCrop { index: 3 }));
         assert!(of(InferenceError::NoDirection { model: "m".into(), index: 3 }));
-        assert!(!of(InferenceError::Session(SessionError::NoRuntime { path: PathBuf::new() })));
+        assert!(!of(InferenceError::Session(SessionError::NoRuntime { path })));
     }
 }

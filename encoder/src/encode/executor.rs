@@ -2,8 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::context::RunContext;
-use super::engines::Engines;
+use super::context::{Engines, RunContext};
 use super::error::EncodeError;
 use super::plan::Plan;
 use super::report::{SkippedView, StageReport};

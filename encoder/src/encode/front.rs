@@ -25,7 +25,6 @@ pub struct Front {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrontSetting {
     pub name: String,
-    /// Flags of `encode`.
     pub flags: String,
     /// The profile whose bytes and accuracy these are.
     pub profile: Profile,

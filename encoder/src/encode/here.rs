@@ -6,8 +6,7 @@ use std::time::Instant;
 
 use slag_common::View;
 
-use super::context::RunContext;
-use super::engines::Engines;
+use super::context::{Engines, RunContext};
 use super::error::EncodeError;
 use super::executor::{Executor, ViewsRun};
 use super::pipeline;

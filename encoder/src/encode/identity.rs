@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::{Gaussians, Hash32, Intrinsics, View};
 
-use super::engines::Engines;
+use super::context::Engines;
 use super::error::EncodeError;
 use super::inputs::Inputs;
 use super::settings::{EncodeSettings, MAX_RASTER_WIDTH_PX, ViewSettings};

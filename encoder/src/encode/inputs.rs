@@ -125,7 +125,6 @@ pub(super) fn reserve_crops(
     memory.reserve(Phase::Views, "crops in work", bytes);
 }
 
-/// Reserves the largest photos that threads cut thumbnails from.
 pub(super) fn reserve_thumbnails(memory: &mut MemoryPlan, views: &[View], n_threads: usize) {
     let in_work_px: u64 = areas_px(views).iter().take(n_threads).sum();
     memory.reserve(Phase::Refine, "photos that thumbnails are cut from", in_work_px * PHOTO_BYTES_PER_PX);

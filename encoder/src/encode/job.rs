@@ -355,9 +355,8 @@ fn record_key(id: Hash32) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
+    use crate::store::tests::DAMAGES;
 
     fn keep(job: &Job, view: &str) {
         let contributions = ViewContributions {
@@ -443,20 +442,7 @@ mod tests {
     /// other. A view is done again once its files are.
     #[test]
     fn views_with_damaged_files_are_made_again() {
-        let damages: [fn(&Path); 4] = [
-            |path| fs_err::remove_file(path).expect("there"),
-            |path| fs_err::write(path, b"").expect("writes"),
-            |path| {
-                let bytes = fs_err::read(path).expect("there");
-                fs_err::write(path, &bytes[..bytes.len() - 1]).expect("writes");
-            },
-            |path| {
-                let mut bytes = fs_err::read(path).expect("there");
-                bytes[20] ^= 1;
-                fs_err::write(path, bytes).expect("writes");
-            },
-        ];
-        for (number, damage) in damages.iter().enumerate() {
+        for (number, damage) in DAMAGES.iter().enumerate() {
             for of_contributions in [true, false] {
                 let dir = tempfile::tempdir().expect("a folder");
                 let store = Store::create_or_open(dir.path()).expect("opens");

@@ -1,14 +1,5 @@
 //! The pipeline: photos, poses and a splat in, a published generation of shards out.
 //!
-//! | step | result | file |
-//! |---|---|---|
-//! | draw | planned views of a splat without photos | `drawings.rs` |
-//! | plan | inputs read and checked, memory reserved, the order of views | `plan.rs` |
-//! | run views | a file of contributions per view, in the job's folder | `views.rs`, `view.rs`, `pipeline.rs`, `job.rs` |
-//! | look around | free and occupied places, if they are asked for | `views.rs` |
-//! | build cells | objects, fields and shards in the store | `cells.rs`, `cell.rs` |
-//! | publish | the manifest and its metadata, the summary | `publish.rs` |
-//!
 //! Views are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet.
 //!
 //! Views are independent: a killed encode resumes after the last finished view, if it is the same encode
@@ -20,7 +11,6 @@ mod cells;
 mod context;
 pub mod coverage;
 mod drawings;
-mod engines;
 mod error;
 mod executor;
 pub mod front;
@@ -41,12 +31,13 @@ mod views;
 use std::sync::atomic::AtomicBool;
 
 use crate::lift::ContributionError;
+use crate::memory::Phase;
 use crate::progress::Progress;
 use crate::store::{Store, StoreError};
 use context::RunContext;
 use executor::Executor;
 
-pub use engines::Engines;
+pub use context::Engines;
 pub(crate) use error::EncodeError;
 pub(crate) use inputs::count_inputs;
 pub(crate) use job::{JobStatus, job_status};
@@ -54,7 +45,7 @@ pub use preset::Preset;
 pub use report::EncodeSummary;
 #[cfg(feature = "fleet")]
 pub(crate) use report::SkippedView;
-pub(crate) use report::{GpuReport, Phase, StageReport};
+pub(crate) use report::{GpuReport, StageReport};
 #[cfg(feature = "fleet")]
 pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};

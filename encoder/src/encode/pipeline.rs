@@ -40,7 +40,6 @@ struct Schedule<T, E> {
     /// Waiting before each stage but the first.
     waiting: Vec<VecDeque<T>>,
     n_running: Vec<usize>,
-    /// Whether a thread asks the source.
     is_asking: bool,
     /// Whether the source had nothing, and no step has ended since it was asked.
     has_no_more: bool,

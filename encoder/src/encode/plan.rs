@@ -7,9 +7,9 @@ use std::time::Instant;
 use slag_common::Hash32;
 use slag_models::SessionOptions;
 
+use super::context::Engines;
 use super::context::RunContext;
 use super::coverage::{self, Coverage};
-use super::engines::Engines;
 use super::error::EncodeError;
 use super::identity;
 use super::inputs::{self, Inputs};
@@ -116,7 +116,6 @@ pub(super) fn plan<'a>(
 }
 
 impl Plan<'_> {
-    /// Reserves what depends on segmenter and views.
     fn reserve_views(&mut self) -> Result<(), EncodeError> {
         let mut memory = self.memory.clone();
         self.view_tools().reserve(&mut memory, &self.inputs.views);

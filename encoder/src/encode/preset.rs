@@ -75,7 +75,6 @@ mod tests {
         settings
     }
 
-    /// By their descriptions.
     #[test]
     fn presets_are_what_they_are_called() {
         let [plain, fast, balanced] = [Preset::Plain, Preset::Fast, Preset::Balanced].map(settings);

@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::coverage::CoverageReport;
 use super::settings::ViewOrder;
 use crate::lanes::GpuLoad;
+use crate::memory::Phase;
 use crate::objects::ObjectsReport;
 use crate::occupancy::OccupancyReport;
 
@@ -46,7 +47,6 @@ impl LeftOut {
 #[derive(Clone, Debug, Serialize)]
 pub struct LostViews {
     pub n_views: usize,
-    /// All this in words.
     pub reason: String,
 }
 
@@ -107,31 +107,7 @@ impl StageReport {
     }
 }
 
-/// A part of a run, one after the other.
-#[derive(Clone, Copy, Debug, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub(crate) enum Phase {
-    /// Scene and poses are read and split into cells.
-    Read,
-    /// What is to do is decided, and what is done is found.
-    Plan,
-    /// Views are segmented, embedded and rasterised.
-    Views,
-    /// Free and occupied places are found.
-    Occupancy,
-    /// Photos are searched for landmarks.
-    Landmarks,
-    /// The views' contributions are opened.
-    Merge,
-    /// Masks are weighed and superpoints found.
-    Superpoints,
-    Objects,
-    Refine,
-    Cells,
-    Publish,
-}
-
-/// A part of the run. The parts follow each other and add up to the run's time.
+/// A step of the run. The steps follow each other and add up to the run's time.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct PhaseReport {
     pub phase: Phase,

@@ -11,8 +11,7 @@ use slag_common::View;
 use slag_models::preprocess::Preprocess;
 use slag_models::{Crop, ImageEncoder, ModelError, SessionOptions};
 
-use super::context::RunContext;
-use super::engines::Engines;
+use super::context::{Engines, RunContext};
 use super::error::EncodeError;
 use super::inputs;
 use super::pipeline::{self, Stage};

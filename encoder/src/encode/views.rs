@@ -13,9 +13,10 @@ use super::error::EncodeError;
 use super::executor::{Executor, ViewsRun};
 use super::inputs::Inputs;
 use super::plan::Plan;
-use super::report::{Phase, SkippedView, StageReport};
+use super::report::{SkippedView, StageReport};
 use super::sink::{ViewRecord, ViewSink};
 use crate::landmarks;
+use crate::memory::Phase;
 use crate::occupancy::{self, OccupancyError, SceneOccupancy};
 use crate::shard;
 

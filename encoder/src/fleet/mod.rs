@@ -14,16 +14,6 @@
 //!
 //! Inputs and views are named by what they are made of, and put on condition that they are not there: work that is
 //! done twice, by a worker that was thought dead, changes nothing, and a run takes up what earlier ones left.
-//!
-//! | file | job |
-//! |---|---|
-//! | [`coordinator`] | the executor of `encode --blobs` |
-//! | [`worker`], `views` | `worker`: prepares a run, and does its views |
-//! | `dispatch`, `queue` | which views a worker takes: its share, or what JetStream hands out |
-//! | `run`, `heartbeat` | the runs in a bucket, their fence, and whether their coordinator lives |
-//! | `documents`, `objects` | what lies in the bucket |
-//! | `run_folder` | a worker's folder for photos in work |
-//! | `inputs`, `prepared` | scene, photos and masks on their way to and from the bucket |
 
 pub(crate) mod coordinator;
 mod dispatch;

@@ -75,11 +75,11 @@ pub(super) fn unpack_scene(bytes: &[u8]) -> Result<Gaussians, ContainerError> {
     let layout = Layout::check(&bytes, SCENE_MAGIC, VERSION)?;
     let n = usize::try_from(layout.value::<u64>(&bytes, 1, "number of Gaussians")?).unwrap_or(usize::MAX);
     Ok(Gaussians {
-        means_in_world: bytemuck::pod_collect_to_vec(&bytes[layout.column::<[f64; 3]>(2, "means", n)?]),
-        rotations_wxyz: bytemuck::pod_collect_to_vec(&bytes[layout.column::<[f32; 4]>(3, "rotations", n)?]),
-        scales: bytemuck::pod_collect_to_vec(&bytes[layout.column::<[f32; 3]>(4, "scales", n)?]),
-        opacities: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(5, "opacities", n)?]),
-        sh_dc: bytemuck::pod_collect_to_vec(&bytes[layout.column::<[f32; 3]>(6, "colours", n)?]),
+        means_in_world: layout.values(&bytes, 2, "means", n)?,
+        rotations_wxyz: layout.values(&bytes, 3, "rotations", n)?,
+        scales: layout.values(&bytes, 4, "scales", n)?,
+        opacities: layout.values(&bytes, 5, "opacities", n)?,
+        sh_dc: layout.values(&bytes, 6, "colours", n)?,
         sh_rest: Vec::new(),
         sh_degree: 0,
     })

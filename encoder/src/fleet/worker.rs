@@ -51,9 +51,6 @@ pub(crate) struct WorkerSettings {
     pub(crate) segmenter: Option<PathBuf>,
     /// Time to wait for a run to begin, and for a heartbeat of its coordinator.
     pub(crate) patience: Duration,
-    /// Whether it goes on to the next run when one is published; to the run that takes a run's place it always
-    /// does.
-    pub(crate) stays: bool,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -85,7 +82,7 @@ pub(crate) fn work(
             work_for(bucket, run, settings, engines, &context, &mut report)?;
             report.n_runs += 1;
             waiting_since = Instant::now();
-            awaits_another = settings.stays || id.is_superseded(bucket)?;
+            awaits_another = id.is_superseded(bucket)?;
         } else if !awaits_another || waiting_since.elapsed() >= settings.patience {
             break;
         } else {

@@ -1,11 +1,5 @@
 //! The ground, and what stands on it: in photos from above a car and its park have one colour, but not one height.
 //!
-//! | file | job |
-//! |---|---|
-//! | `up` | the upward direction, from the normals of flat Gaussians |
-//! | `height` | the height of the ground, tile by tile |
-//! | `standing` | the things above it: voxels that touch each other |
-//!
 //! Surveys have separated things from terrain by height since laser scanners fly (Zhang et al., "A Progressive
 //! Morphological Filter", IEEE TGRS 41(4), 2003).
 

@@ -66,7 +66,6 @@ pub struct Contribution {
     /// The Gaussian, by its index within its cell.
     pub local: u32,
     pub region: u32,
-    /// Its weight, pixels.
     pub weight: f32,
 }
 
@@ -75,7 +74,6 @@ pub struct Contribution {
 #[repr(C)]
 pub(super) struct PackedEntry {
     key: u32,
-    /// Its weight, pixels.
     pub(super) weight: f32,
 }
 
@@ -276,34 +274,19 @@ impl ContributionFile {
     }
 
     pub(super) fn read(&self, runs: Range<usize>) -> Result<Vec<PackedEntry>, ContributionError> {
-        let bytes = self.bytes_of_runs(runs.clone());
-        let mut entries =
-            vec![PackedEntry::zeroed(); (bytes.end - bytes.start) as usize / size_of::<PackedEntry>()];
-        if !runs.is_empty() {
-            let mut file = fs_err::File::open(&self.path)?;
-            file.seek(SeekFrom::Start(bytes.start))?;
-            file.read_exact(bytemuck::cast_slice_mut(&mut entries))?;
-            self.check_runs(runs, &entries)?;
-        }
-        Ok(entries)
-    }
-
-    /// Returns the place of some runs' entries in the file.
-    fn bytes_of_runs(&self, runs: Range<usize>) -> Range<u64> {
         if runs.is_empty() {
-            return 0..0;
+            return Ok(Vec::new());
         }
         let (start, end) = (self.entries_of_run(runs.start).start, self.entries_of_run(runs.end - 1).end);
-        self.offset_bytes(start)..self.offset_bytes(end)
-    }
-
-    fn check_runs(&self, runs: Range<usize>, entries: &[PackedEntry]) -> Result<(), ContributionError> {
-        let start = if runs.is_empty() { 0 } else { self.entries_of_run(runs.start).start };
+        let mut entries = vec![PackedEntry::zeroed(); (end - start) as usize];
+        let mut file = fs_err::File::open(&self.path)?;
+        file.seek(SeekFrom::Start(self.offset_bytes(start)))?;
+        file.read_exact(bytemuck::cast_slice_mut(&mut entries))?;
         for run in runs {
             let range = self.entries_of_run(run);
             self.check(run, &entries[(range.start - start) as usize..(range.end - start) as usize])?;
         }
-        Ok(())
+        Ok(entries)
     }
 
     fn offset_bytes(&self, entry: u64) -> u64 {
@@ -333,12 +316,12 @@ fn parse(bytes: &[u8]) -> Result<(Header, ViewRegions, Vec<Run>), ContainerError
     let layout = Layout::check(bytes, MAGIC, VERSION)?;
     let header: Header = layout.value(bytes, section::HEADER, "header")?;
     let (n_regions, n_masks, dim) = (header.n_regions as usize, header.n_masks as usize, header.dim as usize);
-    let starts: Vec<u32> = column(bytes, &layout, section::REGION_STARTS, "region starts", n_regions + 1)?;
-    let masks: Vec<u32> =
-        column(bytes, &layout, section::REGION_MASKS, "region masks", header.n_region_masks as usize)?;
-    let mask_vectors =
-        column(bytes, &layout, section::MASK_VECTORS, "mask vectors", n_masks.saturating_mul(dim))?;
-    let runs: Vec<Run> = column(bytes, &layout, section::RUNS, "runs", header.n_runs as usize)?;
+    let starts: Vec<u32> = layout.values(bytes, section::REGION_STARTS, "region starts", n_regions + 1)?;
+    let n_listed = header.n_region_masks as usize;
+    let masks: Vec<u32> = layout.values(bytes, section::REGION_MASKS, "region masks", n_listed)?;
+    let n_components = n_masks.saturating_mul(dim);
+    let mask_vectors = layout.values(bytes, section::MASK_VECTORS, "mask vectors", n_components)?;
+    let runs: Vec<Run> = layout.values(bytes, section::RUNS, "runs", header.n_runs as usize)?;
     let consistent = dim > 0
         && starts.is_sorted()
         && starts[0] == 0
@@ -352,14 +335,4 @@ fn parse(bytes: &[u8]) -> Result<(Header, ViewRegions, Vec<Run>), ContainerError
         return Err(ContainerError::Damaged { offset_bytes: 0, what });
     }
     Ok((header, ViewRegions { dim, mask_vectors, starts, masks }, runs))
-}
-
-fn column<T: Pod>(
-    bytes: &[u8],
-    layout: &Layout,
-    id: u32,
-    name: &'static str,
-    len: usize,
-) -> Result<Vec<T>, ContainerError> {
-    Ok(bytemuck::pod_collect_to_vec(&bytes[layout.column::<T>(id, name, len)?]))
 }

@@ -10,7 +10,7 @@ use std::ops::Range;
 use pulp::Simd;
 use rayon::prelude::*;
 
-use super::part::PartContributions;
+use super::index::PartContributions;
 use super::table::RegionTable;
 use slag_math::dot;
 use slag_math::simd::{InstructionSet, Work};

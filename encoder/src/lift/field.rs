@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
 use super::embeddings::{make_unit, write_embeddings};
-use super::part::PartContributions;
+use super::index::PartContributions;
 use super::table::{RegionTable, are_starts};
 
 const MAGIC: [u8; 8] = *b"SLAGFELD";
@@ -115,14 +115,12 @@ impl CellField {
         let [n, n_entries]: [u64; 2] = layout.value(bytes, 1, "header")?;
         let (n, n_entries) = (n as usize, n_entries as usize);
         let field = Self {
-            input_indices: bytemuck::pod_collect_to_vec(&bytes[layout.column::<u32>(2, "input indices", n)?]),
-            starts: bytemuck::pod_collect_to_vec(
-                &bytes[layout.column::<u64>(3, "starts", n.saturating_add(1))?],
-            ),
-            regions: bytemuck::pod_collect_to_vec(&bytes[layout.column::<u32>(4, "regions", n_entries)?]),
-            weights: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(5, "weights", n_entries)?]),
-            total_weights: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(6, "total weights", n)?]),
-            mean_lengths: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(7, "mean lengths", n)?]),
+            input_indices: layout.values(bytes, 2, "input indices", n)?,
+            starts: layout.values(bytes, 3, "starts", n.saturating_add(1))?,
+            regions: layout.values(bytes, 4, "regions", n_entries)?,
+            weights: layout.values(bytes, 5, "weights", n_entries)?,
+            total_weights: layout.values(bytes, 6, "total weights", n)?,
+            mean_lengths: layout.values(bytes, 7, "mean lengths", n)?,
         };
         let consistent =
             are_starts(&field.starts, n_entries) && field.regions.iter().all(|r| (*r as usize) < n_regions);

@@ -11,26 +11,11 @@
 //! so the field stays factorised: a sparse matrix of contributions times a small matrix of region vectors.
 //! Contributions are summed in one canonical order (views by name, then regions), whatever order, thread or
 //! process made them: the result is the same bit for bit.
-//!
-//! | file | job |
-//! |---|---|
-//! | `contributions` | a view's contributions in a file, ordered by cell |
-//! | [`photos`] | how a view's masks lie in its photo |
-//! | `table` | the regions of all views: which masks cover each |
-//! | `index` | the files of all views, and the parts that their entries form |
-//! | `transpose` | a group of parts, transposed from the views' order to the Gaussians' |
-//! | `passes` | a pass over all parts within the memory budget, from files or from memory |
-//! | [`refine`] | optional refinements: weights of masks, evidence shared within superpoints |
-//! | [`superpoint`] | superpoints: small pieces of surface of one appearance |
-//! | `embeddings` | each Gaussian's embedding, computed once |
-//! | `field` | the published field: contributions, total weight, length |
-//! | [`published`] | the field of a published generation, read back |
 
 mod contributions;
 mod embeddings;
 mod field;
 mod index;
-mod part;
 mod passes;
 pub mod photos;
 pub mod published;
@@ -43,8 +28,7 @@ mod transpose;
 
 pub use contributions::{Contribution, ContributionError, ContributionFile, ViewContributions};
 pub use field::CellField;
-pub use index::ContributionIndex;
-pub use part::{Part, PartContributions};
+pub use index::{ContributionIndex, Part, PartContributions};
 pub(crate) use passes::SceneContributions;
 pub use refine::Aggregation;
 pub use table::RegionTable;

@@ -8,8 +8,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 
 use super::contributions::ContributionError;
-use super::index::ContributionIndex;
-use super::part::PartContributions;
+use super::index::{ContributionIndex, PartContributions};
 use super::photos::Photo;
 use super::table::RegionTable;
 use crate::cells::CellSplit;

@@ -80,8 +80,7 @@ pub(crate) fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<MaskOutli
         let what = format!("outlines of {n} masks, the view has {n_masks}");
         return Err(damaged(ContainerError::Damaged { offset_bytes: 0, what }));
     }
-    let outlines = layout.column::<MaskOutline>(2, "outlines", n_masks).map_err(damaged)?;
-    Ok(bytemuck::pod_collect_to_vec(&bytes[outlines]))
+    layout.values(&bytes, 2, "outlines", n_masks).map_err(damaged)
 }
 
 #[cfg(test)]

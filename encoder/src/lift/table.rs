@@ -199,20 +199,17 @@ impl RegionTable {
         let layout = Layout::check(bytes, MAGIC, VERSION)?;
         let [dim, n, n_masks, n_listed] =
             layout.value::<[u64; 4]>(bytes, 1, "header")?.map(|n| usize::try_from(n).unwrap_or(usize::MAX));
-        let vectors = layout.column::<f32>(2, "mask vectors", n_masks.saturating_mul(dim))?;
-        let starts = layout.column::<u64>(3, "starts", n.saturating_add(1))?;
-        let masks = layout.column::<u32>(4, "masks", n_listed)?;
         let table = Self {
             dim,
-            mask_vectors: bytemuck::pod_collect_to_vec(&bytes[vectors]),
-            starts: bytemuck::pod_collect_to_vec(&bytes[starts]),
-            masks: bytemuck::pod_collect_to_vec(&bytes[masks]),
+            mask_vectors: layout.values(bytes, 2, "mask vectors", n_masks.saturating_mul(dim))?,
+            starts: layout.values(bytes, 3, "starts", n.saturating_add(1))?,
+            masks: layout.values(bytes, 4, "masks", n_listed)?,
             shares: match layout.find(5) {
-                Some(_) => bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(5, "shares", n_listed)?]),
+                Some(_) => layout.values(bytes, 5, "shares", n_listed)?,
                 None => Vec::new(),
             },
             levels: match layout.find(6) {
-                Some(_) => bytes[layout.column::<u8>(6, "levels", n_masks)?].to_vec(),
+                Some(_) => layout.values(bytes, 6, "levels", n_masks)?,
                 None => Vec::new(),
             },
         };

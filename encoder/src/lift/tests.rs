@@ -178,20 +178,6 @@ proptest! {
     }
 }
 
-#[test]
-fn same_bits_for_any_number_of_threads() {
-    let with = |n_threads| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("starts");
-        pool.install(|| {
-            let scene = scene_of(40, 9000, 5);
-            let contributions = transpose(&scene, 0).remove(0);
-            let mut embeddings = vec![f32::NAN; 9000 * 40];
-            (CellField::new((0..9000).collect(), contributions, &scene.table, &mut embeddings), embeddings)
-        })
-    };
-    assert_eq!(with(1), with(3));
-}
-
 /// A cell's parts, read one after the other, are the cell.
 #[test]
 fn parts_of_a_cell_make_the_cell() {

@@ -5,8 +5,7 @@ use rayon::prelude::*;
 use slag_common::container::ContainerError;
 
 use super::contributions::{ContributionError, GAUSSIANS_PER_SLICE, PackedEntry};
-use super::index::{ContributionIndex, IndexedView, RawGroup};
-use super::part::PartContributions;
+use super::index::{ContributionIndex, IndexedView, PartContributions, RawGroup};
 use super::table::RegionTable;
 
 /// A slice's entries in one view.

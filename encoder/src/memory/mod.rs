@@ -10,31 +10,40 @@ mod process;
 
 use std::fmt;
 
+use serde::Serialize;
+
 pub(crate) use process::give_back;
 pub use process::peak_bytes;
 
-/// The steps that hold memory one after the other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// The steps of a run, one after the other, each with memory of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Phase {
     /// From the first view to the end.
     Always,
-    /// While views are worked on.
+    /// Scene and poses are read and split into cells.
+    Read,
+    /// What is to do is decided, and what is done is found.
+    Plan,
+    /// Views are segmented, embedded and rasterised.
     Views,
-    /// While free and occupied places are found.
+    /// Free and occupied places are found.
     Occupancy,
-    /// While photos are searched for landmarks.
+    /// Photos are searched for landmarks.
     Landmarks,
-    /// While superpoints are found.
+    /// The views' contributions are opened.
+    Merge,
+    /// Masks are weighed and superpoints found.
     Superpoints,
-    /// While objects are found.
     Objects,
-    /// While Gaussians share evidence.
+    /// Gaussians share evidence.
     Refine,
-    /// While cells become shards.
+    /// Cells become shards.
     Cells,
+    Publish,
 }
 
-/// Those that come before the contributions of all views are opened first.
+/// Those that hold memory; those that come before the contributions of all views are opened first.
 const PHASES: [Phase; 7] = [
     Phase::Views,
     Phase::Occupancy,

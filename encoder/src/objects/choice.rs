@@ -43,7 +43,6 @@ const LEAST_UNCUT: f32 = 0.05;
 struct NodeView {
     /// Gaussians that the view sees.
     n: u32,
-    /// Their blending weight.
     weight_px: f64,
     /// Of these, those under each mask, by mask.
     masks: Vec<(u32, u32)>,

@@ -14,7 +14,6 @@ use super::tree::Tree;
 use super::{near, object, tree};
 use crate::codebook::ScoreMetricContext;
 use crate::lift::photos::MaskOutline;
-use crate::lift::refine::PendingRefinement;
 use crate::lift::superpoint::{SuperpointSettings, Superpoints};
 use crate::lift::{ContributionError, RegionTable, SceneContributions};
 use crate::masks::Mask;
@@ -25,17 +24,9 @@ const MIN_GAUSSIANS: u32 = 10;
 /// floaters would make the box as large as the room.
 const TRIMMED: f64 = 0.02;
 
-/// Finds the objects of a scene while its refinement is pending: superpoints are known, and nothing is mixed yet.
+/// Finds the objects of a scene while its refinement is pending: nothing is mixed yet. `superpoints`: where absent, they
+/// are found from colour and shape.
 pub(crate) fn find(
-    scene: &SceneContributions<'_>,
-    pending: &PendingRefinement,
-    score_context: &ScoreMetricContext,
-) -> Result<SceneObjects, ContributionError> {
-    find_among(scene, pending.table(), pending.superpoints(), score_context)
-}
-
-/// `superpoints`: where absent, they are found from colour and shape.
-pub(super) fn find_among(
     scene: &SceneContributions<'_>,
     table: &RegionTable,
     superpoints: Option<&Superpoints>,
@@ -90,7 +81,6 @@ pub(super) fn find_among(
 
 /// The masks of each object, and how well each mask shows its object.
 struct Masks {
-    /// The masks of each object, ascending.
     of_object: Vec<Vec<u32>>,
     /// `[n_masks]`: blending weight of all Gaussians under the mask, pixels.
     weights: Vec<f64>,

@@ -2,19 +2,6 @@
 //!
 //! No model and no training are needed: the contributions tell which Gaussians each mask shows.
 //!
-//! | file | job |
-//! |---|---|
-//! | `find` | the steps below, in order, and what an object's masks say of it |
-//! | `sightings` | what each view shows of each superpoint, under which masks |
-//! | `near` | pairs of superpoints that lie near each other |
-//! | `affinity` | how much masks speak for a pair being of one object |
-//! | `tree` | superpoints joined pair by pair |
-//! | `choice` | the nodes of the tree that views agree on: the objects, and their masks |
-//! | `vectors` | the few vectors that represent an object's masks |
-//! | `thumbnails` | a small picture of each object |
-//! | [`shards`] | the objects of a cell, as its shards store them |
-//! | `object` | the result |
-//!
 //! The contributions are needed once, part by part; the result takes four bytes a Gaussian.
 
 mod choice;

@@ -7,7 +7,6 @@ use slag_math::nearest::{self, Neighbours};
 use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::memory::{MemoryPlan, Phase};
 
-/// Gaussians that stand for a superpoint.
 const MAX_SAMPLES: usize = 4;
 /// Gaussians for each sample, where superpoints are so small that there would be more samples.
 const GAUSSIANS_PER_SAMPLE: usize = 8;

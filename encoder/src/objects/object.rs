@@ -20,7 +20,6 @@ pub const NONE: u32 = NO_SUPERPOINT;
 pub struct Object {
     /// First 8 bytes of the BLAKE3 hash of its Gaussians' indices in the input, ascending, u32 little-endian.
     pub id: u64,
-    /// Its Gaussians, in all cells.
     pub n_gaussians: u32,
     pub n_masks: u32,
     /// Mean of its Gaussians inside the box.

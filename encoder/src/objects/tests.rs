@@ -7,7 +7,6 @@ use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 use slag_math::random::Random;
 
-use super::find::find_among;
 use super::shards::{CellObjects, CentroidBasis};
 use super::tree::Evidence;
 use super::*;
@@ -117,7 +116,7 @@ impl World {
             group_bytes,
             cancel,
         };
-        find_among(&scene, &self.table, superpoints, &self.score_context)
+        find(&scene, &self.table, superpoints, &self.score_context)
     }
 }
 

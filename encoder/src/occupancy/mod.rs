@@ -1,10 +1,4 @@
 //! Which places are free, occupied or unknown, for robots that move. The definition is in `docs/numerics.md`.
-//!
-//! | step | result | file |
-//! |---|---|---|
-//! | density | voxels with a surface, from all Gaussians | `density.rs` |
-//! | seen | voxels that views have looked through, from depth pictures | `seen.rs` |
-//! | owners | the cell that stores each block | `owners.rs` |
 
 mod density;
 mod lattice;
@@ -40,7 +34,6 @@ pub struct SceneOccupancy {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct OccupancyReport {
     pub(crate) voxel_m: f64,
-    /// Voxels with a surface.
     pub(crate) n_occupied: u64,
     /// Voxels that views have looked through.
     pub n_free: u64,

@@ -13,7 +13,6 @@ pub struct Adapter {
     none: Infallible,
 }
 
-/// An opened device; there is none.
 pub struct Device {
     none: Infallible,
 }

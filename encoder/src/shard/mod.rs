@@ -88,13 +88,11 @@ pub struct CellExtras<'a> {
     pub objects: Option<&'a SceneObjects>,
     /// The free and occupied places of the cell, if they were asked for.
     pub occupancy: Option<Occupancy<'a>>,
-    /// Where the photos of the cell were taken, if that was asked for.
     pub photo_poses: Option<PhotoPoses<'a>>,
     /// What robots recognise the cell by, if that was asked for.
     pub landmarks: Option<Landmarks<'a>>,
 }
 
-/// What is common to the shards of a scene.
 #[derive(Clone, Copy)]
 pub struct ShardBuilder<'a> {
     pub scene: &'a Gaussians,

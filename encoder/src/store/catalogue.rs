@@ -76,6 +76,15 @@ fn guarded<T>(work: impl FnOnce() -> Result<T, Fault>) -> Result<T, Fault> {
         .unwrap_or_else(|_| Err(Fault::Damaged("the database panicked".into())))
 }
 
+fn records_error(path: &Path, fault: Fault) -> StoreError {
+    let cause = match fault {
+        Fault::Failed(cause) => cause,
+        Fault::Damaged(what) => sled::Error::ReportableBug(what),
+        Fault::Held => sled::Error::ReportableBug("it is held twice".into()),
+    };
+    StoreError::Records { path: path.to_owned(), cause }
+}
+
 fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<T, Fault> {
     serde_json::from_slice(bytes).map_err(|e| Fault::Damaged(e.to_string()))
 }
@@ -98,10 +107,7 @@ impl Catalogue {
         let path = store.join("db");
         let refused = |fault| match fault {
             Fault::Held => StoreError::Locked { store: store.to_owned() },
-            Fault::Damaged(what) => {
-                StoreError::Records { path: path.clone(), cause: sled::Error::ReportableBug(what) }
-            }
-            Fault::Failed(cause) => StoreError::Records { path: path.clone(), cause },
+            fault => records_error(&path, fault),
         };
         match Self::load(&path, patience) {
             Err(Fault::Damaged(what)) => {
@@ -147,26 +153,17 @@ impl Catalogue {
         &self.db
     }
 
-    fn error(&self, fault: Fault) -> StoreError {
-        let cause = match fault {
-            Fault::Failed(cause) => cause,
-            Fault::Damaged(what) => sled::Error::ReportableBug(what),
-            Fault::Held => sled::Error::ReportableBug("it is held twice".into()),
-        };
-        StoreError::Records { path: self.path.clone(), cause }
-    }
-
     fn history(&self) -> Result<Vec<GenerationRecord>, Fault> {
         self.generations.iter().values().map(|value| decode(&value?)).collect()
     }
 
     /// Returns all generations ever published, the oldest first.
     pub(crate) fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
-        self.history().map_err(|fault| self.error(fault))
+        self.history().map_err(|fault| records_error(&self.path, fault))
     }
 
     pub(crate) fn last_generation(&self) -> Result<Option<u64>, StoreError> {
-        let last = self.generations.last().map_err(|e| self.error(e.into()))?;
+        let last = self.generations.last().map_err(|e| records_error(&self.path, e.into()))?;
         Ok(last.and_then(|(key, _)| Some(u64::from_be_bytes(key.as_ref().try_into().ok()?))))
     }
 
@@ -182,7 +179,7 @@ impl Catalogue {
             }
             self.db.flush().map(drop).map_err(Fault::from)
         };
-        guarded(write).map_err(|fault| self.error(fault))
+        guarded(write).map_err(|fault| records_error(&self.path, fault))
     }
 }
 

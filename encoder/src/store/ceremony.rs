@@ -16,6 +16,8 @@ use super::error::StoreError;
 use super::metadata::{Metadata, MetadataReader, ROOT_SECS, RootFile};
 use super::{files, roles};
 
+pub(crate) use super::roles::root_folder as default_root_folder;
+
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Change {
     /// All keys of these roles; of no role, the root is signed anew for its whole time.
@@ -191,9 +193,4 @@ pub(crate) fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, Stor
     let signed = add_signatures(Root::TYPE, &bytes, &keys).map_err(refuse)?;
     slag_common::durable::write(draft, &signed)?;
     Ok(keys.len())
-}
-
-/// Returns where a store's root keys lie unless they are kept elsewhere.
-pub(crate) fn default_root_folder(store: &Path) -> PathBuf {
-    roles::root_folder(store)
 }

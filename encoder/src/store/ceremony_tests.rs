@@ -1,27 +1,12 @@
 //! Changes of keys; the oracle is the client of `slag-common`.
 
-use std::path::Path;
-
-use slag_common::manifest::{self, Manifest};
-use slag_common::tuf::{Kept, TufError, refresh};
+use slag_common::tuf::TufError;
 
 use super::ceremony::{Change, default_root_folder, sign_draft};
 use super::metadata::{Metadata, clock_unix_secs};
-use super::metadata_tests::{Folder, client};
+use super::metadata_tests::{client, follow, publish_in as publish};
 use super::tests::manifest as manifest_of;
 use super::{Extras, Store, StoreError};
-
-fn publish(dir: &Path, generation: u64) {
-    let scene = Manifest { created_unix_secs: 1, ..manifest_of(generation, &[]) };
-    Store::create_or_open(dir).expect("opens").publish(&scene, &Extras::new()).expect("publishes");
-}
-
-/// A robot sees the manifest that is published.
-fn follows(kept: &mut Kept, dir: &Path) -> Result<(), TufError> {
-    let trusted = refresh(kept, &mut Folder(dir), clock_unix_secs())?;
-    let found = trusted.target(manifest::TARGET).expect("listed");
-    found.check(manifest::TARGET, &fs_err::read(dir.join("manifest")).expect("there"))
-}
 
 fn roles(names: &[&str]) -> Change {
     Change::Roles(names.iter().map(|name| (*name).to_owned()).collect())
@@ -30,7 +15,7 @@ fn roles(names: &[&str]) -> Change {
 #[test]
 fn robots_follow_every_change_of_keys() {
     let dir = tempfile::tempdir().expect("temporary folder");
-    publish(dir.path(), 1);
+    publish(dir.path(), 1).expect("publishes");
     let (mut kept, mut sleeper) = (client(dir.path()), client(dir.path()));
     let root_keys = default_root_folder(dir.path());
     let changes = [
@@ -41,7 +26,7 @@ fn robots_follow_every_change_of_keys() {
         &["root", "targets", "snapshot", "timestamp"],
     ];
     for (version, names) in (2u64..).zip(changes) {
-        follows(&mut kept, dir.path()).expect("before");
+        follow(&mut kept, dir.path(), clock_unix_secs()).expect("before");
         let metadata = Metadata::open(dir.path()).expect("opens");
         let before = metadata.keys_status(&root_keys).expect("a root").keys;
         let changed = metadata.change_keys(&roles(names), &root_keys, clock_unix_secs()).expect("signs");
@@ -52,10 +37,10 @@ fn robots_follow_every_change_of_keys() {
             assert!(new.is_here, "{}", new.role);
         }
         drop(metadata);
-        publish(dir.path(), version);
-        follows(&mut kept, dir.path()).unwrap_or_else(|e| panic!("{names:?}: {e}"));
+        publish(dir.path(), version).expect("publishes");
+        follow(&mut kept, dir.path(), clock_unix_secs()).unwrap_or_else(|e| panic!("{names:?}: {e}"));
     }
-    follows(&mut sleeper, dir.path()).expect("follows all roots at once");
+    follow(&mut sleeper, dir.path(), clock_unix_secs()).expect("follows all roots at once");
 }
 
 /// Two of three root keys must sign; they lie on other machines, one each.
@@ -65,10 +50,10 @@ fn a_draft_is_carried_to_the_root_keys() {
     let (store, usb) = (dir.path().join("store"), dir.path().join("usb"));
     fs_err::create_dir(&store).expect("made");
     Metadata::open(&store).and_then(|m| m.make_root(&usb, 3, 2, clock_unix_secs())).expect("made");
-    publish(&store, 1);
+    publish(&store, 1).expect("publishes");
     assert!(!default_root_folder(&store).exists(), "the store never has a root key");
     let mut kept = client(&store);
-    follows(&mut kept, &store).expect("honest");
+    follow(&mut kept, &store, clock_unix_secs()).expect("honest");
 
     let holders = ["a", "b"].map(|name| dir.path().join(name));
     for (holder, number) in holders.iter().zip(1..) {
@@ -84,7 +69,7 @@ fn a_draft_is_carried_to_the_root_keys() {
     let draft = changed.draft.expect("without a key it is a draft");
     // The store goes on under the present root meanwhile.
     metadata.refresh(clock_unix_secs(), 1).expect("signs");
-    follows(&mut kept, &store).expect("nothing has changed");
+    follow(&mut kept, &store, clock_unix_secs()).expect("nothing has changed");
     for holder in &holders {
         assert!(matches!(
             metadata.install_root(&draft, clock_unix_secs()),
@@ -99,7 +84,7 @@ fn a_draft_is_carried_to_the_root_keys() {
     assert!(!draft.exists());
     let keys = metadata.keys_status(&usb).expect("a root").keys;
     assert!(keys.iter().all(|key| key.id != stolen), "{keys:?}");
-    follows(&mut kept, &store).expect("follows");
+    follow(&mut kept, &store, clock_unix_secs()).expect("follows");
     assert!(matches!(
         metadata.change_keys(&Change::Key(stolen), &usb, clock_unix_secs()),
         Err(StoreError::NoSuchKey { .. })
@@ -111,7 +96,7 @@ fn a_draft_is_carried_to_the_root_keys() {
 #[test]
 fn a_key_that_a_crash_left_behind_is_put_in_place() {
     let dir = tempfile::tempdir().expect("temporary folder");
-    publish(dir.path(), 1);
+    publish(dir.path(), 1).expect("publishes");
     let mut kept = client(dir.path());
     let metadata = Metadata::open(dir.path()).expect("opens");
     let key = |name: &str| dir.path().join("keys").join(name);
@@ -122,7 +107,7 @@ fn a_key_that_a_crash_left_behind_is_put_in_place() {
     fs_err::rename(key("timestamp.key"), key("timestamp.next.key")).expect("moved");
     fs_err::write(key("timestamp.key"), old).expect("written");
     metadata.refresh(clock_unix_secs(), 1).expect("signs with the new key");
-    follows(&mut kept, dir.path()).expect("fresh");
+    follow(&mut kept, dir.path(), clock_unix_secs()).expect("fresh");
 }
 
 /// A role's key that is lost or damaged: the error names the command that helps, and robots follow it.
@@ -131,9 +116,9 @@ fn a_lost_key_of_a_role_is_rotated() {
     for role in ["targets", "snapshot", "timestamp"] {
         for text in [None, Some(""), Some("0123")] {
             let dir = tempfile::tempdir().expect("temporary folder");
-            publish(dir.path(), 1);
+            publish(dir.path(), 1).expect("publishes");
             let mut kept = client(dir.path());
-            follows(&mut kept, dir.path()).expect("honest");
+            follow(&mut kept, dir.path(), clock_unix_secs()).expect("honest");
             let path = dir.path().join("keys").join(format!("{role}.key"));
             match text {
                 Some(text) => fs_err::write(&path, text).expect("written"),
@@ -152,8 +137,8 @@ fn a_lost_key_of_a_role_is_rotated() {
             let metadata = Metadata::open(dir.path()).expect("opens");
             metadata.change_keys(&roles(&[role]), &root_keys, clock_unix_secs()).expect("signs");
             drop(metadata);
-            publish(dir.path(), 3);
-            follows(&mut kept, dir.path()).unwrap_or_else(|e| panic!("{role}: {e}"));
+            publish(dir.path(), 3).expect("publishes");
+            follow(&mut kept, dir.path(), clock_unix_secs()).unwrap_or_else(|e| panic!("{role}: {e}"));
         }
     }
 }
@@ -162,10 +147,10 @@ fn a_lost_key_of_a_role_is_rotated() {
 #[test]
 fn a_damaged_root_key_stops_changes_of_keys_alone() {
     let dir = tempfile::tempdir().expect("temporary folder");
-    publish(dir.path(), 1);
+    publish(dir.path(), 1).expect("publishes");
     let root_keys = default_root_folder(dir.path());
     fs_err::write(root_keys.join("1.key"), "damaged").expect("written");
-    publish(dir.path(), 2);
+    publish(dir.path(), 2).expect("publishes");
     let metadata = Metadata::open(dir.path()).expect("opens");
     metadata.refresh(clock_unix_secs(), 1).expect("signs");
     let status = metadata.keys_status(&root_keys).expect("a root");

@@ -69,17 +69,27 @@ pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
 
 /// Reads a manifest's bytes; `None` if there is no such file.
 pub(super) fn read_manifest_bytes(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
+    read_limited(path, manifest::MAX_BYTES, |len_bytes| {
+        let cause = ManifestError::TooLong { len_bytes };
+        StoreError::Manifest { path: path.to_owned(), cause }
+    })
+}
+
+/// Reads a file of at most `max_bytes`; `None` if there is no such file.
+pub(super) fn read_limited(
+    path: &Path,
+    max_bytes: u64,
+    too_long: impl FnOnce(u64) -> StoreError,
+) -> Result<Option<Vec<u8>>, StoreError> {
     let file = match File::open(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
         file => file?,
     };
     let mut bytes = Vec::new();
-    file.take(manifest::MAX_BYTES + 1).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 > manifest::MAX_BYTES {
-        let cause = ManifestError::TooLong { len_bytes: bytes.len() as u64 };
-        return Err(StoreError::Manifest { path: path.to_owned(), cause });
+    match file.take(max_bytes + 1).read_to_end(&mut bytes)? as u64 {
+        n if n > max_bytes => Err(too_long(n)),
+        _ => Ok(Some(bytes)),
     }
-    Ok(Some(bytes))
 }
 
 const FILE: &str = "models.json";

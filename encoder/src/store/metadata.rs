@@ -456,18 +456,10 @@ pub(crate) fn read_published(store: &Path, name: &str) -> Result<Option<Vec<u8>>
 
 fn read_file(store: &Path, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, StoreError> {
     let path = folder(store).join(name);
-    let file = match fs_err::File::open(&path) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-        file => file?,
-    };
-    let mut bytes = Vec::new();
-    io::Read::read_to_end(&mut io::Read::take(file, max_bytes + 1), &mut bytes)?;
-    match bytes.len() as u64 > max_bytes {
-        true => {
-            Err(StoreError::Metadata { path, cause: TufError::TooLong { what: name.to_owned(), max_bytes } })
-        }
-        false => Ok(Some(bytes)),
-    }
+    files::read_limited(&path, max_bytes, |_| {
+        let cause = TufError::TooLong { what: name.to_owned(), max_bytes };
+        StoreError::Metadata { path: path.clone(), cause }
+    })
 }
 
 /// Lists the names in the folder of a store's metadata; none if there is no such folder.
@@ -479,7 +471,6 @@ pub(super) fn names(store: &Path) -> io::Result<Vec<String>> {
     entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect()
 }
 
-/// Returns the targets of a store with this manifest.
 fn targets_of(manifest: &[u8]) -> Targets {
     Targets { targets: BTreeMap::from([(TARGET.to_owned(), TargetFile::of(manifest))]) }
 }

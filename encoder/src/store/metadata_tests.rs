@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use slag_common::manifest::{self, Manifest};
-use slag_common::tuf::{Kept, Source, TargetFile, Trusted, TufError, refresh};
+use slag_common::tuf::{Kept, Source, Trusted, TufError, refresh};
 
 use super::ceremony::{Change, default_root_folder};
 use super::metadata::{
@@ -16,7 +16,7 @@ const DAY: u64 = 86_400;
 /// Later than the clock, in the year 2079.
 const NOW: u64 = 40_000 * DAY;
 
-pub(super) struct Folder<'a>(pub(super) &'a Path);
+struct Folder<'a>(&'a Path);
 
 impl Source for Folder<'_> {
     fn metadata(&mut self, name: &str, _: u64) -> Result<Option<Vec<u8>>, String> {
@@ -24,7 +24,6 @@ impl Source for Folder<'_> {
     }
 }
 
-/// Returns a store with generation 1, and its folder.
 fn published(now: u64) -> (tempfile::TempDir, Store) {
     let dir = tempfile::tempdir().expect("temporary folder");
     let store = Store::create_or_open(dir.path()).expect("opens");
@@ -41,10 +40,17 @@ pub(super) fn client(dir: &Path) -> Kept {
     Kept::from_root(&read_published(dir, "1.root.json").expect("readable").expect("there")).expect("a root")
 }
 
-fn update(kept: &mut Kept, dir: &Path, now: u64) -> Result<(Trusted, TargetFile), TufError> {
+/// Publishes a generation of an empty scene, of 1970.
+pub(super) fn publish_in(dir: &Path, generation: u64) -> Result<(), StoreError> {
+    Store::create_or_open(dir)?.publish(&manifest_of(generation, &[]), &Extras::new()).map(drop)
+}
+
+/// Lets a robot see the manifest that is published.
+pub(super) fn follow(kept: &mut Kept, dir: &Path, now: u64) -> Result<Trusted, TufError> {
     let trusted = refresh(kept, &mut Folder(dir), now)?;
-    let found = trusted.target(manifest::TARGET).expect("listed").clone();
-    Ok((trusted, found))
+    let bytes = fs_err::read(dir.join("manifest")).expect("there");
+    trusted.target(manifest::TARGET).expect("listed").check(manifest::TARGET, &bytes)?;
+    Ok(trusted)
 }
 
 #[test]
@@ -53,9 +59,7 @@ fn each_generation_is_a_target() {
     let mut kept = client(dir.path());
     for generation in 2..5 {
         publish(&store, generation, NOW + generation);
-        let (trusted, target) = update(&mut kept, dir.path(), NOW).expect("honest");
-        let signed = fs_err::read(dir.path().join("manifest")).expect("there");
-        target.check("manifest", &signed).expect("the manifest");
+        let trusted = follow(&mut kept, dir.path(), NOW).expect("honest");
         assert_eq!(trusted.timestamp().map(|t| t.head.version), Some(generation));
         assert_eq!(trusted.now_unix_secs(), NOW + generation, "the signed time is later than the clock");
     }
@@ -75,10 +79,7 @@ fn metadata_behind_the_manifest_is_made_good() {
     fs_err::write(&timestamp, old).expect("written");
     drop(store);
     Store::create_or_open(dir.path()).expect("opens");
-    let (_, target) = update(&mut client(dir.path()), dir.path(), NOW).expect("honest");
-    target
-        .check("manifest", &fs_err::read(dir.path().join("manifest")).expect("there"))
-        .expect("generation 2");
+    follow(&mut client(dir.path()), dir.path(), NOW).expect("generation 2");
 }
 
 #[test]
@@ -93,17 +94,17 @@ fn a_refresh_keeps_clients_and_needs_no_root_key() {
     let mut kept = client(dir.path());
     fs_err::remove_dir_all(dir.path().join("keys/root")).expect("there");
     let later = NOW + 31 * DAY;
-    assert!(matches!(update(&mut kept, dir.path(), later), Err(TufError::Expired { .. })));
+    assert!(matches!(follow(&mut kept, dir.path(), later), Err(TufError::Expired { .. })));
     // While a writer is open.
     let refreshed = Metadata::open(dir.path()).expect("opens").refresh(later, 1).expect("signs");
     assert_eq!((refreshed.timestamp_version, refreshed.snapshot_version), (2, 1));
     assert_eq!(refreshed.expires_unix_secs, later + DAY);
-    update(&mut kept, dir.path(), later).expect("fresh");
+    follow(&mut kept, dir.path(), later).expect("fresh");
     // Long after: snapshot and targets are signed anew too.
     let later = NOW + 400 * DAY;
     let refreshed = Metadata::open(dir.path()).expect("opens").refresh(later, 1).expect("signs");
     assert_eq!(refreshed.snapshot_version, 2);
-    update(&mut kept, dir.path(), later).expect("fresh");
+    follow(&mut kept, dir.path(), later).expect("fresh");
 }
 
 /// A root that was made while the clock stood at 1970 has expired for every robot: a refresh does not help, a
@@ -117,7 +118,7 @@ fn an_expired_root_is_warned_of_and_renewed() {
     let store = Store::create_or_open(dir.path()).expect("opens");
     publish(&store, 1, NOW);
     let mut kept = client(dir.path());
-    let is_refused = |kept: &mut Kept| matches!(update(kept, dir.path(), NOW), Err(TufError::Expired { .. }));
+    let is_refused = |kept: &mut Kept| matches!(follow(kept, dir.path(), NOW), Err(TufError::Expired { .. }));
     assert!(is_refused(&mut kept));
     let warned = || MetadataReader::new(dir.path()).expiry_warnings(NOW).expect("reads");
     let [warning] = &warned()[..] else { panic!("{:?}", warned()) };
@@ -131,7 +132,7 @@ fn an_expired_root_is_warned_of_and_renewed() {
     let renewal = Change::Roles(Vec::new());
     let renewed = metadata.change_keys(&renewal, &default_root_folder(dir.path()), NOW).expect("renews");
     assert_eq!((renewed.root_version, renewed.draft), (2, None));
-    update(&mut kept, dir.path(), NOW).expect("the same client follows");
+    follow(&mut kept, dir.path(), NOW).expect("the same client follows");
     assert_eq!(warned(), [""; 0]);
     // Half a year before its end.
     let later = NOW + (5 * 365 - 180) * DAY;
@@ -149,16 +150,16 @@ fn an_expired_root_is_warned_of_and_renewed() {
 fn a_clock_that_went_back_locks_no_robot_out() {
     let (dir, _store) = published(NOW);
     let mut kept = client(dir.path());
-    update(&mut kept, dir.path(), NOW).expect("fresh");
+    follow(&mut kept, dir.path(), NOW).expect("fresh");
     let now = NOW - 3650 * DAY;
     let metadata = Metadata::open(dir.path()).expect("opens");
     assert_eq!(metadata.refresh(now, 30).expect("signs").expires_unix_secs, NOW + 30 * DAY);
-    update(&mut kept, dir.path(), now).expect("no robot is locked out");
+    follow(&mut kept, dir.path(), now).expect("no robot is locked out");
     let warnings = MetadataReader::new(dir.path()).expiry_warnings(now).expect("reads");
     assert!(warnings.len() == 1 && warnings[0].contains("keys rotate"), "{warnings:?}");
     let rotate = Change::Roles(vec!["timestamp".to_owned()]);
     metadata.change_keys(&rotate, &default_root_folder(dir.path()), now).expect("rotates");
-    let (trusted, _) = update(&mut kept, dir.path(), now).expect("follows");
+    let trusted = follow(&mut kept, dir.path(), now).expect("follows");
     assert_eq!(trusted.now_unix_secs(), now, "the later time is forgotten");
     assert_eq!(MetadataReader::new(dir.path()).expiry_warnings(now).expect("reads"), [""; 0]);
 }
@@ -207,5 +208,5 @@ fn only_names_of_metadata_are_read() {
 #[test]
 fn a_manifest_that_is_dated_back_is_signed_today() {
     let (dir, _store) = published(1);
-    update(&mut client(dir.path()), dir.path(), clock_unix_secs()).expect("fresh");
+    follow(&mut client(dir.path()), dir.path(), clock_unix_secs()).expect("fresh");
 }

@@ -22,8 +22,8 @@ use super::files::{self, Access};
 /// The roles whose keys lie with the store.
 pub(super) const ONLINE: [&str; 3] = ["targets", "snapshot", "timestamp"];
 
-/// Returns the folder of root's key, unless it was moved away.
-pub(super) fn root_folder(store: &Path) -> PathBuf {
+/// Returns where a store's root keys lie unless they are kept elsewhere.
+pub(crate) fn root_folder(store: &Path) -> PathBuf {
     store.join("keys").join("root")
 }
 
@@ -90,43 +90,39 @@ fn before_root(error: StoreError) -> StoreError {
 
 /// Reads all keys of root in a folder, by name; none if the folder is not there.
 pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
-    let read = |path: PathBuf| match KeyFile::read(&path)? {
-        KeyFile::Key(key) => Ok(Some(*key)),
-        KeyFile::Missing => Ok(None),
-        KeyFile::Damaged => Err(damaged(path)),
-    };
-    files_of_keys(folder)?.into_iter().filter_map(|path| read(path).transpose()).collect()
+    read_all(folder, Err)
 }
 
 /// As [`read_folder`], without those that are damaged: these are warned of.
 pub(super) fn read_sound(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
+    read_all(folder, |error| {
+        tracing::warn!("{error}");
+        Ok(())
+    })
+}
+
+fn read_all(
+    folder: &Path,
+    on_damage: impl Fn(StoreError) -> Result<(), StoreError>,
+) -> Result<Vec<SigningKey>, StoreError> {
+    let entries = match fs_err::read_dir(folder) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries?,
+    };
+    let mut paths = entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<PathBuf>>>()?;
+    paths.retain(|path| path.extension().is_some_and(|extension| extension == "key"));
+    paths.sort();
     let mut keys = Vec::new();
-    for path in files_of_keys(folder)? {
+    for path in paths {
         match KeyFile::read(&path)? {
             KeyFile::Key(key) => keys.push(*key),
             KeyFile::Missing => {}
-            KeyFile::Damaged => tracing::warn!("{}", damaged(path)),
+            KeyFile::Damaged => on_damage(damaged(path))?,
         }
     }
     Ok(keys)
 }
 
-fn files_of_keys(folder: &Path) -> Result<Vec<PathBuf>, StoreError> {
-    let mut names = Vec::new();
-    match fs_err::read_dir(folder) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => {}
-        entries => {
-            for entry in entries? {
-                names.push(entry?.path());
-            }
-        }
-    }
-    names.retain(|path| path.extension().is_some_and(|extension| extension == "key"));
-    names.sort();
-    Ok(names)
-}
-
-/// Makes a further key of root.
 pub(super) fn make_root_key(folder: &Path) -> Result<SigningKey, StoreError> {
     let path = (1u32..).map(|number| folder.join(format!("{number}.key"))).find(|path| !path.exists());
     read_or_make(&path.unwrap_or_else(|| folder.join("0.key")))

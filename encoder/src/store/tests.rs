@@ -11,6 +11,21 @@ use slag_common::shard::Profile;
 use super::metadata::Metadata;
 use super::*;
 
+/// Ways in which a file is damaged: lost, empty, cut, changed near its beginning.
+pub(crate) const DAMAGES: [fn(&Path); 4] = [
+    |path| fs_err::remove_file(path).expect("there"),
+    |path| fs_err::write(path, b"").expect("writable"),
+    |path| {
+        let bytes = fs_err::read(path).expect("there");
+        fs_err::write(path, &bytes[..bytes.len() / 2]).expect("writable");
+    },
+    |path| {
+        let mut bytes = fs_err::read(path).expect("there");
+        bytes[20] ^= 1;
+        fs_err::write(path, bytes).expect("writable");
+    },
+];
+
 /// A manifest of cells without shards.
 pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
     let cell = |(cell_id, bounds): (usize, &Aabb)| CellRecord {
@@ -375,19 +390,7 @@ fn verification_reads_every_byte_and_names_what_is_bad() {
 /// way keep the generation before.
 #[test]
 fn a_damaged_manifest_is_published_anew() {
-    let damages: [fn(&Path); 4] = [
-        |path| {
-            let bytes = fs_err::read(path).expect("there");
-            fs_err::write(path, &bytes[..bytes.len() / 2]).expect("written");
-        },
-        |path| fs_err::write(path, "").expect("written"),
-        |path| {
-            let text = fs_err::read_to_string(path).expect("there");
-            fs_err::write(path, text.replace("\"dim\":4", "\"dim\":0")).expect("written");
-        },
-        |path| fs_err::remove_file(path).expect("there"),
-    ];
-    for (number, damage) in damages.iter().enumerate() {
+    for (number, damage) in DAMAGES.iter().enumerate() {
         let dir = tempfile::tempdir().expect("a folder");
         let store = Store::create_or_open(dir.path()).expect("opens");
         for generation in 1..=2 {

@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_common::manifest::TextModelRecord;
+use slag_common::manifest::{Manifest, ShardRecord, TextModelRecord};
 
-use super::reader::{Published, StoreReader};
+use super::reader::{Extras, StoreReader};
 use super::walk::{self, Refused};
 use super::{files, metadata};
 
@@ -59,7 +59,7 @@ impl StoreReader {
     pub(crate) fn listing(&self) -> Listing<'_> {
         let mut holds: BTreeMap<_, Vec<String>> = BTreeMap::new();
         for published in std::iter::once(self.current()).chain(self.previous()) {
-            for (hash, len_bytes, what) in contents(published) {
+            for (hash, len_bytes, what) in contents(&published.manifest, &published.extras) {
                 let generation = published.manifest.generation;
                 holds.entry((hash, len_bytes)).or_default().push(format!("{what}, generation {generation}"));
             }
@@ -104,15 +104,15 @@ impl Listing<'_> {
 }
 
 /// Lists the objects of a generation: hash, length if the manifest states it, and content.
-fn contents(published: &Published) -> Vec<(Hash32, Option<u64>, String)> {
-    let shards = published.manifest.cells.iter().flat_map(|cell| {
-        let of_profile = |(profile, shard): (&_, &slag_common::manifest::ShardRecord)| {
+pub(super) fn contents(manifest: &Manifest, extras: &Extras) -> Vec<(Hash32, Option<u64>, String)> {
+    let shards = manifest.cells.iter().flat_map(|cell| {
+        let of_profile = |(profile, shard): (&_, &ShardRecord)| {
             (shard.hash, Some(shard.len_bytes), format!("cell {}, {profile}", cell.cell_id))
         };
         cell.shards.iter().map(of_profile).collect::<Vec<_>>()
     });
-    let text_model = published.manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
+    let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
     let text_model = text_model.map(|object| (object.hash, Some(object.len_bytes), "text model".to_owned()));
-    let extras = published.extras.iter().map(|(name, hash)| (*hash, None, name.clone()));
+    let extras = extras.iter().map(|(name, hash)| (*hash, None, name.clone()));
     shards.chain(text_model).chain(extras).collect()
 }

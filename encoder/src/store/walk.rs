@@ -28,7 +28,6 @@ pub(super) struct Refused {
 /// The files of a store's metadata by name; the error of one that cannot be read.
 pub(super) type MetadataFiles = BTreeMap<String, Result<Vec<u8>, TufError>>;
 
-/// Reads all metadata of a store.
 pub(super) fn read_all(store: &Path) -> Result<MetadataFiles, StoreError> {
     let mut found = MetadataFiles::new();
     for name in names(store)? {

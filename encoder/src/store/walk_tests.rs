@@ -2,32 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use slag_common::manifest;
-use slag_common::tuf::{Kept, Trusted, refresh};
+use slag_common::tuf::Trusted;
 
 use super::ceremony::{Change, default_root_folder};
 use super::metadata::{Metadata, clock_unix_secs};
-use super::metadata_tests::{Folder, client};
-use super::tests::manifest as manifest_of;
-use super::{Extras, Fault, Store, StoreError, StoreReader, export, walk};
-
-const DAMAGES: [fn(&Path); 3] = [
-    |path| fs_err::remove_file(path).expect("there"),
-    |path| {
-        let bytes = fs_err::read(path).expect("there");
-        fs_err::write(path, &bytes[..bytes.len() / 2]).expect("written");
-    },
-    |path| {
-        let mut bytes = fs_err::read(path).expect("there");
-        let middle = bytes.len() / 2;
-        bytes[middle] ^= 1;
-        fs_err::write(path, bytes).expect("written");
-    },
-];
-
-fn publish(dir: &Path, generation: u64) -> Result<(), StoreError> {
-    Store::create_or_open(dir)?.publish(&manifest_of(generation, &[]), &Extras::new()).map(drop)
-}
+use super::metadata_tests::{client, follow, publish_in as publish};
+use super::tests::DAMAGES;
+use super::{Fault, StoreError, StoreReader, export, walk};
 
 /// Returns a store with two generations and two roots, whose timestamp was refreshed.
 fn store() -> tempfile::TempDir {
@@ -44,19 +25,11 @@ fn store() -> tempfile::TempDir {
     dir
 }
 
-/// Returns the path of the newest file of a role.
 fn newest(dir: &Path, role: &str) -> PathBuf {
     let folder = dir.join("metadata");
     let of = |version: u32| folder.join(format!("{version}.{role}.json"));
     let newest = (1..9).rev().map(of).find(|path| path.exists());
     newest.unwrap_or_else(|| folder.join(format!("{role}.json")))
-}
-
-fn follow(kept: &mut Kept, dir: &Path) -> Trusted {
-    let trusted = refresh(kept, &mut Folder(dir), clock_unix_secs()).expect("a robot follows");
-    let bytes = fs_err::read(dir.join("manifest")).expect("there");
-    trusted.target(manifest::TARGET).expect("listed").check(manifest::TARGET, &bytes).expect("the manifest");
-    trusted
 }
 
 /// Each file that a robot needs, removed, cut and changed: `verify` names it and says what helps, and `export` writes
@@ -107,7 +80,7 @@ fn metadata_is_signed_anew_and_no_version_goes_back() {
                 let case = format!("{role}, damage {number}, by refresh: {by_refresh}");
                 let dir = store();
                 let mut kept = client(dir.path());
-                let before = follow(&mut kept, dir.path());
+                let before = follow(&mut kept, dir.path(), clock_unix_secs()).expect("follows");
                 damage(&newest(dir.path(), role));
                 match by_refresh {
                     true => drop(
@@ -118,7 +91,7 @@ fn metadata_is_signed_anew_and_no_version_goes_back() {
                     false => publish(dir.path(), 3).unwrap_or_else(|e| panic!("{case}: {e}")),
                 }
                 assert_eq!(walk::refused(dir.path()).expect("reads"), [], "{case}");
-                let after = follow(&mut kept, dir.path());
+                let after = follow(&mut kept, dir.path(), clock_unix_secs()).expect("follows");
                 let versions = |trusted: &Trusted| {
                     let [timestamp, snapshot, targets] = [
                         trusted.timestamp().map(|file| file.head.version),

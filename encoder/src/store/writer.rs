@@ -8,13 +8,14 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use slag_common::Hash32;
-use slag_common::manifest::{Manifest, ManifestError, TextModelRecord};
+use slag_common::manifest::{Manifest, ManifestError};
 
 use super::catalogue::Catalogue;
 use super::error::{StoreError, manifest_fault};
 use super::files::{self, Access, HashingWriter, ModelsRecord};
 use super::metadata::Metadata;
 use super::reader::{self, Extras, Published, StoreReader};
+use super::verify;
 
 /// Time to wait for the lock: sled releases the lock of a writer that has just ended on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);
@@ -148,11 +149,7 @@ impl Store {
     /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is damaged,
     /// [`StoreError::Generation`] unless the generation is above the current one.
     pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
-        let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
-        let shards = shards.map(|shard| (shard.hash, Some(shard.len_bytes)));
-        let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
-        let text_model = text_model.map(|object| (object.hash, Some(object.len_bytes)));
-        for (hash, len_bytes) in shards.chain(text_model).chain(extras.values().map(|hash| (*hash, None))) {
+        for (hash, len_bytes, _) in verify::contents(manifest, extras) {
             self.check_object(hash, len_bytes)?;
         }
         let bytes = manifest.to_bytes();
@@ -220,27 +217,23 @@ impl Store {
     /// Brings metadata and catalogue up to the manifests, which a crash may have left ahead of them.
     fn repair_records(&self) -> Result<(), StoreError> {
         // Without the extras: a damaged record of them is replaced by the next publication.
-        let read = |name: &str| match reader::read_manifest(&self.dir.join(name)) {
-            Ok(read) => Ok(Some(read)),
-            Err(StoreError::NotPublished { .. }) => Ok(None),
-            Err(e) => Err(e),
-        };
+        let read = |name: &str| reader::read_manifest(&self.dir.join(name));
         // It only serves fetches under way.
-        if let Ok(Some((manifest, bytes))) = read(files::MANIFEST_PREVIOUS) {
+        if let Ok((manifest, bytes)) = read(files::MANIFEST_PREVIOUS) {
             self.catalogue.record(&manifest, Hash32::of(&bytes))?;
         }
-        let current = match read(files::MANIFEST) {
+        match read(files::MANIFEST) {
+            Err(StoreError::NotPublished { .. }) => {}
             Err(StoreError::Manifest { path, cause }) => {
                 self.check_is_damaged(&path, &cause)?;
                 let fault = manifest_fault(&cause);
                 tracing::warn!("{}: {fault}; the next publication writes it anew", path.display());
-                None
             }
-            read => read?,
-        };
-        if let Some((manifest, bytes)) = current {
-            Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
-            self.catalogue.record(&manifest, Hash32::of(&bytes))?;
+            current => {
+                let (manifest, bytes) = current?;
+                Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
+                self.catalogue.record(&manifest, Hash32::of(&bytes))?;
+            }
         }
         Ok(())
     }

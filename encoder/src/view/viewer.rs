@@ -111,7 +111,7 @@ impl Viewer {
         }
         // Photos that are at hand count more than published poses: they have pictures.
         if !self.shown.views.is_empty() {
-            description.views = described(&self.shown.views);
+            description.views = self.shown.views.iter().map(photo).collect();
         }
         Ok(description)
     }
@@ -205,10 +205,6 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn described(views: &[View]) -> Vec<Photo> {
-    views.iter().map(photo).collect()
-}
-
 fn photo(view: &View) -> Photo {
     let world_from_camera = view.camera_from_world.inverse();
     let rotation = DQuat::from_mat3(&world_from_camera.matrix3).as_quat();
@@ -278,7 +274,7 @@ mod tests {
 
     #[test]
     fn poses_are_those_of_the_cameras() {
-        let [photo] = &described(&[level()])[..] else { panic!("one") };
+        let photo = photo(&level());
         assert!((photo.position_m - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-9 && !photo.has_picture);
         let forward = glam::Quat::from_array(photo.rotation_xyzw) * Vec3::Z;
         assert!((forward - Vec3::Y).length() < 1e-6, "{forward}");

@@ -1,12 +1,4 @@
 //! Viewpoints: where to draw a splat that has no photos, from its Gaussians alone.
-//!
-//! | step | result | file |
-//! |---|---|---|
-//! | space | the scene turned, centred and scaled to a width of 10; its occupied voxels | `space.rs` |
-//! | candidates | the kind of scene; cameras in free places, by kind | `candidates.rs` |
-//! | looks | a small drawing of each candidate: can it be trusted, and which Gaussians does it show? | `looks.rs` |
-//! | choice | those that together show most, greedily | here |
-//! | draw | images, sharpened, and the poses file that says that they are drawings | `draw.rs` |
 
 mod candidates;
 mod draw;

@@ -56,16 +56,6 @@ fn a_scene_that_fits_its_photos_passes() {
     assert_eq!((picture.width(), picture.height()), (2000, 562));
 }
 
-#[test]
-#[ignore = "18 photos at full training size: half a minute"]
-fn psnr_is_what_the_trainer_reports() {
-    let root = shared("scenes/brighton");
-    let scene = read_scene(&root);
-    let options = CheckOptions { width_px: 1000, ..CheckOptions::default() };
-    let report = run(&scene, &read_views(&root, 1), &options);
-    assert!((report.mean_psnr_db - TRAINER_PSNR_DB).abs() < 0.5, "{}", report.mean_psnr_db);
-}
-
 /// Plants each mistake as the inverse of its correction, written independently of the code.
 #[needs_shared]
 #[test]

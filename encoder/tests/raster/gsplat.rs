@@ -1,19 +1,8 @@
 //! Compares with recorded weights: a float64 reference, and gsplat 1.5.3.
 
-use std::collections::BTreeMap;
-
-use slag_encoder::raster::ViewWeights;
-
 use super::backends::{Backend, backends};
 use super::fixtures::{Npz, needs_shared, points, view, widened};
-
-type Sums = BTreeMap<(u32, u32), f64>;
-
-fn sums(found: &ViewWeights) -> Sums {
-    let keys: Vec<_> = found.entries.iter().map(|e| (e.gaussian, e.region)).collect();
-    assert!(keys.is_sorted_by(|a, b| a < b), "ordered, each pair once");
-    found.entries.iter().map(|e| ((e.gaussian, e.region), e.weight.into())).collect()
-}
+use super::table::{Weights as Sums, by_pair as sums};
 
 fn recorded(npz: &mut Npz, k: &str, l: &str, w: &str) -> Sums {
     let (k, l, w) = (npz.array::<u16>(k), npz.array::<u8>(l), npz.array::<f64>(w));

@@ -40,7 +40,7 @@ impl Row {
     /// Compares every contribution of every case with the oracle, on every backend, and prints the row, with the
     /// backend's distance from the first one outside cuts.
     pub fn check(&self, cases: &[Case]) {
-        let mut of_first: Vec<Found> = Vec::new();
+        let mut of_first: Vec<Weights> = Vec::new();
         for (b, backend) in backends().iter().enumerate() {
             if !backend.keeps_order && ROWS_OF_TIES.contains(&self.name) {
                 println!("| {} | {} | {} | not claimed |", self.name, self.range, backend.name);
@@ -90,15 +90,15 @@ impl Row {
 }
 
 /// Weights by (Gaussian, region).
-type Found = BTreeMap<(u32, u32), f64>;
+pub type Weights = BTreeMap<(u32, u32), f64>;
 
-fn by_pair(weights: &ViewWeights) -> Found {
+pub fn by_pair(weights: &ViewWeights) -> Weights {
     let pairs = weights.entries.iter().map(|e| (e.gaussian, e.region));
     assert!(pairs.is_sorted_by(|a, b| a < b), "ordered, each pair once");
     assert!(weights.entries.iter().all(|e| e.weight.is_finite()));
     weights.entries.iter().map(|e| ((e.gaussian, e.region), e.weight.into())).collect()
 }
 
-fn weight(found: &Found, key: &(u32, u32)) -> f64 {
+fn weight(found: &Weights, key: &(u32, u32)) -> f64 {
     found.get(key).copied().unwrap_or(0.0)
 }

@@ -12,7 +12,6 @@ const CELL: usize = 62_500;
 const KINDS: usize = 400;
 const THING: usize = 1_250;
 const VIEWS: usize = 6;
-/// Length of the noise that a view adds to its thing's vector.
 const VIEW_NOISE: f32 = 0.45;
 /// Length of the noise that a thing adds to its kind's vector.
 const THING_NOISE: f32 = 0.25;

@@ -2,7 +2,6 @@
 
 mod embeddings;
 mod field;
-pub(crate) mod load;
 pub(crate) mod query;
 pub(crate) mod raster;
 pub(crate) mod robot;

@@ -19,8 +19,6 @@ use slag_math::random::Random;
 use crate::harness::{Machine, Times, resident_bytes};
 
 const N_QUERIES: usize = 32;
-/// Queries used to measure recall: exact answers take long.
-const N_RECALL: usize = 16;
 /// Untimed queries, and untimed runs of a text, before the timed ones.
 const N_WARM_UP: usize = 5;
 /// Weight of a scene's embedding in a query that resembles a text: text and image vectors of one thing have
@@ -79,8 +77,6 @@ struct Timing {
     best: Times,
     /// All that reach the score of the last of those.
     threshold: Times,
-    /// Share of the exact best that is found; absent if answers are exact or the shards have no exact embeddings.
-    recall: Option<f64>,
 }
 
 pub(crate) fn run(args: &QueryArgs) -> Result<QueryReport> {
@@ -118,7 +114,7 @@ pub(crate) fn run(args: &QueryArgs) -> Result<QueryReport> {
         n_shards: shards.len(),
         dim,
         shard_bytes: snapshot.shards.iter().map(|shard| shard.len_bytes()).sum(),
-        rss_bytes: resident_bytes(None),
+        rss_bytes: resident_bytes(),
     })
 }
 
@@ -149,34 +145,7 @@ fn time(shards: &[ShardView<'_>], questions: &[Question], limit: usize, args: &Q
         black_box(positions.collect::<Vec<_>>());
         Ok(())
     })?;
-    Ok(Timing { limit, best, threshold, recall: recall(shards, questions, limit, args.precision)? })
-}
-
-/// Returns the share of the exact answers that is found, over some of the queries.
-fn recall(
-    shards: &[ShardView<'_>],
-    questions: &[Question],
-    limit: usize,
-    precision: Precision,
-) -> Result<Option<f64>> {
-    if precision == Precision::Exact || !shards.iter().all(|shard| shard.exact.is_some()) {
-        return Ok(None);
-    }
-    let questions = &questions[..questions.len().min(N_RECALL)];
-    let mut sum = 0.0;
-    for question in questions {
-        let best = |precision| -> Result<Vec<(u32, u32)>> {
-            let search = Search::new(shards, question, Region::default(), precision)?;
-            let hits = search.best(limit, f32::NEG_INFINITY, None);
-            let mut names: Vec<(u32, u32)> = hits.iter().map(|hit| (hit.shard, hit.index)).collect();
-            names.sort_unstable();
-            Ok(names)
-        };
-        let (truth, found) = (best(Precision::Exact)?, best(precision)?);
-        let n = found.iter().filter(|name| truth.binary_search(name).is_ok()).count();
-        sum += n as f64 / truth.len().max(1) as f64;
-    }
-    Ok(Some(sum / questions.len() as f64))
+    Ok(Timing { limit, best, threshold })
 }
 
 /// Returns unit vectors: every other one in a random direction, the rest as similar to an embedding of the scene

@@ -2,7 +2,6 @@
 //!
 //! For a scene of any size, `generate copies` makes one.
 
-use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -58,7 +57,6 @@ type Device = (String, Box<dyn Rasterizer>);
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct RasterReport {
     machine: Machine,
-    /// One per device.
     cases: Vec<RasterCase>,
 }
 
@@ -79,8 +77,6 @@ struct RasterCase {
     load_ms: f64,
     /// Time of a view, one at a time.
     weights: Times,
-    /// Sum of absolute differences from the first device's contributions, relative to the sum of these.
-    relative_l1: f64,
 }
 
 pub(crate) fn run(args: &RasterArgs, progress: &dyn Progress) -> Result<RasterReport> {
@@ -99,7 +95,6 @@ pub(crate) fn run(args: &RasterArgs, progress: &dyn Progress) -> Result<RasterRe
 }
 
 impl BenchScene {
-    /// Reads a splat and its poses, scaled to `width_px`.
     fn read(splat: &Path, poses: &Path, width_px: u32) -> Result<Self> {
         let gaussians = splat::read(splat, &ReadOptions { with_sh_rest: false })?;
         let view = |view: &View| {
@@ -168,35 +163,16 @@ fn measure(
             n_entries: mean(|v| v.entries.len()),
             load_ms: loaded[at].1,
             weights: Times::of(timings),
-            relative_l1: relative_l1(&results[at], &results[0]),
         }
     };
     Ok(timings.into_iter().enumerate().map(case).collect())
 }
 
-/// Returns the sum of absolute differences between found and expected contributions, over all (Gaussian, region)
-/// pairs of either, relative to the sum of the expected ones.
-fn relative_l1(found: &[ViewWeights], expected: &[ViewWeights]) -> f64 {
-    let (mut off, mut total) = (0.0, 0.0);
-    for (found, expected) in found.iter().zip(expected) {
-        let mut differences = BTreeMap::new();
-        for entry in &expected.entries {
-            differences.insert((entry.gaussian, entry.region), f64::from(entry.weight));
-            total += f64::from(entry.weight);
-        }
-        for entry in &found.entries {
-            *differences.entry((entry.gaussian, entry.region)).or_insert(0.0) -= f64::from(entry.weight);
-        }
-        off += differences.values().map(|d| d.abs()).sum::<f64>();
-    }
-    if total > 0.0 { off / total } else { 0.0 }
-}
-
 impl fmt::Display for RasterReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}\n", self.machine)?;
-        let columns = ["scene", "device", "visible", "pairs", "contributions", "median ms", "p90 ms"];
-        let mut table = Table::new(columns.into_iter().chain(["rel. L1"]));
+        let mut table =
+            Table::new(["scene", "device", "visible", "pairs", "contributions", "median ms", "p90 ms"]);
         for case in &self.cases {
             table.row([
                 case.scene.clone(),
@@ -206,7 +182,6 @@ impl fmt::Display for RasterReport {
                 format!("{:.0}", case.n_entries),
                 format!("{:.2}", case.weights.median_ms),
                 format!("{:.2}", case.weights.p90_ms),
-                format!("{:.1e}", case.relative_l1),
             ]);
         }
         write!(f, "{table}")
@@ -219,7 +194,7 @@ mod tests {
     use crate::generate::Scene;
     use crate::generate::grammar::SceneKind;
     use slag_encoder::progress::Silent;
-    use slag_encoder::raster::{CpuRasterizer, RegionWeight};
+    use slag_encoder::raster::CpuRasterizer;
 
     #[test]
     fn every_device_is_measured() {
@@ -231,21 +206,8 @@ mod tests {
         let cases = measure(&scene, &devices, 3, &Silent).expect("rasterises");
         assert_eq!(cases.iter().map(|case| case.device.as_str()).collect::<Vec<_>>(), ["a", "b"]);
         for case in &cases {
-            assert_eq!((case.weights.n, case.relative_l1, case.n_regions), (3, 0.0, 48));
+            assert_eq!((case.weights.n, case.n_regions), (3, 48));
             assert!(case.n_pairs > case.n_visible && case.weights.min_ms > 0.0);
         }
-    }
-
-    #[test]
-    fn differences_count_on_both_sides() {
-        let of = |entries: &[(u32, f32)]| ViewWeights {
-            entries: entries
-                .iter()
-                .map(|&(gaussian, weight)| RegionWeight { gaussian, region: 0, weight })
-                .collect(),
-            ..ViewWeights::default()
-        };
-        let found = relative_l1(&[of(&[(0, 1.0), (2, 0.5)])], &[of(&[(0, 1.25), (1, 0.75)])]);
-        assert_eq!(found, (0.25 + 0.75 + 0.5) / 2.0);
     }
 }

@@ -61,7 +61,6 @@ pub(crate) struct RobotArgs {
     models: ModelArgs,
 }
 
-/// An engine, and the most Gaussians that it is given.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Engine {
     /// A profile of `slag-edge`, or an engine of `edge/benches/rivals`.
@@ -362,7 +361,6 @@ impl fmt::Display for RobotReport {
     }
 }
 
-/// Vectors that are read at a time.
 const BLOCK: usize = 1 << 14;
 /// Scores this close to the last of the best count as ties: the products of others are of f32.
 const TIE: f64 = 1e-6;

@@ -9,7 +9,7 @@ use slag_encoder::progress::Progress;
 use slag_encoder::store::StoreReader;
 use std::fmt::Display;
 
-use crate::bench::{load, query, raster, robot, tradeoff};
+use crate::bench::{query, raster, robot, tradeoff};
 use crate::eval::{
     all, defaults, encoder, goal, judge, lerf, locate, masks, names, relations, run, scannet, splat_only,
 };
@@ -25,7 +25,7 @@ pub(crate) enum EvalCommand {
     Defaults(run::ScenesArgs),
     /// Compares drawings of planned views with as many photos on labelled scenes, with automatic masks.
     SplatOnly(run::ScenesArgs),
-    /// Judges segmenters without words: by labelled photos, by coverage, and by agreement between views.
+    /// Judges segmenters without words: by labelled photos and by coverage.
     Masks(masks::MasksArgs),
     /// Judges the names of objects and their confidences by labels.
     Names(names::NamesArgs),
@@ -86,8 +86,6 @@ pub(crate) enum BenchCommand {
     Query(query::QueryArgs),
     /// Times a text model; prints JSON.
     Text(query::TextArgs),
-    /// Loads a robot's service with more queries than it can answer; prints JSON.
-    Load(load::LoadArgs),
     /// Fills the paper's table of query times on the robot, with other engines on the same vectors beside it.
     Robot(robot::RobotArgs),
     /// Times the weights of a view: each device on generated scenes, or on one of yours.
@@ -100,7 +98,6 @@ pub(super) fn bench(command: &BenchCommand, progress: &dyn Progress, json: bool)
     match command {
         BenchCommand::Query(args) => print_json(&query::run(args)?),
         BenchCommand::Text(args) => print_json(&query::time_texts(args)?),
-        BenchCommand::Load(args) => print_json(&load::run(args)?),
         BenchCommand::Robot(args) => {
             let report = robot::run(args, progress)?;
             show(json, &report, report.not_run.is_empty())

@@ -195,7 +195,6 @@ impl Map {
     }
 }
 
-/// Edge of a glyph, in pixels of the font.
 const GLYPH: u32 = 8;
 /// Pixels of the picture per pixel of the font, along each axis.
 const SCALE: u32 = 2;

@@ -6,7 +6,6 @@ use crate::generate::TrueObject;
 
 /// Only things with at least this many pixels in the photos are asked for.
 const MIN_PIXELS: u64 = 12_000;
-/// A thing that no scene has.
 const ABSENT: &str = "an elephant";
 
 pub(super) struct Asked<'a> {

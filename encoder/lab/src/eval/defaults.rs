@@ -18,7 +18,6 @@ use crate::table::{Table, figure, percent};
 /// Encodes of a scene: given and automatic masks, the plain average and the default.
 const N_ENCODES: usize = 4;
 
-/// Figures of one scene with one source of masks and one method.
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     scene: String,

@@ -67,13 +67,11 @@ pub(crate) struct EncoderReport {
     nouns: Vec<NounReport>,
     /// Lowest cosine of a match.
     threshold: Option<f32>,
-    /// Share of the crops that match their own noun.
     found: Option<f64>,
     /// Share of the pairs of crop and another noun that match.
     found_others: Option<f64>,
     /// Share of the pairs of crop and absent category that match.
     found_absent: Option<f64>,
-    /// Median milliseconds per crop with one thread.
     ms_per_crop: f64,
     /// Median milliseconds per text with one thread.
     ms_per_text: f64,

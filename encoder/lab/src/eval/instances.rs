@@ -12,7 +12,6 @@ use slag_encoder::objects::NONE;
 /// Share of an object or a thing that counts as a piece of it.
 const PIECE: f64 = 0.25;
 
-/// Counts of things found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Recall {
     pub(crate) n: usize,
@@ -142,12 +141,7 @@ mod tests {
     /// objects 1 and 2; thing 9 has no Gaussians; 8..10 are wall, which object 2 includes.
     #[test]
     fn recall_by_hand() {
-        let thing = |id: u16, category: &str| Thing {
-            id,
-            category: category.into(),
-            words: Vec::new(),
-            train_pixels: 0,
-        };
+        let thing = |id: u16, category: &str| Thing { id, category: category.into(), ..Thing::default() };
         let truth = Truth {
             things: vec![thing(7, "chair"), thing(8, "chair"), thing(9, "table")],
             background: vec![thing(1, "wall")],

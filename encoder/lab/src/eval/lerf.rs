@@ -92,7 +92,6 @@ pub(super) struct LabelledFrame {
 #[derive(Clone, Debug)]
 pub(super) struct LerfLabels {
     pub(super) frames: Vec<LabelledFrame>,
-    /// Names of frames without a pose.
     pub(super) without_view: Vec<String>,
 }
 

@@ -64,7 +64,6 @@ struct Named {
     names: [(f32, bool); MAX_NAMES],
 }
 
-/// Figures of a scene, or of all.
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     scene: String,
@@ -75,8 +74,6 @@ struct Row {
     /// Expected calibration error of the best names, by their confidence and, for comparison, by their cosine.
     calibration_error: f64,
     calibration_error_of_cosine: f64,
-    /// Mean over all names of -ln of the confidence, or of what is left of 1 for a wrong one: what fits minimise.
-    log_loss: f64,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -166,10 +163,6 @@ impl Row {
         let n = named.len().max(1) as f64;
         let best = || named.iter().map(|named| named.names[0]);
         let by_cosine = named.iter().map(|named| (named.cosine.clamp(0.0, 1.0), named.names[0].1));
-        let losses = named.iter().flat_map(|named| named.names).map(|(confidence, is_right)| {
-            let chance = if is_right { f64::from(confidence) } else { 1.0 - f64::from(confidence) };
-            -chance.max(1e-9).ln()
-        });
         Self {
             scene,
             n_objects: named.len(),
@@ -178,7 +171,6 @@ impl Row {
             mean_confidence: best().map(|best| f64::from(best.0)).sum::<f64>() / n,
             calibration_error: calibration_error(best()),
             calibration_error_of_cosine: calibration_error(by_cosine),
-            log_loss: losses.sum::<f64>() / (n * MAX_NAMES as f64),
         }
     }
 }
@@ -199,13 +191,11 @@ fn calibration_error(names: impl Iterator<Item = (f32, bool)>) -> f64 {
 
 impl fmt::Display for NamesReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let columns =
-            ["scene", "objects", "top-1", "top-3", "confidence", "ECE", "ECE of the cosine", "log loss"];
+        let columns = ["scene", "objects", "top-1", "top-3", "confidence", "ECE", "ECE of the cosine"];
         let mut table = Table::new(columns);
         for row in &self.rows {
             let share = |n: usize| percent(n as u64, row.n_objects as u64);
-            let figures =
-                [row.mean_confidence, row.calibration_error, row.calibration_error_of_cosine, row.log_loss];
+            let figures = [row.mean_confidence, row.calibration_error, row.calibration_error_of_cosine];
             let cells =
                 [row.scene.clone(), row.n_objects.to_string(), share(row.n_top_1), share(row.n_top_3)];
             table.row(cells.into_iter().chain(figures.map(|of| figure(Some(of)))));
@@ -221,10 +211,9 @@ mod tests {
     #[test]
     fn right_names() {
         let thing = |category: &str, words: &[&str]| Thing {
-            id: 1,
             category: category.to_owned(),
             words: words.iter().map(|word| (*word).to_owned()).collect(),
-            train_pixels: 0,
+            ..Thing::default()
         };
         for (name, category) in [
             ("couch", "sofa"),

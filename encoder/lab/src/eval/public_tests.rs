@@ -12,7 +12,7 @@ use slag_common::{Gaussians, Intrinsics, poses, splat};
 use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 
 use super::lerf::{self, LerfLabels};
-use super::scannet::{self, Scan, ScanReport, ScannetReport, ScannetSettings};
+use super::scannet::{self, Scan, ScanReport, ScannetReport};
 use slag_encoder::cells::CellLimits;
 use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
 use slag_encoder::lift::Aggregation;
@@ -237,11 +237,10 @@ fn scans_are_judged_by_the_protocol() {
     let message = Scan::read(&wrong).expect_err("no such label").to_string();
     assert!(message.contains("label 41, expected 0 to 40"), "{message}");
     let mut encoder = renamed(&[("wall", "red"), ("floor", "blue"), ("toilet", "green")]);
-    let judge = |scan: &Scan, scene: &Gaussians, encoder: &mut Renamed, by_index| {
-        let settings = ScannetSettings { by_index, ..ScannetSettings::default() };
-        scannet::judge(&wall.reader(), scan, scene, encoder, settings)
+    let judge = |scan: &Scan, scene: &Gaussians, encoder: &mut Renamed| {
+        scannet::judge(&wall.reader(), scan, scene, encoder, false)
     };
-    let report = judge(&scan, &wall.gaussians, &mut encoder, false).expect("judges");
+    let report = judge(&scan, &wall.gaussians, &mut encoder).expect("judges");
     assert_eq!((report.n_labelled, report.n_without_answer), (192 * 2 + 5, 5));
     for subset in &report.subsets {
         assert_eq!(subset.n_classes, 2);
@@ -257,20 +256,16 @@ fn scans_are_judged_by_the_protocol() {
 
     // Swapped words: no answer is correct.
     let mut swapped = renamed(&[("wall", "blue"), ("floor", "red")]);
-    let judged = judge(&scan, &wall.gaussians, &mut swapped, false);
+    let judged = judge(&scan, &wall.gaussians, &mut swapped);
     assert_eq!(judged.expect("judges").subsets[0].miou, Some(0.0));
-    let none = judge(&scan, &wall.gaussians, &mut renamed(&[]), false).expect_err("no word");
+    let none = judge(&scan, &wall.gaussians, &mut renamed(&[])).expect_err("no word");
     assert!(none.to_string().contains("none of the 19 words"), "{none}");
 
-    // By index: needs equal numbers of vertices and Gaussians, and leaves out transparent Gaussians.
-    let message = judge(&scan, &wall.gaussians, &mut encoder, true).expect_err("another length").to_string();
-    assert!(message.contains("391 vertices, the splat has 384 Gaussians"), "{message}");
-    write_mesh(&dir.join("scene0062_00_vh_clean_2.labels.ply"), &vertices()[..COLUMNS * ROWS]);
-    let scan = Scan::read(&dir).expect("a scan");
+    // Transparent Gaussians do not answer: of the first row and the 16 behind it, one has a neighbour within reach.
     let mut faint = wall.gaussians.clone();
     faint.opacities[..40].fill(0.05);
-    let judged = judge(&scan, &faint, &mut encoder, true).expect("judges");
-    assert_eq!((judged.n_labelled, judged.subsets[2].miou), (COLUMNS * ROWS - 40, Some(1.0)));
+    let judged = judge(&scan, &faint, &mut encoder).expect("judges");
+    assert_eq!((judged.n_labelled, judged.n_without_answer), (192 * 2 + 5, 5 + 39));
 }
 
 /// Oracle: the rules restated. The wall's answers are known (left half `wall`, right half `floor`); segments and
@@ -302,13 +297,10 @@ fn filtered_answers_are_the_majority_of_each_segment() {
         })
         .collect();
     write_mesh(&dir.join("scene0097_00_vh_clean_2.labels.ply"), &rows);
-    let mut splat = wall.gaussians.clone();
-    splat.opacities[7..40].fill(0.05);
     let scan = Scan::read(&dir).expect("a scan");
     let mut encoder = renamed(&[("wall", "red"), ("floor", "blue")]);
     let mut judged = |segments| -> anyhow::Result<ScanReport> {
-        let settings = ScannetSettings { by_index: true, segments };
-        scannet::judge(&wall.reader(), &scan, &splat, &mut encoder, settings)
+        scannet::judge(&wall.reader(), &scan, &wall.gaussians, &mut encoder, segments)
     };
     let message = format!("{:#}", judged(true).expect_err("no segments"));
     assert!(message.contains("segs.json"), "{message}");
@@ -319,21 +311,20 @@ fn filtered_answers_are_the_majority_of_each_segment() {
     assert!(judged(false).expect("judges").filtered.is_none());
     let report = judged(true).expect("judges");
 
-    let counted: Vec<usize> = (0..n).filter(|i| !(7..40).contains(i)).collect();
     let voted: Vec<usize> = (0..n)
         .map(|i| {
-            let of_segment = counted.iter().filter(|k| segments[**k] == segments[i]);
-            let (walls, floors): (Vec<usize>, Vec<usize>) = of_segment.partition(|k| answers[**k] == 0);
+            let of_segment = (0..n).filter(|k| segments[*k] == segments[i]);
+            let (walls, floors): (Vec<usize>, Vec<usize>) = of_segment.partition(|k| answers[*k] == 0);
             usize::from(floors.len() > walls.len())
         })
         .collect();
     let means = |answers: &[usize]| {
         let of_class = |(class, label): (usize, u16)| {
             // Vertices of other labels than the classes' are not judged.
-            let judged = counted.iter().filter(|i| [1, 2, 4].contains(&rows[**i].1));
+            let judged = (0..n).filter(|i| [1, 2, 4].contains(&rows[*i].1));
             let (mut both, mut either, mut truth) = (0.0, 0.0, 0.0);
             for i in judged {
-                let (is, said) = (rows[*i].1 == label, answers[*i] == class);
+                let (is, said) = (rows[i].1 == label, answers[i] == class);
                 both += f64::from(u8::from(is && said));
                 either += f64::from(u8::from(is || said));
                 truth += f64::from(u8::from(is));

@@ -68,7 +68,6 @@ pub(crate) struct Runner {
     out: PathBuf,
 }
 
-/// A store as a run left it.
 pub(crate) struct Encoded {
     pub(crate) reader: StoreReader,
     pub(crate) summary: EncodeSummary,

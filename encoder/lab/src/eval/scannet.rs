@@ -1,9 +1,8 @@
 //! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes, 19, 15 and 10
 //! classes, argmax over the classes' words, means over the classes that a scene has.
 //!
-//! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares by index; for other splats, the
-//! nearest Gaussian answers for a vertex. Gaussians with an opacity below `MIN_OPACITY` do not count, as in its
-//! `scripts/eval_scannet.py`.
+//! The nearest Gaussian answers for a vertex (OpenGaussian fixes Gaussians to the mesh's vertices). Gaussians with
+//! an opacity below `MIN_OPACITY` do not count, as in its `scripts/eval_scannet.py`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
@@ -61,7 +60,6 @@ const CLASSES: [(u16, &str); 19] = [
     (34, "sink"),
     (36, "bathtub"),
 ];
-/// Ids of the 15 classes, and of the 10.
 const IDS_OF_15: [u16; 15] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 33, 34];
 const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
 /// More transparent Gaussians are ignored.
@@ -94,20 +92,10 @@ pub(crate) struct ScannetArgs {
     /// The models that the stores were encoded with.
     #[command(flatten)]
     models: ModelArgs,
-    #[command(flatten)]
-    judge: ScannetSettings,
-}
-
-#[derive(Clone, Copy, Debug, Default, Args)]
-pub(super) struct ScannetSettings {
-    /// Compares Gaussians and vertices one by one, for splats trained with Gaussians fixed to the vertices
-    /// (OpenGaussian).
-    #[arg(long)]
-    pub(super) by_index: bool,
     /// Also evaluates with the paper's prediction filter (PF): all vertices of a segment of ScanNet's segs.json
     /// take its most frequent class.
     #[arg(long)]
-    pub(super) segments: bool,
+    segments: bool,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -117,7 +105,6 @@ pub(crate) struct ScanReport {
     pub(super) subsets: Vec<Subset>,
     /// The same after the prediction filter.
     pub(super) filtered: Option<Vec<Subset>>,
-    /// Labelled vertices of the 19 classes.
     pub(super) n_labelled: usize,
     /// Labelled vertices without an answer, because no Gaussian is near or it has no evidence; they count as
     /// wrong.
@@ -151,19 +138,9 @@ pub(crate) fn run(args: &ScannetArgs) -> Result<ScannetReport> {
         let mut scene = splat::read(path, &splat::ReadOptions { with_sh_rest: false })?;
         ingest::to_poses(&mut scene, path, &args.splat_frame, PoseSource::Scannet, None)?;
         let scan = Scan::read(scan)?;
-        scenes.push(judge(&reader, &scan, &scene, &mut *encoder, args.judge)?);
+        scenes.push(judge(&reader, &scan, &scene, &mut *encoder, args.segments)?);
     }
     Ok(ScannetReport::new(scenes))
-}
-
-/// The answer's source for a vertex.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Answerer {
-    Gaussian(usize),
-    /// None is near; the vertex counts as wrong.
-    None,
-    /// The Gaussian is too transparent; the vertex is left out.
-    LeftOut,
 }
 
 /// Evaluates a store against a labelled mesh. `scene` is the splat that was encoded, in the mesh's frame.
@@ -172,10 +149,10 @@ pub(super) fn judge(
     scan: &Scan,
     scene: &Gaussians,
     encoder: &mut dyn TextEncoder,
-    settings: ScannetSettings,
+    with_segments: bool,
 ) -> Result<ScanReport> {
     check_scene(reader, scene.len())?;
-    let answerers = if settings.by_index { by_index(scan, scene)? } else { by_distance(scan, scene) };
+    let nearest = nearest_gaussians(scan, scene);
     let (mut unknown_words, mut scores) = (BTreeMap::new(), Vec::new());
     for (_, word) in CLASSES {
         scores.push(match encoder.encode(word) {
@@ -189,42 +166,41 @@ pub(super) fn judge(
     if unknown_words.len() == CLASSES.len() {
         bail!("the encoder knows none of the {} words: {unknown_words:?}", CLASSES.len());
     }
-    let answers = Answers { scan, answerers: &answerers, scores: &scores };
-    let segments = if settings.segments { Some(scan.segments()?) } else { None };
+    let answers = Answers { scan, nearest: &nearest, scores: &scores };
+    let segments = if with_segments { Some(scan.segments()?) } else { None };
     let subsets = |segments: Option<&[u32]>| {
         let ids_of_19 = CLASSES.map(|(id, _)| id);
         [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| answers.subset(ids, segments)).to_vec()
     };
-    let is_judged = |(label, answerer): &(&u16, &Answerer)| {
-        CLASSES.iter().any(|(id, _)| id == *label) && **answerer != Answerer::LeftOut
-    };
-    let judged: Vec<&Answerer> =
-        scan.labels.iter().zip(&answerers).filter(is_judged).map(|(_, answerer)| answerer).collect();
+    let is_judged = |label: &u16| CLASSES.iter().any(|(id, _)| id == label);
+    let judged = scan.labels.iter().zip(&nearest).filter(|(label, _)| is_judged(label));
+    let judged: Vec<Option<usize>> = judged.map(|(_, nearest)| *nearest).collect();
     let all: Vec<usize> = (0..CLASSES.len()).collect();
     Ok(ScanReport {
         scene: scan.name.clone(),
         subsets: subsets(None),
         filtered: segments.as_deref().map(|segments| subsets(Some(segments))),
         n_labelled: judged.len(),
-        n_without_answer: judged.iter().filter(|answerer| answers.best(answerer, &all).is_none()).count(),
+        n_without_answer: judged.iter().filter(|gaussian| answers.best(**gaussian, &all).is_none()).count(),
         unknown_words,
     })
 }
 
-/// What answers each vertex, and its scores of each class.
+/// The Gaussian that answers each vertex, and its scores of each class.
 struct Answers<'a> {
     scan: &'a Scan,
-    answerers: &'a [Answerer],
+    /// `None`: no Gaussian is near; the vertex counts as wrong.
+    nearest: &'a [Option<usize>],
     /// Of each class; empty for an unknown word.
     scores: &'a [Vec<f32>],
 }
 
 impl Answers<'_> {
     /// Returns the best of some classes for a vertex; ties go to the first.
-    fn best(&self, answerer: &Answerer, classes: &[usize]) -> Option<usize> {
-        let Answerer::Gaussian(gaussian) = answerer else { return None };
+    fn best(&self, gaussian: Option<usize>, classes: &[usize]) -> Option<usize> {
+        let gaussian = gaussian?;
         let score =
-            |class: &usize| self.scores[*class].get(*gaussian).copied().filter(|score| !score.is_nan());
+            |class: &usize| self.scores[*class].get(gaussian).copied().filter(|score| !score.is_nan());
         let scored = classes.iter().filter_map(|class| Some((*class, score(class)?)));
         scored.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))).map(|(class, _)| class)
     }
@@ -234,14 +210,13 @@ impl Answers<'_> {
         let classes: Vec<usize> =
             (0..CLASSES.len()).filter(|class| ids.contains(&CLASSES[*class].0)).collect();
         let mut answers: Vec<Option<usize>> =
-            self.answerers.iter().map(|answerer| self.best(answerer, &classes)).collect();
+            self.nearest.iter().map(|gaussian| self.best(*gaussian, &classes)).collect();
         if let Some(segments) = segments {
-            self.vote(&mut answers, segments);
+            vote(&mut answers, segments);
         }
         let mut confusion = Confusion::new(CLASSES.len());
-        for ((label, answerer), answer) in self.scan.labels.iter().zip(self.answerers).zip(answers) {
-            let truth = classes.iter().copied().find(|class| CLASSES[*class].0 == *label);
-            if let Some(truth) = truth.filter(|_| *answerer != Answerer::LeftOut) {
+        for (label, answer) in self.scan.labels.iter().zip(answers) {
+            if let Some(truth) = classes.iter().copied().find(|class| CLASSES[*class].0 == *label) {
                 confusion.count(truth, answer);
             }
         }
@@ -253,42 +228,25 @@ impl Answers<'_> {
             macc: mean(present.iter().map(|class| confusion.accuracy(*class))),
         }
     }
+}
 
-    /// The paper's prediction filter: all vertices of a segment take the class that most of its vertices with an
-    /// answer have, ties going to the first of the list. Vertices that are left out do not vote; those without a
-    /// label do.
-    fn vote(&self, answers: &mut [Option<usize>], segments: &[u32]) {
-        let mut votes: HashMap<u32, [u32; CLASSES.len()]> = HashMap::new();
-        for ((segment, answer), answerer) in segments.iter().zip(&*answers).zip(self.answerers) {
-            if let Some(class) = answer.filter(|_| *answerer != Answerer::LeftOut) {
-                votes.entry(*segment).or_default()[class] += 1;
-            }
+/// The paper's prediction filter: all vertices of a segment take the class that most of its vertices with an answer
+/// have, ties going to the first of the list. Vertices without a label vote, too.
+fn vote(answers: &mut [Option<usize>], segments: &[u32]) {
+    let mut votes: HashMap<u32, [u32; CLASSES.len()]> = HashMap::new();
+    for (segment, answer) in segments.iter().zip(&*answers) {
+        if let Some(class) = answer {
+            votes.entry(*segment).or_default()[*class] += 1;
         }
-        for (segment, answer) in segments.iter().zip(answers) {
-            if let Some(counts) = votes.get(segment) {
-                *answer = (0..counts.len()).max_by_key(|class| (counts[*class], std::cmp::Reverse(*class)));
-            }
+    }
+    for (segment, answer) in segments.iter().zip(answers) {
+        if let Some(counts) = votes.get(segment) {
+            *answer = (0..counts.len()).max_by_key(|class| (counts[*class], std::cmp::Reverse(*class)));
         }
     }
 }
 
-fn by_index(scan: &Scan, scene: &Gaussians) -> Result<Vec<Answerer>> {
-    let (n_vertices, n_gaussians) = (scan.vertices.len(), scene.len());
-    if n_vertices != n_gaussians {
-        bail!(
-            "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; --by-index needs a splat trained with its \
-             Gaussians fixed to the vertices; omit it",
-            scan.dir.display()
-        );
-    }
-    let answerer = |k: usize| match scene.opacities[k] < MIN_OPACITY {
-        true => Answerer::LeftOut,
-        false => Answerer::Gaussian(k),
-    };
-    Ok((0..n_gaussians).map(answerer).collect())
-}
-
-fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
+fn nearest_gaussians(scan: &Scan, scene: &Gaussians) -> Vec<Option<usize>> {
     let counts = |k: &usize| scene.is_usable(*k) && scene.opacities[*k] >= MIN_OPACITY;
     // Cubes of edge MAX_DISTANCE_M: a Gaussian within reach lies in the vertex's own cube or in a neighbouring
     // one.
@@ -310,11 +268,10 @@ fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
         let (distance2, k) = distances.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))?;
         (distance2 <= MAX_DISTANCE_M * MAX_DISTANCE_M).then_some(k)
     };
-    scan.vertices.iter().map(|vertex| nearest(vertex).map_or(Answerer::None, Answerer::Gaussian)).collect()
+    scan.vertices.iter().map(nearest).collect()
 }
 
 impl ScannetReport {
-    /// Takes the means over scenes.
     pub(super) fn new(scenes: Vec<ScanReport>) -> Self {
         let means_of = |subsets: &dyn Fn(&ScanReport) -> Option<Vec<Subset>>| -> Option<Vec<Subset>> {
             let of_scenes: Vec<Vec<Subset>> = scenes.iter().map(subsets).collect::<Option<_>>()?;

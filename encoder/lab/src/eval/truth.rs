@@ -9,18 +9,27 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
+use glam::DVec3;
 use serde::Deserialize;
 use slag_encoder::store::StoreReader;
 
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Default, Deserialize)]
 pub(super) struct Thing {
     pub(super) id: u16,
     pub(super) category: String,
     #[serde(default)]
     pub(super) words: Vec<String>,
+    /// What it is a kind of, in generated scenes.
+    #[serde(default)]
+    pub(super) kinds: Vec<String>,
     /// Pixels that show it, over all photos to encode; generated scenes have it.
     #[serde(default)]
     pub(super) train_pixels: u64,
+    /// Smallest and largest corner of its box, metres, where the labels have it.
+    #[serde(default)]
+    pub(super) aabb_min: DVec3,
+    #[serde(default)]
+    pub(super) aabb_max: DVec3,
 }
 
 #[derive(Clone, Debug)]
@@ -60,7 +69,6 @@ pub(super) fn check_scene(reader: &StoreReader, n_scene: usize) -> Result<()> {
 }
 
 impl Truth {
-    /// Reads the labels of a scene with `n_gaussians` Gaussians.
     pub(super) fn read(dir: &Path, n_gaussians: usize) -> Result<Self> {
         let (things, background) = read_things(dir)?;
         let path = dir.join("gt/gaussian_instance.npy");

@@ -54,7 +54,6 @@ pub struct Label {
     pub area_px: u32,
     /// Visible share of the thing.
     pub shown: f64,
-    /// Whether the mask is a part of the true one.
     pub cut: bool,
     /// Whether the mask is the segmenter's instead of the true one.
     pub segmented: bool,

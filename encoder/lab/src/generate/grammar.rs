@@ -140,11 +140,9 @@ pub struct Object {
     /// Its colours, the main one first.
     pub colours: Vec<Colour>,
     pub paint: Paint,
-    /// Surface for other things.
     pub top: Option<Top>,
 }
 
-/// Returns the items of a list, trimmed.
 fn list(text: &str) -> impl Iterator<Item = &str> {
     text.split(',').map(str::trim)
 }
@@ -160,7 +158,6 @@ fn exactly<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; 
 }
 
 impl Noun {
-    /// Parses an object file's text.
     fn parse(name: String, text: &str) -> Result<Self, String> {
         let mut noun = Self {
             name,

@@ -50,7 +50,6 @@ struct Piece {
     longest_axis: usize,
 }
 
-/// All solids of a scene, and its light.
 #[derive(Clone, Debug)]
 pub struct Solids {
     pub things: Vec<Thing>,

@@ -51,7 +51,6 @@ pub struct TrueObject {
     pub background: bool,
     pub centre: DVec3,
     pub aabb_min: DVec3,
-    /// Largest corner.
     pub aabb_max: DVec3,
     pub n_gaussians: usize,
     /// Pixels that show it, over all photos to encode.
@@ -61,7 +60,6 @@ pub struct TrueObject {
 pub struct WrittenScene {
     pub scene: PathBuf,
     pub views: PathBuf,
-    /// The folder of labels.
     pub truth: PathBuf,
 }
 

@@ -28,7 +28,6 @@ pub struct Part {
     pub paint: Paint,
 }
 
-/// A point on a surface.
 #[derive(Clone, Copy, Debug)]
 pub struct Surfel {
     pub position: DVec3,

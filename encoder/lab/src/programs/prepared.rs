@@ -56,7 +56,7 @@ impl Service {
 }
 
 /// Returns a client that asks without a proxy and returns replies of every status.
-pub(crate) fn agent() -> ureq::Agent {
+fn agent() -> ureq::Agent {
     let config = ureq::Agent::config_builder().proxy(None).http_status_as_error(false);
     config.timeout_global(Some(TIMEOUT)).build().into()
 }

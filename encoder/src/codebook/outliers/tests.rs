@@ -18,7 +18,7 @@ fn the_farthest_get_centroids_first() {
         })
         .collect();
     let rows = Rows::all(&vectors, dim);
-    let basis = Basis::fit(rows, &ScoreMetric::new(dim, &TextBank::default()), 0.0, dim);
+    let basis = Basis::fit(rows, &ScoreMetric::new(dim, &TextBank::directions(dim)), 0.0, dim);
     let m = basis.n_components;
     let points = basis.components(rows);
     let mut found = Clusters { codes: vec![0; n], centres: vec![0.0; m] };

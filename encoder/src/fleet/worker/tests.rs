@@ -49,7 +49,6 @@ fn a_worker_that_finds_no_run_says_so() {
         folder: dir.path().to_owned(),
         segmenter: None,
         patience: Duration::from_millis(100),
-        stays: false,
     };
     let engines = Engines::new(&models, &session, &CpuRasterizer);
     let error = work(&bucket, &settings, &engines, &Silent, &AtomicBool::new(false)).expect_err("no run");

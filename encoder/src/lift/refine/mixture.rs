@@ -8,7 +8,7 @@ use slag_math::dot;
 
 use crate::lift::contributions::ContributionError;
 use crate::lift::embeddings::MIN_MEAN_LENGTH;
-use crate::lift::part::PartContributions;
+use crate::lift::index::PartContributions;
 use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::lift::table::RegionTable;
 

@@ -25,7 +25,7 @@ mod settings;
 use slag_math::axes::principal_coordinates;
 
 use super::contributions::ContributionError;
-use super::part::PartContributions;
+use super::index::PartContributions;
 use super::passes::SceneContributions;
 use super::photos::{MaskOutline, Photo};
 use super::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::lift::part::PartContributions;
+use crate::lift::index::PartContributions;
 
 /// Gaussians that a thread works on at a time, at least.
 const CHUNK: usize = 4096;

@@ -172,6 +172,21 @@ fn norm(v: &[f64]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
+fn unit(v: &[f64]) -> Vec<f64> {
+    v.iter().map(|x| x / norm(v).max(1e-12)).collect()
+}
+
+/// The sum of some Gaussians' rows, where every mask counts once.
+fn sum_of(views: &[ViewContributions], gaussians: impl IntoIterator<Item = usize>) -> Vec<f64> {
+    let mut sum = vec![0.0; DIM];
+    for k in gaussians {
+        for (view, entries) in views.iter().zip(row(views, k)) {
+            contribution(view, &entries, &[1.0; 6]).iter().enumerate().for_each(|(c, x)| sum[c] += x);
+        }
+    }
+    sum
+}
+
 /// What masks count, by the definition, with everything in float64 and no axes.
 fn oracle_counts(views: &[ViewContributions], settings: &Aggregation) -> Vec<Vec<f64>> {
     let whole = |v: usize, mask: usize| {
@@ -229,25 +244,13 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
 #[test]
 fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
     let views = views();
-    let once = vec![1.0; 6];
-    let sum_of = |k: usize| -> Vec<f64> {
-        let mut sum = vec![0.0; DIM];
-        for (view, entries) in views.iter().zip(row(&views, k)) {
-            contribution(view, &entries, &once).iter().enumerate().for_each(|(c, x)| sum[c] += x);
-        }
-        sum
-    };
     // Larger superpoints are the same patches here.
     let parts = |superpoint, coarse| Aggregation { superpoint, coarse, fill: true, ..Aggregation::PLAIN };
     for (settings, n_levels) in [(parts(1.0, 0.0), 1), (parts(0.0, 0.5), 2), (parts(2.0, 0.5), 2)] {
         let Lifted { field, embeddings, table } = lifted(settings, u64::MAX);
         for k in 0..N {
-            let mut patch = vec![0.0; DIM];
-            (k / 30 * 30..k / 30 * 30 + 30).for_each(|other| {
-                sum_of(other).iter().enumerate().for_each(|(c, x)| patch[c] += x);
-            });
-            let unit = |v: &[f64]| -> Vec<f64> { v.iter().map(|x| x / norm(v).max(1e-12)).collect() };
-            let mut expected = unit(&sum_of(k));
+            let patch = sum_of(&views, k / 30 * 30..k / 30 * 30 + 30);
+            let mut expected = unit(&sum_of(&views, [k]));
             for count in [settings.superpoint, settings.coarse] {
                 let own = if norm(&expected) > 0.0 { unit(&expected) } else { unit(&patch) };
                 let of_patch = unit(&patch);
@@ -279,24 +282,12 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
 fn an_object_gives_its_part_to_its_gaussians() {
     let views = views();
     let [object_of] = object_of();
-    let of = |k: usize| -> Vec<f64> {
-        let mut sum = vec![0.0; DIM];
-        for (view, entries) in views.iter().zip(row(&views, k)) {
-            contribution(view, &entries, &[1.0; 6]).iter().enumerate().for_each(|(c, x)| sum[c] += x);
-        }
-        sum
-    };
-    let unit = |v: &[f64]| -> Vec<f64> { v.iter().map(|x| x / norm(v).max(1e-12)).collect() };
-    let sum_of = |members: &dyn Fn(usize) -> bool| {
-        let mut sum = vec![0.0; DIM];
-        (0..N).filter(|k| members(*k)).for_each(|k| of(k).iter().enumerate().for_each(|(c, x)| sum[c] += x));
-        unit(&sum)
-    };
+    let sum_of = |members: &dyn Fn(usize) -> bool| unit(&sum_of(&views, (0..N).filter(|k| members(*k))));
     for superpoint in [0.0, 1.0] {
         let found = lifted(Aggregation { superpoint, object: 0.5, ..Aggregation::PLAIN }, u64::MAX);
         for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
             let patch = sum_of(&|other| other / 30 == k / 30);
-            let mut expected = unit(&of(k));
+            let mut expected = unit(&self::sum_of(&views, [k]));
             expected =
                 unit(&(0..DIM).map(|c| expected[c] + f64::from(superpoint) * patch[c]).collect::<Vec<_>>());
             if object_of[k] != NO_SUPERPOINT {

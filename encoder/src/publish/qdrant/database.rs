@@ -19,6 +19,9 @@ use super::{IndexSettings, PushError, PushOptions, Snapshot};
 use crate::store::{StoreReader, StoredShard};
 
 const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
+/// Time limit of one request, and of one for a snapshot.
+const TIMEOUT: Duration = Duration::from_secs(60);
+const SNAPSHOT_TIMEOUT: Duration = Duration::from_secs(3600);
 
 pub(super) struct Database<'a> {
     client: Qdrant,
@@ -39,15 +42,15 @@ impl<'a> Database<'a> {
             Qdrant::from_url(&options.url)
                 .api_key(options.api_key.as_deref())
                 .timeout(timeout)
-                .connect_timeout(options.timeout)
+                .connect_timeout(TIMEOUT)
                 // The check prints to standard output.
                 .skip_compatibility_check()
                 .build()
                 .map_err(|cause| database_error(options, "set up the client", &cause))
         };
         Ok(Self {
-            client: client(options.timeout)?,
-            patient_client: client(options.snapshot_timeout)?,
+            client: client(TIMEOUT)?,
+            patient_client: client(SNAPSHOT_TIMEOUT)?,
             options,
             n_retries: AtomicU64::new(0),
             is_reached: AtomicBool::new(false),

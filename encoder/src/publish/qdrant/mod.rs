@@ -17,7 +17,7 @@ mod tests;
 use std::num::NonZeroUsize;
 use std::time::Duration;
 
-use clap::ValueEnum;
+use clap::{Args, ValueEnum};
 use serde::Serialize;
 use slag_common::shard::Profile;
 
@@ -29,55 +29,47 @@ pub(crate) use settings::IndexSettings;
 /// Which collections a scene is pushed to.
 ///
 /// Shard keys, which divide one collection, need a distributed Qdrant; a collection a cell needs nothing.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Layout {
     /// One collection, NAME.
-    #[default]
     One,
     /// A collection for each cell, NAME-cell-ID: each can be snapshotted, dropped and restored alone.
     Cells,
 }
 
-#[derive(Clone)]
-pub(crate) struct PushOptions {
-    pub(crate) url: String,
-    /// The collection, or the beginning of the names of one a cell; created if absent.
+/// Where a scene is pushed to, and how.
+#[derive(Clone, Debug, Args)]
+pub struct PushOptions {
+    /// Qdrant's gRPC address.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:6334")]
+    pub url: String,
+    /// Collection; created if it does not exist. With `--layout cells`: NAME-cell-ID for each cell.
+    #[arg(long, value_name = "NAME")]
     pub(crate) collection: String,
-    pub(crate) layout: Layout,
-    pub(crate) index: IndexSettings,
-    /// Whether each collection has a snapshot at the end.
-    pub(crate) snapshots: bool,
+    /// API key.
+    #[arg(long, value_name = "KEY", env = "QDRANT_API_KEY", hide_env_values = true)]
     pub(crate) api_key: Option<String>,
+    /// Points per request.
+    #[arg(long = "batch", value_name = "N", default_value = "256")]
     pub(crate) n_points_per_batch: NonZeroUsize,
-    /// Attempts after the first, for errors that may pass.
+    /// One collection for the scene, or one for each cell.
+    #[arg(long, value_enum, default_value = "one")]
+    pub layout: Layout,
+    /// Makes a snapshot of each collection at the end, on the server's disk.
+    #[arg(long)]
+    pub(crate) snapshots: bool,
+    /// Settings of the collections.
+    #[command(flatten)]
+    pub(crate) index: IndexSettings,
+    /// Attempts after the first, for errors that may pass: over about a minute.
+    #[arg(skip = 8_u32)]
     pub(crate) n_retries: u32,
     /// Pause before the second attempt; it doubles with each.
+    #[arg(skip = Duration::from_millis(250))]
     pub(crate) retry_delay: Duration,
     /// How long a database that was never reached is waited for.
+    #[arg(skip = Duration::from_secs(10))]
     pub(crate) connect_patience: Duration,
-    /// Time limit of one request, and of one for a snapshot.
-    pub(crate) timeout: Duration,
-    pub(crate) snapshot_timeout: Duration,
-}
-
-impl PushOptions {
-    /// Returns options with eight retries over about a minute.
-    pub(crate) fn new(url: impl Into<String>, collection: impl Into<String>) -> Self {
-        Self {
-            url: url.into(),
-            collection: collection.into(),
-            layout: Layout::One,
-            index: IndexSettings::default(),
-            snapshots: false,
-            api_key: None,
-            n_points_per_batch: const { NonZeroUsize::new(256).expect("not zero") },
-            n_retries: 8,
-            retry_delay: Duration::from_millis(250),
-            connect_patience: Duration::from_secs(10),
-            timeout: Duration::from_secs(60),
-            snapshot_timeout: Duration::from_secs(3600),
-        }
-    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

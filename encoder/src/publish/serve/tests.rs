@@ -473,13 +473,6 @@ async fn over_tcp_a_download_outlives_the_stop() {
     assert!(tokio::net::TcpStream::connect(running.address).await.is_err(), "no longer listening");
 }
 
-#[test]
-fn nothing_published_is_an_error_at_the_start() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let started = router(dir.path(), Limits::default(), Access::default(), Router::new());
-    assert!(matches!(started, Err(StoreError::NotPublished { .. })));
-}
-
 #[tokio::test]
 async fn every_described_resource_and_parameter_is_answered() {
     let fixture = fixture();

@@ -269,7 +269,6 @@ pub(crate) struct Band<'a> {
 }
 
 impl Band<'_> {
-    /// Returns the number of columns and rows of tiles.
     pub fn tiles(&self) -> [u32; 2] {
         let [_, _, first_row, end_row, columns, ..] = self.view.words;
         [columns, end_row - first_row]

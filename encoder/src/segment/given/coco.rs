@@ -217,7 +217,6 @@ pub(super) fn undistorted(
     ideal
 }
 
-/// Returns the error for masks above [`MAX_MASK_BYTES`].
 pub(super) fn too_large(path: &Path) -> SegmentError {
     SegmentError::TooLarge { path: path.to_owned(), limit_bytes: MAX_MASK_BYTES }
 }

@@ -3,14 +3,39 @@
 use rayon::prelude::*;
 use slag_models::sam::{Decoded, MASKS_PER_PROMPT};
 
-use super::candidate::Candidate;
-use super::score_filter;
-use super::settings::SamSettings;
+use super::runs::RunMask;
+use super::settings::{SamSettings, ScoreFilter};
 use super::upsample::Upsampler;
 use crate::masks::BoxPx;
 
 /// Distance within which a box touches an edge, as in the reference implementation.
 const EDGE_TOLERANCE_PX: u32 = 20;
+/// A mask is contained if at least this share of it lies in another one ...
+const CONTAINED_SHARE: f64 = 0.85;
+/// ... of which it covers less than this share.
+const LARGE_SHARE: f64 = 0.5;
+/// Masks that stay where no score is above the threshold.
+const N_BEST: usize = 3;
+
+/// A mask that the filters judge.
+#[derive(Clone, Debug)]
+pub(super) struct Candidate {
+    pub(super) mask: RunMask,
+    /// IoU with the true mask, predicted by the model.
+    pub(super) predicted_iou: f32,
+    /// IoU of the mask with itself under a higher and a lower threshold.
+    pub(super) stability: f64,
+    /// 0 whole, 1 part, 2 subpart.
+    pub(super) level: u8,
+    /// The crop of the image in which the mask was found.
+    pub(super) crop: BoxPx,
+}
+
+impl Candidate {
+    pub(super) fn score(&self) -> f64 {
+        f64::from(self.predicted_iou) * self.stability
+    }
+}
 
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Filters<'a> {
@@ -108,7 +133,7 @@ impl Filters<'_> {
             candidates = suppress(candidates, scores, |a, b| a.mask.iou(&b.mask) > mask_nms_iou);
         }
         match score_filter {
-            Some(filter) => score_filter::keep(candidates, &filter),
+            Some(filter) => keep_by_score(candidates, &filter),
             None => candidates,
         }
     }
@@ -151,6 +176,32 @@ fn box_iou(a: BoxPx, b: BoxPx) -> f64 {
     let overlap = |low: u32, high: u32| f64::from(high.saturating_sub(low + 1));
     let both = overlap(a.x0.max(b.x0), a.x1.min(b.x1)) * overlap(a.y0.max(b.y0), a.y1.min(b.y1));
     both / (area(a) + area(b) - both)
+}
+
+/// LangSplat's last filter of the masks of one level (Qin et al. 2024, `mask_nms` of `preprocess.py`). Returns the masks
+/// that stay, the one with the highest score first; equal scores in their order.
+///
+/// Unlike greedy suppression, a mask counts against others even where it is dropped itself.
+pub(super) fn keep_by_score(mut candidates: Vec<Candidate>, filter: &ScoreFilter) -> Vec<Candidate> {
+    candidates.sort_by(|a, b| b.score().total_cmp(&a.score()));
+    let mut keeps: Vec<bool> = candidates.iter().map(|mask| mask.score() > filter.min_score).collect();
+    if !keeps.contains(&true) {
+        keeps.iter_mut().take(N_BEST).for_each(|keeps| *keeps = true);
+    }
+    for j in 1..candidates.len() {
+        for i in 0..j {
+            let [better, worse] = [i, j].map(|k| &candidates[k].mask);
+            let both_px = better.intersection_px(worse) as f64;
+            let [of_better, of_worse] = [better, worse].map(|mask| both_px / f64::from(mask.area_px));
+            let union_px = f64::from(better.area_px) + f64::from(worse.area_px) - both_px;
+            let is_contained = |share: f64, of_other: f64| {
+                share >= CONTAINED_SHARE && of_other < LARGE_SHARE && share * of_other < filter.max_contained
+            };
+            keeps[j] &= both_px / union_px <= filter.max_iou && !is_contained(of_worse, of_better);
+            keeps[i] &= !is_contained(of_better, of_worse);
+        }
+    }
+    candidates.into_iter().zip(keeps).filter(|(_, keeps)| *keeps).map(|(mask, _)| mask).collect()
 }
 
 #[cfg(test)]

@@ -6,11 +6,9 @@
 //! once per image and crop, the decoder once per batch of points. While it decodes a batch, the masks of the
 //! previous batch are enlarged and filtered in parallel.
 
-mod candidate;
 mod filter;
 mod points;
 mod runs;
-mod score_filter;
 mod settings;
 #[cfg(test)]
 mod tests;
@@ -27,8 +25,7 @@ use slag_models::{ModelError, SessionOptions};
 use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::lanes::{GpuLoad, Lanes};
 use crate::masks::{BoxPx, Mask};
-use candidate::Candidate;
-use filter::Filters;
+use filter::{Candidate, Filters};
 use upsample::Upsampler;
 
 pub use settings::{SamLevels, SamSettings, ScoreFilter};

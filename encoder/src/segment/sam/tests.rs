@@ -361,24 +361,6 @@ fn the_filters_equal_a_plain_recomputation() {
     assert_eq!(n(&SamSettings { min_region_px: 1_000_000, crop_nms_iou: 1.0, ..all.clone() }), n_all);
 }
 
-/// Includes soft objects with a wide fringe around their mask.
-#[test]
-fn stability_equals_a_plain_recomputation() {
-    let letterbox = Letterbox::new(SIZE_PX, [210, 150]);
-    let upsampler = Upsampler::new(&letterbox, [LOGITS_PX; 2]);
-    let mut n_soft = 0;
-    for (k, blob) in blobs(10, 11, letterbox.resized_px.map(f64::from)).into_iter().enumerate() {
-        let blob = Blob { slope: 0.01 * 1.2_f64.powi(k as i32), ..blob };
-        let dense = enlarged(&logits(&blob), &letterbox, [LOGITS_PX; 2]);
-        let n_above = |limit: f64| dense.iter().filter(|logit| **logit > limit).count() as f64;
-        let expected = n_above(1.0) / n_above(-1.0);
-        let found = upsampler.cut(&logits(&blob), 1.0, [0, 0]).map_or(0.0, |cut| cut.stability);
-        assert_eq!(found, expected, "slope {}", blob.slope);
-        n_soft += u32::from(expected < 0.5);
-    }
-    assert!((5..25).contains(&n_soft), "{n_soft}");
-}
-
 /// Outlines, holes and rough places lie along blocks of pixels that are enlarged, beside others that are not.
 #[test]
 fn rough_masks_equal_a_plain_recomputation() {

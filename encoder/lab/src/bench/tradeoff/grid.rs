@@ -32,7 +32,6 @@ pub(super) struct Grid {
     pub(super) points: Vec<Point>,
 }
 
-/// One way of encoding a scene.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Point {

@@ -36,7 +36,6 @@ pub(super) struct Figures {
     pub(super) bytes_per_gaussian: f64,
 }
 
-/// Figures of a measured grid, in the order of scenes and grid.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct TradeoffReport {
     pub(super) machine: Machine,
@@ -46,7 +45,6 @@ pub(crate) struct TradeoffReport {
 
 type Cost = fn(&Figures) -> f64;
 
-/// Seconds of the encode, bytes a Gaussian.
 const COSTS: [Cost; 2] = [|f| f.seconds, |f| f.bytes_per_gaussian];
 
 /// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate,

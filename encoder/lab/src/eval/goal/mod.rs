@@ -25,7 +25,7 @@ use truth::{MIN_SHOWN, RADIUS_M, SENSOR_HEIGHT_M, Truth, goal_request};
 
 use super::truth as labels;
 use crate::generate::compose::{Layout, Walk};
-use crate::generate::grammar::{NOUNS, SceneKind};
+use crate::generate::grammar::SceneKind;
 use crate::harness::Times;
 use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
@@ -54,9 +54,6 @@ pub(crate) struct GoalArgs {
     /// masks.
     #[arg(long)]
     from_photos: bool,
-    /// Tell each thing and pose that was not as it should be.
-    #[arg(long)]
-    list: bool,
 }
 
 pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport> {
@@ -82,16 +79,14 @@ pub(crate) fn run(args: &GoalArgs, progress: &dyn Progress) -> Result<GoalReport
         let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
         match args.from_photos {
             true => road.add(&dir.join("scene"), &layout, &truth, &service),
-            false => judge(args, dir, &layout, &truth, &service, &mut places),
+            false => judge(dir, &layout, &truth, &service, &mut places),
         }
     })?;
     let (places, road) = if args.from_photos { (None, Some(road)) } else { (Some(places), None) };
     Ok(GoalReport { scenes, places, road })
 }
 
-/// Judges the places of a scene.
 fn judge(
-    args: &GoalArgs,
     dir: &Path,
     layout: &Layout,
     truth: &Truth<'_>,
@@ -101,7 +96,7 @@ fn judge(
     report.voxels.add(compare_voxels(layout, &dir.join("store"))?);
     let labels = labels(&dir.join("scene"), &dir.join("store"))?;
     let start = truth.start;
-    for (index, placed) in layout.placed.iter().enumerate().filter(|(_, placed)| !placed.shell) {
+    for index in (0..layout.placed.len()).filter(|index| !layout.placed[*index].shell) {
         let Some(label) = labels.get(index).filter(|label| label.n_pixels >= MIN_PIXELS) else { continue };
         let is_reachable = truth.is_reachable(index);
         let verdict = match &label.object {
@@ -113,11 +108,6 @@ fn judge(
                 verdict(truth, index, &reply)?
             }
         };
-        let noun = &NOUNS[placed.noun].name;
-        if args.list && verdict.is_fault(is_reachable) {
-            let id = label.object.as_deref().unwrap_or("no object");
-            tracing::warn!("{}: {noun} {id} (reachable: {is_reachable}): {verdict:?}", dir.display());
-        }
         report.count(is_reachable, &verdict);
     }
     Ok(())
@@ -174,23 +164,22 @@ fn objects_of_things(thing_of: &[u16], object_of: &[u32]) -> BTreeMap<u16, u32> 
     most.into_iter().map(|(thing, (_, object))| (thing, object)).collect()
 }
 
-#[derive(Clone, Debug)]
 enum Verdict {
     /// The thing is no object on board.
     NoObject,
-    /// No pose, for a reason.
     None(String),
     /// A pose, and the truth about it.
-    Pose { clearance_m: f64, is_reached: bool, shown: f64, height_error_m: f64 },
+    Pose {
+        clearance_m: f64,
+        is_reached: bool,
+        shown: f64,
+        height_error_m: f64,
+    },
 }
 
 impl Verdict {
     fn is_shown(&self) -> bool {
         matches!(self, Self::Pose { shown, .. } if *shown >= MIN_SHOWN)
-    }
-
-    fn is_fault(&self, is_reachable: bool) -> bool {
-        if is_reachable { !self.is_shown() } else { matches!(self, Self::Pose { .. }) }
     }
 }
 

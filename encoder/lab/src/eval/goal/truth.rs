@@ -10,7 +10,6 @@ use slag_math::distance_transform::squared_distances;
 use crate::generate::compose::{Layout, looking, pinhole};
 use crate::generate::render::Solids;
 
-/// Radius of the robot.
 pub(super) const RADIUS_M: f64 = 0.3;
 /// Largest horizontal distance to the thing.
 const REACH_M: f64 = 0.8;

@@ -10,16 +10,17 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, anyhow};
 use clap::Args;
 use glam::DVec3;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::{Value, json};
 use slag_common::frames::Aabb;
 use slag_encoder::progress::Progress;
 
+use super::truth::{Thing, read_things};
 use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 use crate::programs::{Prepared, Service, sibling};
 use crate::table::{Table, percent};
-use truth::{Asked, TrueThing};
+use truth::Asked;
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
@@ -56,11 +57,6 @@ struct Question {
     truth: Vec<usize>,
 }
 
-#[derive(Deserialize)]
-struct Instances {
-    instances: Vec<TrueThing>,
-}
-
 pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<RelationsReport> {
     let mut report = RelationsReport::default();
     let scenes = Prepared {
@@ -75,10 +71,8 @@ pub(crate) fn run(args: &RelationsArgs, progress: &dyn Progress) -> Result<Relat
     Ok(report)
 }
 
-/// Asks a robot about a scene.
 fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
-    let text = fs_err::read(dir.join("scene/gt/instances.json"))?;
-    let Instances { instances: things } = serde_json::from_slice(&text)?;
+    let (things, _) = read_things(&dir.join("scene"))?;
     let robot = middle(&things);
     let service = Service::start(&sibling("slag-edge")?, "--cache", &dir.join("cache"))?;
     for question in questions(&things, robot) {
@@ -105,7 +99,7 @@ fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
 }
 
 /// Returns the middle of a scene, where the robot stands.
-fn middle(things: &[TrueThing]) -> DVec3 {
+fn middle(things: &[Thing]) -> DVec3 {
     let all = things.iter().fold(Aabb::EMPTY, |all, thing| Aabb {
         min: all.min.min(thing.aabb_min),
         max: all.max.max(thing.aabb_max),
@@ -115,8 +109,8 @@ fn middle(things: &[TrueThing]) -> DVec3 {
 
 /// Returns questions about the things of a scene: for each relation those with an answer and those without, evenly
 /// spread over all pairs of words.
-fn questions(things: &[TrueThing], robot: DVec3) -> Vec<Question> {
-    let is_shown = |thing: &&TrueThing| thing.train_pixels >= MIN_PIXELS;
+fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
+    let is_shown = |thing: &&Thing| thing.train_pixels >= MIN_PIXELS;
     let nouns: BTreeSet<&str> = things.iter().filter(is_shown).map(|thing| thing.category.as_str()).collect();
     let mut n_of_kind: BTreeMap<&str, usize> = BTreeMap::new();
     // "Furniture", but not "something to sit on", which is a relation in words.
@@ -133,7 +127,7 @@ fn questions(things: &[TrueThing], robot: DVec3) -> Vec<Question> {
             for of in nouns.iter().filter(|of| *of != thing) {
                 // One thing must be meant by the second word, or the question is ambiguous.
                 let n_of = things.iter().filter(|thing| thing.sounds_like(of)).count();
-                let is_part = |at: &TrueThing| at.sounds_like(thing) && at.sounds_like(of);
+                let is_part = |at: &Thing| at.sounds_like(thing) && at.sounds_like(of);
                 if n_of != 1 || things.iter().any(is_part) {
                     continue;
                 }
@@ -162,9 +156,6 @@ fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result
     let body = match way {
         Way::Relations => json!({"texts": [question.text], "near": near, "limit": LIMIT}),
         Way::Phrase => json!({"texts": [question.text], "relations": false, "limit": LIMIT}),
-        Way::BestOfPhrase => {
-            json!({"texts": [question.text], "relations": false, "limit": 1, "min_score": -1.0})
-        }
         Way::Noun => json!({"texts": [question.thing], "relations": false, "limit": LIMIT}),
     };
     let mut reply = service.post("/v1/query", &body)?;
@@ -176,7 +167,7 @@ fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result
     }
 }
 
-fn thing_of(things: &[TrueThing], answer: &Value) -> Option<usize> {
+fn thing_of(things: &[Thing], answer: &Value) -> Option<usize> {
     let corner = |name: &str| serde_json::from_value::<DVec3>(answer[name].clone()).ok();
     let of = Aabb { min: corner("box_min_in_world")?, max: corner("box_max_in_world")? };
     let position = corner("position_in_world")?;
@@ -204,21 +195,17 @@ fn iou(a: &Aabb, b: &Aabb) -> f64 {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 enum Way {
-    /// As relations between things.
     Relations,
     /// The phrase as one text, with the scene's threshold.
     Phrase,
-    /// The phrase as one text; its best answer, whatever the score.
-    BestOfPhrase,
     /// The noun alone, with the scene's threshold.
     Noun,
 }
 
 impl Way {
-    const ALL: [Self; 4] = [Self::Relations, Self::Phrase, Self::BestOfPhrase, Self::Noun];
+    const ALL: [Self; 3] = [Self::Relations, Self::Phrase, Self::Noun];
 }
 
-/// What came of some questions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 struct Counts {
     n_questions: usize,
@@ -242,7 +229,6 @@ impl Counts {
     }
 }
 
-/// Figures of one way of asking.
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     /// `None` for all of them.

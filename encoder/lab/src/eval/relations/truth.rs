@@ -2,8 +2,10 @@
 //! share no code with the robot's.
 
 use glam::{DVec2, DVec3};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use slag_common::frames::Aabb;
+
+use crate::eval::truth::Thing;
 
 /// Distance of two boxes at which their things are near each other, metres.
 const NEAR_M: f64 = 1.0;
@@ -17,19 +19,6 @@ const SEEN_DEG: f64 = 45.0;
 const TOUCHES_M: f64 = 0.05;
 /// A thing on another is at least this far from the ground.
 const RAISED_M: f64 = 0.1;
-
-#[derive(Clone, Debug, Deserialize)]
-pub(super) struct TrueThing {
-    pub(super) category: String,
-    #[serde(default)]
-    pub(super) kinds: Vec<String>,
-    /// Smallest corner of its box, metres.
-    pub(super) aabb_min: DVec3,
-    /// Largest corner.
-    pub(super) aabb_max: DVec3,
-    /// Pixels that show it, over all photos.
-    pub(super) train_pixels: u64,
-}
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -76,7 +65,7 @@ impl Asked {
     }
 }
 
-impl TrueThing {
+impl Thing {
     pub(super) fn bounds(&self) -> Aabb {
         Aabb { min: self.aabb_min, max: self.aabb_max }
     }
@@ -100,11 +89,11 @@ impl TrueThing {
 }
 
 /// Returns the things that a question means, by their indices. `robot`: where it is asked.
-pub(super) fn meant(things: &[TrueThing], asked: Asked, thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
+pub(super) fn meant(things: &[Thing], asked: Asked, thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
     let named =
         |word: &str| -> Vec<usize> { (0..things.len()).filter(|at| things[*at].sounds_like(word)).collect() };
     let (ones, others) = (named(thing), named(of));
-    let related = |holds: &dyn Fn(&TrueThing, &TrueThing) -> bool| -> Vec<usize> {
+    let related = |holds: &dyn Fn(&Thing, &Thing) -> bool| -> Vec<usize> {
         let is_related =
             |at: &usize| others.iter().any(|other| other != at && holds(&things[*at], &things[*other]));
         ones.iter().copied().filter(is_related).collect()
@@ -136,18 +125,18 @@ pub(super) fn meant(things: &[TrueThing], asked: Asked, thing: &str, of: &str, r
 }
 
 /// Returns whether a thing stands on another, as the layout places things on tops.
-fn is_on(thing: &TrueThing, below: &TrueThing) -> bool {
+fn is_on(thing: &Thing, below: &Thing) -> bool {
     let centre = thing.centre().truncate();
     let over = centre.cmpge(below.aabb_min.truncate()).all() && centre.cmple(below.aabb_max.truncate()).all();
     let bottom = thing.aabb_min.z;
     over && bottom > RAISED_M && bottom > below.centre().z - RAISED_M && bottom < below.aabb_max.z + TOUCHES_M
 }
 
-fn gap(a: &TrueThing, b: &TrueThing) -> f64 {
+fn gap(a: &Thing, b: &Thing) -> f64 {
     (a.aabb_min - b.aabb_max).max(b.aabb_min - a.aabb_max).max(DVec3::ZERO).length()
 }
 
-fn is_level(a: &TrueThing, b: &TrueThing) -> bool {
+fn is_level(a: &Thing, b: &Thing) -> bool {
     let shared = a.aabb_max.z.min(b.aabb_max.z) - a.aabb_min.z.max(b.aabb_min.z);
     let lower = (a.aabb_max.z - a.aabb_min.z).min(b.aabb_max.z - b.aabb_min.z);
     shared >= 0.3 * lower
@@ -155,7 +144,7 @@ fn is_level(a: &TrueThing, b: &TrueThing) -> bool {
 
 /// Returns whether a thing lies in a direction from another: degrees to the left of the line from the robot to
 /// that.
-fn is_seen(thing: &TrueThing, of: &TrueThing, robot: DVec3, direction_deg: f64) -> bool {
+fn is_seen(thing: &Thing, of: &Thing, robot: DVec3, direction_deg: f64) -> bool {
     let sight = (of.centre() - robot).truncate();
     let offset = (thing.centre() - of.centre()).truncate();
     let meant = DVec2::from_angle(direction_deg.to_radians()).rotate(sight);
@@ -166,10 +155,10 @@ fn is_seen(thing: &TrueThing, of: &TrueThing, robot: DVec3, direction_deg: f64) 
 mod tests {
     use super::*;
 
-    fn thing(category: &str, min: [f64; 3], max: [f64; 3]) -> TrueThing {
+    fn thing(category: &str, min: [f64; 3], max: [f64; 3]) -> Thing {
         let kinds = vec!["furniture".into()];
         let (aabb_min, aabb_max) = (min.into(), max.into());
-        TrueThing { category: category.into(), kinds, aabb_min, aabb_max, train_pixels: 1 }
+        Thing { category: category.into(), kinds, aabb_min, aabb_max, ..Thing::default() }
     }
 
     #[test]

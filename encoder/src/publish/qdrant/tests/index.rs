@@ -33,7 +33,6 @@ fn scalar() -> ScalarQuantization {
     }
 }
 
-/// The graph of [`ALL`].
 fn graph() -> HnswConfigDiff {
     HnswConfigDiff { m: Some(32), ef_construct: Some(200), on_disk: Some(true), ..Default::default() }
 }

@@ -8,6 +8,7 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::Duration;
 
+use clap::Parser;
 use glam::DVec3;
 use half::f16;
 use qdrant_client::qdrant::{Distance, VectorParamsBuilder, value::Kind};
@@ -196,11 +197,16 @@ impl Fixture {
 }
 
 fn options(url: &str) -> PushOptions {
-    PushOptions {
-        n_points_per_batch: NonZeroUsize::new(BATCH).expect("not zero"),
-        retry_delay: Duration::from_millis(1),
-        ..PushOptions::new(url, "yard")
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        options: PushOptions,
     }
+    let line = ["push", "--collection", "yard", "--url", url];
+    let mut options = Line::parse_from(line).options;
+    options.n_points_per_batch = NonZeroUsize::new(BATCH).expect("not zero");
+    options.retry_delay = Duration::from_millis(1);
+    options
 }
 
 #[tokio::test]
@@ -372,7 +378,7 @@ async fn errors_that_do_not_pass_are_not_repeated_and_hide_the_key() {
     for wrong in
         ["no address", "127.0.0.1:6334", "http://", "http://host:port", "grpc://host:6334", "http://a b"]
     {
-        let refused = fixture.push(&PushOptions::new(wrong, "yard")).await.expect_err("no URL").to_string();
+        let refused = fixture.push(&options(wrong)).await.expect_err("no URL").to_string();
         assert!(refused.contains(wrong) && refused.contains("http://HOST:6334"), "{refused}");
     }
     assert!(begun.elapsed() < Duration::from_secs(10), "without a second attempt");

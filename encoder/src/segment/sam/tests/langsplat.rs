@@ -6,9 +6,8 @@
 use serde::Deserialize;
 
 use crate::masks::BoxPx;
-use crate::segment::sam::candidate::Candidate;
+use crate::segment::sam::filter::{Candidate, keep_by_score};
 use crate::segment::sam::runs::{Run, RunMask};
-use crate::segment::sam::score_filter::keep;
 use crate::segment::sam::settings::ScoreFilter;
 
 #[derive(Deserialize)]
@@ -91,7 +90,8 @@ fn the_score_filter_keeps_what_langsplats_own_code_keeps() {
         let of = |score: f64| {
             candidates.iter().position(|c| c.score().total_cmp(&score).is_eq()).expect("one of them")
         };
-        let mut kept: Vec<usize> = keep(candidates.clone(), &filter).iter().map(|c| of(c.score())).collect();
+        let mut kept: Vec<usize> =
+            keep_by_score(candidates.clone(), &filter).iter().map(|c| of(c.score())).collect();
         kept.sort_unstable();
         assert_eq!(kept, set.kept, "set {at}");
         (n_masks, n_kept) = (n_masks + candidates.len(), n_kept + kept.len());
