@@ -25,7 +25,7 @@ pub(crate) enum EvalCommand {
     Defaults(run::ScenesArgs),
     /// Compares drawings of planned views with as many photos on labelled scenes, with automatic masks.
     SplatOnly(run::ScenesArgs),
-    /// Judges segmenters without words: by labelled photos and by coverage.
+    /// Judges segmenters without words: by labelled photos, by coverage, and by agreement between views.
     Masks(masks::MasksArgs),
     /// Judges the names of objects and their confidences by labels.
     Names(names::NamesArgs),

@@ -30,8 +30,11 @@ const HELD_OUT: usize = 4;
 /// Foreign photos that are tried in a scene at most, evenly among all.
 const MAX_FOREIGN: usize = 48;
 const FOCAL_FACTOR: f64 = 1.03;
+const DARK_FACTOR: f32 = 0.4;
 /// Steps of a robot's positions where the scene is metric, metres.
 const POSITION_STEP_M: f64 = 0.02;
+/// Width of the square of [`Change::Covered`], as a share of each side: 20 % of the area.
+const COVERED_SIDE: f64 = 0.447;
 /// Of so many things of [`Change::Moved`] one stands elsewhere, so many metres away.
 const MOVED_THINGS: u16 = 3;
 const MOVED_M: f64 = 1.0;
@@ -45,14 +48,23 @@ pub(crate) struct LocateArgs {
     /// Changes each query.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
+    /// Tells each query that was not found where it is.
+    #[arg(long)]
+    list: bool,
 }
 
 /// How queries differ from their photos.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Change {
     None,
+    /// 40 % of the light.
+    Dark,
+    /// Half the resolution, and back.
+    Blurred,
     /// The focal length is stated 3 % too large.
     Focal,
+    /// A grey square hides 20 % of the photo.
+    Covered,
     /// The splat drawn in the photo's place.
     Drawn,
     /// The same, with a third of the labelled things 1 m from where the map has them.
@@ -73,13 +85,13 @@ struct Located {
 
 /// A query's result: errors in metres and degrees, where it was found.
 struct Try {
-    found: Option<[f64; 2]>,
+    found: Result<[f64; 2], String>,
     secs: f64,
 }
 
 impl Try {
     fn is_within(&self, metres: f64, degrees: f64) -> bool {
-        self.found.is_some_and(|[m, deg]| m <= metres && deg <= degrees)
+        self.found.as_ref().is_ok_and(|[m, deg]| *m <= metres && *deg <= degrees)
     }
 }
 
@@ -129,7 +141,15 @@ pub(crate) fn run(args: &LocateArgs, progress: &dyn Progress) -> Result<LocateRe
         };
         let mut tries = Vec::new();
         for view in &scene.queries {
-            tries.push(attempt(at, view)?);
+            let one = attempt(at, view)?;
+            if args.list && !one.is_within(0.25, 5.0) {
+                let told = match &one.found {
+                    Err(reason) => reason.clone(),
+                    Ok([m, deg]) => format!("off by {m:.2} m, {deg:.1} degrees"),
+                };
+                tracing::warn!("{} {}: {told}", scene.name, view.name);
+            }
+            tries.push(one);
         }
         let others = (0..scenes.len()).filter(|other| *other != at);
         let others: Vec<(usize, &View)> =
@@ -225,11 +245,8 @@ fn query(view: &View, change: Change, drawn: Option<&dyn LoadedScene>) -> Result
         None => loaded.image,
     };
     let (width, height) = image.dimensions();
-    let grey = Grey::from_rgb8(width as usize, height as usize, image.as_raw());
-    if change == Change::Focal {
-        intrinsics.focal_x_px *= FOCAL_FACTOR;
-        intrinsics.focal_y_px *= FOCAL_FACTOR;
-    }
+    let mut grey = Grey::from_rgb8(width as usize, height as usize, image.as_raw());
+    changed(change, &mut grey, &mut intrinsics);
     Ok(Query { grey, intrinsics, camera_from_world })
 }
 
@@ -245,11 +262,42 @@ fn attempt(scene: &Located, query: &Query, renderer: &dyn Renderer) -> Try {
             let metres = truth.inverse().translation.distance(pose.inverse().translation);
             let between = glam::DQuat::from_mat3(&(pose.matrix3 * truth.matrix3.transpose()));
             let degrees = between.to_axis_angle().1.to_degrees();
-            Some([metres, degrees.min(360.0 - degrees)])
+            Ok([metres, degrees.min(360.0 - degrees)])
         }
-        Outcome::Unsure(_) | Outcome::Lost(_) => None,
+        Outcome::Unsure(_) => Err("unsure".into()),
+        Outcome::Lost(reason) => Err(reason.to_string()),
     };
     Try { found, secs }
+}
+
+fn changed(change: Change, grey: &mut Grey, intrinsics: &mut Intrinsics) {
+    let (width, height) = (grey.width, grey.height);
+    match change {
+        Change::None | Change::Drawn | Change::Moved => {}
+        Change::Dark => grey.values.iter_mut().for_each(|v| *v = (*v * DARK_FACTOR * 255.0).round() / 255.0),
+        Change::Blurred => {
+            let sharp = grey.values.clone();
+            for y in 0..height {
+                for x in 0..width {
+                    let (x0, y0) = (x / 2 * 2, y / 2 * 2);
+                    let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
+                    let corners = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)];
+                    grey.values[y * width + x] =
+                        0.25 * corners.map(|(x, y)| sharp[y * width + x]).iter().sum::<f32>();
+                }
+            }
+        }
+        Change::Focal => {
+            intrinsics.focal_x_px *= FOCAL_FACTOR;
+            intrinsics.focal_y_px *= FOCAL_FACTOR;
+        }
+        Change::Covered => {
+            let side = |n: usize| (n as f64 * COVERED_SIDE) as usize;
+            for y in height / 4..height / 4 + side(height) {
+                grey.values[y * width + width / 4..][..side(width)].fill(0.5);
+            }
+        }
+    }
 }
 
 impl Figures {
@@ -269,10 +317,10 @@ impl Figures {
             n_foreign: foreign.len(),
             within_25cm_5deg: of_tries(&|one| one.is_within(0.25, 5.0)),
             within_1m_10deg: of_tries(&|one| one.is_within(1.0, 10.0)),
-            lost: of_tries(&|one| one.found.is_none()),
-            wrong: of_tries(&|one| one.found.is_some() && !one.is_within(1.0, 10.0)),
-            foreign_accepted: share(foreign.iter().filter(|one| one.found.is_some()).count(), foreign.len()),
-            median_m: median(tries.iter().filter_map(|one| Some(one.found?[0])).collect()),
+            lost: of_tries(&|one| one.found.is_err()),
+            wrong: of_tries(&|one| one.found.is_ok() && !one.is_within(1.0, 10.0)),
+            foreign_accepted: share(foreign.iter().filter(|one| one.found.is_ok()).count(), foreign.len()),
+            median_m: median(tries.iter().filter_map(|one| Some(one.found.as_ref().ok()?[0])).collect()),
             median_secs: median(tries.iter().map(|one| one.secs).collect()),
             bytes_per_million: (n_gaussians > 0).then(|| len_bytes as f64 * 1e6 / n_gaussians as f64),
             map_secs: scenes.iter().map(|scene| scene.map_secs).sum(),

@@ -1,6 +1,7 @@
 //! `eval masks`: judges segmenters without words. On labelled photos by the best mask of each labelled segment; on
-//! all photos by the share of the scene that masks cover.
+//! all photos by the share of the scene that masks cover, and by agreement between views.
 
+mod agreement;
 mod segments;
 
 use std::fmt;
@@ -15,7 +16,7 @@ use slag_common::{View, poses};
 use slag_encoder::cli::common::session_options;
 use slag_encoder::encode::DEFAULT_MASK_LEVELS;
 use slag_encoder::ingest;
-use slag_encoder::masks::{Mask, NO_REGION, RegionMap, regions};
+use slag_encoder::masks::{Mask, NO_REGION, regions};
 use slag_encoder::progress::{Progress, Silent};
 use slag_encoder::raster::devices::{DeviceChoice, Devices};
 use slag_encoder::raster::gpu::GpuOptions;
@@ -33,6 +34,7 @@ use crate::generate::grammar::SceneKind;
 use crate::programs::flag_value;
 use crate::scenes::SceneFiles;
 use crate::table::{Table, figure, percent};
+use agreement::{Agreement, Seen};
 use segments::{Ious, MIN_PX, Segments};
 
 /// Opacity from which a pixel has splat behind it.
@@ -58,8 +60,8 @@ pub(crate) struct MasksArgs {
     /// model.
     #[arg(long, value_name = "auto|graph|DIR,...", value_delimiter = ',', default_value = "auto")]
     segmenter: Vec<PathBuf>,
-    /// Most photos of a scene, evenly spread [default: all].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    /// Most photos of a scene: pairs of neighbours, evenly spread [default: all].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
     views_limit: Option<u32>,
     /// Device that draws the scene: auto (GPUs, else the CPU), gpu, cpu, or numbers of adapters.
     #[arg(long, value_name = "DEVICE", default_value_t)]
@@ -78,6 +80,7 @@ struct Row {
     /// Pixels with splat behind them, and those of them in a mask.
     n_seen_px: u64,
     n_covered_px: u64,
+    agreement: Agreement,
     /// Absent without labels.
     segments: Option<Segments>,
     /// Seconds of the segmenter a photo.
@@ -104,11 +107,10 @@ pub(crate) fn run(args: &MasksArgs, progress: &dyn Progress) -> Result<MasksRepo
         let gaussians = splat::read(&files.splat, &ReadOptions { with_sh_rest: false })?;
         let scene = devices.load(&gaussians)?;
         let all = poses::read(&files.poses, files.images.as_deref())?.views;
-        let step = all.len().div_ceil(args.views_limit.map_or(usize::MAX, |n| n as usize)).max(1);
-        let views: Vec<&View> = all.iter().step_by(step).collect();
+        let views = pairs(&all, args.views_limit);
         for name in &args.segmenter {
             let segmenter = open(name, &session)?;
-            progress.begin(&format!("{} {}", files.name, name.display()), "photo", views.len() as u64, 0);
+            progress.begin(&format!("{} {}", files.name, name.display()), "photo", views.len() as u64 * 2, 0);
             let judge =
                 Judge { files: &files, scene: scene.as_ref(), segmenter: segmenter.as_ref(), progress };
             let row = judge.row(&views, name).with_context(|| files.dir.display().to_string())?;
@@ -137,6 +139,13 @@ fn open(name: &Path, session: &SessionOptions) -> Result<Box<dyn Segmenter>> {
     })
 }
 
+/// Returns pairs of neighbouring views: all of them, or as many evenly spread ones as have `limit` photos.
+fn pairs(views: &[View], limit: Option<u32>) -> Vec<[&View; 2]> {
+    let all: Vec<[&View; 2]> = views.chunks_exact(2).map(|pair| [&pair[0], &pair[1]]).collect();
+    let n = limit.map_or(all.len(), |limit| (limit as usize / 2).clamp(1, all.len().max(1)));
+    (0..n.min(all.len())).map(|i| all[i * all.len() / n]).collect()
+}
+
 struct Judge<'a> {
     files: &'a SceneFiles,
     scene: &'a dyn LoadedScene,
@@ -145,7 +154,7 @@ struct Judge<'a> {
 }
 
 impl Judge<'_> {
-    fn row(&self, views: &[&View], name: &Path) -> Result<Row> {
+    fn row(&self, pairs: &[[&View; 2]], name: &Path) -> Result<Row> {
         let mut row = Row { scene: self.files.name.clone(), ..Row::default() };
         row.segmenter = name.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let labels = match &self.files.true_masks {
@@ -153,24 +162,31 @@ impl Judge<'_> {
             None => None,
         };
         row.segments = labels.is_some().then(Segments::default);
-        for view in views {
-            let (regions, masks_of_region) = self.photo(view, &mut row).with_context(|| view.name.clone())?;
-            if let (Some((dir, (things, background))), Some(segments)) = (&labels, &mut row.segments) {
-                let known = things.iter().chain(background).map(|thing| thing.id);
-                let ids = true_ids(dir, view, [regions.width_px, regions.height_px])?;
-                let things = things.iter().map(|thing| thing.id).collect();
-                segments.add(&regions, &masks_of_region, &ids, &known.collect(), &things);
+        for pair in pairs {
+            let mut seen = Vec::new();
+            for view in pair {
+                let of_view = || view.name.clone();
+                let photo = self.photo(view, &mut row).with_context(of_view)?;
+                if let (Some((dir, (things, background))), Some(segments)) = (&labels, &mut row.segments) {
+                    let known = things.iter().chain(background).map(|thing| thing.id);
+                    let ids = true_ids(dir, view, [photo.regions.width_px, photo.regions.height_px])?;
+                    let things = things.iter().map(|thing| thing.id).collect();
+                    segments.add(&photo.regions, &photo.masks_of_region, &ids, &known.collect(), &things);
+                }
+                seen.push(photo);
+                self.progress.advance(1);
             }
-            self.progress.advance(1);
+            row.agreement.add(&seen[0], &seen[1]);
         }
         row.secs /= row.n_photos.max(1) as f64;
         Ok(row)
     }
 
-    /// Segments a photo, counts its masks, and returns its regions with the masks of each.
-    fn photo(&self, view: &View, row: &mut Row) -> Result<(RegionMap, Vec<Vec<u32>>)> {
+    /// Segments a photo and counts its masks.
+    fn photo(&self, view: &View, row: &mut Row) -> Result<Seen> {
         let loaded = ingest::load_image(view)?;
-        let drawing = self.scene.draw(&RasterView::of(&loaded.view), [0.0; 3])?;
+        let view = RasterView::of(&loaded.view);
+        let drawing = self.scene.draw(&view, [0.0; 3])?;
         let is_seen: Vec<bool> = drawing.coverage.iter().map(|share| *share > MIN_COVERAGE).collect();
         let depth: Vec<f32> = drawing
             .depth
@@ -194,7 +210,7 @@ impl Judge<'_> {
             row.n_seen_px += 1;
             row.n_covered_px += u64::from(*region != NO_REGION);
         }
-        Ok((regions, masks_of_region))
+        Ok(Seen { view, depth, regions, masks_of_region })
     }
 }
 
@@ -214,9 +230,8 @@ fn true_ids(dir: &Path, view: &View, size_px: [u32; 2]) -> Result<Vec<u16>> {
 
 impl fmt::Display for MasksReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let columns =
-            ["scene", "segmenter", "photos (without a mask)", "masks a photo", "covered", "s a photo"];
-        let mut table = Table::new(columns);
+        let columns = ["scene", "segmenter", "photos (without a mask)", "masks a photo", "covered"];
+        let mut table = Table::new(columns.into_iter().chain(["agreement", "agree at 0.5", "s a photo"]));
         for row in &self.rows {
             table.row([
                 row.scene.clone(),
@@ -224,13 +239,16 @@ impl fmt::Display for MasksReport {
                 format!("{} ({})", row.n_photos, row.n_photos_without),
                 format!("{:.1}", row.n_masks as f64 / row.n_photos.max(1) as f64),
                 percent(row.n_covered_px, row.n_seen_px),
+                figure(row.agreement.ious.mean()),
+                format!("{} of {}", row.agreement.ious.found(), row.agreement.ious.n),
                 format!("{:.2}", row.secs),
             ]);
         }
         writeln!(
             f,
-            "Masks of at least {MIN_PX} pixels. Covered: of the pixels with splat behind them.\n\n{table}"
+            "Masks of at least {MIN_PX} pixels. Covered: of the pixels with splat behind them. Agreement: best IoU of"
         )?;
+        writeln!(f, "a mask drawn into the next photo with a mask there.\n\n{table}")?;
         let columns =
             ["scene", "segmenter", "segments", "mean IoU", "found at 0.5", "small / medium / large"];
         let mut table = Table::new(columns.into_iter().chain(["split / merged / lost", "background found"]));

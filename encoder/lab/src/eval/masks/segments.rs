@@ -53,11 +53,7 @@ impl Segments {
             *n_of_id.entry(*id).or_default() += 1;
             *n_of_both.entry((*id, *region)).or_default() += 1;
         }
-        let n_masks = masks_of_region.iter().flatten().max().map_or(0, |most| *most as usize + 1);
-        let mut area_of_mask = vec![0u64; n_masks];
-        for region in regions.region_of_pixel.iter().filter(|region| **region != NO_REGION) {
-            masks_of_region[*region as usize].iter().for_each(|mask| area_of_mask[*mask as usize] += 1);
-        }
+        let area_of_mask = areas(regions, masks_of_region, |_| true);
         for (id, area) in n_of_id.into_iter().filter(|(_, area)| *area >= u64::from(MIN_PX)) {
             let of_id = || n_of_both.range((id, 0)..(id, NO_REGION));
             let mut n_of_mask: BTreeMap<u32, u64> = BTreeMap::new();
@@ -94,6 +90,20 @@ impl Segments {
 
 /// Masks and labelled segments with fewer pixels do not count, as in `encode`.
 pub(super) const MIN_PX: u32 = 200;
+
+pub(super) fn areas(
+    regions: &RegionMap,
+    masks_of_region: &[Vec<u32>],
+    counts: impl Fn(usize) -> bool,
+) -> Vec<u64> {
+    let n = masks_of_region.iter().flatten().max().map_or(0, |most| *most as usize + 1);
+    let mut areas = vec![0; n];
+    let pixels = regions.region_of_pixel.iter().enumerate();
+    for (_, region) in pixels.filter(|(pixel, region)| **region != NO_REGION && counts(*pixel)) {
+        masks_of_region[*region as usize].iter().for_each(|mask| areas[*mask as usize] += 1);
+    }
+    areas
+}
 
 /// The best masks' intersections over union of some segments.
 #[derive(Clone, Debug, Default, Serialize)]
