@@ -7,7 +7,6 @@ use serde::Serialize;
 use slag_common::manifest::Manifest;
 
 use super::geometry::Solid;
-use super::rank::SURE;
 use crate::query::cluster::Cluster;
 use crate::query::objects::{self, FoundObject, ScoredObjects};
 use crate::query::request::QueryRequest;
@@ -20,6 +19,9 @@ const MAX_CANDIDATES: usize = 256;
 
 /// Metres by which a piece may stick out of the thing that it is a piece of.
 const PIECE_SLACK_M: f64 = 0.1;
+/// Things and pieces with less than this share of the best one's score are too doubtful to be compared with it: a doubtful
+/// large thing must not win over a sure one.
+pub(super) const SURE: f64 = 0.65;
 /// Distance, in metres, up to which things of the same words are pieces of one.
 const TOUCHES_M: f64 = 0.05;
 /// The same for a thing above another, such as the back of a chair above its seat.

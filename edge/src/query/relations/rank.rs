@@ -4,14 +4,10 @@ use glam::DVec3;
 use schemars::JsonSchema;
 use serde::Serialize;
 
-use super::candidates::{Candidate, Things};
+use super::candidates::{Candidate, SURE, Things};
 use super::geometry::{self, HOLDS, Solid, Viewer};
 use super::phrase::{By, Phrase, Pick, Place};
 use crate::query::answers::{Reason, ReasonKind};
-
-/// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not
-/// win over a sure one.
-pub(super) const SURE: f64 = 0.65;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
