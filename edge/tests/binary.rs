@@ -320,6 +320,26 @@ fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
     assert_eq!(run(dir.path(), &["query", "blue"]).0, Some(0));
 }
 
+/// A sector that gives EIO when the service starts: it listens, names the cell, and answers after the next fetch.
+#[slag_test_support::needs_loop_disk]
+#[test]
+fn a_service_starts_with_a_sector_that_cannot_be_read() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let disk = slag_test_support::LoopDisk::new(dir.path());
+    let (listed, shard) = painted(&[[5000; 3]; 4000], 2000);
+    let path = disk.path().join("shards").join(Hash32::of(&shard).to_string());
+    let from = store((listed, shard));
+    let fetch = ["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--json"];
+    assert_eq!(run(disk.path(), &fetch).0, Some(0));
+    disk.break_block(&path, 15);
+    let (serving, url) = serve(disk.path(), &[]);
+    assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
+    assert!(stop(serving).contains("cannot be read"));
+    let (code, out, err) = run(disk.path(), &fetch);
+    assert_eq!((code, &json(&out)["downloaded"]["n_shards"]), (Some(0), &1.into()), "{out}{err}");
+    assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
+}
+
 /// Returns a figure of a program's memory; 0 where Linux does not tell it.
 fn bytes_of(program: &Child, figure: &str) -> u64 {
     let status = fs_err::read_to_string(format!("/proc/{}/status", program.id())).unwrap_or_default();
