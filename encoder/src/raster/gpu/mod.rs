@@ -317,17 +317,6 @@ impl<'s> GpuScene<'s> {
         Ok(counters)
     }
 
-    /// Refuses a view whose pixels are not told apart by the device's numbers.
-    fn check_size(&self, view: &RasterView) -> Result<(), RasterError> {
-        let size_px = view.intrinsics.width_px.max(view.intrinsics.height_px);
-        if self.device.report.precision == Precision::F64 || size_px <= MAX_SIZE_OF_F32_PX {
-            return Ok(());
-        }
-        let what =
-            format!("{size_px} px along a side, a device without f64 tells {MAX_SIZE_OF_F32_PX} apart");
-        Err(self.device.capacity_error(what))
-    }
-
     fn colours(&self, view: &RasterView) -> Result<wgpu::Buffer, RasterError> {
         let position_in_world = view.camera_from_world.inverse().translation;
         let colours: Vec<[f32; 3]> = (0..self.scene.len())
@@ -386,15 +375,12 @@ struct Rows {
     is_whole: bool,
 }
 
-/// Longest side of a view that a device without f64 projects: centres of pixels are multiples of a half.
-const MAX_SIZE_OF_F32_PX: u32 = 1 << 23;
 /// Largest number of regions in a view; the next number stands for "no region".
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
 impl LoadedScene for GpuScene<'_> {
     fn weights(&self, view: &RasterView, regions: &RegionMap) -> Result<ViewWeights, RasterError> {
         check_view(view)?;
-        self.check_size(view)?;
         check_regions(regions, &view.intrinsics)?;
         if regions.n_regions > MAX_REGIONS {
             let what = format!("the view has {} regions, expected at most {MAX_REGIONS}", regions.n_regions);
@@ -422,7 +408,6 @@ impl LoadedScene for GpuScene<'_> {
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
         check_view(view)?;
-        self.check_size(view)?;
         if self.chunks.is_empty() {
             return CpuRasterizer.load(self.scene)?.draw(view, background);
         }
@@ -465,7 +450,7 @@ mod tests {
         let (gaussians, options) =
             (Gaussians::default(), GpuOptions { views_in_flight: 1, ..GpuOptions::default() });
         let scene = GpuScene::new(device, options, &gaussians).expect("loads");
-        let mut view = RasterView {
+        let view = RasterView {
             camera_from_world: glam::DAffine3::IDENTITY,
             intrinsics: crate::raster::pinhole([16, 16], 16.0),
         };
@@ -474,9 +459,6 @@ mod tests {
         assert_eq!(scene.pool().n_made, 0);
         scene.each_band(&view, REGION_BYTES, |_, _, _| Ok(bytemuck::Zeroable::zeroed())).expect("goes on");
         assert_eq!(scene.pool().idle.len(), 1);
-        (view.intrinsics.width_px, view.intrinsics.height_px) = (MAX_SIZE_OF_F32_PX + 1, 1);
-        let refused = scene.draw(&view, [0.0; 3]).expect_err("too wide for f32").to_string();
-        assert!(refused.contains("8388608"), "{refused}");
     }
 
     /// Three views, and memory for one of them: the places of two are given up, the last one is kept, and none is

@@ -534,5 +534,5 @@ fn masks_that_are_no_numbers_fail_the_view() {
         is_rotated: false,
     };
     let error = segmenter.segment(&SegmentInput::new(&loaded, None)).expect_err("no numbers").to_string();
-    assert!(error.contains("\"a.jpg\": the mask model's output is not finite"), "{error}");
+    assert!(error.contains("view a.jpg: the mask model's output is not finite"), "{error}");
 }
