@@ -13,10 +13,10 @@ use crate::score::Budget;
 const MAX_THINGS: usize = 5;
 const MAX_POINTS: usize = 4096;
 
-/// Finds places to stand near a thing. Blocks for tens of milliseconds.
+/// Finds places to stand near a thing. Blocks for tens of milliseconds. No such place is a reply, not an error.
 ///
 /// # Errors
-/// [`GoalError`]. That there is no such place is a reply.
+/// [`GoalError`].
 pub fn find(
     engine: &Engine,
     on_board: &OnBoard,
@@ -55,7 +55,7 @@ pub fn find(
         let points = engine.object_points(snapshot, id, MAX_POINTS, budget);
         budget.check().map_err(GoalError::spent)?;
         let chosen = choose(&mut around, request, &points);
-        // What looks end early for.
+        // Whatever ended early because the budget is spent.
         budget.check().map_err(GoalError::spent)?;
         match chosen {
             Ok(mut goals) => {
