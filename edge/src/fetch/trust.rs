@@ -11,16 +11,12 @@ use crate::store::EdgeCache;
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum FirstRoot {
+    /// Given by hand.
     Bytes(Vec<u8>),
     /// The first root of a store, with its SHA-256 in hex given by hand.
-    Sha256 {
-        from: String,
-        sha256: String,
-    },
+    Sha256 { from: String, sha256: String },
     /// The first root of a store, unverified.
-    Any {
-        from: String,
-    },
+    Any { from: String },
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
