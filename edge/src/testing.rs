@@ -127,8 +127,7 @@ impl TestShard {
         }
     }
 
-    /// Writes the shard and reads it back. Centroids are the members' means, radii the largest distance of an
-    /// unrounded embedding from the stored centroid.
+    /// Writes the shard and reads it back; centroids are means, radii the largest distance of an unrounded embedding.
     pub fn build(&self, exact: bool) -> BuiltShard {
         let members = || self.centroids.iter().flatten();
         let dim = members().next().map_or(2, |m| m.embedding.len());

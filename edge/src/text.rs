@@ -169,7 +169,7 @@ impl Drop for TextService {
     }
 }
 
-/// Encodes texts until all senders are gone. An encoder that panics is reopened; meanwhile `is_alive` is false and
+/// Encodes texts until all senders are gone. A panicked encoder is reopened; until then `is_alive` is false and
 /// callers fail at once.
 fn run(
     mut encoder: Box<dyn TextEncoder>,

@@ -21,8 +21,7 @@ use slag_models::{ModelDir, SessionOptions};
 use crate::fetch::scene::Published;
 use crate::fetch::server::Server;
 
-/// Returns manifest and single shard of a scene with 40 red Gaussians around x = 2 and 60 blue ones around x = 8, in
-/// the space of the built-in colours.
+/// A scene's manifest and single shard: 40 red Gaussians around x = 2, 60 blue ones around x = 8, built-in colours.
 fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
     positions.extend((0..60).map(|i| [8000 + i, 0, 0]));

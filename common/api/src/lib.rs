@@ -1,5 +1,4 @@
-//! Replies of the robot's HTTP interface, version 1: the service writes them, the doors parse them, and its
-//! description is made from them.
+//! Replies of the robot's HTTP interface, version 1, for the service, the doors and the description.
 
 pub mod changes;
 pub mod floor;

@@ -34,8 +34,7 @@ struct TooSlow {
 }
 
 /// A body that fails at its deadline, counted from the end of the head. When dropped, its rest is drained within
-/// [`DRAINED_BYTES`] and [`DRAIN_TIME`]: a connection closed on unread bytes is reset, and the client sees a broken
-/// pipe instead of the answer.
+/// [`DRAINED_BYTES`] and [`DRAIN_TIME`]: closing on unread bytes would reset the connection and lose the answer.
 pub(crate) struct TimedBody {
     /// Absent once it ended or failed.
     body: Option<Incoming>,
@@ -196,8 +195,7 @@ fn too_slow(error: &axum::Error) -> Option<TooSlow> {
     None
 }
 
-/// Refuses a body with a Content-Type outside `media_types`, including forms and plain text, which a page of any
-/// origin can post without a preflight.
+/// Refuses a Content-Type outside `media_types`; any page may post forms and plain text without a preflight.
 pub(crate) fn check_type(headers: &HeaderMap, media_types: &[&str]) -> Result<(), Problem> {
     let found = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let kind = found.and_then(|value| value.split(';').next()).unwrap_or_default().trim();

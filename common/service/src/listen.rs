@@ -13,9 +13,8 @@ use crate::tls::{Tls, TlsError, TlsFiles};
 
 const UNIX: &str = "unix:";
 
-/// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a new connection, so
-/// that accept loop, threads and routes work. With TLS, any answer to a non-handshake suffices. Does not return while
-/// the service is silent.
+/// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a new connection. With
+/// TLS, any answer to a non-handshake suffices. Does not return while the service is silent.
 pub async fn answers(url: &str) -> bool {
     let asked = match (url.strip_prefix(UNIX), url.split_once("://")) {
         (Some(path), _) => match tokio::net::UnixStream::connect(path).await {

@@ -116,8 +116,8 @@ impl Problem {
         self.cause.as_deref()
     }
 
-    /// Returns the problem of an error response without one, from a layer or the router. A service without a list of
-    /// resources at `/` has its own for unknown paths.
+    /// Returns the problem of an error response without one, from a layer or the router. Services without a list of
+    /// resources at `/` have their own for unknown paths.
     pub(crate) fn of_status(status: StatusCode, method: &str, path: &str) -> Self {
         let shown: String = path.chars().take(80).collect();
         match status {

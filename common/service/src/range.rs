@@ -84,8 +84,7 @@ impl Selection {
     }
 }
 
-/// Parses a position: `Some(None)` without digits, `None` for anything else. Numbers beyond `u64` saturate, beyond
-/// any file.
+/// Parses a position: `Some(None)` without digits, `None` for anything else. Saturates beyond `u64`.
 fn position(digits: &str) -> Option<Option<u64>> {
     match digits {
         "" => Some(None),

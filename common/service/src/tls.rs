@@ -1,7 +1,6 @@
 //! TLS: a certificate and its key from PEM files, reread on changes.
 //!
-//! A renewal replaces two files, one after the other. A pair that does not match is ignored with a warning, and the
-//! previous one stays in use.
+//! A renewal replaces two files in turn. A pair that does not match is ignored with a warning; the last one stays.
 
 use std::fmt;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,4 @@
-//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each; all, or every n-th for a first picture and far
-//! cells.
+//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each; all, or every n-th (first picture, far cells).
 
 use glam::{DVec3, Vec3};
 use half::f16;
@@ -79,8 +78,7 @@ impl Step {
     }
 }
 
-/// Returns half the distance of each position to the nearer of its neighbours in order, clamped to a quarter and
-/// twice the median.
+/// Returns half the distance to the nearer neighbour in order, clamped to a quarter and twice the median.
 fn sizes(positions: &[DVec3]) -> Vec<f32> {
     let apart: Vec<f32> = positions.windows(2).map(|pair| pair[0].distance(pair[1]) as f32).collect();
     let mut sorted: Vec<f32> = apart.iter().copied().filter(|d| *d > 0.0).collect();

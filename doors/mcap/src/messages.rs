@@ -1,5 +1,4 @@
-//! The robot's answers as Foxglove's messages in JSON (foxglove.dev/docs/sdk/schemas): positions in metres in the
-//! scene's frame.
+//! The robot's answers as Foxglove's JSON messages (foxglove.dev/docs/sdk/schemas), in metres in the scene's frame.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -76,8 +75,7 @@ pub fn points(stamp: Stamp<'_>, answers: &[PointAnswer]) -> Value {
     })
 }
 
-/// Returns a `foxglove.Grid` of the ground: 0 unknown, 1 unreachable ground, 2 reached, 3 obstacle. `None` if the
-/// robot's runs do not match its size.
+/// Returns a `foxglove.Grid`: 0 unknown, 1 unreachable, 2 reached, 3 obstacle; `None` if runs and size differ.
 pub fn ground(stamp: Stamp<'_>, floor: &Floor) -> Option<Value> {
     let number = |place: Place| match place {
         Place::Unknown => 0,

@@ -20,8 +20,7 @@ const N_PER_PEER: usize = 24;
 /// Serves until `stop` completes.
 ///
 /// A request names one of `hosts`, this machine or the address listened on, which stops DNS rebinding: a page sends
-/// its own name. Requests of web pages (`Origin`) are refused. There are no sessions: nothing is kept between
-/// requests.
+/// its own name. Requests of web pages (`Origin`) are refused. Nothing is kept between requests: no sessions.
 pub async fn serve(
     tools: Tools,
     listener: Listener,

@@ -65,8 +65,7 @@ pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGri
     })
 }
 
-/// Returns the cells with their middle nearer than `radius` cells to a reached one's: a cell at exactly that distance
-/// may be an obstacle.
+/// Returns the cells nearer than `radius` cells to a reached one; at exactly that distance may be an obstacle.
 fn free(places: &[Place], [width, height]: [usize; 2], radius: f64) -> Vec<bool> {
     let reach = radius.clamp(0.0, 1e3).floor() as isize;
     let offsets: Vec<(isize, isize)> = (-reach..=reach)
@@ -119,8 +118,8 @@ mod tests {
         assert_eq!(<[f64; 3]>::from(grid.info.origin.position), [1.0, 2.0, 0.5]);
     }
 
-    /// By hand: a million cells become at most 60,000; an obstacle of one cell stays, and no joined cell is free
-    /// unless all of it is.
+    /// By hand: a million cells become at most 60,000; a one-cell obstacle stays; joined cells are free only if
+    /// whole.
     #[test]
     fn large_maps_are_joined() {
         let grid = map([1000, 1000], "r500500o1r499499", 0.05, 0.0);

@@ -1,5 +1,4 @@
-//! A robot's answers on ROS 2 topics and services without a ROS installation: a DDS node in front of `slag-edge
-//! serve`.
+//! A robot's answers on ROS 2 topics and services without a ROS installation: a DDS node before `slag-edge serve`.
 
 mod answers;
 mod args;

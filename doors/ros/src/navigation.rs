@@ -25,8 +25,7 @@ pub struct Navigator {
 }
 
 impl Navigator {
-    /// Makes the client of `/navigate_to_pose`. `service`, `topic`, `latched`: QoS of the action's services, feedback
-    /// and status.
+    /// Makes the client of `/navigate_to_pose`. `service`, `topic`, `latched`: QoS of services, feedback and status.
     pub fn new(
         node: &mut Node,
         mapping: ServiceMapping,

@@ -154,8 +154,7 @@ impl Args {
 
 impl Shared {
     fn new(node: &mut Node, args: Args, robot: Robot) -> Result<Self> {
-        // Late subscribers get no earlier answer, which they would take for the last; the map is latched as
-        // map_server's is.
+        // Latched with depth 1, as map_server's map: late subscribers would take an earlier answer for the last.
         let latest = reliable(1).durability(Durability::TransientLocal);
         let kept = reliable(KEPT).durability(Durability::TransientLocal);
         let now = reliable(1).durability(Durability::Volatile);
@@ -398,8 +397,7 @@ impl Shared {
         }
     }
 
-    /// Cancels the newest goal because a later wish has no place to stand: the robot must not drive to an outdated
-    /// goal.
+    /// Cancels the newest goal because a later wish has no place to stand; its goal is outdated.
     async fn stop_driving(&self, text: &str, reason: &str) {
         if let Some(navigation) = &self.navigation {
             navigation.stop().await;

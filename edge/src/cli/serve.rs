@@ -177,8 +177,7 @@ fn tls(args: &mut ServeArgs) -> Result<Option<Tls>, Failure> {
     args.listen.tls(files).map_err(|e| Failure::Usage(e.into()))
 }
 
-/// Returns a folder of the cache that every user may write to: files on board are identified only by hash, and only
-/// fetches check signatures.
+/// Returns a cache folder that every user may write to: answers come from files checked only by hash.
 fn open_to_everybody(cache: &EdgeCache) -> Option<PathBuf> {
     let folders = ["", "manifests", "shards", "trust"].map(|name| cache.dir().join(name));
     let is_open = |path: &PathBuf| {

@@ -1,9 +1,7 @@
 //! A small record in two checksummed copies, which survives a power cut or one damaged copy.
 //!
-//! A copy is `slag-record 1 SEQUENCE HASH
-//! ` and the content; HASH is the BLAKE3 hash of `SEQUENCE
-//! ` and the content. One copy is durable before the other is replaced, so one is always whole; at rest both are the
-//! same.
+//! A copy is `slag-record 1 SEQUENCE HASH\n` and the content; HASH is the BLAKE3 hash of `SEQUENCE\n` and the content.
+//! One copy is durable before the other is replaced, so one is always whole; at rest both are the same.
 
 use std::io;
 use std::path::PathBuf;

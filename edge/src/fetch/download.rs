@@ -90,8 +90,7 @@ impl<'a> Client<'a> {
         })
     }
 
-    /// Downloads a root that may be absent: some static hosts answer 403 or 410 for that, and a 404 could hide a
-    /// newer root just as well.
+    /// Downloads a root that may be absent: some static hosts answer 403 or 410, and a 404 could hide a root as well.
     pub fn next_root(&self, path: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, FetchError> {
         match self.file(path, max_bytes) {
             Err(FetchError::Download {

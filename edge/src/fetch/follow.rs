@@ -76,8 +76,7 @@ impl Follower {
         self.settings.radius + self.settings.margin
     }
 
-    /// Decides for a robot at a position in the world frame; `None` if it is geographic and no manifest relates it to
-    /// the scene.
+    /// Decides for a position in the world frame; `None` if it is geographic and no manifest relates it to the scene.
     pub fn decide(&self, now: Duration, at: Option<DVec3>) -> Decision {
         let slack = self.settings.margin / 2.0;
         let rest = match (self.covered, at) {
@@ -202,8 +201,7 @@ impl Following {
         self.inbox.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the last position, the number posted, and whether they are over; a requested refresh makes the
-    /// follower forget.
+    /// Returns the last position, the number posted, and whether they ended; after a refresh the follower forgets.
     fn read(&self, follower: &mut Follower) -> (Option<Position>, u64, bool) {
         let mut inbox = self.lock();
         if std::mem::take(&mut inbox.is_due) {
@@ -242,8 +240,8 @@ pub struct FollowEnvironment<'a> {
     pub cancel: &'a AtomicBool,
 }
 
-/// Follows the posted positions until they end and the last one is served, or until cancelled. `request` gives
-/// everything except position and radius. Blocks.
+/// Follows the posted positions until the last one is served, or until cancelled. `request` gives everything except
+/// position and radius. Blocks.
 ///
 /// # Errors
 /// The error of the last fetch, if it was still due when positions ended; [`FetchError::Cancelled`].
@@ -316,8 +314,7 @@ fn in_world(position: Position, manifest: Option<&Manifest>) -> Option<DVec3> {
     }
 }
 
-/// Reads positions, one a line, until the end. Skips empty lines; overlong ones are not stored. `each` receives the
-/// line number, from 1.
+/// Reads positions, one a line, skipping empty lines, with bounded memory. `each` receives the line number, from 1.
 pub fn read_positions(
     mut reader: impl BufRead,
     mut each: impl FnMut(u64, Result<Position, NotAPosition>),
@@ -395,8 +392,7 @@ mod tests {
     }
 
     proptest! {
-        /// Wherever a robot goes, the last fetch covers the radius whenever none is due, and fetches keep their
-        /// minimum interval.
+        /// Whenever no fetch is due, the last one covers the radius; fetches keep their minimum interval.
         #[test]
         fn the_radius_is_covered_whenever_nothing_is_due(
             steps in prop::collection::vec((prop::array::uniform3(-3.0..3.0f64), 0..5u64, prop::bool::weighted(0.2)), 1..200),

@@ -121,8 +121,7 @@ fn write_record(cache: &EdgeCache, record: Record) -> Result<(), FetchError> {
     put(cache, &record.to_bytes(), &history::path(cache, generation))
 }
 
-/// Removes the records of all earlier generations to free disk space; they may be lost. Returns whether there were
-/// any.
+/// Removes all earlier generations' records, which may be lost, to free space; returns whether there were any.
 pub fn forget_earlier(cache: &EdgeCache) -> bool {
     let known = history::generations(cache);
     for generation in &known {

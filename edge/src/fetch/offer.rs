@@ -27,8 +27,7 @@ impl Offer {
         (Hash32::of(&bytes) == manifest_hash).then_some(Self { bytes, manifest_hash, manifest })
     }
 
-    /// Updates the accepted metadata of the store, durably, and returns the manifest that it names. `on_board`: used
-    /// if it is that manifest.
+    /// Durably updates the store's accepted metadata; returns the manifest it names, `on_board` if that is the same.
     pub fn get(
         client: &Client<'_>,
         cache: &EdgeCache,

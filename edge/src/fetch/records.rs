@@ -1,5 +1,4 @@
-//! The metadata and scene that a robot accepted: two checksummed copies on the cache's own storage ([`Copies`]); the
-//! cache's lock ensures one fetch at a time.
+//! The metadata and scene that a robot accepted, in two checksummed copies ([`Copies`]), under the cache's lock.
 
 use std::fs::{File, TryLockError};
 use std::io;

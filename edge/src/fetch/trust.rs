@@ -27,8 +27,7 @@ pub struct AddedRoot {
     pub is_new: bool,
 }
 
-/// Trusts a root by hand. The root already started from changes nothing, so that revoked keys stay revoked.
-/// `replace`: replaces another root.
+/// Trusts a root by hand, `replace`: in place of another. The first root again changes nothing: revoked keys stay so.
 pub fn add_root(
     cache: &EdgeCache,
     root: &FirstRoot,

@@ -75,10 +75,9 @@ impl Ground {
         below.checked_ilog2().map(|z| z as u8)
     }
 
-    /// Continues a surface from a cell: what a robot that climbs `step` voxels reaches over neighbours is
-    /// ground at that height, even above a lower surface (furniture of the storey below). A column with such
-    /// a lower surface and one at the robot's height is an obstacle, not a drop. Returns which cells are
-    /// ground.
+    /// Continues a surface from a cell: what a robot that climbs `step` voxels reaches over neighbours is ground,
+    /// even above a lower surface (furniture of the storey below). A column with such a lower surface and one at the
+    /// robot's height is an obstacle, not a drop. Returns which cells are ground.
     pub(crate) fn continue_from(&mut self, cell: usize, z: u8, step: u8, headroom: u32) -> Vec<bool> {
         let (n_y, n) = (self.n_y, self.floors.len());
         let mut is_met = vec![false; n];
@@ -265,8 +264,7 @@ mod tests {
         assert_eq!(floor(1 | 1 << 127, 0, 128, 1), Floor::Blocked);
     }
 
-    /// By hand: a row of cells with a floor at 5; the third has a surface at 1 below it (a table of the
-    /// storey below).
+    /// By hand: a row of cells with a floor at 5; the third has a surface at 1 below it (a table downstairs).
     #[test]
     fn ground_continues_at_the_robots_height() {
         let mut ground = Ground {

@@ -30,8 +30,7 @@ pub struct Thing<'a> {
     n: [usize; 2],
     /// By local cell: free voxels.
     free: Vec<Bits>,
-    /// Voxels that its surface may occupy: those with a point of it and their neighbours, as voxels are
-    /// occupied up to 0.94 edges from a surface.
+    /// Voxels with a point of it and their neighbours: voxels are occupied up to 0.94 edges from a surface.
     own: Vec<Bits>,
     /// Own voxels outside the local table.
     own_elsewhere: HashSet<[i32; 3]>,

@@ -129,8 +129,7 @@ impl Space {
         &self.blocks[self.starts[column] as usize..self.starts[column + 1] as usize]
     }
 
-    /// Returns the free voxels (seen through, without a surface) of a block, counted from the window's
-    /// corner; none beyond the window.
+    /// Returns a block's free voxels (seen through, no surface), by the window's corner; none beyond the window.
     pub fn free(&self, [x, y, z]: [i32; 3]) -> u64 {
         let [n_x, n_y] = self.window.n;
         let is_inside = x >= 0 && y >= 0 && (x as usize) < n_x && (y as usize) < n_y;

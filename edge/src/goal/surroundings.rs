@@ -62,9 +62,8 @@ pub(super) struct Surroundings<'a> {
     budget: &'a Budget,
 }
 
-/// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`]
-/// away. A position given by the request excludes surfaces above it (table tops) and the floor of the storey
-/// below.
+/// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`] away. A
+/// position in the request excludes surfaces above it (table tops) and the floor of the storey below.
 fn own_surface(window: &Window, ground: &Ground, request: &GoalRequest, near: DVec3) -> Option<(usize, u8)> {
     let height = |offset: f64| window.voxel_of(near + DVec3::Z * offset)[2];
     let highest = height(request.robot.step_m(window.voxel) + SURFACE_DEPTH * window.voxel) - 1;

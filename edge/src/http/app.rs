@@ -199,8 +199,7 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// Returns limits for a machine with a few cores, with a budget for each query. All queries together may use four
-    /// times the memory.
+    /// Returns limits for a machine with a few cores. All queries together may use four times the memory of one.
     pub(crate) fn with_budget(query_bytes: u64, query_timeout: Duration) -> Self {
         let connections = ConnectionLimits {
             n_connections: 512,

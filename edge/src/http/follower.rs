@@ -50,8 +50,7 @@ fn text_of(panic: &(dyn Any + Send)) -> &str {
 /// Pause while no scene is loaded.
 const IDLE: Duration = Duration::from_secs(1);
 
-/// Reads every shard on board once per `round`, evenly, until `cancel` is set. A damaged one is marked and fetched
-/// again; the generation is reopened without it.
+/// Reads every shard on board once per `round`, evenly, until `cancel` is set; damaged ones are fetched again.
 pub fn keep_scrubbing(app: &App, round: Duration, cancel: &AtomicBool) {
     let mut scrubber = Scrubber::default();
     while !cancel.load(Ordering::Relaxed) {

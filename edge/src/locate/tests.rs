@@ -123,7 +123,7 @@ fn written(photo: &DynamicImage, format: image::ImageFormat) -> Vec<u8> {
 }
 
 /// By hand: of 12 megapixels the grey takes 48 MB, halved once 12 MB; halved twice, doubled, and in ten pictures 120
-/// MB. Decoding takes 144 MB before that.
+/// MB; before that, decoding takes 144 MB.
 #[test]
 fn the_memory_of_a_photo_is_known_before_it_is_read() {
     let bytes = png(4000, 3000);

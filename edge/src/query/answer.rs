@@ -334,8 +334,7 @@ fn bad_cells(scene: &Scene<'_>, region: &Region) -> Vec<BadCellAnswer> {
     scene.bad_cells.iter().filter(touches).map(described).collect()
 }
 
-/// Returns whether the whole region was fetched: certainly if all of the ball or all of the box was, since only their
-/// intersection is asked for.
+/// Returns whether the whole region was fetched: surely if all of ball or box was, as their intersection counts.
 fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Option<bool> {
     let region = &request.region;
     let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);

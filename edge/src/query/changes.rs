@@ -61,9 +61,8 @@ impl ChangesError {
 }
 
 impl Engine {
-    /// Compares two generations that the robot has had; an area known to only one of them yields no changes. Blocks
-    /// for milliseconds; for a second if thousands of things changed. No remembered generation is a reply, not an
-    /// error.
+    /// Compares two generations that the robot has had, where both know an area. Blocks for milliseconds; for a
+    /// second if thousands of things changed. No remembered generation is a reply, not an error.
     ///
     /// # Errors
     /// [`ChangesError`].

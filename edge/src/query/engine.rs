@@ -22,8 +22,7 @@ use crate::text::{EncoderInfo, TextError, TextOpenError, TextService};
 
 /// Buffers of answers that used more are dropped.
 const KEPT_BYTES: u64 = 32 << 20;
-/// Interval at which a failed load is retried although `current` is unchanged: the disk may have been full, or too
-/// many files open.
+/// Retry interval of a failed load while `current` is unchanged: disk full, too many open files.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
 #[derive(Debug, thiserror::Error)]
@@ -74,8 +73,7 @@ struct Loaded {
     failed_at: Option<Instant>,
 }
 
-/// A generation and its text model: a reload replaces both at once, as vectors of one model must not meet the scene
-/// of another.
+/// A generation and its text model, replaced together: vectors of one model must not meet another's scene.
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
     pub(super) text: Arc<TextService>,
@@ -181,8 +179,7 @@ impl Engine {
         Arc::clone(&self.loaded.read().unwrap_or_else(PoisonError::into_inner).text)
     }
 
-    /// Returns whether the cache's `current` differs from the loaded one (one `stat` call), or loading it failed a
-    /// while ago.
+    /// Returns whether the cache's `current` differs from the loaded one (one `stat`), or a load is to be retried.
     pub(crate) fn is_stale(&self) -> bool {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let retry = loaded.failed_at.is_some_and(|at| at.elapsed() >= RETRY_AFTER);

@@ -1,5 +1,4 @@
-//! Names of the things on board. Words are encoded once per text model, beside questions, and scored once per
-//! generation; requests then only read.
+//! Names of the things on board. Words are encoded once per text model and scored once per generation.
 
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};

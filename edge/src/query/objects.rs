@@ -1,7 +1,6 @@
 //! Answers made of objects, which are scored as a whole.
 //!
-//! An object in several cells is stored in all of their shards and scored once; its Gaussians are those on board in
-//! the region.
+//! An object in several cells is stored in all their shards and scored once, with its Gaussians in the region.
 
 use glam::DVec3;
 use slag_api::objects::{Alignment, Evidence, OrientedBox};

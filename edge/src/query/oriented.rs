@@ -55,8 +55,7 @@ fn axes_of(points: &[DVec3], alignment: Alignment) -> DMat3 {
     }
 }
 
-/// Makes the box unique: axes by length, longest first (an upright box keeps z), each flipped so that its largest
-/// component is positive, and right-handed.
+/// Makes the box unique: longest axis first (an upright box keeps z), largest components positive, right-handed.
 fn longest_first(axes: DMat3, min: DVec3, max: DVec3, alignment: Alignment) -> (DMat3, DVec3, DVec3) {
     let size = max - min;
     let mut order = [0, 1, 2];

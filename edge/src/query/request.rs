@@ -212,8 +212,7 @@ pub struct QueryRequest {
     pub negatives: Negatives,
     /// Most answers to each question; [`DEFAULT_LIMIT`] if absent.
     pub limit: Option<usize>,
-    /// Whether answers come in pages: `offset` is allowed, and one extra answer is ranked to tell whether there is a
-    /// next page.
+    /// Whether answers are paged: `offset` is allowed, and an extra answer is ranked to detect a next page.
     pub paged: bool,
     /// Answers to each question before the page.
     pub offset: usize,

@@ -25,8 +25,7 @@ impl Scale {
         Self(if question.negatives.is_empty() { ScoreKind::Cosine } else { ScoreKind::Relevancy })
     }
 
-    /// Returns the threshold and its source. `calibration`: mean and spread of a bank of texts' scores over whatever
-    /// is scored.
+    /// Returns the threshold and its source. `calibration`: mean and spread of a bank of texts' scores.
     pub fn threshold(
         self,
         request: &QueryRequest,
@@ -100,8 +99,7 @@ pub enum ThresholdSource {
     Relevancy,
 }
 
-/// Returns the default cosine threshold: three spreads above the scene's mean, or the encoder's own default without a
-/// usable calibration.
+/// Returns the default cosine threshold: three spreads above the scene's mean; if uncalibrated, the encoder's.
 pub fn calibrated_threshold(encoder_default: f32, scene: Option<Calibration>) -> (f32, ThresholdSource) {
     let of_scene = |c: Calibration| c.score_mean + SPREADS_ABOVE_MEAN * c.score_spread;
     let usable = scene.filter(|c| c.score_spread >= MIN_SPREAD && (-1.0..=1.0).contains(&of_scene(*c)));

@@ -11,8 +11,7 @@ use slag_math::stats::median;
 use crate::store::BadCell;
 use crate::store::objects::ObjectIndex;
 
-/// Edge of the voxels in a metric scene, metres. Parts of one piece of furniture are closer than two edges; two
-/// pieces mostly are not.
+/// Voxel edge in a metric scene, metres: parts of a piece of furniture are within two edges, two pieces mostly not.
 const METRIC_VOXEL_M: f64 = 0.25;
 /// Voxels per middle edge of the median cell, in a non-metric scene.
 const VOXELS_PER_CELL: f64 = 64.0;

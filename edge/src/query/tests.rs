@@ -312,8 +312,7 @@ fn negatives_make_relevancies() {
     assert!((f64::from(none.best_score.expect("the best")) - expected(0.95)).abs() <= bound);
 }
 
-/// Relevancies are steepest half way between question and negative: there the members of a centroid differ from it by
-/// nearly the whole bound.
+/// Relevancies are steepest half way between question and negative: there errors nearly reach the bound.
 #[test]
 fn relevancies_keep_within_their_bound_and_use_it() {
     let angles = |turn: f64| [-turn, turn].map(|turn| turn + std::f64::consts::FRAC_PI_4);

@@ -68,8 +68,7 @@ impl Engine {
         })
     }
 
-    /// Returns the message of a cell's Gaussians (all, or one in `step`); none if the cell is not on board or is not
-    /// of `generation`, if given.
+    /// Returns the message of a cell's Gaussians (one in `step`), if on board and of `generation` or that is absent.
     pub(crate) fn view_cell(
         &self,
         cell_id: u32,

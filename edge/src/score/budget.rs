@@ -125,8 +125,7 @@ impl Drop for Account {
     }
 }
 
-/// Largest coordinate of a scene, world units. Larger ones (a hundred times the earth's diameter) are refused,
-/// because computations with them would overflow.
+/// Largest coordinate, world units: a hundred times the earth's diameter; computations with more would overflow.
 pub const MAX_COORDINATE: f64 = 1e9;
 
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -70,8 +70,7 @@ struct Refine {
 }
 
 impl AskedQuestion<'_> {
-    /// Gathers the Gaussians that reach a threshold. `each`: scores members individually, if the shard can, even
-    /// where the centroid alone decides.
+    /// Gathers the Gaussians that reach a threshold. `each`: scores members individually wherever the shard can.
     pub(super) fn collect(&self, gather: &mut Gather, cut: Cut, each: bool) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
@@ -290,8 +289,7 @@ impl Cell<'_> {
                 found.effort.n_embeddings_read += 1;
                 *score = self.exact_score(measured.exact.embeddings, *at as usize);
             }
-            // A member accepted by its code stays unless below the minimum, so that the number found equals the
-            // number asked for.
+            // Accepted members stay unless below the minimum, so that the number found equals the number asked for.
             let is_out = *of_code < cut.score && *score < cut.score - measured.fine_margin;
             if is_out || *score < cut.least {
                 *score = f32::NEG_INFINITY;

@@ -28,8 +28,7 @@ pub fn dot(embedding: &[f16], vector: &[f32]) -> f32 {
     let mut products = [0.0f32; BLOCK];
     for (embedding, vector) in embedding.chunks(BLOCK).zip(vector.chunks(BLOCK)) {
         let n = embedding.len().min(vector.len());
-        // One plain loop each for the products and every halving: the compiler vectorises those, but not a single
-        // loop over eight running sums.
+        // One plain loop each: the compiler vectorises those, but not a single loop over eight running sums.
         for ((product, a), b) in products.iter_mut().zip(embedding).zip(vector) {
             *product = widen(*a) * b;
         }

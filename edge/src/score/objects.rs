@@ -29,8 +29,7 @@ pub struct ObjectScores {
     pub error_bound: f32,
 }
 
-/// Scores all objects: [`object_score`] of the question's vector, minus the largest score of its negatives. `objects`
-/// and `index` belong to the shards.
+/// Scores the shards' objects: [`object_score`] of the question's vector, minus the largest of its negatives'.
 ///
 /// Shared negatives are multiplied once. Scores are the same for any number of threads and on every processor.
 pub fn score_objects(

@@ -30,8 +30,7 @@ pub struct Rounded {
 }
 
 impl Rounded {
-    /// Rounds finite values with the smallest step that keeps every product with 8-bit centroids within 32
-    /// bits.
+    /// Rounds finite values with the smallest step that keeps all products with 8-bit centroids within 32 bits.
     pub fn set(&mut self, values: &[f64]) {
         let largest = values.iter().fold(0.0f64, |most, v| most.max(v.abs()));
         let sum: f64 = values.iter().map(|v| v.abs()).sum();

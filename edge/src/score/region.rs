@@ -20,8 +20,7 @@ impl Ball {
     }
 }
 
-/// A ball, a box and a polygon, each optional. A Gaussian lies inside if its mean lies in all of them; the borders of
-/// ball and box are included.
+/// A ball, box and polygon, each optional; a mean must lie in all. The borders of ball and box are included.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Region {
     pub ball: Option<Ball>,
@@ -84,8 +83,7 @@ pub struct Polygon {
 }
 
 impl Polygon {
-    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for another number, corners out of bounds, or
-    /// all on one line.
+    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for others, out of bounds, or all on one line.
     pub fn new(corners: Vec<DVec2>) -> Option<Self> {
         let is_within = |corner: &DVec2| corner.is_finite() && corner.abs().max_element() <= MAX_COORDINATE;
         if !(3..=MAX_CORNERS).contains(&corners.len()) || !corners.iter().all(is_within) {
@@ -113,8 +111,8 @@ impl Polygon {
         (0..n).map(move |at| (self.corners[at], self.corners[(at + 1) % n]))
     }
 
-    /// Returns whether a point lies inside: a ray along x crosses an odd number of edges. Points on the border may
-    /// lie on either side.
+    /// Returns whether a point lies inside: a ray along x crosses an odd number of edges. Borders may count either
+    /// way.
     pub fn contains(&self, point: DVec2) -> bool {
         let crosses = |(a, b): (DVec2, DVec2)| {
             (a.y > point.y) != (b.y > point.y) && point.x < (b.x - a.x) * (point.y - a.y) / (b.y - a.y) + a.x

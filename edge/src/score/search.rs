@@ -167,8 +167,7 @@ impl<'a> Search<'a> {
         searched.map(|(shard, _)| shard)
     }
 
-    /// Bounds the error of every score: the difference between the score of a centroid or Gaussian and that of any
-    /// embedding it represents.
+    /// Bounds every score's difference from the score of any embedding that the centroid or Gaussian represents.
     pub fn score_error_bound(&self) -> f32 {
         let cells = (0..self.asked.shards.len()).into_par_iter().filter_map(|at| self.asked.cell(at));
         let of_cell = |cell: Cell<'_>| {

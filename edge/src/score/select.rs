@@ -44,8 +44,7 @@ impl AskedQuestion<'_> {
         let AnswerBuffers { gather, order } = buffers;
         let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
         let cut = if has_detail {
-            // Ranks half as many again by centroid scores: members ranking last by their own scores are then not
-            // among the best.
+            // Half as many again: members ranking last by their own scores are then not among the best.
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
             let floor = self.centroid_score_at(order, enough, f32::NEG_INFINITY);
             self.count(gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
@@ -126,8 +125,8 @@ impl AskedQuestion<'_> {
 impl Order {
     /// Returns the score of the Gaussian at a rank, counted from 1 for the best; `None` if there are fewer.
     ///
-    /// `scores` gives the scores at each of `n_places`; `count` the number of Gaussians with each. Only the bin of
-    /// the rank, found by a histogram, is sorted.
+    /// `scores`: by place, of `n_places`; `count`: the number of Gaussians with each. Sorts only the rank's bin,
+    /// found by a histogram.
     fn score_at<I: Iterator<Item = (f32, usize)>>(
         &mut self,
         rank: usize,

@@ -206,8 +206,7 @@ mod tests {
     use slag_math::random::Random;
     use slag_math::simd::InstructionSet;
 
-    /// Oracle: plain 64-bit sums. Covers lengths around every width, extreme values, and the last rows, which cannot
-    /// be read past their end.
+    /// Oracle: plain 64-bit sums. Lengths around every width, extreme values, rows that end the matrix.
     #[test]
     fn products_are_the_sums_with_every_instruction_set() {
         let mut random = Random::new(11);

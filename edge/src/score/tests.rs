@@ -116,8 +116,7 @@ pub(super) fn views(built: &[BuiltShard]) -> Vec<ShardView<'_>> {
 }
 
 proptest! {
-    /// Oracle: every Gaussian scored in f64. Arithmetic is exact, so sets and orders must be equal, in a batch and
-    /// alone.
+    /// Oracle: every Gaussian scored in f64. Arithmetic is exact, so sets and orders are equal, in a batch and alone.
     #[test]
     fn equals_brute_force(
         shards in exact_shards(), is_exact in any::<bool>(), centroids_only in any::<bool>(),
@@ -176,8 +175,7 @@ fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: u
     (0..n_shards).map(&mut shard).collect()
 }
 
-/// The bound holds for every Gaussian's unrounded embedding. Compact membership is wrong only within the bound, exact
-/// membership only in the last bits.
+/// The bound holds for every unrounded embedding. Compact membership errs within the bound, exact in the last bits.
 #[test]
 fn answers_keep_within_the_stated_bound() {
     let mut random = Random::new(1);

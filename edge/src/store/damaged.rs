@@ -1,6 +1,5 @@
-//! Shards on board found damaged. Readers hold no lock, so they only leave a mark: an empty file `damaged/HASH`. A
-//! marked shard is no longer opened, and the next fetch downloads it again, unread: an unreadable sector would end
-//! the program that maps it.
+//! Shards on board found damaged. Readers hold no lock, so they only leave a mark, `damaged/HASH` (empty). Marked
+//! shards are not opened, and the next fetch replaces them unread: mapping an unreadable sector ends the program.
 
 use std::collections::BTreeSet;
 

@@ -47,8 +47,7 @@ fn open(path: &Path) -> io::Result<File> {
     Err(bad_medium(path, io::Error::new(io::ErrorKind::InvalidData, what)))
 }
 
-/// Removes a folder, pipe or device in a file's place: a rename does not replace a folder, and a pipe blocks its
-/// writer. Links stay.
+/// Removes a folder, which a rename does not replace, or a pipe, which blocks its writer. Links stay.
 fn make_way(path: &Path) -> io::Result<()> {
     match fs::symlink_metadata(path) {
         Ok(about) if about.is_dir() => fs::remove_dir_all(path).map_err(at(path)),
@@ -75,7 +74,6 @@ pub struct Stat {
 /// Errors are those of the file system, with the path. All paths are the cache's own: a folder, pipe or device in a
 /// file's place is never read, and removed where a file is written, renamed or removed. Nothing is durable before
 /// [`Files::sync`] of the file and [`Files::sync_dir`] of its folder.
-/// and [`Files::sync_dir`] of its folder.
 pub trait Files: Send + Sync {
     /// Creates a folder and its parents, durably.
     fn create_dir(&self, dir: &Path) -> io::Result<()>;

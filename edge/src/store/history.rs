@@ -1,5 +1,4 @@
-//! Records of the objects of earlier generations, `history/GENERATION`, to compare generations after their shards are
-//! gone.
+//! Objects of earlier generations, `history/GENERATION`, to compare generations after their shards are gone.
 //!
 //! A record is a container (`slag_common::container`) of JSON, vectors (`[n][dim]` i8) and their steps (`[n]` f32).
 //! Without it, or if it is damaged, its generation is merely not compared.
@@ -59,8 +58,7 @@ struct Missing {
 }
 
 impl Record {
-    /// Collects the objects of shards of one generation, those nearest to `centre` if too many. `None`: none, or too
-    /// much to record.
+    /// Collects one generation's objects, those nearest to `centre` if too many; `None`: none, or too much to record.
     pub fn collect<'a>(
         manifest: &Manifest,
         centre: DVec3,

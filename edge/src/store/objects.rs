@@ -66,8 +66,8 @@ impl ObjectIndex {
         &self.parts[self.starts[object] as usize..self.starts[object + 1] as usize]
     }
 
-    /// Returns the objects with their first part in a shard: their number there, ascending, and the object. Every
-    /// object is in exactly one shard's list.
+    /// Returns the objects with their first part in this shard (each is in exactly one shard's list): their number
+    /// there, ascending, and the object.
     pub(crate) fn first_in(&self, shard: usize) -> &[(u32, u32)] {
         &self.shards[shard].first
     }

@@ -46,8 +46,7 @@ impl Snapshot {
         Self::open_after(cache, None)
     }
 
-    /// As [`Snapshot::open`], but takes over the open shards of a snapshot of the same cache without mapping or
-    /// checking them again.
+    /// As [`Snapshot::open`], but shards that a snapshot of the same cache has open are not mapped or checked again.
     pub fn open_after(cache: &EdgeCache, before: Option<&Self>) -> Result<Self, StoreError> {
         let mut seen = None;
         for _ in 0..MAX_RACES {

@@ -160,8 +160,7 @@ fn following_survives_the_loss_of_the_network() {
     assert_eq!(scene.hash(6, Profile::Compact), robot.snapshot().current.cells[0].hash);
 }
 
-/// A follower without trust retries when the robot moves, and when a root is added; the pause after failures would be
-/// an hour.
+/// Without trust it retries when the robot moves or a root is added; the pause after failures would be an hour.
 #[test]
 fn a_follower_waits_for_trust_and_not_for_time() {
     let scene = Published::new(1, &[0; 3], 20);

@@ -27,8 +27,7 @@ fn before() -> Published {
     published(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1), thing(3, 25.0, 2), thing(9, 55.0, 0)])
 }
 
-/// By hand: 1 stays, 2 goes, 3 moves to x = 5, 5 appears. 9, beyond the robot's cells, goes as well, and 10 appears
-/// there.
+/// By hand: 1 stays, 2 goes, 3 moves to x = 5, 5 appears. Beyond the robot's cells, 9 goes and 10 appears.
 fn after() -> Published {
     published(2, &[thing(1, 2.0, 0), thing(4, 5.0, 2), thing(5, 18.0, 3), thing(10, 45.0, 3)])
 }

@@ -62,8 +62,7 @@ fn a_rotten_shard_costs_its_cell_only() {
     }
 }
 
-/// Each file of the generation on board, and substitutes for it. A reader comes first: it never blocks, and marks its
-/// finds.
+/// Each file on board, and substitutes for it. A reader comes first: it never blocks, and marks its finds.
 #[test]
 fn whatever_is_lost_is_put_back() {
     let scene = Published::new(1, &[0; 3], 40);

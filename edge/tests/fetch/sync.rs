@@ -104,8 +104,7 @@ fn an_interrupted_download_goes_on_where_it_ended() {
     assert!(robot.staged().is_empty());
 }
 
-/// One transient fault of each kind on every object, in one fetch: it succeeds, and each retry resumes the last
-/// attempt.
+/// One transient fault of each kind on every object, in one fetch: it succeeds, each retry resuming the last.
 #[test]
 fn passing_faults_are_overcome() {
     let faults = [

@@ -14,8 +14,8 @@ pub struct Meta {
     pub n_queries: usize,
 }
 
-/// A dump on disk: little-endian `vectors.f32` `[n][dim]`, `queries.f32` `[n_queries][dim]` and `meta.json`; unit
-/// vectors.
+/// A dump on disk, unit vectors: little-endian `vectors.f32` `[n][dim]`, `queries.f32` `[n_queries][dim]`,
+/// `meta.json`.
 pub struct Dump {
     pub meta: Meta,
     vectors: Mmap,

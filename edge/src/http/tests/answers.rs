@@ -147,8 +147,7 @@ async fn formats_are_negotiated() {
     assert!(reader.next().is_none());
 }
 
-/// A client that does not read holds no permit, so others are answered; its answer is visibly cut off and releases
-/// its memory.
+/// A client that does not read holds no permit; its answer is visibly cut off and releases its memory.
 #[tokio::test]
 async fn answers_that_nobody_reads_stop_nobody() {
     let settings = Settings { max_queries: 1, stream_timeout: Duration::from_secs(1), ..Settings::default() };

@@ -101,8 +101,7 @@ async fn questions_in_json_are_reads() {
     }
 }
 
-/// Every described route, with either method, either answers within a size and time bounded by the cells on board, or
-/// charges its allocations and checks the clock.
+/// Every described route is bounded in size and time by the cells on board, or charges its budget.
 #[tokio::test]
 async fn every_route_keeps_within_its_budget() {
     let room = super::v1::room_with(Some(&super::goal::places()));

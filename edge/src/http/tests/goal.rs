@@ -6,8 +6,7 @@ use super::openapi::{check, description};
 use super::v1::room_with;
 use super::*;
 
-/// Occupancy of the room with two mugs and a table: a floor from -1 to 5 m along x and to 4 m along y, and their
-/// boxes.
+/// Occupancy of the room: a floor from -1 to 5 m along x and to 4 m along y, and the boxes of two mugs and a table.
 pub(super) fn places() -> BuiltOccupancy {
     let voxel = 0.1;
     let inside = |p: glam::DVec3, low: [f64; 3], high: [f64; 3]| {
@@ -47,8 +46,7 @@ fn is_as_described(path: &str, body: &Value) {
 async fn poses_or_reasons_are_given() {
     let shards = room_with(Some(&places()));
     let service = Service::new(Some(&shards), Settings::default());
-    // The mug on the floor is seen; the one on the table is too high for the sensor, and is named as missed or comes
-    // second.
+    // The mug on the floor is seen; the one on the table is too high, and is named as missed or comes second.
     let (status, _, body) = service.get("/v1/goal?id=o0000000000000002&near=2,3,0&step_m=0.15").await;
     assert_eq!(status, StatusCode::OK, "{body:#}");
     is_as_described("/v1/goal", &body);

@@ -19,8 +19,7 @@ const MAX_CANDIDATES: usize = 256;
 
 /// Metres by which a piece may stick out of its thing.
 const PIECE_SLACK_M: f64 = 0.1;
-/// Things and pieces below this share of the best one's score are not compared with it: a doubtful large thing must
-/// not win over a sure one.
+/// Candidates below this share of the best score are not compared: a doubtful large thing must not beat a sure one.
 pub(super) const SURE: f64 = 0.65;
 /// Distance, metres, up to which things of the same words are pieces of one.
 const TOUCHES_M: f64 = 0.05;
@@ -29,8 +28,7 @@ const ABOVE_M: f64 = 0.25;
 /// Default voxels in a metre of a metric scene; in others this many stand for a metre.
 const VOXELS_PER_METRE: f64 = 4.0;
 
-/// A candidate for a thing. Pieces of a better candidate of the same words are excluded, so that they are neither
-/// counted nor compared.
+/// A candidate for a thing. Pieces of better candidates of the same words are excluded: neither counted nor compared.
 pub struct Candidate<'a> {
     pub of: CandidateOf<'a>,
     pub id: String,

@@ -86,8 +86,7 @@ pub fn understand(text: &str) -> Option<Phrase> {
     (!phrase.is_asker() && (phrase.pick.is_some() || phrase.relation.is_some())).then_some(phrase)
 }
 
-/// Returns the thing that a text asks for, such as "sofa" for "Where is the sofa?"; `None` without words before a
-/// thing.
+/// Returns the thing asked for ("sofa" for "Where is the sofa?"); `None` without words before a thing.
 pub fn asked_thing(text: &str) -> Option<String> {
     let lower = text.to_lowercase();
     let words = words(&lower);

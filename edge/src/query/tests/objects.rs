@@ -169,9 +169,8 @@ fn objects_abstain_and_keep_to_the_region() {
     assert_eq!(ask(&yard(), |_, _| ()).kind, AnswerKind::Clusters);
 }
 
-/// Reasons ignore everything outside the region, and suggest no fetch of an area on board. By hand: object 22 alone
-/// lies beyond x = 22.195, with a score of 0; from 20.5 to 20.9 lie Gaussians of no object, from 20.195 to 20.9 20 of
-/// object 21.
+/// Reasons are of the region, and suggest no fetch of an area on board. By hand: object 22 alone lies beyond x =
+/// 22.195, with a score of 0; from 20.5 to 20.9 lie Gaussians of no object, from 20.195 to 20.9 20 of object 21.
 #[test]
 fn reasons_are_of_the_region() {
     let scene = scene_of_objects();

@@ -1,5 +1,4 @@
-//! Relations as plain geometry of upright boxes. Each has a degree from 0 to 1 and holds from [`HOLDS`] on.
-//! Definitions for users: `docs/api.md`.
+//! Relations as plain geometry of upright boxes: degrees from 0 to 1, holding from [`HOLDS`] on (`docs/api.md`).
 
 mod solid;
 
