@@ -101,7 +101,7 @@ impl<'a> Frustum<'a> {
         Self { view, tangents }
     }
 
-    /// Returns whether a Gaussian before the camera is beside the picture by at most its reach.
+    /// Returns whether a Gaussian is before the camera and may reach into the picture.
     fn may_see(&self, mean_in_world: DVec3, max_size: f32) -> bool {
         let DVec3 { x, y, z } = self.view.camera_from_world.transform_point3(mean_in_world);
         let reach = REACH_SIGMAS * f64::from(max_size);

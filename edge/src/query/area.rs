@@ -62,7 +62,7 @@ fn corners<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<Corner>, D::Error> 
 }
 
 impl Area {
-    /// Returns the region in the world frame. Errors name the wrong member.
+    /// Returns the region in the world frame. Errors name the invalid member.
     pub(crate) fn in_world(&self, manifest: &Manifest) -> Result<Region, RequestError> {
         let ball = self.ball.map(|AreaBall { centre, radius }| {
             Ok::<_, RequestError>(Ball { centre_in_world: centre.in_world("centre", manifest)?, radius })

@@ -61,7 +61,7 @@ impl ChangesError {
 }
 
 impl Engine {
-    /// Compares two generations that the robot has had, where both know an area. Blocks for milliseconds; for a
+    /// Compares two generations that the robot has had, in areas that both know. Blocks for milliseconds; for a
     /// second if thousands of things changed. No remembered generation is a reply, not an error.
     ///
     /// # Errors

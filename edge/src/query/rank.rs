@@ -11,7 +11,7 @@ const VOXELS_TO_HALF_RELEVANCE: f64 = 40.0;
 
 /// Returns the ranking key of an answer: `(score - base) / (1 + distance / half)`, and 0 below `base`.
 ///
-/// `base`: the score of an unrelated text. Neither the threshold, which only filters, nor another parameter changes
+/// `base`: the score of an unrelated thing. Neither the threshold, which only filters, nor another parameter changes
 /// it. Rounded to f32 to hide the last bits of a machine's division.
 pub fn relevance(score: f32, base: f32, distance: Option<f64>, half: f64) -> f32 {
     let margin = (f64::from(score) - f64::from(base)).max(0.0);

@@ -43,7 +43,7 @@ impl Scale {
         }
     }
 
-    /// Returns the reported score of an unrelated text: 0 for a relevancy; for a cosine the mean of a bank of texts'
+    /// Returns the reported score of an unrelated thing: 0 for a relevancy; for a cosine the mean of a bank of texts'
     /// scores over whatever is scored, or 0 if not measured.
     pub fn base(self, calibration: Option<Calibration>) -> f32 {
         match self.0 {

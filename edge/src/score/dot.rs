@@ -28,7 +28,7 @@ pub fn dot(embedding: &[f16], vector: &[f32]) -> f32 {
     let mut products = [0.0f32; BLOCK];
     for (embedding, vector) in embedding.chunks(BLOCK).zip(vector.chunks(BLOCK)) {
         let n = embedding.len().min(vector.len());
-        // One plain loop each: the compiler vectorises those, but not a single loop over eight running sums.
+        // Plain loops for products and halvings: the compiler vectorises these, but not one over eight running sums.
         for ((product, a), b) in products.iter_mut().zip(embedding).zip(vector) {
             *product = widen(*a) * b;
         }

@@ -35,7 +35,7 @@ pub struct Candidate<'a> {
     /// With its pieces.
     pub solid: Solid,
     pub score: f32,
-    /// 0: an unrelated text's score; 1: the best score on board.
+    /// 0: an unrelated thing's score; 1: the best score on board.
     pub confidence: f64,
     /// Whether it has enough Gaussians in the region.
     pub is_inside: bool,
@@ -60,7 +60,7 @@ impl Candidate<'_> {
 pub struct ClustersOfThing {
     pub clusters: Vec<Cluster>,
     pub threshold: f32,
-    /// Score of an unrelated text.
+    /// Score of an unrelated thing.
     pub base: f32,
 }
 
