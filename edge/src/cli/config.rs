@@ -421,7 +421,7 @@ fn exclude(command: &Command, one: &Arg, other: &Arg) -> bool {
     against(one, other) || against(other, one)
 }
 
-/// Returns the flags that one requires beside it, as `--near <X,Y,Z>`: clap's error if it stands alone.
+/// Returns the flags that one requires, as `--near <X,Y,Z>`: those that clap demands for it alone, not for no flag.
 fn needs(command: &Command, arg: &Arg, values: &[String]) -> Vec<String> {
     let is_help = |arg: &&Arg| matches!(arg.get_action(), ArgAction::HelpShort | ArgAction::HelpLong);
     let args = || command.get_arguments().filter(|arg| !is_help(arg)).cloned().map(|arg| arg.required(false));

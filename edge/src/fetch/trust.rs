@@ -27,7 +27,8 @@ pub struct AddedRoot {
     pub is_new: bool,
 }
 
-/// Trusts a root by hand, `replace`: in place of another. The first root again changes nothing: revoked keys stay so.
+/// Trusts a root by hand. The first root again changes nothing, so that revoked keys stay revoked. `replace`: trusts
+/// it in place of another root.
 pub fn add_root(
     cache: &EdgeCache,
     root: &FirstRoot,

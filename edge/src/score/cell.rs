@@ -14,8 +14,8 @@ use super::region::Region;
 /// scores have the largest errors.
 pub(super) const UNDECIDED: f32 = 9.0;
 
-/// Most distance of an f16-rounded unit embedding from the unrounded one of its centroid's radius: half a step of f16
-/// at 1 (2^-11), plus the steps of components too small for f16's exponents.
+/// Largest distance of an f16-rounded unit embedding from the unrounded one that its centroid's radius refers to: half
+/// a step of f16 at 1 (2^-11), plus the steps of components too small for f16's exponents.
 pub(super) const F16_ROUNDING: f32 = 5e-4;
 
 #[derive(Clone, Copy)]

@@ -19,8 +19,8 @@ pub struct CodedShard {
     pub has_basis: bool,
     /// 0: no residual code.
     pub n_subspaces: usize,
-    /// Whether exact embeddings and fine residuals accompany the code. The latter are arbitrary, with stated errors
-    /// [`CODE_ERROR`] and [`FINE_ERROR`]: without measured errors they decide nothing.
+    /// Whether exact embeddings and fine residuals accompany the code. The latter are arbitrary: errors of both are
+    /// stated, not measured ([`CODE_ERROR`], [`FINE_ERROR`]).
     pub is_exact: bool,
     pub centroid_lens: Vec<usize>,
     pub origin: DVec3,
