@@ -61,7 +61,7 @@ impl<'a> PhotoFile<'a> {
     /// Reads the header of a JPEG, PNG or WebP, with at most [`Self::opening_bytes`].
     ///
     /// # Errors
-    /// Not such a picture, truncated, or too large.
+    /// The bytes are no such picture, one that lost a piece, or one that is too large.
     pub fn open(bytes: &'a [u8]) -> Result<Self, LocateError> {
         let decoder = photo::open(Cursor::new(bytes))?;
         let (width, height) = decoder.dimensions();
@@ -117,7 +117,7 @@ pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
 /// rendered pictures verify and improve the pose.
 ///
 /// # Errors
-/// [`LocateError`]. A photo of another place is no error but [`Answer::Lost`].
+/// [`LocateError`]. A photo that shows another place is no error: its answer is [`Answer::Lost`].
 pub fn answer(
     snapshot: &Snapshot,
     photo: PhotoFile<'_>,

@@ -125,8 +125,8 @@ impl Access {
     /// Checks a request.
     ///
     /// # Errors
-    /// 400 for an invalid or repeated `Host`, 421 for another host's name, 403 for another origin and for writes
-    /// where none are accepted, 401 without the token.
+    /// 400 for a `Host` that cannot be read or is one of several, 421 for another host's name, 403 for another origin
+    /// and for writes where none are accepted, 401 without the token.
     pub(crate) fn check(&self, request: &Request) -> Result<(), Problem> {
         let headers = request.headers();
         let of_header = one_host(headers)?;

@@ -139,7 +139,8 @@ impl Held {
 /// Reads a whole body of at most `max_bytes`. `all`: room for long bodies, held until this one is dropped.
 ///
 /// # Errors
-/// 413 if too long, 408 if too slow, 400 if it broke off, 503 without room. Each ends the connection.
+/// 413 if it is longer, 408 if it was not complete in time, 400 if it broke off, 503 if there is no room. Each ends
+/// the connection.
 pub(crate) async fn read(
     mut body: Body,
     max_bytes: usize,

@@ -40,7 +40,7 @@ pub enum ConfigError {
 /// Parses a command line; `variable` looks up the environment.
 ///
 /// # Errors
-/// [`ConfigError`]. The whole file is checked, for all commands.
+/// [`ConfigError`]. The whole file is checked, whichever command is asked for.
 pub fn parse(
     command: Command,
     line: &[OsString],

@@ -13,10 +13,10 @@ use crate::score::Budget;
 const MAX_THINGS: usize = 5;
 const MAX_POINTS: usize = 4096;
 
-/// Finds places to stand near a thing. Blocks for tens of milliseconds. No such place is a reply, not an error.
+/// Finds places to stand near a thing. Blocks for tens of milliseconds.
 ///
 /// # Errors
-/// [`GoalError`].
+/// [`GoalError`]. That there is no such place is a reply.
 pub fn find(
     engine: &Engine,
     on_board: &OnBoard,

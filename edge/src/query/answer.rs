@@ -31,7 +31,7 @@ type Questions<'a> = (&'a [&'a str], &'a [Question]);
 /// The result depends neither on the number of threads nor on the other questions. `scratch`: buffers to reuse, and
 /// the budget.
 /// # Errors
-/// [`ScoreError`], also if the request exceeds its budget.
+/// [`ScoreError`]; one is a request that needs more than its budget.
 pub fn answer(
     scratch: &mut Scratch,
     scene: &Scene<'_>,

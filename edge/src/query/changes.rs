@@ -61,11 +61,11 @@ impl ChangesError {
 }
 
 impl Engine {
-    /// Compares two generations that the robot has had, in areas that both know. Blocks for milliseconds; for a
-    /// second if thousands of things changed. No remembered generation is a reply, not an error.
+    /// Compares two generations that the robot has had, in areas that both know. Blocks for milliseconds; for a second
+    /// if thousands of things changed.
     ///
     /// # Errors
-    /// [`ChangesError`].
+    /// [`ChangesError`]. That nothing is remembered yet is a reply.
     pub fn changes(&self, request: &ChangesRequest, budget: &Budget) -> Result<ChangesReply, ChangesError> {
         let on_board = self.on_board()?;
         let snapshot = &on_board.snapshot;

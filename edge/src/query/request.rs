@@ -256,7 +256,7 @@ impl QueryRequest {
     /// Parses texts with relations, if answers are objects and the generation has them.
     ///
     /// # Errors
-    /// A text names more things than a phrase may have: without its relations it would mean something else.
+    /// A text names more things than a phrase may have: without its relations it would ask for something else.
     pub(super) fn understand(&mut self, snapshot: &Snapshot) -> Result<(), RequestError> {
         if !matches!(self.kind, None | Some(AnswerKind::Objects)) || snapshot.objects.is_empty() {
             return Ok(());

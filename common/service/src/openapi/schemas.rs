@@ -9,9 +9,9 @@ use serde_json::{Map, Value, json};
 
 use crate::replies::{Reply, SchemaOf};
 
-/// Place of schemas in a description.
+/// Path of the schemas in a description.
 const SCHEMAS: &str = "#/components/schemas/";
-/// Place of requests' schemas during construction.
+/// Path of requests' schemas under construction.
 const REQUESTS: &str = "#/requests/";
 /// Suffix of a request's schema that differs from the reply's of the same type.
 const SUFFIX: &str = "Request";
