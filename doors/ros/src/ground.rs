@@ -65,7 +65,7 @@ pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGri
     })
 }
 
-/// Returns the cells nearer than `radius` cells to a reached one; at exactly that distance may be an obstacle.
+/// Returns the cells nearer than `radius` cells to a reached one; one at just `radius` may be an obstacle.
 fn free(places: &[Place], [width, height]: [usize; 2], radius: f64) -> Vec<bool> {
     let reach = radius.clamp(0.0, 1e3).floor() as isize;
     let offsets: Vec<(isize, isize)> = (-reach..=reach)
