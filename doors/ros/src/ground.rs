@@ -118,7 +118,7 @@ mod tests {
         assert_eq!(<[f64; 3]>::from(grid.info.origin.position), [1.0, 2.0, 0.5]);
     }
 
-    /// By hand: a million cells become at most 60,000; a one-cell obstacle stays; free joined cells are free throughout.
+    /// By hand: a million cells become at most 60,000; a one-cell obstacle stays; free ones are free throughout.
     #[test]
     fn large_maps_are_joined() {
         let grid = map([1000, 1000], "r500500o1r499499", 0.05, 0.0);

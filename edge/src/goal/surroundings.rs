@@ -96,7 +96,8 @@ impl<'a> Surroundings<'a> {
     /// Examines the places around a robot, which is at the request's `near`, or else at `centre`.
     ///
     /// # Errors
-    /// [`GoalError::NoOccupancy`]; a range with too many places; a step that the voxels do not tell from none; the budget.
+    /// [`GoalError::NoOccupancy`]; a range with too many places; a step that the voxels do not tell from none;
+    /// the budget.
     pub(super) fn look(
         snapshot: &Snapshot,
         request: &GoalRequest,

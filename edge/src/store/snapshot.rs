@@ -40,7 +40,8 @@ impl Snapshot {
     /// and is marked for the next fetch.
     ///
     /// # Errors
-    /// [`StoreError`]; that of the first shard if none opens. A fetch that replaces `current` meanwhile is not an error.
+    /// [`StoreError`]; that of the first shard if none opens. A fetch that replaces `current` meanwhile is not an
+    /// error.
     pub fn open(cache: &EdgeCache) -> Result<Self, StoreError> {
         Self::open_after(cache, None)
     }
