@@ -31,7 +31,7 @@ fn sam_finds_masks_the_same_for_any_number_of_threads() {
         command.args("--views-limit 3 --view-order nth --metric --raster-width 320".split(' '));
         // Random weights find weak masks.
         command.args("--sam-predicted-iou 0 --sam-stability 0.2 --sam-stability-offset 0.05".split(' '));
-        command.args("--points-per-side 8 --sam-points-per-batch 24 --sam-crop-layers 1".split(' '));
+        command.args("--points-per-side 4 --sam-points-per-batch 24 --sam-crop-layers 1".split(' '));
         command
             .args("--sam-min-region-px 3000 --sam-box-nms 1 --sam-crop-nms 1 --sam-mask-nms 0.7".split(' '));
         command.args(more);

@@ -1,4 +1,4 @@
-//! Compresses the built page (`dist/`) and lists its files for `src/lib.rs`; an empty list where it was not built.
+//! Compresses the built page (`dist/`) and lists its files for `src/lib.rs`; without the page, the list is empty.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -18,8 +18,7 @@ fn files_under(folder: &Path, found: &mut Vec<PathBuf>) {
 fn main() {
     let dist = Path::new(&std::env::var("CARGO_MANIFEST_DIR").expect("set by cargo")).join("dist");
     let out = PathBuf::from(std::env::var("OUT_DIR").expect("set by cargo"));
-    // Cargo would take a folder that is missing for one that changed; `scripts/build-page.sh` touches this file
-    // instead.
+    // Cargo treats a missing folder as changed; `scripts/build-page.sh` touches this file instead.
     println!("cargo::rerun-if-changed=build.rs");
     let mut paths = Vec::new();
     if std::env::var_os("CARGO_FEATURE_PAGE").is_some() && dist.is_dir() {

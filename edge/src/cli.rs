@@ -91,7 +91,6 @@ enum Command {
     },
 }
 
-/// Parses this process's command line, environment and configuration.
 pub fn parse() -> Result<Cli, Exit> {
     let line: Vec<OsString> = std::env::args_os().collect();
     let parsed = config::parse(help::layered(Cli::command()), &line, &args::variable);
@@ -100,7 +99,7 @@ pub fn parse() -> Result<Cli, Exit> {
             let names = std::env::vars_os().filter_map(|(name, _)| name.into_string().ok());
             for warning in config::unknown_variables(&Cli::command(), names) {
                 if !cli.quiet {
-                    // The log is not open yet; where nobody reads stderr, nobody is told.
+                    // The log is not open yet, so an unreadable stderr is ignored.
                     let _ = writeln!(io::stderr(), "warning: {}", text::visible(&warning));
                 }
             }
@@ -112,7 +111,6 @@ pub fn parse() -> Result<Cli, Exit> {
 }
 
 impl Cli {
-    /// Returns the log filter used unless `RUST_LOG` is set.
     pub fn log_filter(&self) -> &'static str {
         match (self.quiet, self.verbose, &self.command) {
             (true, ..) => "error",
@@ -168,7 +166,7 @@ mod tests {
         Cli::command().debug_assert();
     }
 
-    /// The documented lines are parsed by the tests of the documents; here are values with a meaning of their own.
+    /// The documents' tests parse the documented lines; these are values with a special meaning.
     #[test]
     fn lines_parse() {
         let command = |line: &str| parse(line).unwrap_or_else(|e| panic!("{line}: {e}")).command;

@@ -14,7 +14,7 @@ pub mod text;
 
 pub use slag_common::error_line;
 
-/// Returns the current time, seconds since 1970; 0 if the clock is set before that.
+/// Returns the time in seconds since 1970; 0 if the clock is earlier.
 pub fn now_unix_secs() -> u64 {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     since.map_or(0, |since| since.as_secs())

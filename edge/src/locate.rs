@@ -49,17 +49,16 @@ pub struct Camera {
     pub centre_px: Option<[f64; 2]>,
     /// Direction of gravity in the camera's frame (x right, y down, z forward).
     pub gravity: Option<DVec3>,
-    /// Where it may be.
     pub prior: Option<Prior>,
 }
 
-/// A photo whose size is known, and whose pixels are not read yet.
+/// A photo with known size and unread pixels.
 pub struct PhotoFile<'a> {
     decoder: Box<dyn ImageDecoder + 'a>,
 }
 
 impl<'a> PhotoFile<'a> {
-    /// Reads the head of a JPEG, PNG or WebP, with at most [`Self::opening_bytes`].
+    /// Reads the header of a JPEG, PNG or WebP, with at most [`Self::opening_bytes`].
     ///
     /// # Errors
     /// The bytes are no such picture, one that lost a piece, or one that is too large.
@@ -72,16 +71,16 @@ impl<'a> PhotoFile<'a> {
         Ok(Self { decoder })
     }
 
-    /// Returns the bytes that opening a file takes at most, whatever it says; they are in use until it is located.
+    /// Returns the most bytes that opening a file takes, whatever its header says; in use until it is located.
     pub fn opening_bytes(file: &[u8]) -> usize {
         HEAD_BYTES as usize + file.len()
     }
 
-    /// Returns the bytes that locating it takes at most, besides those of opening it and of the map.
+    /// Returns the most bytes that locating it takes, besides opening and the map.
     pub fn working_bytes(&self) -> usize {
         let (width, height) = self.decoder.dimensions();
         let n_px = width as usize * height as usize;
-        // Decoding: pixels as they are stored, as RGB, and a progressive JPEG's coefficients. Then grey.
+        // Decoding: pixels as stored, as RGB, and a progressive JPEG's coefficients. Then grey.
         let decoding = self.decoder.total_bytes() as usize + n_px * (3 + 6);
         decoding.max(n_px * size_of::<f32>() + working_bytes(width as usize, height as usize))
     }
@@ -114,8 +113,8 @@ pub fn map_on_board(snapshot: &Snapshot) -> Result<Map, LocateError> {
     Ok(Map::new(all))
 }
 
-/// Finds the camera of a photo. Same photo, same answer. Where cells tell how their Gaussians look, and the budget
-/// allows it, pictures of them verify and improve the pose.
+/// Finds the camera of a photo. Same photo, same answer. Where cells have an appearance and the budget allows it,
+/// rendered pictures verify and improve the pose.
 ///
 /// # Errors
 /// [`LocateError`]. A photo that shows another place is no error: its answer is [`Answer::Lost`].
@@ -129,7 +128,7 @@ pub fn answer(
     let grey = photo.grey()?;
     let (width, height) = (grey.width as f64, grey.height as f64);
     let [centre_x_px, centre_y_px] = camera.centre_px.unwrap_or([width / 2.0, height / 2.0]);
-    // With a centre that is no camera's, a pose far away may agree with the photo.
+    // With an impossible principal point, a distant pose may fit the photo.
     if !((0.0..=width).contains(&centre_x_px) && (0.0..=height).contains(&centre_y_px)) {
         let expected = format!("a point of the photo, which has {width} x {height} pixels");
         let found = format!("{centre_x_px},{centre_y_px}");
@@ -167,7 +166,7 @@ pub fn answer(
 
 fn pose_of(snapshot: &Snapshot, located: &Located) -> Pose {
     let world_from_camera = located.camera_from_world.inverse();
-    // Of the image's axes: forward is z, left is -x, up is -y.
+    // In the image's axes, forward is z, left is -x, up is -y.
     let camera_from_body = DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y);
     let rotation = |matrix: DMat3| DQuat::from_mat3(&matrix).normalize().to_array();
     let at = world_from_camera.translation;

@@ -15,9 +15,9 @@ fn main() -> ExitCode {
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(cli.log_filter()));
     let ansi = std::io::stderr().is_terminal();
-    // Without the names of modules, which mean nothing to who reads it.
+    // Module names mean nothing to users.
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(ansi).with_target(false);
-    // It would panic where nobody reads stderr any more.
+    // It would panic if nobody reads stderr any more.
     log.log_internal_errors(false).with_writer(std::io::stderr).init();
     cli.run().into()
 }

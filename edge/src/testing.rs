@@ -36,10 +36,10 @@ pub struct TestShard {
     pub encoder_id: Hash32,
     /// Whether centroids are quantised with a power-of-two step, so that values exact in f32 stay exact.
     pub has_exact_centroids: bool,
-    /// Whether the shard has the indices in the input splat file whatever its profile.
+    /// Whether the shard has the input splat's indices in any profile.
     pub has_packed_indices: bool,
     pub centroids: Vec<Vec<Member>>,
-    /// Gaussians without a centroid, after the centroids'.
+    /// Gaussians without a centroid, after the others.
     pub without_evidence: Vec<[u16; 3]>,
 }
 
@@ -58,11 +58,9 @@ pub struct TestObject {
     pub n_gaussians: u32,
 }
 
-/// How the scores of test objects scatter.
 pub(crate) const CALIBRATION: Calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
 
 impl BuiltShard {
-    /// Rewrites the shard with additions.
     pub(crate) fn with(&self, additions: Additions<'_>) -> Self {
         let mut bytes = Vec::new();
         self.view().write_with(&mut bytes, additions).expect("writes to memory");
@@ -74,7 +72,7 @@ impl BuiltShard {
         self.with_objects_and_places(objects, calibration, None)
     }
 
-    /// Rewrites the shard with objects, as [`Self::with_objects`] does, and with free and occupied places.
+    /// As [`Self::with_objects`], with occupancy.
     pub(crate) fn with_objects_and_places(
         &self,
         objects: &[TestObject],
@@ -129,8 +127,7 @@ impl TestShard {
         }
     }
 
-    /// Writes the shard and reads it back. Centroids are the members' means, radii the largest distance of an
-    /// unrounded embedding from the stored centroid.
+    /// Writes the shard and reads it back; centroids are means, radii the largest distance of an unrounded embedding.
     pub fn build(&self, exact: bool) -> BuiltShard {
         let members = || self.centroids.iter().flatten();
         let dim = members().next().map_or(2, |m| m.embedding.len());
@@ -200,7 +197,7 @@ pub fn normalised(vector: Vec<f32>) -> Vec<f32> {
     vector.into_iter().map(|v| (f64::from(v) / length) as f32).collect()
 }
 
-/// Lets threads pass once it is open.
+/// Blocks threads until open.
 pub type Gate = Arc<(Mutex<bool>, Condvar)>;
 
 pub fn open_gate(gate: &Gate) {
@@ -250,7 +247,7 @@ impl TextEncoder for Axes {
                 drop(self.gate.1.wait_while(open, |open| !*open).expect("no panic inside"));
                 0
             }
-            // The first word alone, so that a text may have others.
+            // The first word alone counts, so that a text may have others.
             _ => {
                 let axis = text.split_whitespace().next().and_then(|word| word.parse().ok());
                 axis.filter(|axis| *axis < self.dim).ok_or_else(|| InferenceError::UnknownPhrase {
@@ -264,14 +261,14 @@ impl TextEncoder for Axes {
     }
 }
 
-/// Returns a service over [`Axes`] and the count of texts it really encoded.
+/// Returns a service over [`Axes`] and the number of texts that it encoded.
 pub fn axes_service(dim: usize, gate: Gate) -> (TextService, Arc<AtomicUsize>) {
     let axes = Axes { gate, ..Axes::new(dim) };
     let n_encoded = axes.n_encoded();
     (TextService::start(Axes::info(dim), Box::new(axes)).expect("a thread"), n_encoded)
 }
 
-/// Returns the manifest of some shards, as an encoder of [`Axes`]' space would list them.
+/// Returns the manifest of some shards in [`Axes`]' space.
 pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
     let listed: Vec<_> = shards.iter().map(|shard| (Profile::Compact, &*shard.bytes)).collect();
     let mut manifest = Manifest { generation, ..sample::manifest("yard", &listed) };

@@ -18,9 +18,9 @@ use slag_models::{
 
 /// Longest query text; every text model here truncates far below.
 pub const MAX_TEXT_BYTES: usize = 512;
-/// Texts that may wait for the encoder; at about 30 ms each, more would time out anyway.
+/// Texts that may wait for the encoder; at about 30 ms each, more would time out.
 const MAX_WAITING: usize = 64;
-/// Pause before a text model that panicked is opened again, where that failed.
+/// Pause between attempts to reopen a text model that panicked.
 const REOPEN_PAUSE: Duration = Duration::from_secs(1);
 /// Cached vectors (2 MB at 512 components).
 const MAX_CACHED: usize = 1024;
@@ -61,7 +61,6 @@ struct Job {
     reply: SyncSender<Result<Vec<f32>, InferenceError>>,
 }
 
-/// A text encoder owned by one thread, with a cache of recent vectors.
 pub struct TextService {
     info: EncoderInfo,
     nouns: Vec<String>,
@@ -69,7 +68,7 @@ pub struct TextService {
     jobs: Option<SyncSender<Job>>,
     thread: Option<JoinHandle<()>>,
     cache: Mutex<Cache>,
-    /// Whether the encoder runs: it has panicked otherwise, and was not opened again yet.
+    /// Whether the encoder runs: false after a panic until it is reopened.
     is_alive: Arc<AtomicBool>,
 }
 
@@ -86,7 +85,7 @@ impl TextService {
         Ok(Self::start_with(info, encoder, Some(Box::new(move || models.text_encoder(&options))))?)
     }
 
-    /// Starts the thread that owns an encoder, which cannot be opened again.
+    /// Starts the thread that owns an encoder, without a way to reopen it.
     pub fn start(info: EncoderInfo, encoder: Box<dyn TextEncoder>) -> io::Result<Self> {
         Self::start_with(info, encoder, None)
     }
@@ -118,12 +117,12 @@ impl TextService {
         &self.info
     }
 
-    /// Returns the words that things can be called by; none if everyday nouns do.
+    /// Returns the model's own words for naming; empty if everyday nouns serve.
     pub fn nouns(&self) -> &[String] {
         &self.nouns
     }
 
-    /// Returns what is asked in place of a text with words that the model does not know.
+    /// Returns the replacement of a text with words unknown to the model.
     pub(crate) fn asked_as(&self, text: &str) -> Option<String> {
         self.known.as_ref()?.asked_as(&words_to_find(text).ok()?)
     }
@@ -143,7 +142,7 @@ impl TextService {
         Ok(vector)
     }
 
-    /// Returns a text's vector as [`Self::encode`] does, without the cache and signs included.
+    /// As [`Self::encode`], without the cache and with its symbols.
     pub(crate) fn run(&self, text: String) -> Result<Vec<f32>, TextError> {
         let (reply, answer) = sync_channel(1);
         let jobs = self.jobs.as_ref().ok_or(TextError::Stopped)?;
@@ -170,8 +169,8 @@ impl Drop for TextService {
     }
 }
 
-/// Encodes texts until nobody can ask. An encoder that panics is opened again; until it is, `is_alive` says so and
-/// askers hear at once that it has stopped.
+/// Encodes texts until all senders are gone. A panicked encoder is reopened; until then `is_alive` is false and
+/// callers fail at once.
 fn run(
     mut encoder: Box<dyn TextEncoder>,
     mut reopen: Option<Reopen>,
@@ -179,9 +178,9 @@ fn run(
     is_alive: &AtomicBool,
 ) {
     while let Ok(Job { text, reply }) = jobs.recv() {
-        // What a panic leaves half done is dropped with the encoder.
+        // State broken by a panic is dropped with the encoder.
         if let Ok(encoded) = catch_unwind(AssertUnwindSafe(|| encoder.encode(&text))) {
-            // The asker may have given up meanwhile.
+            // The caller may have given up.
             drop(reply.send(encoded));
             continue;
         }
@@ -189,7 +188,7 @@ fn run(
         tracing::error!("the text model panicked");
         drop(reply);
         let Some(reopen) = &mut reopen else { return };
-        // Its end and its start may panic as it did.
+        // Dropping and opening may panic, too.
         let mut broken = Some(encoder);
         encoder = loop {
             match catch_unwind(AssertUnwindSafe(|| {
@@ -200,7 +199,7 @@ fn run(
                 Ok(Err(error)) => tracing::error!("the text model does not open again: {error}"),
                 Err(_) => tracing::error!("the text model panicked as it was opened again"),
             }
-            // Those who ask in the pause are refused when their jobs are dropped.
+            // Callers in the pause fail when their jobs are dropped.
             match jobs.recv_timeout(REOPEN_PAUSE) {
                 Ok(job) => drop(job),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -270,7 +269,7 @@ mod tests {
         assert!(cache.get("1").is_none() && cache.get("0").is_some() && cache.get("new").is_some());
     }
 
-    /// One text more than the queue and the encoder can hold: one of them is refused, at once.
+    /// One text beyond the queue and the encoder: one is refused, at once.
     #[test]
     fn a_full_queue_turns_away() {
         let gate = Gate::default();
@@ -316,7 +315,7 @@ mod tests {
         assert_eq!(phrases.info().execution_provider, "none");
     }
 
-    /// Signs beside words count for nothing; without words there is nothing to look for.
+    /// Symbols beside words are ignored; a text without words is an error.
     #[test]
     fn only_words_count() {
         let (service, n_encoded) = axes_service(3, Default::default());
@@ -330,7 +329,7 @@ mod tests {
         }
     }
 
-    /// A model that panics is opened again, also where opening it panics at first; meanwhile it is not alive.
+    /// A model that panics is reopened, even if opening it panics at first; meanwhile it is not alive.
     #[test]
     fn a_dead_model_is_opened_again() {
         let (opens, opened) = sync_channel::<bool>(2);
@@ -350,7 +349,7 @@ mod tests {
         assert!(service.encode("1").is_ok() && service.is_alive());
     }
 
-    /// A model that panics stops the service; every later call fails at once.
+    /// A model that panics stops the service; later calls fail at once.
     #[test]
     fn a_dead_model_is_an_error() {
         let service = TextService::start(Axes::info(2), Box::new(Axes::new(2))).expect("a thread");

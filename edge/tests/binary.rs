@@ -21,16 +21,14 @@ use slag_models::{ModelDir, SessionOptions};
 use crate::fetch::scene::Published;
 use crate::fetch::server::Server;
 
-/// Returns the manifest and the one shard of a scene with 40 red Gaussians around x = 2 and 60 blue
-/// ones around x = 8, in the colour stand-in's space.
+/// A scene's manifest and single shard: 40 red Gaussians around x = 2, 60 blue ones around x = 8, built-in colours.
 fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
     positions.extend((0..60).map(|i| [8000 + i, 0, 0]));
     painted(&positions, 40)
 }
 
-/// Returns the manifest and the one shard of a scene whose first Gaussians are red and the others blue; positions
-/// in millimetres.
+/// Returns manifest and single shard of a scene of `n_red` red, then blue Gaussians; positions in millimetres.
 fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
     let text =
         TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
@@ -67,7 +65,7 @@ fn store((listed, shard): (Vec<u8>, Vec<u8>)) -> String {
     Box::leak(Box::new(server)).url()
 }
 
-/// Returns a cache with a scene of one shard on board.
+/// Returns a cache with a one-shard scene.
 fn fetched(scene: (Vec<u8>, Vec<u8>)) -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(scene);
@@ -172,7 +170,7 @@ fn a_robot_fetches_asks_and_serves() {
     assert!(log.contains("stopping"), "{log}");
 }
 
-/// systemd hears when the service is ready, that it lives, and that it stops.
+/// systemd is told that the service is ready, alive, and stopping.
 #[test]
 #[cfg(target_os = "linux")]
 fn a_supervisor_hears_of_start_life_and_stop() {
@@ -198,7 +196,7 @@ fn a_supervisor_hears_of_start_life_and_stop() {
     assert_eq!(serving.wait().expect("ends").code(), Some(0));
 }
 
-/// A store that never answers: ctrl-c ends the fetch with exit code 130.
+/// The store never answers: ctrl-c ends the fetch with exit code 130.
 #[test]
 fn an_interrupted_fetch_says_so() {
     let silent = TcpListener::bind("127.0.0.1:0").expect("a port");
@@ -206,8 +204,7 @@ fn an_interrupted_fetch_says_so() {
     let dir = tempfile::tempdir().expect("a folder");
     let mut fetching = slag_edge(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]);
     let fetching = fetching.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
-    // The signal handler is installed before it connects. Closing the connection makes it retry, and check
-    // the flag.
+    // The signal handler is installed before it connects. Closing the connection makes it retry and check the flag.
     let (connection, _) = silent.accept().expect("a connection");
     let interrupted = Command::new("kill").args(["-INT", &fetching.id().to_string()]).status().expect("runs");
     assert!(interrupted.success());
@@ -226,8 +223,7 @@ fn nobody_reads_and_nobody_complains() {
     assert_eq!((output.status.code(), output.stderr.len()), (Some(0), 0));
 }
 
-/// Positions on stdin: the first is fetched, those near it are not, and invalid lines are reported and
-/// skipped.
+/// Positions on stdin: the first is fetched, nearby ones are not, and invalid lines are reported and skipped.
 #[test]
 fn a_robot_is_followed_along_stdin() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -254,13 +250,12 @@ fn a_robot_is_followed_along_stdin() {
         let reports: Vec<Value> = String::from_utf8_lossy(&stdout).lines().map(json).collect();
         (status.code(), reports, String::from_utf8_lossy(&stderr).into_owned())
     };
-    // Timing decides which positions are seen; the last one always is.
+    // Timing decides which positions are seen, except the last.
     let (code, reports, log) = watch("1 2 3\nnonsense\n\n1 2 4\n{\"x\":1,\"y\":2,\"z\":3}\n");
     assert_eq!((code, reports.len()), (Some(0), 1), "{log}");
     assert_eq!((&reports[0]["n_cells"], &reports[0]["radius"]), (&1.into(), &24.0.into()));
     assert!(log.contains("line 2: \"nonsense\" is not a position"), "{log}");
-    // A geographic position is meaningless in this scene: the last fetch fails, and the generation on board
-    // stays.
+    // A geographic position is meaningless in this scene: the last fetch fails, and the generation on board stays.
     let (code, reports, log) = watch("46.8,-92\n");
     assert_eq!((code, &reports[0]["error"]["kind"]), (Some(1), &"fetch".into()), "{log}");
     assert!(reports[0]["error"]["detail"].as_str().is_some_and(|text| text.contains("geo-reference")));
@@ -268,7 +263,6 @@ fn a_robot_is_followed_along_stdin() {
     assert_eq!(watch("").0, Some(0));
 }
 
-/// The service fetches around the positions posted to it and answers from the result.
 #[test]
 fn a_robot_is_followed_by_its_service() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -295,8 +289,8 @@ fn a_robot_is_followed_by_its_service() {
     assert!(stop(serving).contains("fetched 1 shards of generation 3"));
 }
 
-/// A page that was there when the shard was checked and mapped, and is not any more: the program ends once, its
-/// next start does not answer from that shard, and the next fetch brings it again.
+/// A page is lost after the shard was checked and mapped: the program ends once, its next start does not answer from
+/// that shard, and the next fetch replaces it.
 #[test]
 #[cfg(target_os = "linux")]
 fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
@@ -340,15 +334,14 @@ fn a_service_starts_with_a_sector_that_cannot_be_read() {
     assert_eq!(run(disk.path(), &["query", "blue"]).0, Some(0));
 }
 
-/// Returns a figure of a program's memory; 0 where Linux does not tell it.
+/// Returns a memory figure of a program; 0 where Linux has none.
 fn bytes_of(program: &Child, figure: &str) -> u64 {
     let status = fs_err::read_to_string(format!("/proc/{}/status", program.id())).unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix(figure)).unwrap_or("0 kB");
     line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
 }
 
-/// The robot's program includes the embedded text model, but not the image model, which is larger than all
-/// other models together.
+/// The robot's program includes the embedded text model, but not the image model, larger than all others together.
 #[test]
 fn the_image_model_stays_with_the_encoder() {
     let program = std::fs::read(env!("CARGO_BIN_EXE_slag-edge")).expect("the program");
@@ -361,12 +354,12 @@ fn the_image_model_stays_with_the_encoder() {
     assert_eq!((carries("text.onnx"), carries("image.onnx")), (true, false));
 }
 
-/// 32 at once, three times: what they take together is bounded, and who gets no memory is told the budget.
+/// 32 at once, three times: their total memory is bounded, and refusals name the budget.
 #[test]
 #[cfg(target_os = "linux")]
 fn the_memory_attack_stays_within_the_budget() {
     const QUERY_BYTES: u64 = 64 << 20;
-    // Every Gaussian matches, and is a cluster of its own, whatever the limit.
+    // Every Gaussian matches and is its own cluster, whatever the limit.
     const ATTACK: &str = "kind=clusters&threshold=-1&min_count=1&voxel=1e-9&limit=1";
     // 120,000 of them, 0.1 m apart.
     let grid = |i: u32| [i % 100, i / 100 % 100, i / 10_000].map(|at| at as u16 * 100);
@@ -392,7 +385,6 @@ fn the_memory_attack_stays_within_the_budget() {
         );
     }
     assert!(n_answered > 0);
-    // Four queries' worth, and twice as much again for what is not counted: text models, stacks, what the
-    // allocator keeps.
+    // Four queries' worth, and twice as much again for uncounted memory: text models, stacks, the allocator's.
     assert!(grown < 12 * QUERY_BYTES, "{grown}");
 }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{FRAME, Geographic, UNITS};
 
-/// Why nothing was compared: the robot remembers no earlier generation.
+/// Nothing was compared: the robot remembers no earlier generation.
 pub const NO_EARLIER: &str = "no-earlier-generation";
 
 /// The changes from one generation to another.

@@ -8,19 +8,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::FRAME;
 
-/// Most cells that a client takes: 100 m in voxels of 5 cm, each way.
+/// Most cells that a client accepts: 100 m in voxels of 5 cm, each way.
 const MAX_CELLS: usize = 4 << 20;
 
-/// What a cell is to a robot.
+/// State of a cell for a robot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// Nobody has seen ground there.
+    /// No ground was seen there.
     Unknown,
-    /// It must not be touched.
     Obstacle,
-    /// Ground; the robot's middle may not or cannot go there.
+    /// Ground that the robot's middle may not or cannot reach.
     Ground,
-    /// The robot's middle can go there.
     Reached,
 }
 
@@ -56,7 +54,7 @@ pub fn runs_of(cells: &[Place]) -> String {
 }
 
 impl Floor {
-    /// Returns the cells, `[size.y][size.x]`; `None` if the runs are not as many cells, or too many.
+    /// Returns the cells, `[size.y][size.x]`; `None` if the runs do not have that many cells, or too many.
     pub fn cells(&self) -> Option<Vec<Place>> {
         let n = self.size[0].checked_mul(self.size[1]).filter(|n| *n <= MAX_CELLS)?;
         let mut cells = Vec::with_capacity(n);

@@ -1,5 +1,4 @@
-//! The replies of version 1 of the robot's interface that its clients read too: the service writes them, the doors
-//! parse them, and the description is made from them.
+//! Replies of the robot's HTTP interface, version 1, for the service, the doors and the description.
 
 pub mod changes;
 pub mod floor;

@@ -1,11 +1,11 @@
-//! Who may ask: checks of `Host`, `Origin` and bearer tokens, and CORS.
+//! Access checks: `Host`, `Origin` and bearer tokens, and CORS.
 //!
-//! A browser on the robot's network runs pages of strangers. Such a page can send requests to the robot, and by
-//! DNS rebinding it can read the answers: its own name then resolves to the robot's address. Three checks stop
-//! that. The `Host` must be an IP address, `localhost` or a name that was given: a stranger's page always sends
-//! its own name. A foreign `Origin` (RFC 6454) is refused unless it was given, and so is a request that the
-//! browser itself marks as another site's (`Sec-Fetch-Site`). Writes take JSON only ([`crate::routes`]), which a
-//! page cannot post to another origin without asking first (CORS), and that is off unless an origin was given.
+//! A browser on the robot's network runs pages of strangers. Such a page can send requests to the robot, and by DNS
+//! rebinding (its own name then resolves to the robot's address) read the answers. Three checks stop that. The `Host`
+//! must be an IP address, `localhost` or a configured name: a stranger's page always sends its own name. A foreign
+//! `Origin` (RFC 6454) is refused unless configured, as is a request that the browser marks as cross-site
+//! (`Sec-Fetch-Site`). Writes take JSON only ([`crate::routes`]), which a page cannot post to another origin without
+//! a CORS preflight, and CORS is off unless an origin was configured.
 
 use std::io;
 use std::net::IpAddr;
@@ -19,21 +19,20 @@ use slag_common::files;
 use crate::listen::Listen;
 use crate::problem::Problem;
 
-/// Least characters of a token: 128 bits as hex digits take 32, as base64 22.
+/// Least characters of a token: 128 bits take 32 hex digits or 22 of base64.
 const MIN_TOKEN_CHARS: usize = 16;
 const MAX_TOKEN_BYTES: u64 = 4096;
 const ALLOWED_METHODS: HeaderValue = HeaderValue::from_static("GET, HEAD, POST");
 const ALLOWED_HEADERS: HeaderValue = HeaderValue::from_static("authorization, content-type, x-request-id");
 const EXPOSED_HEADERS: HeaderValue = HeaderValue::from_static("retry-after, x-request-id");
 
-/// What a service is told about who may ask.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct AccessSettings {
     /// Names that clients call this machine by, without port.
     pub hosts: Vec<String>,
     /// Origins whose pages may read answers, such as `https://map.example`.
     pub origins: Vec<String>,
-    /// File with the bearer token that writes need.
+    /// File with the bearer token for writes.
     pub token_file: Option<PathBuf>,
 }
 
@@ -47,7 +46,7 @@ pub enum AccessError {
     )]
     Token {
         path: PathBuf,
-        /// What it holds; not the token.
+        /// A description, not the token.
         found: String,
     },
     #[error(
@@ -56,20 +55,17 @@ pub enum AccessError {
     Origin { found: String },
 }
 
-/// Whose writes are accepted.
+/// Accepted writes.
 #[derive(Clone)]
 enum Writes {
-    /// Everybody's who reaches the service.
     All,
-    /// Nobody's.
     None,
     Token(String),
 }
 
-/// Who may ask.
 #[derive(Clone)]
 pub struct Access {
-    /// Lower case. Absent: any name will do.
+    /// Lower case. Absent: any name.
     hosts: Option<Vec<String>>,
     origins: Vec<String>,
     writes: Writes,
@@ -77,14 +73,14 @@ pub struct Access {
     reads: Vec<&'static str>,
 }
 
-/// The checks of a service on a loopback address, without settings.
+/// The checks on a loopback address, without settings.
 impl Default for Access {
     fn default() -> Self {
         Self { hosts: Some(Vec::new()), origins: Vec::new(), writes: Writes::All, reads: Vec::new() }
     }
 }
 
-/// The token stays out of logs.
+/// Keeps the token out of logs.
 impl std::fmt::Debug for Access {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Access")
@@ -97,7 +93,7 @@ impl std::fmt::Debug for Access {
 impl Access {
     /// Makes the checks of a service that listens on `listen`.
     ///
-    /// Writes need the token if there is one; beyond this machine they are refused if there is none.
+    /// Writes need the token if there is one; without it they are refused from other machines.
     pub fn new(listen: &Listen, settings: AccessSettings) -> Result<Self, AccessError> {
         let writes = match settings.token_file {
             Some(path) => Writes::Token(read_token(&path)?),
@@ -112,8 +108,7 @@ impl Access {
         Ok(Self { hosts, origins, writes, reads: Vec::new() })
     }
 
-    /// Lets clients call this machine by any name: for a service that holds nothing which a page could not fetch
-    /// itself.
+    /// Lets clients use any host name, for a service without anything that a page could not fetch itself.
     pub fn with_any_host(self) -> Self {
         Self { hosts: None, ..self }
     }
@@ -135,7 +130,7 @@ impl Access {
     pub(crate) fn check(&self, request: &Request) -> Result<(), Problem> {
         let headers = request.headers();
         let of_header = one_host(headers)?;
-        // It comes before the header (RFC 9112, section 3.2.2), but not every program on the way knows that.
+        // It precedes the header (RFC 9112, section 3.2.2), but not every proxy knows that.
         let of_uri = request.uri().authority().map(|authority| authority.as_str());
         of_header.into_iter().chain(of_uri).try_for_each(|host| self.check_host(host))?;
         let host = of_uri.or(of_header);
@@ -177,7 +172,7 @@ impl Access {
             let is_allowed = (is_own || self.is_given(origin)) && origins.next().is_none();
             return if is_allowed { Ok(()) } else { refused(origin) };
         }
-        // Images and scripts of a page send no origin. A link that a person follows is a navigation.
+        // A page's images and scripts send no origin. A followed link is a navigation.
         let marked = |name: &'static str| text(headers, HeaderName::from_static(name));
         match (marked("sec-fetch-site"), marked("sec-fetch-mode")) {
             (Some("cross-site" | "same-site"), mode) if mode != Some("navigate") => refused("another site"),
@@ -210,7 +205,7 @@ impl Access {
         self.origins.iter().any(|given| given.eq_ignore_ascii_case(origin))
     }
 
-    /// Answers a browser's question whether a page may ask, if this is one and the page may.
+    /// Answers a CORS preflight of an allowed origin.
     pub(crate) fn preflight(&self, request: &Request) -> Option<Response> {
         let is_asked = request.method() == Method::OPTIONS
             && request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
@@ -243,7 +238,7 @@ fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
     headers.get(name).and_then(|value| value.to_str().ok())
 }
 
-/// Returns the only `Host`; `None` if there is none.
+/// Returns the only `Host`, if any.
 fn one_host(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
     let refused = |found: &str| {
         let detail =
@@ -270,7 +265,7 @@ fn name_of(host: &str) -> &str {
     }
 }
 
-/// Compares in a time that does not depend on where the texts differ.
+/// Compares in time independent of where the texts differ.
 fn are_equal(a: &[u8], b: &[u8]) -> bool {
     let differences = a.iter().zip(b).fold(0, |all, (a, b)| std::hint::black_box(all | (a ^ b)));
     a.len() == b.len() && differences == 0

@@ -1,4 +1,4 @@
-//! A request's body, with a deadline and a greatest length.
+//! A request's body, with a deadline and a length limit.
 
 use std::future::poll_fn;
 use std::pin::Pin;
@@ -14,42 +14,39 @@ use tokio::time::{Instant, Sleep, sleep_until};
 
 use crate::problem::Problem;
 
-/// Most bytes of a body that are read for nothing: one just beyond the longest body in JSON, 1 MiB, is read whole.
+/// Most bytes of a refused body that are drained: enough for one just beyond the longest JSON body, 1 MiB.
 const DRAINED_BYTES: usize = 2 << 20;
-/// Bytes of a body that are read whatever else is read.
+/// Bytes of a body that are read without taking room.
 const SHORT_BYTES: usize = 64 << 10;
-/// Room of all longer bodies together, of requests in progress too: four photos of the longest kind.
+/// Memory for all longer bodies in progress: four of the longest photos.
 pub(crate) const ROOM_BYTES: usize = 128 << 20;
-/// Pause after which there may be room again.
+/// `Retry-After` if there is no room.
 const RETRY_SECS: u32 = 1;
-/// Longest time for that.
+/// Longest time of draining.
 const DRAIN_TIME: Duration = Duration::from_secs(1);
 
 type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
-/// A body was not complete in time.
 #[derive(Clone, Copy, Debug, thiserror::Error)]
 #[error("the body was not complete {} s after the head", after.as_secs_f64())]
 struct TooSlow {
     after: Duration,
 }
 
-/// A body that fails once its deadline passes; the deadline counts from the end of the head. What is left of it when it
-/// is dropped is read and thrown away, within [`DRAINED_BYTES`] and [`DRAIN_TIME`]: a connection that closes on unread
-/// bytes is reset, and the client sees a broken pipe in place of the answer.
+/// A body that fails at its deadline, counted from the end of the head. When dropped, its rest is drained within
+/// [`DRAINED_BYTES`] and [`DRAIN_TIME`]: closing on unread bytes would reset the connection and lose the answer.
 pub(crate) struct TimedBody {
     /// Absent once it ended or failed.
     body: Option<Incoming>,
     timeout: Duration,
     deadline: Instant,
-    /// Made when the body first has to be waited for: most requests have none.
+    /// Made when the body is first waited for: most requests have none.
     sleep: Option<Pin<Box<Sleep>>>,
-    /// Whether the client waits for leave before it sends the body; then nothing is under way.
+    /// Whether the client waits for `100 Continue`; then nothing is in transit.
     waits_for_leave: bool,
 }
 
 impl TimedBody {
-    /// `headers`: those of the request.
     pub fn new(body: Incoming, headers: &HeaderMap, timeout: Duration) -> Self {
         let waits_for_leave = headers.contains_key(header::EXPECT);
         Self { body: Some(body), timeout, deadline: Instant::now() + timeout, sleep: None, waits_for_leave }
@@ -102,12 +99,11 @@ impl Drop for TimedBody {
                 n_bytes += frame.data_ref().map_or(0, Bytes::len);
             }
         };
-        // Beyond either bound the connection closes on the rest.
+        // Beyond either bound the connection is closed on the rest.
         runtime.spawn(tokio::time::timeout(DRAIN_TIME, draining));
     }
 }
 
-/// A body, and the room that it takes.
 struct Held {
     bytes: Vec<u8>,
     room: Option<SemaphorePermit<'static>>,
@@ -120,7 +116,7 @@ impl AsRef<[u8]> for Held {
 }
 
 impl Held {
-    /// Makes space for `len` bytes of at most `max`. Returns whether there is room.
+    /// Makes space for `len` bytes of at most `max`; returns whether there is room.
     fn grow(&mut self, len: usize, max: usize, all: &'static Semaphore) -> bool {
         if len <= self.bytes.capacity() {
             return true;
@@ -140,7 +136,7 @@ impl Held {
     }
 }
 
-/// Reads a whole body of at most `max_bytes`. `all`: room for long bodies; this one's stays taken until it is dropped.
+/// Reads a whole body of at most `max_bytes`. `all`: room for long bodies, held until this one is dropped.
 ///
 /// # Errors
 /// 413 if it is longer, 408 if it was not complete in time, 400 if it broke off, 503 if there is no room. Each ends
@@ -200,8 +196,7 @@ fn too_slow(error: &axum::Error) -> Option<TooSlow> {
     None
 }
 
-/// Refuses a body whose Content-Type is none of `media_types`: also forms and plain text, which a page of any origin
-/// can post without asking.
+/// Refuses a Content-Type outside `media_types`; any page may post forms and plain text without a preflight.
 pub(crate) fn check_type(headers: &HeaderMap, media_types: &[&str]) -> Result<(), Problem> {
     let found = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let kind = found.and_then(|value| value.split(';').next()).unwrap_or_default().trim();
@@ -212,7 +207,7 @@ pub(crate) fn check_type(headers: &HeaderMap, media_types: &[&str]) -> Result<()
     Err(unsupported(format!("the body's Content-Type is {shown:?}, expected {}", media_types.join(" or "))))
 }
 
-/// Refuses a body that is compressed: nothing here unpacks one, so that a few bytes cannot become many.
+/// Refuses a compressed body: nothing here decompresses, so that a few bytes cannot become many.
 pub(crate) fn check_encoding(headers: &HeaderMap) -> Result<(), Problem> {
     let values = headers.get_all(header::CONTENT_ENCODING).iter();
     let found: Vec<_> = values.map(|value| String::from_utf8_lossy(value.as_bytes())).collect();

@@ -1,4 +1,4 @@
-//! A connection's byte stream, with a deadline for progress.
+//! A connection's byte stream, with a progress deadline.
 
 use std::io;
 use std::pin::Pin;
@@ -8,15 +8,14 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::{Instant, Sleep, sleep_until};
 
-/// Bytes that count as progress where a client takes less than it is offered.
+/// Bytes that count as progress if writes are taken in part.
 const PROGRESS_BYTES: usize = 64 << 10;
 
 /// A stream that fails once sending made no progress for `stall_timeout`.
 ///
-/// Without progress, a client idles, drips its request or does not read its answer: one deadline bounds all three.
-/// Received bytes do not move the deadline, so a request of any length must arrive within it. A write that is
-/// taken whole is progress; of partial ones, every 64 KiB, so that a client that reads a byte at a time does not
-/// hold its connection.
+/// One deadline bounds idle clients, slow requests and unread answers. Received bytes do not move it, so a request of
+/// any length must arrive within it. A write taken whole is progress; of partial writes, every 64 KiB is, so that a
+/// client that reads a byte at a time cannot hold its connection.
 pub struct Stalling<S> {
     stream: S,
     stall_timeout: Duration,
@@ -26,7 +25,7 @@ pub struct Stalling<S> {
 }
 
 impl<S> Stalling<S> {
-    /// Wraps a stream; its first deadline begins now.
+    /// Wraps a stream; its first deadline starts now.
     pub fn new(stream: S, stall_timeout: Duration) -> Self {
         let deadline = Box::pin(sleep_until(Instant::now() + stall_timeout));
         Self { stream, stall_timeout, deadline, n_partial: 0 }
@@ -133,7 +132,7 @@ mod tests {
         drop(connection);
         drip.await.expect("ends with the connection");
     }
-    /// The attack: a reader that takes a byte at a time would hold its connection for ever.
+    /// The attack: a reader of one byte at a time would hold its connection for ever.
     #[tokio::test]
     async fn a_reader_that_drips_is_dropped() {
         let (ours, mut theirs) = tokio::io::duplex(64);

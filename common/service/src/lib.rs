@@ -1,6 +1,6 @@
-//! The parts that the encoder's service and the robot's service have in common.
+//! Shared parts of the encoder's and the robot's HTTP services.
 //!
-//! A request passes these stages in order. Each stage is the place for the checks that belong to it:
+//! A request passes these stages in order, each with its checks:
 //!
 //! | stage | where | what is decided there |
 //! |---|---|---|
@@ -11,9 +11,8 @@
 //! | route | [`routes`] | path and method; type and length of a request body, and time for it |
 //! | handler | [`params`], the service's own | parameters, admission of expensive work, the answer |
 //!
-//! [`openapi`] describes routes and their types for programs, [`replies`] what handlers return, [`listen`] has the
-//! addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags,
-//! [`metrics`] writes Prometheus' text format, [`stop`] waits for the signals to stop.
+//! [`openapi`] describes routes and types, [`replies`] handlers' results; [`listen`] has addresses, [`problem`] error
+//! bodies, [`range`] byte ranges and entity tags, [`metrics`] Prometheus' text format, [`stop`] the signals to stop.
 
 pub mod access;
 mod body;

@@ -1,4 +1,4 @@
-//! Where a service listens: a TCP address, or a Unix domain socket.
+//! A service's address: TCP, or a Unix domain socket.
 
 use std::fmt;
 use std::io;
@@ -11,12 +11,10 @@ use tokio::net::{TcpListener, UnixListener};
 
 use crate::tls::{Tls, TlsError, TlsFiles};
 
-/// What a Unix socket's address begins with.
 const UNIX: &str = "unix:";
 
-/// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a connection of its
-/// own: its accept loop, its threads and its routes work. Of TLS, any answer to what is no handshake will do. It
-/// does not return while the service is silent.
+/// Returns whether the service at an address of [`Listener::url`] answers `GET /healthz` over a new connection. With
+/// TLS, any answer to a non-handshake suffices. Does not return while the service is silent.
 pub async fn answers(url: &str) -> bool {
     let asked = match (url.strip_prefix(UNIX), url.split_once("://")) {
         (Some(path), _) => match tokio::net::UnixStream::connect(path).await {
@@ -24,7 +22,7 @@ pub async fn answers(url: &str) -> bool {
             Err(error) => Err(error),
         },
         (_, Some((_, address))) => {
-            // A service that listens everywhere is reached through the loopback.
+            // A service on all addresses is reached through the loopback.
             let address = address.replace("0.0.0.0:", "127.0.0.1:").replace("[::]:", "[::1]:");
             match tokio::net::TcpStream::connect(address).await {
                 Ok(stream) => ask_for_health(stream).await,
@@ -50,7 +48,7 @@ async fn ask_for_health(mut stream: impl Stream) -> io::Result<Vec<u8>> {
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Listen {
-    /// A TCP address; with port 0 the system chooses the port.
+    /// With port 0 the system chooses the port.
     Tcp(SocketAddr),
     Unix(PathBuf),
 }
@@ -102,7 +100,6 @@ impl fmt::Display for Listen {
     }
 }
 
-/// The address that a service cannot listen on.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot listen on {address}: {cause}; choose another address, port or path")]
 pub struct ListenError {
@@ -113,7 +110,7 @@ pub struct ListenError {
 #[derive(Debug)]
 pub struct Listener {
     socket: Socket,
-    /// Makes TLS connections out of the accepted ones.
+    /// Wraps accepted connections in TLS.
     pub(crate) tls: Option<Tls>,
 }
 
@@ -129,13 +126,11 @@ impl From<TcpListener> for Listener {
     }
 }
 
-/// A connection's bytes.
 pub(crate) trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
 
 impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
-/// Starts listening. A Unix socket that a dead process left behind is replaced; the new one is open to this user
-/// and group only.
+/// Starts listening. Replaces a Unix socket left by a dead process; the new one is open to this user and group only.
 pub async fn bind(listen: &Listen) -> Result<Listener, ListenError> {
     let bound = match listen {
         Listen::Tcp(address) => TcpListener::bind(address).await.map(Socket::Tcp),
@@ -175,12 +170,12 @@ impl Listener {
         }
     }
 
-    /// Accepts a connection; returns its bytes and the address of its other end, if that has one.
+    /// Accepts a connection; returns its stream and peer address, if any.
     pub(crate) async fn accept(&self) -> io::Result<(Box<dyn Stream>, Option<IpAddr>)> {
         match &self.socket {
             Socket::Tcp(socket) => {
                 let (stream, peer) = socket.accept().await?;
-                // Otherwise an answer in two pieces may wait 40 ms for the acknowledgement of the first.
+                // Otherwise an answer in two pieces may wait 40 ms for the first one's acknowledgement.
                 if let Err(error) = stream.set_nodelay(true) {
                     tracing::debug!("TCP_NODELAY is not set on a connection: {error}");
                 }
@@ -191,7 +186,7 @@ impl Listener {
     }
 }
 
-/// The path of a Unix socket outlives the socket unless it is removed.
+/// The path of a Unix socket outlives the socket.
 impl Drop for Listener {
     fn drop(&mut self) {
         if let Socket::Unix(_, path) = &self.socket
@@ -225,7 +220,7 @@ mod tests {
         }
     }
 
-    /// Bound is not alive: the accept loop must answer.
+    /// A bound address is not enough: the accept loop must answer.
     #[tokio::test]
     async fn only_a_service_that_accepts_answers() {
         let listen: Listen = "0.0.0.0:0".parse().expect("an address");

@@ -1,5 +1,4 @@
-//! The accept loop: a bounded number of connections, deadlines for their requests and answers, a stop with a
-//! deadline.
+//! The accept loop: bounded connections, deadlines for requests and answers, and a graceful stop with a deadline.
 
 use std::io;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -20,35 +19,34 @@ use crate::listen::{Listener, Stream};
 use crate::permits::{Permit, Permits, Reserved};
 use crate::tls::Tls;
 
-/// Pause after a failed accept. Out of file descriptors, an immediate retry would only burn the CPU.
+/// Pause after a failed accept. Out of file descriptors, an immediate retry would only burn CPU.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
-/// Longest time for the request of a connection beyond the limits, and for sending its answer.
+/// Longest time for the request on a reserved connection, and for sending its answer.
 const RESERVED_TIMEOUT: Duration = Duration::from_secs(2);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConnectionLimits {
-    /// Open connections. Further ones are answered once, and with 503 unless they ask for health, readiness or
-    /// metrics.
+    /// Open connections. Further ones get one answer: 503, except for health, readiness and metrics.
     pub n_connections: usize,
-    /// Open connections of one peer: an IPv4 address, or a /64 network of IPv6.
+    /// Open connections per peer: an IPv4 address, or a /64 network of IPv6.
     pub n_per_peer: usize,
-    /// Open connections beyond these limits. Another one ends the oldest.
+    /// Open connections beyond these limits; another one ends the oldest.
     pub n_reserved: usize,
-    /// Length of a request head; a longer one is answered with 431.
+    /// Length of a request head; longer ones get 431.
     pub head_bytes: usize,
-    /// Time for a request head, for the handshake of TLS before it, and that a connection may idle.
+    /// Time for a request head, for the TLS handshake before it, and for idling.
     pub head_timeout: Duration,
-    /// Time for a request body, from the end of its head; a slower one is answered with 408.
+    /// Time for a request body, from the end of its head; slower ones get 408.
     pub body_timeout: Duration,
-    /// Time without progress in sending after which a connection is dropped ([`Stalling`]). It should exceed the
-    /// sum of `head_timeout`, `body_timeout` and the service's own time for an answer.
+    /// Time without sending progress after which a connection is dropped ([`Stalling`]). Should exceed the sum of
+    /// `head_timeout`, `body_timeout` and the service's own time for an answer.
     pub stall_timeout: Duration,
     /// Time for requests in progress after the signal to stop.
     pub drain_timeout: Duration,
 }
 
 impl Default for ConnectionLimits {
-    /// Returns bounds for a machine with a few cores, below the usual limit of 1024 open files.
+    /// Limits for a machine with a few cores, below the usual 1024 open files.
     fn default() -> Self {
         Self {
             n_connections: 768,
@@ -110,7 +108,6 @@ pub async fn serve(
     drained.map_err(|_| CutOff { after: limits.drain_timeout })
 }
 
-/// Answers the requests of a connection.
 async fn converse(
     router: Router,
     stream: Box<dyn Stream>,
@@ -167,7 +164,7 @@ async fn converse(
 /// The first second after the year 9999.
 const YEAR_10000_UNIX_SECS: u64 = 253_402_300_800;
 
-/// Returns whether the header Date can name a time; hyper panics on others.
+/// Returns whether the Date header can express a time; hyper panics on others.
 fn is_of_a_date(now: SystemTime) -> bool {
     now.duration_since(UNIX_EPOCH).is_ok_and(|since| since.as_secs() < YEAR_10000_UNIX_SECS)
 }

@@ -1,7 +1,6 @@
 //! Counters and histograms in Prometheus' text format.
 //!
-//! Not `prometheus-client`: it writes OpenMetrics only, another content type, and the format takes these few
-//! lines.
+//! Not `prometheus-client`: it writes OpenMetrics only, another content type, and the format takes these few lines.
 
 use std::collections::BTreeMap;
 use std::fmt::{Display, Write};
@@ -27,7 +26,7 @@ impl ResponseCounts {
 pub struct Histogram {
     /// Upper bounds of the buckets, seconds, ascending.
     bounds_secs: &'static [f64],
-    /// Not cumulated; the last is beyond all bounds.
+    /// Not cumulative; the last is beyond all bounds.
     counts: Vec<AtomicU64>,
     sum_us: AtomicU64,
 }
@@ -47,7 +46,7 @@ impl Histogram {
     }
 }
 
-/// The text of a scrape; it is the response of `GET /metrics`.
+/// The text of a scrape, the response of `GET /metrics`.
 #[derive(Debug)]
 pub struct Exposition {
     prefix: &'static str,
@@ -57,7 +56,7 @@ pub struct Exposition {
 impl Exposition {
     pub const MEDIA_TYPE: &str = "text/plain; version=0.0.4";
 
-    /// Starts a text whose metrics' names begin with `prefix` and an underscore.
+    /// Starts a text of metrics named `prefix_...`.
     pub fn new(prefix: &'static str) -> Self {
         Self { prefix, text: String::new() }
     }

@@ -1,5 +1,4 @@
-//! The description for programs: OpenAPI 3.1, made from the routes and from the types that their handlers take and
-//! return.
+//! The OpenAPI 3.1 description, made from the routes and their handlers' types.
 
 mod schemas;
 
@@ -18,22 +17,21 @@ use crate::routes::{Parameter, Route, Routes};
 
 const SUMMARY_COLUMN: usize = 36;
 
-/// A service, as its description and help text name it.
+/// A service's name and texts in its description and help.
 #[derive(Clone, Copy, Debug)]
 pub struct About {
     pub name: &'static str,
     pub version: &'static str,
     pub license: &'static str,
-    /// Its job: first line of the help text.
+    /// First line of the help text.
     pub summary: &'static str,
     /// Statuses and meanings of errors of every route.
     pub errors: &'static [(u16, &'static str)],
 }
 
 impl<S: Clone + Send + Sync + 'static> Routes<S> {
-    /// Adds `GET /`, a text for people: every route and parameter; and `GET /openapi.json`, the same for programs
-    /// with all types, made on the first request. `M`: members of the service's problems beyond those of RFC 9457.
-    /// Returns the router and the table.
+    /// Adds `GET /`, a help text with every route and parameter; and `GET /openapi.json`, with all types, made on the
+    /// first request. `M`: members of the service's problems beyond RFC 9457. Returns the router and the table.
     pub fn described<M: JsonSchema>(self, about: About) -> (Router<S>, Vec<Route>) {
         let table = Arc::<OnceLock<Vec<Route>>>::default();
         let (of_help, of_document) = (Arc::clone(&table), Arc::clone(&table));
@@ -55,7 +53,7 @@ fn rows(table: &OnceLock<Vec<Route>>) -> &[Route] {
     table.get().map(Vec::as_slice).unwrap_or_default()
 }
 
-/// Returns the description of a service. `M`: members of its problems beyond those of RFC 9457.
+/// Returns a service's description. `M`: members of its problems beyond RFC 9457.
 pub fn document<M: JsonSchema>(about: &About, table: &[Route]) -> String {
     let mut schemas = Schemas::default();
     let problem = schemas.of_reply::<ProblemBody<M>>();
@@ -126,7 +124,7 @@ fn operation(route: &Route, of_all: &[(u16, &'static str)], problem: &Value, sch
         refuse(400, "A parameter is invalid, or none of this resource.");
     }
     if takes_query {
-        // It is refused before anything can write a problem.
+        // Sent before anything can write a problem.
         let description = "The request's head is longer than the service takes.";
         responses.insert("431".into(), json!({ "description": description }));
     }
@@ -145,7 +143,7 @@ fn described(parameter: &Parameter, schemas: &mut Schemas) -> Value {
     json!({ "name": name, "in": place, "required": is_required, "description": description, "schema": schema })
 }
 
-/// Describes the parameters of a route's query string: the members of a struct, or of all structs of a tuple.
+/// Describes the parameters of a route's query string, from a struct or a tuple of structs.
 fn query_of(route: &Route, schemas: &mut Schemas) -> Vec<Value> {
     let Some(query) = route.query else { return Vec::new() };
     let query = schemas.of_request(query);
@@ -165,7 +163,7 @@ fn query_of(route: &Route, schemas: &mut Schemas) -> Vec<Value> {
     parameters
 }
 
-/// The errors of every route with a body.
+/// Errors of every route with a body.
 const OF_BODIES: [(u16, &str); 6] = [
     (400, "The body is not what the schema says."),
     (401, "The service was started with --token-file, and the request lacks its token."),
@@ -183,7 +181,6 @@ pub(crate) fn sentence(summary: &str) -> String {
     letters.next().map(|first| format!("{}{}.", first.to_uppercase(), letters.as_str())).unwrap_or_default()
 }
 
-/// Returns the text for people: every route and parameter.
 fn help(title: &str, table: &[Route]) -> String {
     let mut text = format!("{title}\n\n");
     let mut line = |what: String, summary: &str| {

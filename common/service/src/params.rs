@@ -1,4 +1,4 @@
-//! Query strings as structs: a parameter is a member, repeated where the member is a list.
+//! Query strings as structs: a parameter is a member, repeated for lists.
 
 use std::fmt;
 use std::str::FromStr;
@@ -18,13 +18,11 @@ use serde::{Serialize, forward_to_deserialize_any};
 use crate::problem::Problem;
 use crate::replies::{SchemaOf, Taken};
 
-/// Longest name of an unknown parameter that is repeated to the client.
+/// Longest part of an unknown parameter's name in errors.
 const MAX_NAME_CHARS: usize = 40;
 
-/// What text in a URL is.
 const UTF8: &str = "text in UTF-8 where %XX stand for its bytes";
 
-/// A part of a request that is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{parameter}: found {found}, expected {expected}")]
 pub struct RequestError {
@@ -48,21 +46,20 @@ pub struct ParameterMembers {
 }
 
 impl RequestError {
-    /// Names a parameter, the value found (cut to 80 characters, control characters escaped) and the values
-    /// expected.
+    /// Names a parameter, the value found (cut to 80 characters, control characters escaped) and the values expected.
     pub fn new(parameter: &str, found: &str, expected: impl Into<String>) -> Self {
         let cut: String = found.chars().take(80).collect();
         let dots = if cut.len() < found.len() { "…" } else { "" };
         Self { parameter: parameter.to_owned(), found: format!("{cut:?}{dots}"), expected: expected.into() }
     }
 
-    /// Names the parameter and its value in an error that knows neither.
+    /// Adds the parameter and its value to an error without them.
     fn at(self, parameter: &str, found: &str) -> Self {
         if self.parameter.is_empty() { Self::new(parameter, found, self.expected) } else { self }
     }
 }
 
-/// What serde says is what it expected.
+/// serde's message becomes the expectation.
 impl de::Error for RequestError {
     fn custom<T: fmt::Display>(expected: T) -> Self {
         Self { parameter: String::new(), found: String::new(), expected: expected.to_string() }
@@ -89,7 +86,6 @@ impl From<RequestError> for Problem {
     }
 }
 
-/// A part of the path, as text.
 pub struct PathText(pub String);
 
 impl<S: Send + Sync> FromRequestParts<S> for PathText {
@@ -112,11 +108,11 @@ impl<S: Send + Sync> FromRequestParts<S> for PathText {
 
 impl Taken for PathText {}
 
-/// A query string as a struct, or as a tuple of structs that share it. Parameters that none of them has are refused.
+/// A query string as a struct, or a tuple of structs that share it. Unknown parameters are refused.
 pub struct Params<T>(pub T);
 
 impl<T: DeserializeOwned> Params<T> {
-    /// Reads decoded `name=value` pairs.
+    /// Parses decoded `name=value` pairs.
     pub fn read(pairs: &[(String, String)]) -> Result<T, RequestError> {
         let mut reader = Pairs { pairs, known: Vec::new() };
         let read = T::deserialize(&mut reader)?;
@@ -133,7 +129,7 @@ impl<T: DeserializeOwned> Params<T> {
         let pairs = Query::<Vec<(String, String)>>::try_from_uri(uri);
         let refused = |text: String| RequestError::new("query string", &text, "name=value pairs");
         let pairs = pairs.map_err(|e| refused(e.body_text()))?.0;
-        // What stands for bytes that are no text.
+        // U+FFFD replaces bytes that are not UTF-8.
         let is_lost =
             |(name, value): &&(String, String)| name.contains('\u{FFFD}') || value.contains('\u{FFFD}');
         match pairs.iter().find(is_lost) {
@@ -143,7 +139,7 @@ impl<T: DeserializeOwned> Params<T> {
     }
 }
 
-/// Returns an unknown name as it is repeated to the client.
+/// Returns an unknown name, shortened for an error.
 fn shown(name: &str) -> String {
     name.chars().take(MAX_NAME_CHARS).collect::<String>().escape_debug().to_string()
 }
@@ -162,7 +158,7 @@ impl<T: JsonSchema> Taken for Params<T> {
     }
 }
 
-/// The pairs, and the names that the structs read from them have.
+/// The pairs, and the member names of the structs read from them.
 struct Pairs<'a> {
     pairs: &'a [(String, String)],
     known: Vec<&'static str>,
@@ -211,7 +207,7 @@ impl<'de> Deserializer<'de> for &mut Pairs<'_> {
 struct Members<'a> {
     pairs: &'a [(String, String)],
     names: std::slice::Iter<'static, &'static str>,
-    /// The member whose value is read next.
+    /// The member to read next.
     next: Option<(&'static str, Vec<&'a str>)>,
 }
 

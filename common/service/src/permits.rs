@@ -1,4 +1,4 @@
-//! Who may connect: a number of connections in all and for each peer, and some that are kept for health checks.
+//! Connection limits, in all and per peer, with some connections reserved for health checks.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::{IpAddr, Ipv6Addr};
@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::oneshot::{Receiver, Sender, channel};
 
-/// Paths that a connection beyond the limits may still ask for.
+/// Paths open to connections beyond the limits.
 pub(crate) const HEALTH_PATHS: [&str; 3] = ["/healthz", "/readyz", "/metrics"];
 
-/// Marks the requests of a connection beyond the limits: only [`HEALTH_PATHS`] are answered.
+/// Marks requests on a connection beyond the limits: only [`HEALTH_PATHS`] are answered.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Reserved;
 
@@ -24,7 +24,6 @@ pub(crate) struct Permits {
 struct Open {
     n_ordinary: usize,
     by_peer: HashMap<IpAddr, usize>,
-    /// Oldest first.
     reserved: VecDeque<ReservedPlace>,
     n_numbered: u64,
 }
@@ -35,7 +34,7 @@ struct ReservedPlace {
     _end: Sender<()>,
 }
 
-/// The right to a connection, until it is dropped.
+/// A place for a connection, until dropped.
 pub(crate) struct Permit {
     permits: Arc<Permits>,
     peer: Option<IpAddr>,
@@ -52,8 +51,8 @@ impl Permits {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Admits a connection: as an ordinary one within the limits, else for health checks only. If these are too
-    /// many, the oldest of the same peer ends, or the oldest of all.
+    /// Admits a connection: as an ordinary one within the limits, else for health checks only. If these are too many,
+    /// the oldest of the same peer ends, or else the oldest of all.
     pub fn admit(self: &Arc<Self>, peer: Option<IpAddr>) -> Permit {
         let peer = peer.map(network);
         let mut open = self.open();
@@ -81,7 +80,7 @@ impl Permit {
         self.reserved.is_some()
     }
 
-    /// Resolves when the connection has to make room for another.
+    /// Resolves when the connection must make room for another.
     pub async fn ended(&mut self) {
         match &mut self.reserved {
             // An error is the signal: the other end was dropped.
@@ -110,7 +109,7 @@ impl Drop for Permit {
     }
 }
 
-/// Returns what counts as one peer: an IPv4 address, or the /64 network that a host of IPv6 has to itself.
+/// Returns the peer: an IPv4 address, or the /64 network of an IPv6 host.
 fn network(peer: IpAddr) -> IpAddr {
     match peer.to_canonical() {
         IpAddr::V6(address) => {
@@ -140,7 +139,7 @@ mod tests {
         let local = [permits.admit(None), permits.admit(b)];
         assert!(local.iter().all(|permit| !permit.is_reserved()));
         assert!(permits.admit(b).is_reserved(), "beyond the total");
-        // Those kept for health make room: the oldest of the same peer first.
+        // Reserved ones make room: the oldest of the same peer first.
         let (mut of_a, mut of_b, mut later) = (permits.admit(a), permits.admit(b), permits.admit(b));
         of_b.ended().await;
         let quiet = tokio::time::timeout(std::time::Duration::from_millis(5), async {

@@ -49,7 +49,7 @@ pub struct Problem {
 }
 
 impl Problem {
-    /// Makes a problem; `kind` ends its type URI and never changes its meaning.
+    /// `kind` ends the problem's type URI; its meaning is stable.
     pub fn new(
         status: StatusCode,
         kind: &'static str,
@@ -60,24 +60,23 @@ impl Problem {
         Self { status, kind, title, detail: detail.into(), members, headers, cause: None }
     }
 
-    /// Makes the problem of an internal error: `cause` is logged, not returned.
+    /// Internal error: `cause` is logged, not returned.
     pub fn internal(cause: impl fmt::Display) -> Self {
         let detail = "the service failed; its log has the cause under the number of this request";
         let problem = Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "Internal error", detail);
         Self { cause: Some(cause.to_string()), ..problem }
     }
 
-    /// Makes the problem of a request beyond a limit; the same request may succeed after `retry_secs`.
+    /// A request beyond a limit; it may succeed after `retry_secs`.
     pub fn overloaded(detail: impl Into<String>, retry_secs: u32) -> Self {
         Self::new(StatusCode::SERVICE_UNAVAILABLE, "overloaded", "Overloaded", detail).retry_after(retry_secs)
     }
 
-    /// Makes the problem of an answer that took too long; the same request may succeed after `retry_secs`.
+    /// An answer that took too long; the same request may succeed after `retry_secs`.
     pub fn timeout(detail: impl Into<String>, retry_secs: u32) -> Self {
         Self::new(StatusCode::SERVICE_UNAVAILABLE, "timeout", "Timeout", detail).retry_after(retry_secs)
     }
 
-    /// Adds `Retry-After`: the same request may succeed then.
     pub fn retry_after(self, seconds: u32) -> Self {
         self.with_header(header::RETRY_AFTER, seconds.into())
     }
@@ -87,7 +86,7 @@ impl Problem {
         self
     }
 
-    /// Adds members beyond those of RFC 9457, those of the type that the service's description names.
+    /// Adds members beyond RFC 9457, of the type named in the service's description.
     pub fn with(mut self, members: &impl Serialize) -> Self {
         if let Value::Object(members) = json!(members) {
             self.members.extend(members);
@@ -95,17 +94,16 @@ impl Problem {
         self
     }
 
-    /// Says more in `detail` than the members of the problem do.
     pub fn with_detail(self, detail: impl Into<String>) -> Self {
         Self { detail: detail.into(), ..self }
     }
 
-    /// Returns the part of the request that is refused.
+    /// Returns the refused part of the request.
     pub fn parameter(&self) -> Option<&str> {
         self.members.get(PARAMETER)?.as_str()
     }
 
-    /// Calls the part of the request that is refused as the request itself does.
+    /// Renames the refused part to its name in the request.
     pub fn rename_parameter(&mut self, name: &str) {
         if let Some(rest) = self.parameter().and_then(|old| self.detail.strip_prefix(old)?.strip_prefix(": "))
         {
@@ -114,13 +112,12 @@ impl Problem {
         self.members.insert(PARAMETER.to_owned(), name.into());
     }
 
-    /// Returns the cause that goes to the log.
     pub(crate) fn cause(&self) -> Option<&str> {
         self.cause.as_deref()
     }
 
-    /// Returns the problem of an error response that came without one, from a layer or the router. A service that
-    /// does not list its resources at `/` has its own for paths that it does not know.
+    /// Returns the problem of an error response without one, from a layer or the router. Services without a list of
+    /// resources at `/` have their own for unknown paths.
     pub(crate) fn of_status(status: StatusCode, method: &str, path: &str) -> Self {
         let shown: String = path.chars().take(80).collect();
         match status {
@@ -145,7 +142,7 @@ impl Problem {
         }
     }
 
-    /// Writes the body into a response that this problem made.
+    /// Writes the body into a response made from this problem.
     pub(crate) fn render(self, response: Response, instance: String) -> Response {
         let (mut head, _) = response.into_parts();
         let body = ProblemBody {

@@ -10,12 +10,11 @@ use axum::http::{HeaderMap, Method, header};
 pub struct EntityTag(String);
 
 impl EntityTag {
-    /// Makes the tag of a representation from a name of its bytes, such as their hash.
+    /// Makes the tag from a name of the bytes, such as their hash.
     pub fn new(name: impl fmt::Display) -> Self {
         Self(format!("\"{name}\""))
     }
 
-    /// Returns the value of the `ETag` header.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -35,9 +34,9 @@ impl EntityTag {
 /// The part of a representation that a request selects.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Selection {
-    /// All of it: no range, or a range that may be ignored (another unit, malformed, several ranges).
+    /// All of it: no range, or an ignored one (another unit, malformed, several ranges).
     Whole,
-    /// These bytes; never empty.
+    /// Never empty.
     Part(RangeInclusive<u64>),
     /// No byte of the representation: 416.
     Unsatisfiable,
@@ -85,8 +84,7 @@ impl Selection {
     }
 }
 
-/// Reads a position: `Some(None)` without digits, `None` for anything else. Numbers beyond `u64` saturate,
-/// which is beyond any file.
+/// Parses a position: `Some(None)` without digits, `None` for anything else. Saturates beyond `u64`.
 fn position(digits: &str) -> Option<Option<u64>> {
     match digits {
         "" => Some(None),
@@ -160,7 +158,6 @@ mod tests {
         }
     }
 
-    /// Whatever is asked, the part lies within the representation.
     #[test]
     fn parts_lie_within() {
         let pieces = ["", "0", "1", "9", "10", "18446744073709551615", "18446744073709551616", "x"];

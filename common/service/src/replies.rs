@@ -1,4 +1,4 @@
-//! What handlers take and return, as the description of the service says it.
+//! Types of handlers' arguments and results for the description.
 
 use std::marker::PhantomData;
 
@@ -18,12 +18,11 @@ pub struct Reply {
     pub status: StatusCode,
     /// Media types of the body, each with its schema; empty: no body.
     pub content: Vec<(&'static str, Schema)>,
-    /// Headers that it always has, and their meaning.
+    /// Headers always present, and their meaning.
     pub headers: &'static [(&'static str, &'static str)],
 }
 
 impl Reply {
-    /// Describes a reply with status 200 and a body of one type.
     pub fn ok(media_type: &'static str, schema: Schema) -> Self {
         Self { status: StatusCode::OK, content: vec![(media_type, schema)], headers: &[] }
     }
@@ -72,7 +71,7 @@ impl Described for Binary {
     }
 }
 
-/// A response that is what `D` describes: a body that was written elsewhere, or is sent in pieces.
+/// A response described by `D`: a body written elsewhere, or sent in pieces.
 pub struct As<D> {
     response: Response,
     described: PhantomData<D>,
@@ -96,9 +95,9 @@ impl<D: Described> Described for As<D> {
     }
 }
 
-/// An argument of a handler, as the description of the service says it.
+/// A handler's argument in the description.
 pub trait Taken {
-    /// Describes the struct whose members are the parameters of the query string.
+    /// Describes the struct of query parameters.
     fn query() -> Option<SchemaOf> {
         None
     }
@@ -116,11 +115,11 @@ impl Taken for HeaderMap {}
 impl Taken for Method {}
 impl Taken for Bytes {}
 
-/// A handler that says what it takes and returns.
+/// A handler with described arguments and results.
 pub trait Answering<T> {
     type Answer: Described;
 
-    /// Describes the struct whose members are the parameters of the query string.
+    /// Describes the struct of query parameters.
     fn query() -> Option<SchemaOf>;
 }
 

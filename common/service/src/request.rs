@@ -1,5 +1,4 @@
-//! The stage around every request: its id, whether it is admitted, its log line, its counter, and the body of an
-//! error.
+//! The stage around every request: its id, access check, log line, counter, and error body.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -18,13 +17,13 @@ use crate::metrics::ResponseCounts;
 use crate::permits::{HEALTH_PATHS, Reserved};
 use crate::problem::Problem;
 
-/// The label of paths that are no route: a scanner must not fill the metrics.
+/// Label of unknown paths: a scanner must not fill the metrics.
 const OTHER: &str = "other";
 
 const REQUEST_ID: &str = "x-request-id";
-/// Longest id taken over from a client.
+/// Longest id accepted from a client.
 const MAX_ID_CHARS: usize = 64;
-/// Pause before a request is worth another attempt when there are too many connections.
+/// `Retry-After` when there are too many connections.
 const RETRY_SECS: u32 = 1;
 
 struct Observer {
@@ -33,8 +32,8 @@ struct Observer {
     access: Access,
 }
 
-/// Puts this stage around a router: ids in `x-request-id` (the client's own if it sent one), the checks of
-/// `access`, a problem as the body of every error (a panic of a handler is one), counts in `responses`.
+/// Wraps a router: ids in `x-request-id` (the client's own if sent), the checks of `access`, a problem as the body of
+/// every error (including handlers' panics), counts in `responses`.
 pub fn observed(router: Router, responses: Arc<ResponseCounts>, access: Access) -> Router {
     let observer = Arc::new(Observer { n_requests: AtomicU64::new(0), responses, access });
     router.layer(CatchPanicLayer::custom(panicked)).layer(from_fn_with_state(observer, observe))
@@ -66,7 +65,7 @@ async fn observe(State(observer): State<Arc<Observer>>, request: Request, next: 
     let route = matched.as_ref().map_or(OTHER, MatchedPath::as_str);
     observer.responses.count(route, status.as_u16());
     tracing::debug!(%id, %method, route, status = status.as_u16(), took = ?started.elapsed(), "request");
-    // An id is visible ASCII, so it is a header's value.
+    // An id is visible ASCII, so it is a valid header value.
     if let Ok(id) = HeaderValue::from_str(&id) {
         response.headers_mut().insert(REQUEST_ID, id);
     }
@@ -76,14 +75,14 @@ async fn observe(State(observer): State<Arc<Observer>>, request: Request, next: 
     response
 }
 
-/// Returns the id that a client gave its request, if it is a short word.
+/// Returns the client's request id, if it is a short word.
 fn id_of(headers: &HeaderMap) -> Option<String> {
     let id = headers.get(REQUEST_ID)?.to_str().ok()?;
     let is_word = id.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._".contains(&b));
     (is_word && (1..=MAX_ID_CHARS).contains(&id.len())).then(|| id.to_owned())
 }
 
-/// Checks who asks, and on a connection beyond the limits, for what.
+/// Checks access, and on a reserved connection the path.
 fn admitted(access: &Access, request: &Request) -> Result<(), Problem> {
     access.check(request)?;
     if request.extensions().get::<Reserved>().is_some() && !HEALTH_PATHS.contains(&request.uri().path()) {

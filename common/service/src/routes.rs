@@ -1,4 +1,4 @@
-//! The table of a service's routes, from which the router and the descriptions are made.
+//! The table of a service's routes, source of the router and the descriptions.
 
 use std::convert::Infallible;
 
@@ -18,20 +18,20 @@ use crate::params::RequestError;
 use crate::problem::Problem;
 use crate::replies::{Answering, Binary, Described, Reply, SchemaOf};
 
-/// A part of the path, or a header that counts.
+/// A path parameter or a header.
 #[derive(Clone, Debug)]
 pub struct Parameter {
     pub(crate) name: &'static str,
-    /// Its place, by its name in OpenAPI.
+    /// Its `in` in OpenAPI.
     pub(crate) place: &'static str,
-    /// Meaning, one line.
+    /// One line.
     pub(crate) summary: &'static str,
     pub(crate) schema: SchemaOf,
     pub(crate) limits: Map<String, Value>,
 }
 
 impl Parameter {
-    /// Describes a part of the path with values of type `T`.
+    /// A path parameter with values of type `T`.
     pub fn of_path<T: JsonSchema>(name: &'static str, summary: &'static str) -> Self {
         Self { name, place: "path", summary, schema: SchemaGenerator::subschema_for::<T>, limits: Map::new() }
     }
@@ -55,20 +55,19 @@ pub(crate) struct BodyOf {
 
 #[derive(Clone, Debug)]
 pub struct Route {
-    /// Method; a GET route takes HEAD as well.
+    /// A GET route takes HEAD as well.
     pub method: Method,
-    /// Path, in axum's form.
+    /// In axum's form.
     pub path: &'static str,
-    /// The answer, one line.
+    /// One line.
     pub summary: &'static str,
-    /// More about it, for the description.
+    /// Longer text for the description.
     pub details: Option<&'static str>,
-    /// Parts of the path, and headers.
+    /// Path parameters and headers.
     pub parameters: Vec<Parameter>,
     pub(crate) query: Option<SchemaOf>,
-    /// Whether it changes nothing although its method is POST, so that it needs no token.
+    /// Whether it changes nothing despite POST, so that it needs no token.
     pub reads: bool,
-    /// Statuses and meanings of its own errors.
     pub errors: Vec<(u16, &'static str)>,
     pub(crate) body: Option<BodyOf>,
     pub(crate) replies: fn(&mut SchemaGenerator) -> Vec<Reply>,
@@ -111,7 +110,6 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         self
     }
 
-    /// Adds a resource that is read.
     pub fn get<T: 'static, H: Handler<T, S> + Answering<T>>(
         self,
         path: &'static str,
@@ -121,8 +119,8 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         self.add::<T, H>(Method::GET, path, summary, get(handler))
     }
 
-    /// Adds a resource that takes a `B` in JSON, of at most `max_body_bytes`. The body is read, and bodies of
-    /// another type, longer ones and slow ones are refused, before the handler is called; the handler parses it.
+    /// Adds a resource that takes a `B` in JSON, of at most `max_body_bytes`. The body is read before the handler
+    /// parses it; bodies of another type, longer or slow ones are refused.
     pub fn post<B: JsonSchema, T: 'static, H: Handler<T, S> + Answering<T>>(
         self,
         path: &'static str,
@@ -134,7 +132,7 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         self.post_of::<T, H>(path, summary, body, max_body_bytes, handler)
     }
 
-    /// The same for bytes of some media types.
+    /// As [`Self::post`], for bytes of some media types.
     pub fn post_bytes<T: 'static, H: Handler<T, S> + Answering<T>>(
         self,
         path: &'static str,
@@ -159,7 +157,7 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         let whole = from_fn(move |request: Request, next: Next| {
             whole_body(media_types, max_body_bytes, request, next)
         });
-        // The length is limited by `whole`; by itself axum refuses a body of more than 2 MB.
+        // `whole` limits the length; by default axum refuses bodies over 2 MB.
         let handler = post(handler).route_layer(DefaultBodyLimit::disable()).route_layer(whole);
         let mut routes = self.add::<T, H>(Method::POST, path, summary, handler);
         routes.last(|route| route.body = Some(body));
@@ -172,25 +170,25 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         }
     }
 
-    /// Describes parts of the path, and headers, of the route added last.
+    /// Adds path parameters and headers to the route added last.
     pub fn parameters(mut self, parameters: impl IntoIterator<Item = Parameter>) -> Self {
         self.last(|route| route.parameters.extend(parameters));
         self
     }
 
-    /// Says that the route added last changes nothing although its method is POST: it is admitted as GET is.
+    /// Marks the route added last as changing nothing despite POST: it is admitted as GET is.
     pub fn reads(mut self) -> Self {
         self.last(|route| route.reads = true);
         self
     }
 
-    /// Says more about the route added last.
+    /// Adds details to the route added last.
     pub fn details(mut self, details: &'static str) -> Self {
         self.last(|route| route.details = Some(details));
         self
     }
 
-    /// Describes errors of the route added last, beyond those that its parameters and its body can cause.
+    /// Adds errors of the route added last, beyond those of its parameters and body.
     pub fn errors(mut self, errors: &[(u16, &'static str)]) -> Self {
         self.last(|route| route.errors.extend_from_slice(errors));
         self
@@ -201,7 +199,7 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
     }
 }
 
-/// Hands a request on that has no query string.
+/// Passes on a request without a query string.
 async fn no_query(request: Request, next: Next) -> Response {
     match request.uri().query() {
         None | Some("") => next.run(request).await,
@@ -213,10 +211,9 @@ async fn no_query(request: Request, next: Next) -> Response {
     }
 }
 
-/// Room for long bodies in this process.
 static LONG_BODIES: Semaphore = Semaphore::const_new(body::ROOM_BYTES);
 
-/// Hands a request on with its body read.
+/// Passes on a request with its body read.
 async fn whole_body(
     media_types: &'static [&'static str],
     max_bytes: usize,

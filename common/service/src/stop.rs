@@ -18,13 +18,13 @@ pub fn stop_signal() -> io::Result<impl Future<Output = ()> + Send + 'static> {
     })
 }
 
-/// Calls `stop` whenever a signal asks the program to end: ctrl-c, SIGTERM or SIGHUP.
+/// Calls `stop` at ctrl-c, SIGTERM or SIGHUP.
 pub fn on_stop(mut stop: impl FnMut() + Send + 'static) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    // It may be called from within another runtime, where none can be driven.
+    // The caller may be within another runtime, where none can be driven.
     let (mut interrupt, mut terminate, mut hangup) = {
         let _context = runtime.enter();
-        // Under `nohup`, which ignores it, the program goes on after its terminal.
+        // Under `nohup`, which ignores it, the program outlives its terminal.
         let hangup = (!ignores_hangup()).then(|| signal(SignalKind::hangup())).transpose()?;
         (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?, hangup)
     };
@@ -49,7 +49,7 @@ pub fn on_stop(mut stop: impl FnMut() + Send + 'static) -> io::Result<()> {
     std::thread::Builder::new().name("signals".to_owned()).spawn(listening).map(drop)
 }
 
-/// Returns whether this program was started with SIGHUP, number 1, ignored; where the system does not tell, not.
+/// Returns whether SIGHUP was ignored at the start; false if the system does not tell.
 fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

@@ -1,7 +1,6 @@
-//! TLS: a certificate and its key from PEM files, read anew when they change.
+//! TLS: a certificate and its key from PEM files, reread on changes.
 //!
-//! Whoever renews a certificate replaces two files, one after the other. A pair that does not fit together is left
-//! aside with a warning, and the one before it stays in use.
+//! A renewal replaces two files in turn. A pair that does not match is ignored with a warning; the last one stays.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -19,9 +18,9 @@ use tokio_rustls::TlsAcceptor;
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TlsFiles {
-    /// Certificate and the chain that leads to its authority, PEM.
+    /// Certificate chain, PEM.
     pub cert: PathBuf,
-    /// The certificate's private key, PEM.
+    /// Private key, PEM.
     pub key: PathBuf,
 }
 
@@ -35,13 +34,12 @@ pub enum TlsError {
     Pair { cert: PathBuf, key: PathBuf, cause: rustls::Error },
 }
 
-/// The versions of both files, read without their content.
+/// State of both files, read without their content.
 type Stamps = [Option<(SystemTime, u64)>; 2];
 
 /// Most bytes of a file: ten times the longest chain in use.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// A certificate with its key, as last read.
 struct ReadPair {
     stamps: Stamps,
     key: Arc<CertifiedKey>,
@@ -89,12 +87,12 @@ impl fmt::Debug for Certificate {
 }
 
 impl ResolvesServerCert for Certificate {
-    /// Returns the certificate for a connection: two `stat` calls, and a few kilobytes read where a file changed.
+    /// Returns the certificate for a connection: two `stat` calls, plus reading a few kilobytes if a file changed.
     fn resolve(&self, _: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let stamps = stamps_of(&self.files);
         if stamps != state.stamps {
-            // Also after a failure: a pair is read once, and again when one of its files changes.
+            // Also after a failure: a pair is read once per change of its files.
             state.stamps = stamps;
             match read(&self.files, &self.provider) {
                 Ok(key) => {

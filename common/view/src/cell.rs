@@ -1,5 +1,4 @@
-//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each; all of them, or for a first picture and for far
-//! cells every few.
+//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each; all, or every n-th (first picture, far cells).
 
 use glam::{DVec3, Vec3};
 use half::f16;
@@ -7,26 +6,24 @@ use slag_common::appearance::{Appearance, larger_size_code, size_code};
 
 const MAGIC: [u8; 4] = *b"SLGG";
 const VERSION: u32 = 1;
-/// Bytes before the columns.
 pub const CELL_HEAD_BYTES: usize = 32;
 pub const GAUSSIAN_BYTES: usize = 16;
-/// Colour and opacity of Gaussians whose appearance is not known; the page shades them by height.
+/// Colour and opacity of Gaussians without appearance; the page shades them by height.
 const PLAIN: [u8; 4] = [160, 160, 160, 230];
 /// No rotation, see [`slag_common::appearance::rotation_code`].
 const UNTURNED: [u8; 3] = [255, 128, 0];
 
-/// Writes a cell's message: magic, version, N (u32), the origin in the world (three f32), flags (u32; 1: the
-/// appearance is known), `step` (u32); then a column each of centres less the origin (three f16), colours,
-/// opacities, sizes and rotations.
+/// Writes a cell's message: magic, version, N (u32), the origin in the world (three f32), flags (u32; 1: has
+/// appearance), `step` (u32); then a column each of centres minus the origin (three f16), colours, opacities, sizes
+/// and rotations.
 ///
-/// `positions`: `[N]`, world, those of every `step`-th Gaussian of the cell, the first one included; `appearance`:
-/// of all its Gaussians. Those that are sent stand for the others: each has the area of `step` of them. Without an
-/// appearance, Gaussians are as large as their distances to their neighbours in the order of the shard, which
-/// follows a curve through space.
+/// `positions`: `[N]`, world, of every `step`-th Gaussian of the cell, from the first; `appearance`: of all its
+/// Gaussians. Each one sent has the area of `step` of them. Without an appearance, sizes are distances to neighbours
+/// in the shard's order, which follows a space-filling curve.
 pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>, step: Step) -> Vec<u8> {
     let low = positions.iter().copied().reduce(DVec3::min).unwrap_or_default();
     let high = positions.iter().copied().reduce(DVec3::max).unwrap_or_default();
-    // As the page reads it: what rounding takes from the origin goes to the centres.
+    // As the page reads it: the origin's rounding error goes to the centres.
     let origin: Vec3 = ((low + high) / 2.0).as_vec3();
     let n = positions.len();
     let mut message = Vec::with_capacity(CELL_HEAD_BYTES + GAUSSIAN_BYTES * n);
@@ -59,7 +56,7 @@ pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>, ste
     message
 }
 
-/// Which Gaussians of a cell are sent: every n-th.
+/// Every n-th Gaussian of a cell is sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Step(usize);
 
@@ -76,14 +73,12 @@ impl Step {
         all.iter().step_by(self.0)
     }
 
-    /// Returns the indices that are sent of `n` Gaussians.
     pub fn indices(self, n: usize) -> impl ExactSizeIterator<Item = usize> {
         (0..n).step_by(self.0)
     }
 }
 
-/// Returns half the distance of each position to the nearer of its neighbours in the order, within a quarter and
-/// twice the median.
+/// Returns half the distance to the nearer neighbour in order, clamped to a quarter and twice the median.
 fn sizes(positions: &[DVec3]) -> Vec<f32> {
     let apart: Vec<f32> = positions.windows(2).map(|pair| pair[0].distance(pair[1]) as f32).collect();
     let mut sorted: Vec<f32> = apart.iter().copied().filter(|d| *d > 0.0).collect();

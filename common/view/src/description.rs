@@ -1,4 +1,4 @@
-//! `GET /v1/view`: what there is to draw.
+//! `GET /v1/view`: the scene to draw.
 
 use std::collections::BTreeMap;
 
@@ -106,7 +106,7 @@ pub struct Photo {
 }
 
 impl Photo {
-    /// Describes the photos of a shard with this origin, whose pictures were not published.
+    /// Describes the photos of a shard with this origin, without published pictures.
     pub fn of_shard<'a>(origin: DVec3, photos: PhotoPoses<'a>) -> impl Iterator<Item = Self> + use<'a> {
         photos.iter().map(move |(pose, name)| Self {
             name: name.to_owned(),
@@ -131,12 +131,12 @@ pub struct Words {
     pub complete: bool,
 }
 
-/// Confidence from which a name is more likely right than wrong; below, nobody is offered it.
+/// Confidence from which a name is more likely right than wrong; others are not offered.
 const LIKELY: f32 = 0.5;
 
 impl Words {
-    /// Counts things by their best names, each with its confidence, where that is [`LIKELY`]; adds the other words of a
-    /// `vocabulary`. Names are ordered by the number of things to expect: the sum of their confidences.
+    /// Counts things by their best names, each with its confidence, if [`LIKELY`]; adds the other words of a
+    /// `vocabulary`. Ordered by the expected number of things: the sum of confidences.
     pub fn new<'a>(
         generation: u64,
         best: impl IntoIterator<Item = (&'a str, f32)>,
@@ -155,7 +155,6 @@ impl Words {
         Self { generation, words: named.chain(others).collect(), complete: true }
     }
 
-    /// Returns the reply while the words are encoded.
     pub fn pending(generation: u64) -> Self {
         Self { generation, words: Vec::new(), complete: false }
     }

@@ -1,8 +1,8 @@
-//! The page that draws a scene, asks it and shows the answers. `scripts/build-page.sh` builds it from `web/` into
-//! `dist/`; the build embeds it compressed, and [`router`] serves it under `/view` without a network or files.
+//! The page that draws a scene, queries it and shows the answers. `scripts/build-page.sh` builds it from `web/` into
+//! `dist/`; the build embeds it compressed, and [`router`] serves it under `/view` without network or files.
 //!
-//! The program that serves the page describes its scene ([`Description`]) and sends Gaussians ([`cell_message`])
-//! and scores ([`ScoresMessage`]) in the layouts of `docs/view.md`.
+//! The serving program sends the scene ([`Description`]), Gaussians ([`cell_message`]) and scores ([`ScoresMessage`])
+//! in the layouts of `docs/view.md`.
 
 mod cell;
 mod description;
@@ -33,13 +33,11 @@ struct File {
     gzip: &'static [u8],
 }
 
-/// The built page; empty where it was not built.
+/// Empty if the page was not built.
 static FILES: &[File] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
 
-/// No inline code, and nothing from elsewhere.
 const POLICY: &str = include_str!("csp.txt");
 
-/// Answer of a program that was built without the page.
 const NOT_BUILT: &str =
     "this program was built without its page; run scripts/build-page.sh and build the program again";
 
@@ -79,7 +77,7 @@ fn reply(path: &str, headers: &HeaderMap) -> Response {
         let detail = format!("the page has no file {shown:?}; reload it");
         return Problem::new(StatusCode::NOT_FOUND, "not-found", "Not found", detail).into_response();
     };
-    // Names under assets/ hold a hash of the content.
+    // Names under assets/ contain a hash of the content.
     let caching =
         if path.starts_with("assets/") { "public, max-age=31536000, immutable" } else { "no-cache" };
     let common = [

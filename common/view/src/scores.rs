@@ -9,20 +9,18 @@ const HEAD_BYTES: usize = 24;
 const ROW_BYTES: usize = 8;
 const LAST_LEVEL: f32 = 255.0;
 
-/// A message of scores in the making: magic, version, least and largest score (f32 each), number of cells and
-/// generation (u32 each); for each cell its id and number of Gaussians (u32 each); then a level for each Gaussian
-/// of each cell. Level 0 is a Gaussian that no view shows; the score of level `b` is `least + b / 255 * (largest -
-/// least)`.
+/// A message of scores under construction: magic, version, least and largest score (f32 each), number of cells and
+/// generation (u32 each); for each cell its id and number of Gaussians (u32 each); then a level for each Gaussian of
+/// each cell. Level 0: in no view; level `b`: a score of `least + b / 255 * (largest - least)`.
 pub struct ScoresMessage {
     bytes: Vec<u8>,
-    /// Where the levels of each cell begin.
     starts: Vec<usize>,
     least: f32,
     largest: f32,
 }
 
 impl ScoresMessage {
-    /// Makes the message of cells (ids and numbers of Gaussians) whose Gaussians have no score yet.
+    /// Starts the message of cells (ids and numbers of Gaussians), without any scores.
     pub fn new(generation: u64, [least, largest]: [f32; 2], cells: &[(u32, u32)]) -> Self {
         let n_gaussians: usize = cells.iter().map(|(_, n)| *n as usize).sum();
         let mut bytes = Vec::with_capacity(Self::len(cells.len(), n_gaussians));
@@ -31,7 +29,7 @@ impl ScoresMessage {
         bytes.extend(least.to_le_bytes());
         bytes.extend(largest.to_le_bytes());
         bytes.extend((cells.len() as u32).to_le_bytes());
-        // The page compares, and 2^32 generations take a while.
+        // The page only compares, and 2^32 generations take a while.
         bytes.extend((generation as u32).to_le_bytes());
         let mut starts = Vec::with_capacity(cells.len());
         let mut start = HEAD_BYTES + ROW_BYTES * cells.len();
@@ -49,7 +47,7 @@ impl ScoresMessage {
         HEAD_BYTES + ROW_BYTES * n_cells + n_gaussians
     }
 
-    /// Gives Gaussians of a cell (by its place in the table) a score.
+    /// Sets the score of Gaussians of a cell (by its place in the table).
     ///
     /// # Panics
     /// If they are not the cell's.

@@ -1,4 +1,4 @@
-//! The file: a channel for each topic, one message each, with its schema.
+//! The file: one channel per topic with one message each, and its schema.
 
 use std::collections::BTreeMap;
 use std::io::{Seek, Write};
@@ -14,7 +14,7 @@ pub struct File<W: Write + Seek> {
 }
 
 impl<W: Write + Seek> File<W> {
-    /// Begins a file. `time_ns`: time of all its messages, nanoseconds since 1970.
+    /// Starts a file. `time_ns`: time of all its messages, nanoseconds since 1970.
     pub fn new(out: W, time_ns: u64) -> Result<Self> {
         let options =
             WriteOptions::new().compression(None).library(concat!("slag-mcap ", env!("CARGO_PKG_VERSION")));
@@ -35,7 +35,6 @@ impl<W: Write + Seek> File<W> {
     }
 }
 
-/// A schema's name and text.
 pub type Schema = (&'static str, fn() -> Value);
 
 pub const THINGS: Schema = ("foxglove.SceneUpdate", scene_update);

@@ -1,5 +1,4 @@
-//! A robot's answers and the ground around it as an MCAP file, which Foxglove and the MCAP libraries read
-//! (docs/api.md).
+//! A robot's answers and ground as an MCAP file for Foxglove and the MCAP libraries (docs/api.md).
 
 mod args;
 mod file;
@@ -15,7 +14,7 @@ use file::File;
 use messages::Stamp;
 use slag_robot::durable;
 
-/// Asks a robot and writes its answers; returns the number of messages. A robot that refuses leaves no file.
+/// Queries a robot and writes its answers; returns the number of messages. A refused request leaves no file.
 pub fn record(args: &Args) -> Result<usize> {
     let robot = args.robot.open()?;
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
@@ -31,7 +30,7 @@ pub fn record(args: &Args) -> Result<usize> {
             let things = messages::things(stamp, text, &found.answers);
             messages.push((format!("/slag/things/{text}"), file::THINGS, things));
         }
-        // A relation is between things; only words have Gaussians that match.
+        // A relation is between things; only plain words have matching Gaussians.
         let is_relation = reply.results.iter().any(|found| found.understood.is_some());
         if args.points > 0 && !is_relation {
             let reply = robot.ask_points(&json!({"texts": [text], "limit": args.points}))?;

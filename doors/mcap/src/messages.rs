@@ -1,5 +1,4 @@
-//! What a robot says, as Foxglove's messages in JSON (foxglove.dev/docs/sdk/schemas): positions in metres in the
-//! scene's frame.
+//! The robot's answers as Foxglove's JSON messages (foxglove.dev/docs/sdk/schemas), in metres in the scene's frame.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -7,13 +6,13 @@ use serde_json::{Value, json};
 use slag_robot::api::floor::{Floor, Place};
 use slag_robot::{Answer, PointAnswer};
 
-/// Foxglove's numbers of the types of fields.
+/// Foxglove's codes of field types.
 const UINT8: u32 = 1;
 const FLOAT32: u32 = 7;
 /// Height of letters, metres.
 const LETTERS_M: f64 = 0.15;
 
-/// When and where a message holds.
+/// Time and frame of a message.
 #[derive(Clone, Copy, Debug)]
 pub struct Stamp<'a> {
     /// Nanoseconds since 1970.
@@ -35,7 +34,7 @@ fn pose(position: [f64; 3], [x, y, z, w]: [f64; 4]) -> Value {
     json!({"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}})
 }
 
-/// Returns a `foxglove.SceneUpdate` with the box and the words of each thing.
+/// Returns a `foxglove.SceneUpdate` with each thing's box and words.
 pub fn things(stamp: Stamp<'_>, text: &str, answers: &[Answer]) -> Value {
     let entity = |answer: &Answer| {
         let of = &answer.oriented_box;
@@ -76,8 +75,7 @@ pub fn points(stamp: Stamp<'_>, answers: &[PointAnswer]) -> Value {
     })
 }
 
-/// Returns a `foxglove.Grid` of the ground: 0 unknown, 1 ground that the robot cannot reach, 2 reached, 3
-/// obstacle. `None` if the robot's runs are not as many cells as it says.
+/// Returns a `foxglove.Grid`: 0 unknown, 1 unreachable, 2 reached, 3 obstacle; `None` if runs and size differ.
 pub fn ground(stamp: Stamp<'_>, floor: &Floor) -> Option<Value> {
     let number = |place: Place| match place {
         Place::Unknown => 0,

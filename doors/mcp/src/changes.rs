@@ -1,4 +1,4 @@
-//! What `what_changed` takes and gives.
+//! Request and reply of `what_changed`.
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
@@ -83,7 +83,6 @@ pub struct Move {
 }
 
 impl Compare {
-    /// Returns the parameters of `GET /v1/changes`.
     pub fn parameters(&self) -> Vec<(&'static str, String)> {
         let words = self.words.iter().map(|word| ("text", word.clone()));
         let more = [

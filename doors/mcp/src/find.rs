@@ -1,4 +1,4 @@
-//! What `find` takes and gives.
+//! Request and reply of `find`.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use slag_robot::{Answer, Reply, Results};
 
-/// Things in an answer unless the request says otherwise: a model reads every one.
+/// Default number of things in an answer: a model reads every one.
 const DEFAULT_LIMIT: u32 = 5;
 /// Most things in an answer.
 const MAX_LIMIT: u32 = 50;
@@ -106,7 +106,6 @@ pub struct Nothing {
 }
 
 impl Wanted {
-    /// Returns the request for `POST /v1/query`, or what is wrong.
     pub fn request(&self) -> Result<Value, String> {
         let limit = self.limit.unwrap_or(DEFAULT_LIMIT);
         if !(1..=MAX_LIMIT).contains(&limit) {
@@ -131,7 +130,6 @@ impl Wanted {
 }
 
 impl Found {
-    /// Shortens the reply to one question.
     pub fn new(reply: Reply) -> Result<Self, String> {
         let [Results { understood, asked_as, none, next_offset, answers }] =
             <[Results; 1]>::try_from(reply.results)

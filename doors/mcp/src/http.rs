@@ -13,15 +13,14 @@ use crate::Tools;
 use crate::locate::MAX_MESSAGE_BYTES;
 
 pub const PATH: &str = "/mcp";
-/// Open connections, and those of one peer: messages of the longest kind are 0.5 GB. Others make room for the next.
+/// Open connections, and those of one peer: together at most 0.5 GB of the longest messages. The oldest make room.
 const N_CONNECTIONS: usize = 32;
 const N_PER_PEER: usize = 24;
 
 /// Serves until `stop` completes.
 ///
-/// A request names one of `hosts`, this machine or the address listened on: a page that made its own name point
-/// here (DNS rebinding) names itself. Requests of web pages (`Origin`) are refused. There are no sessions, so
-/// nothing is kept between requests.
+/// A request names one of `hosts`, this machine or the address listened on, which stops DNS rebinding: a page sends
+/// its own name. Requests of web pages (`Origin`) are refused. Nothing is kept between requests: no sessions.
 pub async fn serve(
     tools: Tools,
     listener: Listener,
@@ -46,7 +45,7 @@ pub async fn serve(
     Ok(listener::serve(router, listener, limits, stop).await?)
 }
 
-/// Returns the names that requests may be for.
+/// Returns the names accepted as `Host`.
 pub fn hosts(listen: &Listen, given: Vec<String>) -> Vec<String> {
     let mut hosts: Vec<String> = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
     if let Listen::Tcp(address) = listen {
@@ -80,7 +79,7 @@ mod tests {
             client.write_all(b"POST ").await.expect("sends");
             waiting.push(client);
         }
-        // The first one beyond the limit ends, long before its head is due.
+        // The first one beyond the limit ends long before its head is due.
         let mut nothing = Vec::new();
         let ended =
             tokio::time::timeout(Duration::from_secs(5), waiting[N_PER_PEER].read_to_end(&mut nothing));

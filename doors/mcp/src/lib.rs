@@ -1,6 +1,6 @@
-//! Lets language models ask a robot: its answers as tools of the Model Context Protocol.
+//! A robot's answers as tools of the Model Context Protocol, for language models.
 //!
-//! The tools ask `slag-edge serve` over HTTP and change nothing there.
+//! The tools query `slag-edge serve` over HTTP and change nothing there.
 
 mod args;
 mod changes;

@@ -1,4 +1,4 @@
-//! What `list` takes and gives.
+//! Request and reply of `list`.
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
@@ -7,7 +7,7 @@ use slag_robot::xyz;
 
 use crate::place::ball;
 
-/// Things in an answer unless the request says otherwise: a model reads every one.
+/// Default number of things in an answer: a model reads every one.
 const DEFAULT_LIMIT: u32 = 30;
 /// Most things in an answer.
 const MAX_LIMIT: u32 = 200;
@@ -65,7 +65,6 @@ pub struct Thing {
 }
 
 impl Listing {
-    /// Returns the parameters of `GET /v1/objects`, or what is wrong.
     pub fn parameters(&self) -> Result<Vec<(&'static str, String)>, String> {
         let limit = self.limit.unwrap_or(DEFAULT_LIMIT);
         if !(1..=MAX_LIMIT).contains(&limit) {

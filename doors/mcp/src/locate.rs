@@ -1,4 +1,4 @@
-//! What `where_am_i` takes and gives.
+//! Request and reply of `where_am_i`.
 
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use base64::{Engine, alphabet};
@@ -9,9 +9,9 @@ use slag_robot::{Robot, xyz};
 
 /// Longest photo, characters in base64: a file of 6 MB.
 pub const MAX_PHOTO_CHARS: usize = 8_000_000;
-/// Longest message on either transport. What is beyond the photo's limit but not beyond this one is told by the tool.
+/// Longest message on either transport. The tool reports photos beyond their own limit.
 pub const MAX_MESSAGE_BYTES: usize = 2 * MAX_PHOTO_CHARS;
-/// With or without what fills it up to four characters.
+/// With or without padding.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
     &alphabet::STANDARD,
     GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
@@ -75,7 +75,7 @@ impl Seen {
     }
 }
 
-/// Decodes a file, also where it comes as a `data:` URL, in lines, or in the alphabet of URLs.
+/// Decodes base64, also as a `data:` URL, in lines, or in the URL alphabet.
 fn decoded(text: &str) -> Result<Vec<u8>, String> {
     if text.len() > MAX_PHOTO_CHARS {
         return Err(format!(

@@ -14,13 +14,13 @@ use tracing_subscriber::EnvFilter;
 
 /// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
-/// Questions to the robot at a time.
+/// Concurrent questions to the robot.
 const MAX_QUESTIONS: usize = 8;
 
 fn main() -> ExitCode {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false);
-    // It would panic where nobody reads stderr any more.
+    // It would panic if nobody reads stderr any more.
     log.log_internal_errors(false).with_writer(io::stderr).init();
     match run(Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,

@@ -1,4 +1,4 @@
-//! What `picture` takes and gives.
+//! Request and reply of `picture`.
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;

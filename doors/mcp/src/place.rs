@@ -1,4 +1,4 @@
-//! What `describe_place` takes and gives.
+//! Request and reply of `describe_place`.
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
@@ -6,9 +6,9 @@ use serde_json::{Value, json};
 use slag_robot::api::map::{MapCell, MapStatus, MissingCell};
 use slag_robot::{Reply, Results, Robot, RobotError};
 
-/// Most words in a request: what one question to the robot takes.
+/// Most words in a request, the limit of one question to the robot.
 const MAX_WORDS: usize = 32;
-/// Things of one kind that are counted; beyond that the count is said to be incomplete.
+/// Most things counted per kind; beyond, the count is marked as incomplete.
 const MAX_COUNTED: u32 = 100;
 const SECS_PER_HOUR: f64 = 3600.0;
 
@@ -67,7 +67,7 @@ pub struct Kind {
     pub best_position_in_world: Option<[f64; 3]>,
 }
 
-/// Returns the place of a middle and a radius; `None`: everywhere.
+/// Returns a ball's centre and radius; `None`: everywhere.
 pub fn ball(near: Option<[f64; 3]>, radius: Option<f64>) -> Result<Option<([f64; 3], f64)>, String> {
     match (near, radius) {
         (None, None) => Ok(None),

@@ -1,4 +1,4 @@
-//! What `where_to_stand` takes and gives.
+//! Request and reply of `where_to_stand`.
 
 use rmcp::schemars::{self, JsonSchema};
 use serde::{Deserialize, Serialize};
@@ -88,7 +88,6 @@ pub struct Stand {
 }
 
 impl Going {
-    /// Returns the parameters of `GET /v1/goal`.
     pub fn parameters(&self) -> Vec<(&'static str, String)> {
         let number = |name, value: Option<f64>| value.map(|value| (name, value.to_string()));
         let near = self.near.map(|near| ("near", xyz(near)));

@@ -1,4 +1,4 @@
-//! Standard input with its longest texts cut off.
+//! Standard input with overlong texts truncated.
 
 use std::io;
 use std::pin::Pin;
@@ -10,37 +10,36 @@ use crate::locate::{MAX_MESSAGE_BYTES, MAX_PHOTO_CHARS};
 
 /// Bytes read at a time.
 const PIECE_BYTES: usize = 8 << 10;
-/// Characters of a text that are never cut: names of members and the message's id are texts too.
+/// Characters of a text that are never cut: member names and the message's id are texts, too.
 const SHORT_CHARS: usize = 1000;
 /// Size of a message beyond which its texts are cut to [`SHORT_CHARS`]; the rest is for everything else.
 const MAX_TEXT_BYTES: usize = MAX_MESSAGE_BYTES / 8 * 7;
 
-/// Messages, one a line, as they are read; of each text in them the first characters, one more than a photo may have.
+/// Reads messages, one a line, keeping the first characters of each text, one more than a photo may have.
 ///
-/// The library drops a line beyond its limit, and the client waits for its answer for ever. So the photo is cut
-/// instead, and the tool says that it is too long. Escapes that stand for signs of ASCII are taken as these: six bytes
-/// for each character of a photo would be more than its limit, of which the tool could not tell.
+/// The library drops a line beyond its limit, and the client would wait for ever. So the photo is cut instead, and
+/// the tool reports that it is too long. Escapes of ASCII characters are decoded: at six bytes per character, a valid
+/// photo could exceed the limit without the tool noticing.
 #[derive(Debug)]
 pub struct ShortTexts<R> {
     input: R,
     max_chars: usize,
     max_bytes: usize,
     place: Place,
-    /// What was kept of the input, and how much of that was given.
+    /// Kept input, and the number of its bytes already given.
     kept: Vec<u8>,
     n_given: usize,
 }
 
-/// Where in a message the next byte stands.
+/// Parser state at the next byte.
 #[derive(Debug, Default)]
 struct Place {
     is_in_text: bool,
     /// Characters of the text so far; an escape is one, or half of one beyond U+FFFF.
     n_chars: usize,
-    /// Bytes of the message that were kept.
+    /// Kept bytes of the message.
     n_bytes: usize,
     is_cut: bool,
-    /// The escape so far.
     escape: Vec<u8>,
 }
 
@@ -59,7 +58,7 @@ impl<R> ShortTexts<R> {
     fn go_on_by(&mut self, byte: u8) {
         let place = &mut self.place;
         match (place.is_in_text, byte) {
-            // No text holds it: messages end here.
+            // Texts cannot contain it: messages end here.
             (_, b'\n') => {
                 *place = Place::default();
                 self.kept.push(byte);
@@ -69,7 +68,7 @@ impl<R> ShortTexts<R> {
                 if place.escape.len() == if place.escape[1] == b'u' { 6 } else { 2 } {
                     let escape = std::mem::take(&mut place.escape);
                     let kept = plain(&escape).map_or(escape.clone(), |byte| vec![byte]);
-                    // The second half of a character.
+                    // The second half of a surrogate pair.
                     self.keep(&kept, matches!(*escape, [_, _, b'd' | b'D', b'c'..=b'f' | b'C'..=b'F', ..]));
                 }
             }
@@ -85,7 +84,7 @@ impl<R> ShortTexts<R> {
         }
     }
 
-    /// Keeps a character of a text, or what continues one, unless the text is cut there.
+    /// Keeps a character of a text, or its continuation, unless the text is cut there.
     fn keep(&mut self, bytes: &[u8], continues: bool) {
         let place = &mut self.place;
         if !continues {
@@ -100,7 +99,7 @@ impl<R> ShortTexts<R> {
     }
 }
 
-/// Returns the sign of ASCII that an escape stands for, where it can stand for itself.
+/// Returns the ASCII character of an escape, if it needs none.
 fn plain(escape: &[u8]) -> Option<u8> {
     let byte = match escape {
         b"\\/" => b'/',
@@ -117,7 +116,7 @@ impl<R: AsyncRead + Unpin> AsyncRead for ShortTexts<R> {
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         let this = self.get_mut();
-        // Nothing would be the end of the input, where nothing was read.
+        // Returning nothing would signal the end of input.
         while this.n_given == this.kept.len() {
             let mut piece = [0; PIECE_BYTES];
             let mut piece = ReadBuf::new(&mut piece);
@@ -180,7 +179,7 @@ mod tests {
         }
     }
 
-    /// Whatever its texts are made of, a message stays below the library's limit and is answered: its id is whole.
+    /// With any content, a message stays below the library's limit and is answered: its id is whole.
     #[test]
     fn messages_stay_within_their_limit() {
         let photo_chars = |unit: &str, n_texts: usize| {

@@ -86,7 +86,6 @@ impl Tools {
         self.blocking(move |robot| robot.changes(&compare.parameters()).map(Difference::from)).await
     }
 
-    /// Asks the robot on a thread that may wait.
     async fn blocking<T: Send + 'static, E: ToString + Send + 'static>(
         &self,
         ask: impl FnOnce(&Robot) -> Result<T, E> + Send + 'static,

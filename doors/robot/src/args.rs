@@ -1,4 +1,4 @@
-//! The flags of every door that say which robot it asks.
+//! Flags of every door that select the robot.
 
 use std::io;
 use std::path::PathBuf;
@@ -30,7 +30,7 @@ fn address(text: &str) -> Result<String, &'static str> {
 }
 
 impl RobotArgs {
-    /// Returns the robot, with the token of the file. Nothing is asked yet.
+    /// Returns the robot, with the file's token; sends nothing.
     pub fn open(&self) -> io::Result<Robot> {
         let read = |path: &PathBuf| io::read_to_string(&files::read_short(path, MAX_TOKEN_BYTES)?[..]);
         let token = self.token_file.as_ref().map(read).transpose()?;

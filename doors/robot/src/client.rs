@@ -1,4 +1,4 @@
-//! Asking a robot.
+//! A client of the robot.
 
 use std::net::IpAddr;
 use std::time::Duration;
@@ -15,9 +15,9 @@ use slag_api::objects::ObjectPage;
 use crate::error::{MAX_TEXT_BYTES, RobotError};
 use crate::reply::{PointAnswer, Reply};
 
-/// Longest reply that is read: ten thousand answers are 10 MB.
+/// Longest reply read: ten thousand answers are 10 MB.
 const MAX_REPLY_BYTES: u64 = 64 << 20;
-/// Characters of what is no id that an error shows.
+/// Most characters of an invalid id in an error.
 const MAX_ID_CHARS: usize = 40;
 const TIMEOUT: Duration = Duration::from_secs(20);
 
@@ -28,12 +28,12 @@ type Response = Result<ureq::http::Response<ureq::Body>, ureq::Error>;
 pub struct Robot {
     agent: ureq::Agent,
     url: String,
-    /// The header that a request with a body needs.
+    /// The header of requests with a body.
     authorization: Option<String>,
 }
 
 impl Robot {
-    /// Takes the address of a robot, and the token of its `--token-file` if it has one. Nothing is asked yet.
+    /// Takes a robot's address, and the token of its `--token-file`, if any; sends nothing.
     pub fn new(url: &str, token: Option<&str>) -> Self {
         let mut config =
             ureq::Agent::config_builder().timeout_global(Some(TIMEOUT)).http_status_as_error(false);
@@ -48,13 +48,13 @@ impl Robot {
         }
     }
 
-    /// Asks what `POST /v1/query` takes.
+    /// Posts a request to `/v1/query`.
     pub fn ask(&self, request: &Value) -> Result<Reply, RobotError> {
         check_texts(texts_of(request))?;
         self.post("/v1/query", request)
     }
 
-    /// Asks what `POST /v1/query` takes, for the Gaussians that match.
+    /// As [`Self::ask`], for matching Gaussians.
     pub fn ask_points(&self, request: &Value) -> Result<Reply<PointAnswer>, RobotError> {
         let mut request = request.clone();
         request["kind"] = json!("gaussians");
@@ -70,7 +70,7 @@ impl Robot {
         self.get_with("/v1/objects", parameters)
     }
 
-    /// Returns the number of things on board, or of those in a ball.
+    /// Returns the number of things on board, or in a ball.
     pub fn n_objects(&self, ball: Option<([f64; 3], f64)>) -> Result<usize, RobotError> {
         let mut parameters = vec![("limit", "1".to_owned())];
         if let Some((centre, radius)) = ball {
@@ -79,7 +79,7 @@ impl Robot {
         Ok(self.objects(&parameters)?.n_objects)
     }
 
-    /// Returns the small picture of a thing: a JPEG file.
+    /// Returns the thumbnail of a thing, a JPEG file.
     pub fn thumbnail(&self, id: &str) -> Result<Vec<u8>, RobotError> {
         if !id.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
             return Err(RobotError::NoId { id: id.chars().take(MAX_ID_CHARS).collect() });
@@ -109,7 +109,7 @@ impl Robot {
         self.send("/v1/locate", parameters, media_type, photo)
     }
 
-    /// Says where the robot is, as `POST /position` takes it; a robot that follows then fetches what is around it.
+    /// Posts the robot's position to `/position`; a following robot then fetches its surroundings.
     ///
     /// # Errors
     /// [`RobotError`]; one that does not follow refuses.
@@ -173,7 +173,7 @@ impl Robot {
     }
 }
 
-/// Returns a point as parameters have it.
+/// Formats a point as parameters do.
 pub fn xyz([x, y, z]: [f64; 3]) -> String {
     format!("{x},{y},{z}")
 }
@@ -181,7 +181,7 @@ pub fn xyz([x, y, z]: [f64; 3]) -> String {
 fn is_loopback(url: &str) -> bool {
     let Ok(uri) = url.parse::<ureq::http::Uri>() else { return false };
     let host = uri.host().unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
-    // Who connects to no address in particular reaches this machine.
+    // The unspecified address reaches this machine.
     let is_here = |ip: IpAddr| ip.to_canonical().is_loopback() || ip.is_unspecified();
     host.eq_ignore_ascii_case("localhost") || host.parse().is_ok_and(is_here)
 }
@@ -190,7 +190,7 @@ fn texts_of(request: &Value) -> impl Iterator<Item = &str> {
     request["texts"].as_array().into_iter().flatten().filter_map(Value::as_str)
 }
 
-/// Refuses texts that are too long here already: doors ask with their own token, and on behalf of anybody.
+/// Refuses overlong texts already here: doors use their own token, on behalf of anybody.
 fn check_texts<'a>(mut texts: impl Iterator<Item = &'a str>) -> Result<(), RobotError> {
     match texts.find(|text| text.len() > MAX_TEXT_BYTES) {
         Some(text) => Err(RobotError::TooLong { n_bytes: text.len() }),
@@ -213,7 +213,7 @@ mod tests {
         }
     }
 
-    /// In a process of its own, whose environment names a proxy.
+    /// In a separate process, with a proxy in its environment.
     #[test]
     fn a_proxy_of_the_environment_is_for_other_machines() {
         const PROXY: &str = "http://192.0.2.1:3128";
@@ -229,7 +229,7 @@ mod tests {
         assert_eq!([has_proxy("http://127.0.0.1:7734"), has_proxy("http://10.0.0.1:7734")], [false, true]);
     }
 
-    /// Nobody listens: a text that is too long is refused before anything is sent.
+    /// Without a listener: an overlong text is refused before anything is sent.
     #[test]
     fn long_texts_are_not_sent() {
         let robot = Robot::new("http://127.0.0.1:9", None);

@@ -1,4 +1,4 @@
-//! Why the robot gave no answer.
+//! Errors of a robot's replies.
 
 use serde_json::Value;
 
@@ -24,7 +24,7 @@ pub enum RobotError {
 }
 
 impl RobotError {
-    /// Reads a refusal: problem details (RFC 9457), or the start of any other text.
+    /// Parses a refusal: problem details (RFC 9457), or the start of any other text.
     pub(crate) fn refused(status: u16, body: &str) -> Self {
         let problem: Option<Value> = serde_json::from_str(body).ok();
         let detail = problem.as_ref().and_then(|problem| problem["detail"].as_str());

@@ -1,4 +1,4 @@
-//! The robot's HTTP interface as its clients see it: `slag-edge serve`, asked over `/v1` (docs/api.md).
+//! A client of the robot's HTTP interface: `slag-edge serve` under `/v1` (docs/api.md).
 
 mod args;
 mod client;

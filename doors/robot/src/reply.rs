@@ -6,11 +6,10 @@ use serde::Deserialize;
 use slag_api::Geographic;
 use slag_api::objects::OrientedBox;
 
-/// The results of a request, one for each question. Members that clients here do not need are left out.
+/// The results of a request, one for each question. Members unused by clients here are left out.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Reply<A = Answer> {
     pub scene: String,
-    /// The published state that all positions belong to.
     pub generation: u64,
     pub frame: String,
     /// `m`, or `world` for scenes whose scale is unknown.
@@ -20,9 +19,9 @@ pub struct Reply<A = Answer> {
 
 #[derive(Clone, Debug, Deserialize)]
 pub struct Results<A = Answer> {
-    /// The phrase that a text with a relation was understood as.
+    /// The parsed phrase of a text with a relation.
     pub understood: Option<serde_json::Value>,
-    /// What was asked in place of words that the robot's model does not know.
+    /// Replacements of words unknown to the robot's model.
     #[serde(default)]
     pub asked_as: BTreeMap<String, String>,
     pub none: Option<Nothing>,
@@ -35,7 +34,6 @@ pub struct Results<A = Answer> {
 pub struct Nothing {
     /// `below-threshold`, `no-such-thing`, `no-such-pair` ...
     pub kind: String,
-    /// The same in a sentence.
     pub detail: String,
 }
 
@@ -46,11 +44,8 @@ pub struct Answer {
     /// Stable within a generation.
     pub id: String,
     pub position_in_world: [f64; 3],
-    /// The same on the earth, where the scene is geo-referenced.
     pub geographic: Option<Geographic>,
-    /// Least corner of its box along the axes.
     pub box_min_in_world: [f64; 3],
-    /// Greatest corner.
     pub box_max_in_world: [f64; 3],
     /// Edges of that box.
     pub size: [f64; 3],
@@ -70,12 +65,11 @@ pub struct PointAnswer {
     pub score: f32,
 }
 
-/// A thing that a relation holds with.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Witness {
-    /// The words that it answers to.
+    /// The words that it answers.
     pub thing: String,
-    /// Its id; absent for the asker.
+    /// Absent for the asker.
     pub id: Option<String>,
     pub position_in_world: [f64; 3],
 }

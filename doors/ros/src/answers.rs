@@ -12,9 +12,9 @@ use crate::messages::{
     ObjectHypothesisWithPose, PointCloud2, PointField, PoseStamped, PoseWithCovariance,
 };
 
-/// Points in a message, so that it stays below 64 kB: UDP takes no more at once.
+/// Points per message, to stay below 64 kB, the most that UDP takes at once.
 const POINTS_IN_CLOUD: usize = 3500;
-/// Things in a list of what is on board, for the same reason: one with three names takes 1.3 kB.
+/// Things in a list of those on board, for the same reason: one with three names takes 1.3 kB.
 pub const MAX_OBJECTS: usize = 45;
 /// Bytes of a point: x, y, z and score.
 const POINT_BYTES: u32 = 16;
@@ -28,7 +28,7 @@ const DELETE_ALL: i32 = 3;
 const LETTERS_M: f64 = 0.15;
 const BOX_COLOR: Color = Color { r: 0.1, g: 0.7, b: 1.0, a: 0.35 };
 const TEXT_COLOR: Color = Color { r: 1.0, g: 1.0, b: 1.0, a: 1.0 };
-/// Boxes of one leaf of a surface are flat; viewers refuse markers without extent.
+/// Boxes of flat surfaces have no thickness; viewers refuse markers without extent.
 const MIN_EDGE_M: f64 = 0.01;
 
 pub fn header(frame_id: &str) -> Header {
@@ -42,7 +42,7 @@ fn pose(oriented: &OrientedBox) -> Pose {
     }
 }
 
-/// Returns a thing with what it may be, best first, each with its score. The covariance is unknown: zero.
+/// Returns a thing with its possible names, best first, with scores. The covariance is unknown: zero.
 fn detection<'a>(
     header: &Header,
     id: &str,
@@ -62,7 +62,6 @@ fn detection<'a>(
     }
 }
 
-/// Returns the answers to a text, best first.
 pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3DArray {
     let detection = |answer: &Answer| {
         let score = f64::from(answer.score);
@@ -71,7 +70,7 @@ pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3
     Detection3DArray { header: header.clone(), detections: answers.iter().map(detection).collect() }
 }
 
-/// Returns what is on board, each thing with its names and the chances that they are right.
+/// Returns the things on board with their names and confidences.
 pub fn objects(header: &Header, page: &ObjectPage) -> Detection3DArray {
     let detections = page.objects.iter().map(|object| {
         let names = object.names.iter().map(|name| (name.name.as_str(), name.confidence));
@@ -92,7 +91,7 @@ pub fn best_pose(header: &Header, answers: &[Answer]) -> Option<PoseStamped> {
     answers.first().map(|best| PoseStamped { header: header.clone(), pose: pose(&best.oriented_box) })
 }
 
-/// Returns boxes with their words and scores; the first marker removes those before.
+/// Returns boxes with their words and scores; the first marker clears earlier ones.
 pub fn markers(header: &Header, text: &str, answers: &[Answer]) -> MarkerArray {
     let mut markers = vec![Marker { action: DELETE_ALL, ..marker(header, "", 0) }];
     for (id, answer) in (0..).zip(answers) {
@@ -141,7 +140,7 @@ fn marker(header: &Header, ns: &str, id: i32) -> Marker {
     }
 }
 
-/// Returns clouds with all points, each below 64 kB; one without points if there are none, which clears a viewer.
+/// Returns clouds of all points, each below 64 kB; an empty one without points, which clears a viewer.
 pub fn clouds(header: &Header, points: &[PointAnswer]) -> Vec<PointCloud2> {
     let fields = ["x", "y", "z", "score"].iter().zip(0..).map(|(name, at)| PointField {
         name: (*name).to_owned(),

@@ -72,7 +72,7 @@ impl Pose {
 impl Rigid {
     pub const IDENTITY: Self = Self { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
 
-    /// Reads a transform; `None` if it is none: not finite, or a quaternion without direction.
+    /// Parses a transform; `None` if it is not finite, or has a zero quaternion.
     pub fn new(translation: Vector3, rotation: Quaternion) -> Option<Self> {
         let translation = DVec3::from_array(translation.into());
         let rotation = DQuat::from_xyzw(rotation.x, rotation.y, rotation.z, rotation.w);
@@ -80,7 +80,7 @@ impl Rigid {
         is_sound.then(|| Self { rotation: rotation.normalize(), translation })
     }
 
-    /// Returns this motion after another: `parent_from_child.after(child_from_grandchild)`.
+    /// Composes motions: `parent_from_child.after(child_from_grandchild)`.
     pub fn after(self, other: Self) -> Self {
         Self {
             rotation: self.rotation * other.rotation,
@@ -88,7 +88,6 @@ impl Rigid {
         }
     }
 
-    /// Returns the motion back: `child_from_parent`.
     pub fn inverse(self) -> Self {
         let rotation = self.rotation.inverse();
         Self { rotation, translation: rotation * -self.translation }
@@ -102,7 +101,7 @@ impl Rigid {
         self.rotation.angle_between(DQuat::IDENTITY)
     }
 
-    /// Returns a direction of the parent in the child's frame.
+    /// Rotates a direction from the parent's to the child's frame.
     pub fn to_child(self, direction: [f64; 3]) -> [f64; 3] {
         (self.rotation.inverse() * DVec3::from_array(direction)).to_array()
     }

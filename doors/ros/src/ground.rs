@@ -5,20 +5,19 @@ use slag_robot::api::floor::{Floor, Place};
 use crate::geometry::Pose;
 use crate::messages::{Header, MapMetaData, OccupancyGrid};
 
-/// Cells of a map, so that it stays below 64 kB: UDP takes no more at once.
+/// Most cells of a map, to stay below 64 kB, the most that UDP takes at once.
 const MAX_CELLS: usize = 60_000;
-/// Ground around what the robot reaches that is shown as well, metres.
+/// Margin of ground shown around the reached area, metres.
 const MARGIN_M: f64 = 0.5;
 const FREE: i8 = 0;
 const OCCUPIED: i8 = 100;
 const UNKNOWN: i8 = -1;
 
-/// Returns the map, or `None` if the robot's reply is none, or it reaches nothing.
+/// Returns the map, or `None` if the robot's reply is invalid or it reaches nothing.
 ///
-/// Free is only ground under a robot that stands where it can go: within `radius_m` of a place that its middle
-/// reaches, which is clear of obstacles by that much. A table top or the roof of a car is ground that nothing
-/// leads to, so it is unknown. Cells are joined until they are few enough; one is free only if all of it is, and
-/// occupied if any of it is.
+/// Only ground under the robot is free: within `radius_m` of a place that its middle reaches, which is clear of
+/// obstacles by that much. A table top or car roof is unreachable ground, so unknown. Cells are joined until few
+/// enough; a joined one is free only if all of it is, and occupied if any of it is.
 pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGrid> {
     let places = floor.cells()?;
     let [width, height] = floor.size;
@@ -66,8 +65,7 @@ pub fn grid(header: Header, floor: &Floor, radius_m: f64) -> Option<OccupancyGri
     })
 }
 
-/// Returns the cells with their middle nearer than `radius` cells to the middle of a reached one: a cell at just
-/// that distance may be an obstacle.
+/// Returns the cells nearer than `radius` cells to a reached one; one at just `radius` may be an obstacle.
 fn free(places: &[Place], [width, height]: [usize; 2], radius: f64) -> Vec<bool> {
     let reach = radius.clamp(0.0, 1e3).floor() as isize;
     let offsets: Vec<(isize, isize)> = (-reach..=reach)
@@ -82,7 +80,7 @@ fn free(places: &[Place], [width, height]: [usize; 2], radius: f64) -> Vec<bool>
     for cell in (0..places.len()).filter(|cell| places[*cell] == Place::Reached) {
         is_free[cell] = true;
         let (x, y) = ((cell % width) as isize, (cell / width) as isize);
-        // Within the reached area all is reached already.
+        // Inside the reached area all cells are already free.
         if [(1, 0), (-1, 0), (0, 1), (0, -1)].iter().all(|(dx, dy)| is_reached(x + dx, y + dy)) {
             continue;
         }
@@ -109,8 +107,8 @@ mod tests {
         grid(header("map"), &floor, radius_m).expect("a map")
     }
 
-    /// By hand, cells of 0.25 m and a robot of 0.26 m: the ground beside the reached cell is free, the table top
-    /// (g after o) and ground farther away are unknown.
+    /// By hand, cells of 0.25 m and a robot of 0.26 m: the ground beside the reached cell is free; the table top (g
+    /// after o) and ground farther away are unknown.
     #[test]
     fn only_ground_under_the_robot_is_free() {
         let grid = map([7, 3], "g7g1r1g1o1g1o1u1g7", 0.25, 0.26);
@@ -120,8 +118,7 @@ mod tests {
         assert_eq!(<[f64; 3]>::from(grid.info.origin.position), [1.0, 2.0, 0.5]);
     }
 
-    /// By hand: a million cells become at most 60,000; an obstacle of one cell stays, and no joined cell is free
-    /// that is not all free.
+    /// By hand: a million cells become at most 60,000; a one-cell obstacle stays; free ones are free throughout.
     #[test]
     fn large_maps_are_joined() {
         let grid = map([1000, 1000], "r500500o1r499499", 0.05, 0.0);

@@ -1,5 +1,4 @@
-//! Puts a robot's answers on ROS 2 topics and services, without a ROS installation: a node over DDS in front of
-//! `slag-edge serve`.
+//! A robot's answers on ROS 2 topics and services without a ROS installation: a DDS node before `slag-edge serve`.
 
 mod answers;
 mod args;

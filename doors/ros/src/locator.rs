@@ -1,4 +1,4 @@
-//! Where the scene lies in a frame that odometry keeps, from single photos.
+//! The scene's place in odometry's frame, from single photos.
 
 use std::collections::VecDeque;
 
@@ -10,13 +10,13 @@ use crate::messages::CameraInfo;
 use crate::transforms::Transforms;
 
 const N_KEPT: usize = 7;
-/// Photos that must agree on where the robot is, this one among them.
+/// Photos that must agree on the robot's place, including this one.
 const MIN_AGREEING: usize = 2;
-/// How far apart two photos that agree may see the robot, world units and radians.
+/// Largest distance between the robot's places by two agreeing photos, world units and radians.
 const MAX_APART: f64 = 0.5;
 const MAX_TURNED: f64 = 0.087;
 
-/// The camera of a photo in the frames of a robot.
+/// The camera's frames at the time of a photo.
 #[derive(Clone, Copy, Debug)]
 pub struct CameraFrames {
     pub fixed_from_optical: Rigid,
@@ -24,7 +24,6 @@ pub struct CameraFrames {
 }
 
 impl CameraFrames {
-    /// Returns them, if the tree of frames connects them.
     pub fn find(frames: &Transforms, fixed: &str, optical: &str, base: &str) -> Option<Self> {
         let fixed_from_optical = frames.target_from(fixed, optical)?;
         Some(Self { fixed_from_optical, optical_from_base: frames.target_from(optical, base)? })
@@ -41,19 +40,19 @@ impl CameraFrames {
     }
 }
 
-/// Returns the motion that a pose states; `None` if it is none.
+/// Returns a pose as a motion; `None` if it is invalid.
 pub fn scene_from_optical(pose: &locate::Pose) -> Option<Rigid> {
     Rigid::new(pose.position_in_world.into(), pose.optical_rotation_xyzw.into())
 }
 
-/// What the last photos said of the scene's place in the fixed frame.
+/// The scene's place in the fixed frame by the last photos.
 #[derive(Debug, Default)]
 pub struct Fixes(VecDeque<Rigid>);
 
 impl Fixes {
-    /// Takes what a photo says, and returns the newest of those that most others agree with; `None` while none has
-    /// another. One wrong photo thus moves nothing, and a robot that was carried is followed once two photos agree on
-    /// the new place and the old ones are forgotten. `base_in_fixed`: where the robot is.
+    /// Adds a photo's result, and returns the newest of those that most others agree with; `None` while no two agree.
+    /// A single wrong photo thus moves nothing, and a carried robot is followed once two photos agree on the new
+    /// place and the old ones are forgotten. `base_in_fixed`: the robot's position.
     pub fn add(&mut self, fixed_from_scene: Rigid, base_in_fixed: [f64; 3]) -> Option<Rigid> {
         self.0.truncate(N_KEPT - 1);
         self.0.push_front(fixed_from_scene);
@@ -64,7 +63,7 @@ impl Fixes {
     }
 }
 
-/// Returns whether two motions see the robot at the same place of the scene.
+/// Returns whether two motions place the robot at the same place of the scene.
 fn agree(a: Rigid, b: Rigid, base_in_fixed: [f64; 3]) -> bool {
     let [p, q] = [a, b].map(|of| of.inverse().apply(base_in_fixed));
     let apart = p.iter().zip(q).map(|(p, q)| (p - q) * (p - q)).sum::<f64>().sqrt();
@@ -81,7 +80,7 @@ mod tests {
         Rigid::new([x, 0.0, 0.0].into(), Quaternion { x: 0.0, y: 0.0, z: sin, w: cos }).expect("a motion")
     }
 
-    /// By hand: the photos at 0.0 and 0.1 agree; the one 5 m away does not, nor one that is turned.
+    /// By hand: the photos at 0.0 and 0.1 agree; the one 5 m away does not, nor a rotated one.
     #[test]
     fn one_wrong_photo_moves_nothing() {
         let mut fixes = Fixes::default();
@@ -90,7 +89,7 @@ mod tests {
             let found = fixes.add(at(x, yaw), [1.0, 0.0, 0.0]).map(|found| found.origin()[0]);
             assert_eq!(found, expected, "{x} {yaw}");
         }
-        // Carried to another place: followed when most of the remembered photos say so.
+        // Carried elsewhere: followed once most remembered photos agree.
         let moved: Vec<f64> = (0..7)
             .filter_map(|_| fixes.add(at(9.0, 0.0), [1.0, 0.0, 0.0]))
             .map(|of| of.origin()[0])

@@ -16,7 +16,7 @@ fn main() -> ExitCode {
     let default = "warn,slag_ros=info";
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(default));
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false);
-    // It would panic where nobody reads stderr any more.
+    // It would panic if nobody reads stderr any more.
     log.log_internal_errors(false).with_writer(io::stderr).init();
     match run(Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,

@@ -1,4 +1,4 @@
-//! Messages of ROS packages, member by member in their order: it is the order on the wire.
+//! Messages of ROS packages, with members in wire order.
 
 use ros2_client::Message;
 use ros2_client::builtin_interfaces::{Duration, Time};

@@ -1,4 +1,4 @@
-//! Nav2's action `NavigateToPose`: a place to stand as a goal, its progress, and how it ended.
+//! Nav2's action `NavigateToPose`: sends a place to stand as a goal, and reports progress and result.
 
 use std::time::Duration;
 
@@ -10,13 +10,13 @@ use tokio::time::timeout;
 
 use crate::messages::{NavigationFeedback, NavigationGoal, NavigationResult, PoseStamped};
 
-/// Longest wait for the server to take a goal.
+/// Longest wait for the server to accept a goal.
 pub const ACCEPT_TIMEOUT: Duration = Duration::from_secs(10);
 
 pub enum Ended {
     Reached,
     Cancelled,
-    /// Nav2 gave the goal up, for this reason.
+    /// Nav2 gave up, for this reason.
     Failed(String),
 }
 
@@ -25,8 +25,7 @@ pub struct Navigator {
 }
 
 impl Navigator {
-    /// Makes the client of `/navigate_to_pose`. `service`, `topic`, `latched`: quality of the action's services,
-    /// of its feedback, and of its status.
+    /// Makes the client of `/navigate_to_pose`. `service`, `topic`, `latched`: QoS of services, feedback and status.
     pub fn new(
         node: &mut Node,
         mapping: ServiceMapping,
@@ -44,8 +43,8 @@ impl Navigator {
         Ok(Self { client: client.map_err(|e| anyhow!("cannot use the action navigate_to_pose: {e}"))? })
     }
 
-    /// Sends a goal, hands on the distances that remain, in metres, and returns how it ended. `stop` cancels the goal,
-    /// and so does whatever leaves its end unknown.
+    /// Sends a goal, reports the remaining distances, in metres, and returns its result. `stop` cancels the goal, as
+    /// does anything that leaves its result unknown.
     pub async fn drive(
         &self,
         pose: PoseStamped,
@@ -56,7 +55,7 @@ impl Navigator {
         let (request, id) =
             self.client.send_goal(goal).map_err(|e| format!("the goal cannot be sent: {e:?}"))?;
         let followed = async {
-            // Nav2 takes no call to cancel a goal that it has not taken yet.
+            // Nav2 refuses to cancel a goal before accepting it.
             if !self.is_accepted(request).await? {
                 return Ok(Ended::Failed("Nav2 rejects the goal".into()));
             }
@@ -101,13 +100,12 @@ impl Navigator {
 }
 
 impl NavigationResult {
-    /// Returns the reason that the distribution gives.
     #[cfg(feature = "jazzy")]
     fn reason(&self) -> String {
         format!(", error code {}", self.error_code)
     }
 
-    /// Returns the reason that the distribution gives: Humble gives none.
+    /// Humble gives no reason.
     #[cfg(not(feature = "jazzy"))]
     fn reason(&self) -> String {
         String::new()

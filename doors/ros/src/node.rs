@@ -1,4 +1,4 @@
-//! The node: what it listens to, what it says.
+//! The node: its subscriptions, services and publications.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -30,17 +30,17 @@ use crate::position;
 use crate::stand;
 use crate::transforms::Transforms;
 
-/// Messages kept for those who join later: the clouds of an answer.
+/// Messages kept for late subscribers: the clouds of an answer.
 const KEPT: usize = 4;
-/// Longest pause for subscribers that do not keep up.
+/// Longest pause for slow subscribers.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
-/// Longest wait for a goal to end once it is cancelled: it must have been taken before.
+/// Longest wait for a cancelled goal to end: it must be accepted first.
 const STOP_TIMEOUT: Duration = ACCEPT_TIMEOUT.saturating_add(Duration::from_secs(2));
-/// Time for what was written last to leave the process.
+/// Time for the last messages to leave the process.
 const SEND_TIME: Duration = Duration::from_millis(500);
-/// Time between looks whether the robot's program answers, and what it has on board.
+/// Interval of checks whether the robot's program answers, and of its objects on board.
 const WATCH_PERIOD: Duration = Duration::from_secs(5);
-/// Least time between two photos that are located.
+/// Least time between two located photos.
 const PHOTO_PERIOD: Duration = Duration::from_secs(2);
 /// Pause after a failed read, so that a broken topic does not burn the CPU.
 const READ_PAUSE: Duration = Duration::from_millis(100);
@@ -49,7 +49,7 @@ struct Shared {
     args: Args,
     robot: Robot,
     frames: Mutex<Transforms>,
-    /// Place of the robot in the scene, and when it was posted last.
+    /// Robot's place in the scene, and time of the last post.
     place: Mutex<(Option<[f64; 3]>, Option<Instant>)>,
     detections: Publisher<Detection3DArray>,
     objects: Publisher<Detection3DArray>,
@@ -58,23 +58,20 @@ struct Shared {
     best_pose: Publisher<PoseStamped>,
     goal: Publisher<PoseStamped>,
     ground: Publisher<OccupancyGrid>,
-    /// `/goal_pose`, if goals are sent there.
     goal_pose: Option<Publisher<PoseStamped>>,
     navigation: Option<Navigation>,
     locating: Option<Locating>,
 }
 
-/// The robot's place by photos, if it has a camera.
 struct Locating {
     camera: Mutex<Option<CameraInfo>>,
     fixes: Mutex<Fixes>,
-    /// When the last photo was taken on.
+    /// Time of the last photo accepted.
     last: Mutex<Option<Instant>>,
     pose: Publisher<PoseWithCovarianceStamped>,
     transforms: Publisher<TransformMessages>,
 }
 
-/// The action that drives, if goals are sent there.
 struct Navigation {
     navigator: Navigator,
     state: Publisher<Text>,
@@ -104,11 +101,10 @@ impl Navigation {
     }
 }
 
-/// The answers to a text.
 struct Found {
     answers: Vec<Answer>,
     points: Vec<PointAnswer>,
-    /// Why there are none.
+    /// Reason for no answers.
     reason: String,
 }
 
@@ -124,7 +120,7 @@ pub async fn run(args: Args, robot: Robot, stop: impl Future<Output = ()>) -> Re
     stop.await;
     if let Some(navigation) = &shared.navigation {
         navigation.stop().await;
-        // DDS sends in the background: a call to cancel must not end with the process.
+        // DDS sends in the background: a cancellation must not end with the process.
         tokio::time::sleep(SEND_TIME).await;
     }
     Ok(())
@@ -144,7 +140,6 @@ fn join(args: &Args) -> Result<Node> {
 }
 
 impl Args {
-    /// Returns the name of a topic in the node's namespace.
     fn own(&self, topic: &str) -> Result<Name> {
         Ok(Name::new(&format!("/{}", self.name), topic)?)
     }
@@ -159,8 +154,7 @@ impl Args {
 
 impl Shared {
     fn new(node: &mut Node, args: Args, robot: Robot) -> Result<Self> {
-        // Those who join later hear no earlier answer, which they would take for the last; so map_server offers
-        // its map.
+        // Latched with depth 1, as map_server's map: late subscribers would take an earlier answer for the last.
         let latest = reliable(1).durability(Durability::TransientLocal);
         let kept = reliable(KEPT).durability(Durability::TransientLocal);
         let now = reliable(1).durability(Durability::Volatile);
@@ -197,7 +191,7 @@ impl Shared {
         })
     }
 
-    /// Answers the topics and services that ask.
+    /// Subscribes to questions and offers services.
     fn answer_asked(self: &Arc<Self>, node: &mut Node) -> Result<()> {
         let (args, volatile, text) = (&self.args, reliable(10), ("std_msgs", "String"));
         let texts = subscription::<Text>(node, args.own("query")?, text, &volatile)?;
@@ -225,7 +219,7 @@ impl Shared {
         let kind = ServiceTypeName::new("slag_msgs", "Stand");
         let server = node.create_server(mapping, &args.own("stand")?, &kind, volatile.clone(), volatile);
         let shared = Arc::clone(self);
-        // A place that was asked for is not a goal yet: nothing is sent to navigation.
+        // A place that was asked for is not a goal: nothing is sent to navigation.
         tokio::spawn(serve(
             server.map_err(|e| anyhow!("cannot offer stand: {e}"))?,
             async move |request: StandRequest| Arc::clone(&shared).stand(request.text).await,
@@ -271,7 +265,7 @@ impl Shared {
     }
 }
 
-/// Returns the usual quality of topics: every message, the last few of them.
+/// Returns the usual QoS of topics: reliable, keeping the last few messages.
 fn reliable(depth: usize) -> QosProfile {
     QosProfile::publisher_default()
         .reliability_reliable(WhenFull::Wait(WRITE_TIMEOUT))
@@ -303,7 +297,7 @@ fn subscription<M: 'static>(
     node.create_subscription(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))
 }
 
-/// Handles the messages of a topic, one after the other.
+/// Handles the messages of a topic in sequence.
 async fn listen<M: ros2_client::Message + 'static>(topic: Subscription<M>, handle: impl AsyncFn(M)) {
     loop {
         match topic.async_take().await {
@@ -316,7 +310,7 @@ async fn listen<M: ros2_client::Message + 'static>(topic: Subscription<M>, handl
     }
 }
 
-/// Answers the calls of a service, one after the other.
+/// Answers the calls of a service in sequence.
 async fn serve<Q: ros2_client::Message + 'static, R: ros2_client::Message + 'static>(
     server: Server<Q, R>,
     answer: impl AsyncFn(Q) -> R,
@@ -337,7 +331,6 @@ async fn serve<Q: ros2_client::Message + 'static, R: ros2_client::Message + 'sta
 }
 
 impl Shared {
-    /// Answers a call of the service that finds things.
     async fn find(self: Arc<Self>, request: FindRequest) -> FindReply {
         let (text, header) = (request.text.clone(), answers::header(&self.args.scene_frame));
         let (answers, message) = match self.ask(request, false).await {
@@ -348,7 +341,6 @@ impl Shared {
         FindReply { success: !answers.is_empty(), message, detections }
     }
 
-    /// Asks the robot for a place to stand, on a thread that may wait.
     async fn stand(self: Arc<Self>, text: String) -> StandReply {
         let place = self.place.lock().expect("no holder panics").0;
         let frame = self.args.scene_frame.clone();
@@ -356,7 +348,7 @@ impl Shared {
         stand::reply(&frame, asked.unwrap_or_else(|error| Err(format!("slag-ros failed: {error}"))))
     }
 
-    /// Publishes a place to stand near a thing and the ground that leads there, or says why there is none.
+    /// Publishes a place to stand near a thing and the ground on the way, or returns why there is none.
     async fn go(self: Arc<Self>, text: String) -> Result<(), String> {
         let shared = Arc::clone(&self);
         let ground = tokio::task::spawn_blocking(move || {
@@ -390,7 +382,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Sends a goal to Nav2 and publishes its progress and its end.
+    /// Sends a goal to Nav2 and publishes its progress and result.
     async fn drive(self: Arc<Self>, text: String, pose: PoseStamped, stop: oneshot::Receiver<()>) {
         let Some(Navigation { navigator, state, .. }) = &self.navigation else { return };
         let say = async |how: String| publish(state, Text { data: format!("{text}: {how}") }).await;
@@ -405,8 +397,7 @@ impl Shared {
         }
     }
 
-    /// Cancels the newest goal because a later wish has no place to stand: the robot must not drive on to what
-    /// nobody asks for any more.
+    /// Cancels the newest goal because a later wish has no place to stand; its goal is outdated.
     async fn stop_driving(&self, text: &str, reason: &str) {
         if let Some(navigation) = &self.navigation {
             navigation.stop().await;
@@ -414,8 +405,8 @@ impl Shared {
         }
     }
 
-    /// Publishes what is on board whenever that changes. Reports when the robot's program stops or begins to answer:
-    /// topics alone are silent then.
+    /// Publishes the objects on board whenever they change. Reports when the robot's program stops or starts
+    /// answering: topics alone are silent then.
     async fn watch(self: Arc<Self>) {
         let (mut answered, mut on_board) = (None, None);
         loop {
@@ -446,7 +437,6 @@ impl Shared {
         }
     }
 
-    /// Asks the robot on a thread that may wait.
     async fn ask(self: Arc<Self>, request: FindRequest, with_points: bool) -> Result<Found, String> {
         let asked = tokio::task::spawn_blocking(move || self.ask_now(&request, with_points)).await;
         asked.map_err(|error| format!("slag-ros failed: {error}"))?
@@ -471,7 +461,7 @@ impl Shared {
         Ok(Found { answers: result.answers, points, reason })
     }
 
-    /// Answers a text on all topics. Nothing found is an empty answer, which clears viewers.
+    /// Answers a text on all topics. No match is an empty answer, which clears viewers.
     async fn publish_answers(self: Arc<Self>, text: String) {
         let request = FindRequest { text: text.clone(), limit: 0 };
         let found = match Arc::clone(&self).ask(request, true).await {
@@ -530,7 +520,7 @@ impl Shared {
         }
     }
 
-    /// Locates a photo, and publishes where the robot is and where the scene lies in the frame of its odometry.
+    /// Locates a photo, and publishes the robot's pose and the scene's place in odometry's frame.
     async fn hear_photo(self: Arc<Self>, photo: CompressedImage) {
         let Some(locating) = &self.locating else { return };
         let Some(camera) = locating.camera_of_due_photo() else { return };
@@ -583,7 +573,7 @@ impl Shared {
         }
     }
 
-    /// Returns whether a position may be posted, and if so counts from here.
+    /// Returns whether a position may be posted, and if so restarts the interval.
     fn is_due(&self) -> bool {
         let (_, posted) = &mut *self.place.lock().expect("no holder panics");
         let is_due = posted.is_none_or(|posted| posted.elapsed() >= self.args.position_period);
@@ -613,7 +603,7 @@ impl Locating {
         })
     }
 
-    /// Returns the camera of a photo, if it is known and a photo is due; then counts from here.
+    /// Returns the camera of a photo, if known and due; then restarts the interval.
     fn camera_of_due_photo(&self) -> Option<CameraInfo> {
         let camera = self.camera.lock().expect("no holder panics").clone()?;
         let mut last = self.last.lock().expect("no holder panics");
@@ -623,7 +613,7 @@ impl Locating {
     }
 }
 
-/// Returns the covariance of a pose in the order of ROS, which is that of the robot's program.
+/// Returns a pose's covariance in ROS order, the same as the robot's program's.
 fn covariance(pose: &locate::Pose) -> [[f64; 6]; 6] {
     let at = |row: usize, column: usize| pose.covariance.get(6 * row + column).copied().unwrap_or(0.0);
     std::array::from_fn(|row| std::array::from_fn(|column| at(row, column)))

@@ -1,29 +1,29 @@
-//! Where the robot is, from what ROS says.
+//! The robot's position from ROS messages.
 
 use serde_json::{Value, json};
 
 use crate::messages::{NavSatFix, Odometry};
 use crate::transforms::Transforms;
 
-/// Returns the place of a robot's frame, if the tree of frames connects it to the scene's.
+/// Returns the position of a robot's frame, if connected to the scene's.
 pub fn of_frame(frames: &Transforms, scene_frame: &str, base_frame: &str) -> Option<[f64; 3]> {
     frames.target_from(scene_frame, base_frame).map(|base| base.origin())
 }
 
-/// Returns the place that odometry states; `None` while nothing connects its frame to the scene's. Odometry
-/// drifts, so its frame is not the scene's unless a localiser says so.
+/// Returns odometry's position; `None` while its frame is not connected to the scene's. Odometry drifts, so its frame
+/// is not the scene's unless a localiser connects them.
 pub fn of_odometry(frames: &Transforms, scene_frame: &str, odometry: &Odometry) -> Option<[f64; 3]> {
     let scene_from_odometry = frames.target_from(scene_frame, &odometry.header.frame_id)?;
     let position: [f64; 3] = odometry.pose.pose.position.into();
     position.iter().all(|x| x.is_finite()).then(|| scene_from_odometry.apply(position))
 }
 
-/// Returns a fix as the robot's program takes it; `None` if it is no fix.
+/// Converts a fix for the robot's program; `None` if invalid.
 pub fn of_fix(fix: &NavSatFix) -> Option<Value> {
     let (lat, lon) = (fix.latitude, fix.longitude);
     let is_fix = fix.status >= 0 && lat.is_finite() && lon.is_finite();
     let mut place = json!({"lat": lat, "lon": lon});
-    // Receivers without a height say NaN; the robot's program then takes the scene's.
+    // Receivers without a height send NaN; the robot's program then takes the scene's.
     if fix.altitude.is_finite() {
         place["height"] = json!(fix.altitude);
     }

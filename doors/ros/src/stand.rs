@@ -1,4 +1,4 @@
-//! Places to stand: what the robot is asked, and its answer as messages.
+//! Places to stand: request to the robot, and its answer as messages.
 
 use slag_robot::api::goal::GoalReply;
 use slag_robot::{Robot, xyz};
@@ -16,7 +16,7 @@ impl Args {
         own.map(|(name, value)| (name, value.to_string())).into_iter().chain(near).collect()
     }
 
-    /// Asks for places to stand near a thing; `place`: where the robot is, if that is known.
+    /// `place`: the robot's position, if known.
     pub fn stand(&self, robot: &Robot, text: &str, place: Option<[f64; 3]>) -> Result<GoalReply, String> {
         let mut parameters = self.parameters(place);
         parameters.extend([
@@ -27,7 +27,7 @@ impl Args {
         robot.goal(&parameters).map_err(|e| e.to_string())
     }
 
-    /// Asks for the ground around the robot; `None` if it reaches none.
+    /// Requests the ground around the robot; `None` if it reaches none.
     pub fn ground(&self, robot: &Robot, place: Option<[f64; 3]>) -> Result<Option<OccupancyGrid>, String> {
         let floor = robot.floor(&self.parameters(place)).map_err(|e| e.to_string())?;
         Ok(ground::grid(answers::header(&self.scene_frame), &floor, self.robot_radius))

@@ -1,11 +1,11 @@
-//! The tree of frames that `/tf` and `/tf_static` tell.
+//! The tree of frames from `/tf` and `/tf_static`.
 
 use std::collections::HashMap;
 
 use crate::geometry::Rigid;
 use crate::messages::TransformStamped;
 
-/// Most frames that are kept: a robot has a few dozen, and messages are foreign.
+/// Most frames kept: a robot has a few dozen, and messages are foreign.
 const MAX_FRAMES: usize = 1024;
 
 /// The newest transform of each frame to its parent.
@@ -13,7 +13,7 @@ const MAX_FRAMES: usize = 1024;
 pub struct Transforms(HashMap<String, (String, Rigid)>);
 
 impl Transforms {
-    /// Takes a transform. One that is none is left out, and so are new frames once there are very many.
+    /// Stores a transform. Invalid ones are dropped, as are new frames beyond the limit.
     pub fn insert(&mut self, transform: TransformStamped) {
         let Some(parent_from_child) = Rigid::new(transform.translation, transform.rotation) else { return };
         let child = plain(&transform.child_frame_id).to_owned();
@@ -22,16 +22,15 @@ impl Transforms {
         }
     }
 
-    /// Returns the motion from a frame to another; `None` if nothing connects them. They are joined at their first
-    /// common ancestor, as a static transform may make the scene a sibling of the robot's map.
+    /// Returns the motion from a frame to another; `None` if unconnected. They are joined at their first common
+    /// ancestor, as a static transform may make the scene a sibling of the robot's map.
     pub fn target_from(&self, target: &str, frame: &str) -> Option<Rigid> {
         let of_target: HashMap<&str, Rigid> = self.ancestors(target).collect();
         self.ancestors(frame)
             .find_map(|(name, from_frame)| Some(of_target.get(name)?.inverse().after(from_frame)))
     }
 
-    /// Returns a frame and those above it, each with the motion from the frame to it. In a circle each is met
-    /// once.
+    /// Returns a frame and its ancestors, each with the motion from the frame. In a cycle each is visited once.
     fn ancestors<'a>(&'a self, frame: &'a str) -> impl Iterator<Item = (&'a str, Rigid)> {
         let first = Some((plain(frame), Rigid::IDENTITY));
         std::iter::successors(first, |(at, at_from_frame)| {
@@ -42,7 +41,7 @@ impl Transforms {
     }
 }
 
-/// Some nodes still write frames as in ROS 1.
+/// Strips the leading slash of ROS 1, which some nodes still write.
 fn plain(frame: &str) -> &str {
     frame.trim_start_matches('/')
 }
@@ -75,7 +74,7 @@ mod tests {
         assert!(frames.target_from("map", "camera").is_none());
         let back = frames.target_from("base_link", "map").expect("connected").apply([9.5, 2.0, 0.0]);
         assert!(back.iter().all(|c| c.abs() < 1e-12), "{back:?}");
-        // As docs/ros.md asks for it: a static transform from the map to the scene makes them siblings.
+        // As in docs/ros.md: a static transform from the map to the scene makes them siblings.
         frames.insert(told("map", "scene", [1.0, 2.0, 0.0], [0.0, 1.0]));
         let [x, y, z] = frames.target_from("scene", "base_link").expect("connected").origin();
         assert!((x - 8.5).abs() < 1e-12 && y.abs() < 1e-12 && z == 0.0, "{x} {y} {z}");

@@ -22,7 +22,7 @@ use slag_models::{ModelDir, SessionOptions};
 
 use super::failure::Failure;
 
-/// Most threads for a text model by default; more gain little for short texts.
+/// Default most threads for a text model; more gain little for short texts.
 const MAX_MODEL_THREADS: usize = 4;
 
 #[derive(Debug, Args)]
@@ -33,7 +33,7 @@ pub struct CacheArgs {
 }
 
 impl CacheArgs {
-    /// Opens the cache named, or the user's own.
+    /// Opens the named cache, or the user's default.
     pub fn open(self) -> Result<EdgeCache, Failure> {
         let dir = self.cache.or_else(|| cache_folder(variable));
         let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
@@ -62,7 +62,7 @@ pub struct DownloadArgs {
 }
 
 impl DownloadArgs {
-    /// Returns the request for a store and a position; without them, those of the last fetch.
+    /// Returns the request for a store and a position; by default those of the last fetch.
     pub fn request(self, from: Option<String>, at: Option<Position>) -> FetchRequest {
         FetchRequest {
             from,
@@ -84,7 +84,7 @@ pub struct ThreadArgs {
 }
 
 impl ThreadArgs {
-    /// Sets the number of threads for answering questions; once per process.
+    /// Sets the number of threads for answering; once per process.
     pub fn apply(&self) -> Result<(), Failure> {
         let Some(n) = self.threads else { return Ok(()) };
         let built = rayon::ThreadPoolBuilder::new().num_threads(n as usize).build_global();
@@ -100,7 +100,7 @@ pub struct ModelArgs {
     pub how: RunArgs,
 }
 
-/// Makes an engine from a cache and a text model; without one given, scenes that carry theirs are asked by it.
+/// Makes an engine from a cache and a text model; without one given, scenes' own models are used.
 pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
     let (given, options) = text_model(models)?;
     let open = || TextService::open(&given, &options).map_err(|e| Failure::Failed("models", e.into()));
@@ -117,14 +117,14 @@ pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failur
     Ok((models.map_err(|e| failed(e.into()))?, options))
 }
 
-/// Returns the options for running one text at a time, with a few threads.
+/// Returns the options for one text at a time, with a few threads.
 pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     let exe = std::env::current_exe().unwrap_or_default();
     let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
     how.session_options(&model_commands::runtime_folders(&exe), n_cores.min(MAX_MODEL_THREADS))
 }
 
-/// Reads a value by its name in JSON.
+/// Parses a value by its name in JSON.
 pub(super) fn named<T: DeserializeOwned>(text: &str) -> Result<T, Error> {
     T::deserialize(StrDeserializer::new(text))
 }
@@ -138,18 +138,17 @@ pub(super) fn parse_radius(text: &str) -> Result<f64, String> {
     radius.ok_or_else(|| format!("expected world units, 0 or more, at most {MAX_COORDINATE:e}"))
 }
 
-/// Reads the radius of a search, which finds nothing at 0.
+/// Parses a search radius; 0 would find nothing.
 pub(super) fn parse_reach(text: &str) -> Result<f64, String> {
     let radius = parse_radius(text).ok().filter(|radius| *radius > 0.0);
     radius.ok_or_else(|| format!("expected world units, {LENGTHS}"))
 }
 
-/// Reads a number of bytes: 2GB, 2GiB or 2G.
+/// Parses a number of bytes: 2GB, 2GiB or 2G.
 pub fn parse_bytes(text: &str) -> Result<u64, ByteSizeError> {
     text.parse::<ByteSize>().map(|size| size.0)
 }
 
-/// Returns the parser of profiles, whose names the help text lists.
 pub fn profile_parser() -> impl TypedValueParser<Value = Profile> {
     PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
 }

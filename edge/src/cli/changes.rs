@@ -94,7 +94,7 @@ mod tests {
         }
     }
 
-    /// One of each kind; the machine that encoded the later generation had an earlier time.
+    /// One of each kind; the later generation's encoder had an earlier clock.
     #[test]
     fn each_change_has_its_line() {
         let of = |generation, created_unix_secs| ComparedGeneration { generation, created_unix_secs };

@@ -1,10 +1,9 @@
-//! Flags from the environment and from a file, where the command line does not give them.
+//! Flags from the environment and from a file, overridden by the command line.
 //!
-//! In the file, a table holds a command's flags by their long names, and keys before the first table count for
-//! every command that has the flag. The environment's names are made of the same words: `SLAG_EDGE_FETCH_RADIUS`
-//! for `fetch --radius`, `SLAG_EDGE_CACHE` for `--cache` of every command. Values become the flags' defaults, so
-//! clap parses them, and `--help` shows them. To clap a default neither needs nor excludes another flag, so that is
-//! checked here.
+//! In the file, a table holds a command's flags by their long names; keys before the first table apply to every
+//! command that has the flag. The environment has `SLAG_EDGE_FETCH_RADIUS` for `fetch --radius`, `SLAG_EDGE_CACHE`
+//! for `--cache` of every command. Values become the flags' defaults, so clap parses them and `--help` shows them.
+//! clap's defaults neither require nor exclude other flags, so that is checked here.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -17,18 +16,17 @@ use clap::{Arg, ArgAction, ArgMatches, Command};
 use slag_common::files;
 use toml::{Table, Value};
 
-/// The file that is read if it is there and no other is named.
+/// Read if it exists and no other file is named.
 const DEFAULT_FILE: &str = "/etc/slag/edge.toml";
 pub const HELP: &str = "Flags may also come from the environment (SLAG_EDGE_CACHE for --cache, SLAG_EDGE_FETCH_RADIUS for fetch --radius) \
     and from the configuration file (cache = \"DIR\", and radius = 20 under [fetch]); the command line comes first, then \
     the environment, then the file.";
-/// What every name in the environment begins with.
+/// Prefix of all variables.
 const PREFIX: &str = "SLAG_EDGE";
 /// The flag that names the file; `SLAG_EDGE_CONFIG` in the environment.
 const FILE_FLAG: &str = "config";
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// Why the command line, the environment and the file do not make a command.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     #[error("the configuration: {cause}")]
@@ -48,7 +46,7 @@ pub fn parse(
     line: &[OsString],
     variable: &dyn Fn(&str) -> Option<OsString>,
 ) -> Result<ArgMatches, ConfigError> {
-    // Without the checks of what is missing: the file may have it.
+    // Without checks for missing flags: the file may have them.
     let first = switchable(command.clone()).ignore_errors(true).try_get_matches_from(line);
     let Ok(first) = first else { return Ok(command.try_get_matches_from(line)?) };
     let named = first.try_get_one::<OsString>(FILE_FLAG).ok().flatten().map(PathBuf::from);
@@ -90,7 +88,6 @@ fn read(
     Ok(Some(File { path, table }))
 }
 
-/// Returns the ids of all arguments that the command line gives.
 fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
     let is_given = |id: &&clap::Id| matches.value_source(id.as_str()) == Some(ValueSource::CommandLine);
     let mut ids: BTreeSet<String> = matches.ids().filter(is_given).map(ToString::to_string).collect();
@@ -100,13 +97,13 @@ fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
     ids
 }
 
-/// Lets `--trust-first=false` switch off what a file switches on.
+/// Lets `--trust-first=false` switch off a flag that a file switches on.
 fn switch(arg: Arg) -> Arg {
     let arg = arg.action(ArgAction::Set).num_args(0..=1).require_equals(true);
     arg.value_parser(clap::value_parser!(bool)).default_missing_value("true")
 }
 
-/// Lets all flags be switched off, so that what follows one on the line is read.
+/// Lets all flags take a value, so that parsing continues after one.
 fn switchable(command: Command) -> Command {
     let below: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_owned()).collect();
     let command = below.iter().fold(command, |command, name| command.mut_subcommand(name, switchable));
@@ -114,7 +111,7 @@ fn switchable(command: Command) -> Command {
     command.mut_args(|arg| if is_switch(&arg) { switch(arg) } else { arg })
 }
 
-/// Returns the names of the command that is asked for and of those above it.
+/// Returns the names of the requested command and its parents.
 fn asked(matches: &ArgMatches) -> Vec<String> {
     let mut names = Vec::new();
     let mut at = matches;
@@ -125,7 +122,7 @@ fn asked(matches: &ArgMatches) -> Vec<String> {
     names
 }
 
-/// Returns a warning for each variable that begins as ours do and is none.
+/// Returns a warning for each variable with our prefix and an unknown name.
 pub fn unknown_variables(root: &Command, names: impl Iterator<Item = String>) -> Vec<String> {
     let known = known_variables(root);
     let warning = |name: String| {
@@ -156,14 +153,13 @@ fn known_variables(root: &Command) -> BTreeSet<String> {
     known
 }
 
-/// Returns the name in the environment of a flag, by the names of the commands above it and its own.
+/// Returns a flag's variable, by the names of its command's path and its own.
 fn variable_of<'a>(words: impl IntoIterator<Item = &'a str>) -> String {
     let words: Vec<&str> = [PREFIX].into_iter().chain(words).collect();
     words.join("_").replace('-', "_").to_uppercase()
 }
 
-/// Returns the flags of a command that a file may set: all but those that must be given on the command line each
-/// time.
+/// Returns the flags that a file may set: all but those required on the command line.
 fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
     let is_choice = |group: &&clap::ArgGroup| group.is_required_set();
     let by_hand = move |arg: &&Arg| {
@@ -184,16 +180,15 @@ fn with_those_below(command: &Command) -> Vec<&Command> {
     all
 }
 
-/// What the environment or the file gives a flag.
+/// A flag's value from the environment or the file.
 struct Given {
     id: clap::Id,
     values: Vec<String>,
-    /// The variable, or the file and the key.
     place: String,
     rank: Rank,
 }
 
-/// What comes before what: the environment before the file, and in each a command's own before that of all commands.
+/// Precedence: the environment before the file, and in each a command's own value before that for all commands.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Rank {
     is_environment: bool,
@@ -201,7 +196,7 @@ struct Rank {
 }
 
 impl Given {
-    /// Returns whether this gives the flag: one that is switched off is as one that is absent.
+    /// Returns whether this sets the flag: one switched off counts as absent.
     fn is_on(&self, arg: &Arg) -> bool {
         match arg.get_action() {
             ArgAction::SetTrue => self.values.iter().any(|value| value == "true"),
@@ -215,13 +210,13 @@ struct Settings<'a> {
     variable: &'a dyn Fn(&str) -> Option<OsString>,
     file: Option<File>,
     explicit: BTreeSet<String>,
-    /// The command that is asked for.
+    /// The requested command.
     asked: Vec<String>,
     root: Command,
 }
 
 impl Settings<'_> {
-    /// Makes the values of the environment and the file the defaults of a command and those below it.
+    /// Makes values of the environment and the file the defaults of a command and its subcommands.
     fn apply(&self, command: Command, path: &[&str]) -> Result<Command, ConfigError> {
         let mut given: Vec<Given> = Vec::new();
         for arg in flags(&command) {
@@ -259,14 +254,14 @@ impl Settings<'_> {
         Ok(command)
     }
 
-    /// Returns whether the command line gives a flag that this one cannot stand beside.
+    /// Returns whether the command line has a flag that excludes this one.
     fn is_overruled(&self, command: &Command, arg: &Arg) -> bool {
         let is_given = |other: &Arg| self.explicit.contains(other.get_id().as_str());
         command.get_arguments().any(|other| is_given(other) && exclude(command, arg, other))
     }
 
-    /// Refuses a flag that needs another one which nobody gives. One for all commands is left out instead where it
-    /// stands alone in another command: `radius` is a fetch's before it is a question's.
+    /// Refuses a flag without another one that it requires. A flag for all commands is skipped instead if another
+    /// command accepts it alone: `radius` is a fetch's before it is a question's.
     fn with_what_it_needs(
         &self,
         command: &Command,
@@ -286,7 +281,7 @@ impl Settings<'_> {
         }
     }
 
-    /// Returns the flags that one needs and nobody gives.
+    /// Returns the missing flags that one requires.
     fn lacks(&self, command: &Command, of: &Given, given: &[Given]) -> Vec<String> {
         let Some(arg) = argument(command, &of.id).filter(|arg| of.is_on(arg)) else { return Vec::new() };
         let is_given = |arg: &Arg| {
@@ -300,7 +295,7 @@ impl Settings<'_> {
         needs(command, arg, &of.values).into_iter().filter(|usage| !is_there(usage)).collect()
     }
 
-    /// Returns whether the flag of this name of another command takes the values, and needs nothing beside it.
+    /// Returns whether another command's flag of this name accepts the values, without requiring others.
     fn stands_alone(&self, command: &Command, of: &Given) -> bool {
         let long = argument(command, &of.id).and_then(Arg::get_long);
         let fits = |arg: &Arg| checked(arg, of.values.clone(), &of.place).is_ok();
@@ -310,7 +305,7 @@ impl Settings<'_> {
         })
     }
 
-    /// Returns what a flag is given: by the environment, else by the file; for its own command, else for all.
+    /// Returns a flag's value: the environment's, else the file's; its own command's, else that for all.
     fn value(&self, arg: &Arg, path: &[&str]) -> Result<Option<Given>, ConfigError> {
         let Some(long) = arg.get_long() else { return Ok(None) };
         let own = variable_of(path.iter().copied().chain([long]));
@@ -334,8 +329,7 @@ impl Settings<'_> {
         Ok(None)
     }
 
-    /// Checks a value. One for all commands need not fit each: `from` is an address to one and a number to
-    /// another.
+    /// Checks a value. One for all commands need not fit each: `from` is an address to one and a number to another.
     fn fitting(
         &self,
         arg: &Arg,
@@ -359,13 +353,12 @@ impl Settings<'_> {
 }
 
 impl File {
-    /// Names a key, as `/etc/slag/edge.toml: serve.listen`.
     fn place(&self, path: &[&str], key: &str) -> String {
         let key: Vec<&str> = path.iter().copied().chain([key]).collect();
         format!("{}: {}", self.path.display(), key.join("."))
     }
 
-    /// Refuses keys that are no flag of any command.
+    /// Refuses keys that are no command's flag.
     fn refuse_unknown<'a>(
         &'a self,
         command: &Command,
@@ -396,7 +389,7 @@ impl File {
     }
 }
 
-/// Leaves out what something before it excludes; refuses two that come together.
+/// Drops a value excluded by one of higher precedence; refuses conflicts within a rank.
 fn compatible(command: &Command, mut given: Vec<Given>) -> Result<Vec<Given>, ConfigError> {
     given.sort_by_key(|of| std::cmp::Reverse(of.rank));
     let mut kept: Vec<Given> = Vec::new();
@@ -428,8 +421,7 @@ fn exclude(command: &Command, one: &Arg, other: &Arg) -> bool {
     against(one, other) || against(other, one)
 }
 
-/// Returns the flags that one needs beside it, as `--near <X,Y,Z>`: what clap asks for where it stands alone, and not
-/// where nothing stands.
+/// Returns the flags that one requires, as `--near <X,Y,Z>`: those that clap demands for it alone, not for no flag.
 fn needs(command: &Command, arg: &Arg, values: &[String]) -> Vec<String> {
     let is_help = |arg: &&Arg| matches!(arg.get_action(), ArgAction::HelpShort | ArgAction::HelpLong);
     let args = || command.get_arguments().filter(|arg| !is_help(arg)).cloned().map(|arg| arg.required(false));
@@ -492,7 +484,7 @@ fn from_value(arg: &Arg, value: &Value) -> Result<Vec<String>, String> {
     }
 }
 
-/// Checks values as clap would: a default that does not parse is our own fault to it.
+/// Checks values with clap's own parser: clap takes an invalid default for a bug of the program.
 fn checked(arg: &Arg, values: Vec<String>, place: &str) -> Result<Vec<String>, ConfigError> {
     let long = arg.get_long().unwrap_or_default().to_owned();
     let refused = |e: clap::Error| {

@@ -1,4 +1,4 @@
-//! `doctor`: can this robot answer, and what is missing?
+//! `doctor`: checks whether this robot can answer.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -21,7 +21,7 @@ use crate::store::{EdgeCache, Snapshot, StoreError};
 /// Free space below which a fetch may not fit.
 const LITTLE_BYTES: u64 = 256 << 20;
 
-/// Age of a scene from which the robot's clock is in doubt.
+/// Age of a scene beyond which the robot's clock is suspect.
 const LONG_AGO_HOURS: f64 = 24.0 * 365.0;
 
 const EXAMPLES: &str = "Examples:\n\
@@ -96,7 +96,7 @@ fn print(findings: &[Finding]) -> io::Result<()> {
 
 fn disk(cache: &EdgeCache) -> Finding {
     let dir = cache.dir();
-    // A folder that no fetch has made yet: the disk is that of the nearest one above.
+    // No fetch has made the folder yet: use the disk of its nearest ancestor.
     let there = dir.ancestors().find(|dir| or_here(dir).is_dir()).map_or(dir, or_here);
     match cache.files().free_bytes(there) {
         Err(error) => Finding::new("disk", Verdict::Missing, format!("{error}; give another --cache")),
@@ -107,7 +107,6 @@ fn disk(cache: &EdgeCache) -> Finding {
     }
 }
 
-/// The folder of a name alone is the empty path, which cannot be opened.
 fn or_here(dir: &Path) -> &Path {
     if dir.as_os_str().is_empty() { Path::new(".") } else { dir }
 }
@@ -192,7 +191,7 @@ fn age(signed_unix_secs: u64, now_unix_secs: u64) -> Finding {
 fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
     let opened = engine(cache.clone(), models).and_then(|engine| {
         match engine.reload() {
-            // Without a scene there is nothing to fit.
+            // An empty cache has nothing to compare with.
             Err(StoreError::Empty { .. }) => return Ok("opens".to_owned()),
             other => other.map_err(store_failure)?,
         }
@@ -210,7 +209,7 @@ fn text_model(cache: &EdgeCache, models: &ModelArgs) -> Finding {
 mod tests {
     use super::*;
 
-    /// As `fetch --cache NAME` would make them, in the current folder or in a new one of it.
+    /// As `fetch --cache NAME` would create them, in the current folder or a new one below.
     #[test]
     fn a_cache_that_is_yet_to_be_made_has_a_disk() {
         for name in ["no-such-cache", "no-such-folder/cache"] {
@@ -219,7 +218,7 @@ mod tests {
         }
     }
 
-    /// A clock of robot or store that is wrong is not an age of no hours, nor one of eight thousand years.
+    /// A wrong clock of robot or store is reported, not turned into an age of 0 hours or 8,000 years.
     #[test]
     fn a_signature_of_another_time_is_noted() {
         let at = |signed: u64| age(signed, 1_800_000_000);

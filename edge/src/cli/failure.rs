@@ -15,7 +15,7 @@ pub enum Exit {
     Failed = 1,
     /// Invalid request; also clap's exit code.
     Usage = 2,
-    /// A fetch brought all cells but some.
+    /// A fetch got some cells only.
     Partial = 3,
     /// Interrupted by a signal (128 + SIGINT).
     Interrupted = 130,
@@ -27,15 +27,14 @@ impl From<Exit> for ExitCode {
     }
 }
 
-/// Reasons for ending a run early.
 pub enum Failure {
     Usage(anyhow::Error),
-    /// Failure; the string is the kind of error for programs.
+    /// The string names the error for programs.
     Failed(&'static str, anyhow::Error),
-    /// A fetch brought all cells but some; its report is printed.
+    /// A fetch got some cells only; its report is printed.
     Partial(anyhow::Error),
     Interrupted(anyhow::Error),
-    /// The reader of stdout has gone away.
+    /// Nobody reads stdout any more.
     BrokenPipe,
 }
 
@@ -54,7 +53,6 @@ impl Failure {
         let (exit, kind, error) = match self {
             Self::BrokenPipe => return Exit::Done,
             Self::Partial(error) => {
-                // The report is on stdout already, and names the cells.
                 let _ = writeln!(io::stderr(), "error: {}", visible(&crate::error_line(&*error)));
                 return Exit::Partial;
             }
@@ -63,7 +61,6 @@ impl Failure {
             Self::Interrupted(error) => (Exit::Interrupted, "interrupted", error),
         };
         let detail = crate::error_line(&*error);
-        // If even this cannot be written, there is nothing left to do.
         let _ = match json {
             true => writeln!(
                 io::stdout(),

@@ -45,7 +45,7 @@ impl FollowArgs {
     }
 }
 
-/// Follows the positions on stdin until they end.
+/// Follows positions from stdin until they end.
 pub fn watch(
     cache: &EdgeCache,
     request: &FetchRequest,
@@ -90,7 +90,6 @@ pub fn watch(
                     }
                 };
                 if result.is_err() {
-                    // The reader has gone away.
                     printed = result;
                     cancel.store(true, Ordering::Relaxed);
                 }
@@ -103,8 +102,8 @@ pub fn watch(
     followed.map_err(failure)
 }
 
-/// Follows the positions posted to the service, on a thread of its own, until the returned flag is set. A follower
-/// that panics is reported by the service, and begins again.
+/// Follows the positions posted to the service, on a separate thread, until the returned flag is set. The service
+/// reports a follower that panicked, and restarts it.
 pub fn follow_in_background(
     request: FetchRequest,
     ca: Option<PathBuf>,
@@ -115,7 +114,7 @@ pub fn follow_in_background(
 ) -> Result<Arc<AtomicBool>, Failure> {
     let cancel = Arc::new(AtomicBool::new(false));
     let stop = Arc::clone(&cancel);
-    // The robot is most likely where it was; the first position that is posted counts instead.
+    // The robot is most likely where it was, until a first position is posted.
     if let Some(at) = last_position(&cache) {
         following.post(at);
     }
@@ -125,7 +124,7 @@ pub fn follow_in_background(
                 fetch: &mut |request| fetch(&cache, request, &environment(ca.as_deref(), &stop, &())),
                 report: &mut |outcome| match outcome {
                     Ok(report) => {
-                        // Served before it is said.
+                        // Load the generation before it is announced.
                         app.reload_now();
                         let (n, generation) = (report.downloaded.n_shards, report.generation);
                         tracing::info!("fetched {n} shards of generation {generation}");
@@ -150,7 +149,7 @@ mod tests {
 
     use crate::cli::{Cli, Exit};
 
-    /// Lengths that no coordinate reaches would be tried for ever.
+    /// Unreachably long distances would be retried for ever.
     #[test]
     fn lengths_keep_their_limits() {
         for line in [

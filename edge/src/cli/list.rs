@@ -16,10 +16,10 @@ use super::text::{table, visible};
 use crate::query::{ListFormat, ObjectFilter, ObjectOrder, check_region, parse_box, parse_point};
 use crate::score::{Ball, Budget, Region};
 
-/// Longest wait for the words to be encoded: a large text model on a slow core takes minutes, once.
+/// Longest wait for the words: a large text model on a slow core takes minutes, once.
 const NAMES_WAIT: Duration = Duration::from_secs(3600);
 
-/// Less likely names are not shown to people, beside the best one.
+/// Less likely names are hidden from people, except the best.
 const LEAST_SHOWN: f64 = 0.01;
 
 const EXAMPLES: &str = "Examples:\n\
@@ -117,7 +117,7 @@ mod tests {
 
     use crate::cli::{Cli, Exit};
 
-    /// As a question is: in a flat box lies nothing, and a scene is not looked for.
+    /// As for questions: a flat box is empty, and no scene is opened.
     #[test]
     fn flat_boxes_are_refused() {
         let line = ["slag-edge", "list", "--box", "0,0,1,5,5,1", "--cache", "nowhere"];

@@ -8,7 +8,6 @@ use crate::fetch::{self, Environment, FetchError, NetworkLimits, Progress};
 
 use super::failure::Failure;
 
-/// Returns the real surroundings.
 pub fn environment<'a>(
     ca: Option<&'a Path>,
     cancel: &'a AtomicBool,
@@ -24,13 +23,13 @@ pub fn environment<'a>(
     }
 }
 
-/// Reads the address of a store, so that a wrong one is refused before anything starts.
+/// Parses a store's address, so that a wrong one is refused before anything starts.
 pub fn parse_store(text: &str) -> Result<String, String> {
     let address = fetch::check_address(text).map(|()| text.to_owned());
     address.map_err(|what| format!("{what}; give an address like http://host:port"))
 }
 
-/// Returns a number in 0..1 that differs from robot to robot, so that a fleet does not retry in step.
+/// Returns a number in 0..1 that differs between robots, so that a fleet does not retry in step.
 pub fn random() -> f64 {
     // The standard library's random hash keys are new for each call.
     (RandomState::new().build_hasher().finish() >> 11) as f64 / (1u64 << 53) as f64

@@ -1,4 +1,4 @@
-//! Display of fetches: a progress line on the terminal, and reports.
+//! A progress line on the terminal, and reports of fetches.
 
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -29,7 +29,7 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     ])
 }
 
-/// Returns what is to be said about cells that could not be fetched.
+/// Returns a note on cells that could not be fetched.
 pub fn bad_cells(report: &FetchReport) -> Option<String> {
     if report.bad_cells.is_empty() {
         return None;
@@ -43,7 +43,7 @@ pub fn bad_cells(report: &FetchReport) -> Option<String> {
     ))
 }
 
-/// Prints a fetch on one line, while following a robot.
+/// Prints a fetch as one line, for a followed robot.
 pub fn print_line(report: &FetchReport) -> Result<(), Failure> {
     let FetchReport { generation, n_cells, centre_in_world, downloaded, freed, .. } = report;
     let (came, went) = (downloaded.n_shards, freed.n_shards);
@@ -71,7 +71,6 @@ impl Bar {
 
     pub fn finish(&self) {
         if self.shown && self.planned_bytes.load(Ordering::Relaxed) > 0 {
-            // Failing to show progress is no reason to stop.
             let _ = writeln!(io::stderr());
         }
     }
@@ -86,7 +85,7 @@ impl Progress for Bar {
         let received = self.received_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         let planned = self.planned_bytes.load(Ordering::Relaxed);
         if self.shown {
-            // As wide as the longest size, so that a line covers the one before.
+            // As wide as the longest size, to overwrite the previous line.
             let _ = write!(io::stderr(), "\r{:>8} of {:>8} ", ByteSize(received), ByteSize(planned));
         }
     }

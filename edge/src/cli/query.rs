@@ -113,7 +113,6 @@ fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
     durable::write_result(path, |file| reply.ply().try_for_each(|piece| Ok(file.write_all(&piece?)?)))
 }
 
-/// Prints a reply as one JSON object, piece by piece.
 fn write_json(reply: Reply) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     for piece in reply.pieces(Format::Json) {
@@ -122,7 +121,6 @@ fn write_json(reply: Reply) -> Result<(), Failure> {
     Ok(writeln!(out)?)
 }
 
-/// Prints answers as a table, and notes about them on stderr.
 fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     for (word, asked) in &answers.asked_as {
         note(format_args!("{word}: asked as {asked}"));
@@ -159,7 +157,6 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
 }
 
-/// Returns notes on an answer, a line each.
 fn notes(found: &Searched) -> String {
     let exactness = match found.score_error_likely.filter(|_| !found.is_exact) {
         Some(likely) => format!("; 99 of 100 scores within ±{likely:.3}"),

@@ -26,7 +26,7 @@ use crate::store::{EdgeCache, StoreError};
 
 /// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
-/// Blocking threads in addition to those of queries, for status and for loading a generation.
+/// Blocking threads besides those of queries, for status and loading.
 const SPARE_BLOCKING_THREADS: usize = 8;
 
 const EXAMPLES: &str = "Examples:\n\
@@ -105,7 +105,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         .enable_all()
         .build()?;
     let served = runtime.block_on(serve(args, tls, cache, engine, settings));
-    // A query that does not end must not keep the process alive.
+    // A stuck query must not keep the process alive.
     runtime.shutdown_timeout(drain);
     served
 }
@@ -142,12 +142,12 @@ async fn serve(
         tell(NotifyState::Stopping);
     };
     let served = http::serve(app, listener, stop).await;
-    // A fetch in progress need not be awaited: the next one resumes it.
+    // A fetch in progress need not finish: the next one resumes it.
     [follower, scrub].iter().flatten().for_each(|cancel| cancel.store(true, Ordering::Relaxed));
     Ok(served?)
 }
 
-/// Loads what is on board, if anything is, and begins to name its things.
+/// Loads the current generation, if any, and starts naming its things.
 fn load(engine: &Engine) {
     match engine.reload() {
         Ok(()) => {}
@@ -164,7 +164,6 @@ fn load(engine: &Engine) {
     engine.begin_names();
 }
 
-/// Returns the certificate to speak TLS with, if there is one.
 fn tls(args: &mut ServeArgs) -> Result<Option<Tls>, Failure> {
     let files = match (args.tls_cert.take(), args.tls_key.take()) {
         (Some(cert), Some(key)) => Some(TlsFiles { cert, key }),
@@ -178,8 +177,7 @@ fn tls(args: &mut ServeArgs) -> Result<Option<Tls>, Failure> {
     args.listen.tls(files).map_err(|e| Failure::Usage(e.into()))
 }
 
-/// Returns a folder of the cache that every user of the machine may write to: what is on board is opened by its
-/// hashes, and signatures are checked by fetches alone.
+/// Returns a cache folder that every user may write to: answers come from files checked only by hash.
 fn open_to_everybody(cache: &EdgeCache) -> Option<PathBuf> {
     let folders = ["", "manifests", "shards", "trust"].map(|name| cache.dir().join(name));
     let is_open = |path: &PathBuf| {
@@ -195,7 +193,7 @@ fn parse_query_bytes(text: &str) -> Result<u64, String> {
     }
 }
 
-/// Scrubs on a thread of its own until the returned flag is set.
+/// Scrubs on a separate thread until the returned flag is set.
 fn scrub_in_background(app: &Arc<App>, secs: u64) -> Result<Option<Arc<AtomicBool>>, Failure> {
     if secs == 0 {
         return Ok(None);
@@ -224,7 +222,7 @@ fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
     Ok(access)
 }
 
-/// Pulses in the time after which systemd takes a silent service for dead; it advises two.
+/// Pulses within systemd's watchdog timeout; it advises two.
 const PULSES_PER_TIMEOUT: u32 = 3;
 
 fn tell(news: NotifyState<'_>) {
@@ -233,8 +231,7 @@ fn tell(news: NotifyState<'_>) {
     }
 }
 
-/// Keeps reporting that the service is alive, as long as `is_alive` says so in time; returns at once if nobody
-/// expects it.
+/// Reports that the service is alive, as long as `is_alive` says so in time; returns at once without a watchdog.
 async fn pulse<A: Future<Output = bool>>(is_alive: impl Fn() -> A) {
     let timeout = sd_notify::watchdog_enabled();
     let Some(pulse) = timeout.map(|timeout| timeout / PULSES_PER_TIMEOUT).filter(|pulse| !pulse.is_zero())

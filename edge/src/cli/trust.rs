@@ -1,4 +1,4 @@
-//! `trust`: whom a robot believes.
+//! `trust`: the keys a robot trusts.
 
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;

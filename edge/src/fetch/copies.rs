@@ -1,8 +1,7 @@
-//! A small record in two checksummed copies: neither a power cut nor a damaged copy loses it.
+//! A small record in two checksummed copies, which survives a power cut or one damaged copy.
 //!
-//! A copy is `slag-record 1 SEQUENCE HASH\n` and the content; HASH is the BLAKE3 hash of `SEQUENCE\n` and the
-//! content. One copy is durable before the other is replaced, so one is whole at any moment, and at rest both
-//! are the same.
+//! A copy is `slag-record 1 SEQUENCE HASH\n` and the content; HASH is the BLAKE3 hash of `SEQUENCE\n` and the content.
+//! One copy is durable before the other is replaced, so one is always whole; at rest both are the same.
 
 use std::io;
 use std::path::PathBuf;
@@ -11,28 +10,25 @@ use slag_common::{Hash32, tuf};
 
 use crate::store::files::{Files, is_bad_medium, put_through};
 
-/// A longer copy is damaged. It holds the longest metadata that a client keeps, with its quotes escaped.
+/// A longer copy is damaged. Fits the longest metadata that a client keeps, with escaped quotes.
 pub const MAX_COPY_BYTES: u64 =
     2 * (tuf::MAX_ROOT_BYTES + tuf::MAX_TIMESTAMP_BYTES + tuf::MAX_SNAPSHOT_BYTES) + (64 << 10);
 const NAMES: [&str; 2] = ["0", "1"];
 
 #[derive(Debug, PartialEq, Eq)]
 pub enum Found {
-    /// Neither exists.
     Nothing,
-    /// The newest whole copy.
     Record(Version),
-    /// There are copies, and none is whole; the fault of the first.
+    /// All copies are damaged; the fault of the first.
     Damaged(String),
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Version {
-    /// Number of the version, from 1.
+    /// From 1.
     pub sequence: u64,
     pub content: Vec<u8>,
     index: usize,
-    /// Whether the other copy is the same.
     pub is_twice: bool,
 }
 
@@ -43,7 +39,7 @@ enum Copy {
     Whole(u64, Vec<u8>),
 }
 
-/// The two copies, in a folder of their own.
+/// The two copies, in their own folder.
 #[derive(Clone, Debug)]
 pub struct Copies {
     pub dir: PathBuf,
@@ -98,7 +94,7 @@ impl Copies {
         files.sync_dir(&self.dir)
     }
 
-    /// Makes the other copy the same as a settled version.
+    /// Makes the other copy equal to a settled version.
     ///
     /// # Errors
     /// The file system's; the version itself is not touched.
@@ -126,7 +122,7 @@ impl Copies {
         for index in [index, 1 - index] {
             match self.write_one(files, index, sequence, &content) {
                 Ok(()) => written.push(index),
-                // Where one copy cannot be replaced, the other must do.
+                // If one copy cannot be replaced, the other must do.
                 Err(e) if is_bad_medium(&e) => broken = Some(e),
                 Err(e) => return Err(e),
             }
@@ -155,7 +151,7 @@ fn parse(bytes: &[u8]) -> Copy {
         Some((sequence.parse::<u64>().ok()?, &bytes[end + 1..]))
     };
     match read() {
-        // Numbers have several spellings; only the one that is written counts.
+        // Numbers have several spellings; only the canonical one is valid.
         Some((sequence, content)) if copy_of(sequence, content) == bytes => {
             Copy::Whole(sequence, content.to_vec())
         }
@@ -187,7 +183,7 @@ mod tests {
         }
     }
 
-    /// Every bit of either copy, every length, and a copy that is gone.
+    /// Every bit of either copy, every length, and a missing copy.
     #[test]
     fn every_fault_of_one_copy_leaves_the_record() {
         let (_dir, copies) = written(&["one", "{\"key\":\"two\"}"]);

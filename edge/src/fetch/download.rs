@@ -48,7 +48,7 @@ pub fn check_address(from: &str) -> Result<(), &'static str> {
     if uri.authority().is_none_or(|a| a.host().is_empty() || a.as_str().contains('@')) {
         return Err("it has no host, or names a user");
     }
-    // A port beyond 65535 would be taken for none.
+    // A port beyond 65535 would be parsed as none.
     let end = uri.authority().and_then(|a| a.as_str().rsplit(']').next()).unwrap_or_default();
     if end.contains(':') && uri.port_u16().is_none() {
         return Err("its port is no number from 0 to 65535");
@@ -60,7 +60,6 @@ pub fn check_address(from: &str) -> Result<(), &'static str> {
 }
 
 impl<'a> Client<'a> {
-    /// Checks the address of a store.
     pub fn new(from: &str, environment: &'a Environment<'a>) -> Result<Self, FetchError> {
         let bad = |what: &str| FetchError::Address { from: from.to_owned(), what: what.to_owned() };
         check_address(from).map_err(bad)?;
@@ -91,8 +90,7 @@ impl<'a> Client<'a> {
         })
     }
 
-    /// Downloads a root that may not be there: some hosts of files say so with 403 or 410, and a 404 would hide a
-    /// newer root just as well.
+    /// Downloads a root that may be absent: some static hosts answer 403 or 410, and a 404 could hide a root as well.
     pub fn next_root(&self, path: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, FetchError> {
         match self.file(path, max_bytes) {
             Err(FetchError::Download {
@@ -117,7 +115,6 @@ impl<'a> Client<'a> {
     }
 }
 
-/// An object in the folder for partial downloads.
 struct StagedObject<'a> {
     files: &'a dyn Files,
     hash: Hash32,
@@ -148,7 +145,7 @@ impl Part for StagedObject<'_> {
         let bytes = match self.files.read(self.path, self.len_bytes) {
             Ok(bytes) => bytes,
             Err(e) => {
-                // Where the medium failed, the next fetch writes it elsewhere.
+                // On a bad medium, the next fetch writes it elsewhere.
                 self.discard()?;
                 return Err(e);
             }

@@ -12,7 +12,6 @@ use super::position::PlanError;
 use super::records::RecordsError;
 use crate::store::StoreError;
 
-/// Reasons for a failed fetch; the previous generation still answers.
 #[derive(Debug, thiserror::Error)]
 pub enum FetchError {
     #[error("no {what} is given, and no earlier fetch recorded one; {advice}")]
@@ -30,7 +29,7 @@ pub enum FetchError {
         url: String,
         attempts: u32,
         failure: DownloadFailure,
-        /// Of the file, where the next fetch resumes.
+        /// Of the file, for the next fetch to resume.
         kept_bytes: u64,
     },
     #[error(transparent)]
@@ -85,7 +84,7 @@ fn what_next(failure: &DownloadFailure, kept_bytes: u64) -> String {
 }
 
 impl FetchError {
-    /// Returns whether it may be gone once somebody has told the robot whom to trust.
+    /// Returns whether an operator's `trust` may fix it.
     pub(super) fn is_want_of_trust(&self) -> bool {
         match self {
             Self::NoTrust { .. } | Self::OtherRoot { .. } => true,
@@ -95,7 +94,7 @@ impl FetchError {
         }
     }
 
-    /// `kept_bytes`: of the file, which the next fetch does not download again.
+    /// `kept_bytes`: of the file, for the next fetch to resume.
     pub(super) fn of_download(url: String, error: DownloadError, kept_bytes: u64) -> Self {
         match error {
             DownloadError::Failed { attempts, failure } => {

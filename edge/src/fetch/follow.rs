@@ -1,9 +1,8 @@
 //! Following a robot: decides when to fetch, so that shards are on board before they are needed.
 //!
-//! A fetch covers `radius + margin` around the robot. The next one is due when the robot is farther than half
-//! the margin from that centre: the other half of the margin is left while shards arrive, and everything
-//! within `radius` stays on board. A robot that moves to and fro within half the margin, along a cell's edge
-//! or not, neither downloads nor frees anything.
+//! A fetch covers `radius + margin` around the robot. The next one is due when the robot is farther than half the
+//! margin from that centre, so the other half is left while shards arrive and everything within `radius` stays on
+//! board. Moving to and fro within half the margin, even along a cell's edge, downloads and frees nothing.
 
 use std::io::{self, BufRead, Read};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -53,9 +52,8 @@ impl Default for FollowSettings {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
     Fetch,
-    /// A fetch is due, but not before this time.
     NotBefore(Duration),
-    /// Everything needed is on board; the next fetch by time is due then, if at all.
+    /// Everything needed is on board; the time of the next fetch, if any.
     Rest(Option<Duration>),
 }
 
@@ -70,7 +68,6 @@ pub struct Follower {
 }
 
 impl Follower {
-    /// Makes a follower that fetches at the first position.
     pub fn new(settings: FollowSettings) -> Self {
         Self { settings, covered: None, attempted: None, n_failures: 0, retry_at: Duration::ZERO }
     }
@@ -79,8 +76,7 @@ impl Follower {
         self.settings.radius + self.settings.margin
     }
 
-    /// Decides for a robot at a position in the world frame; `None` if it is geographic and no manifest
-    /// relates it to the scene.
+    /// Decides for a position in the world frame; `None` if it is geographic and no manifest relates it to the scene.
     pub fn decide(&self, now: Duration, at: Option<DVec3>) -> Decision {
         let slack = self.settings.margin / 2.0;
         let rest = match (self.covered, at) {
@@ -101,7 +97,7 @@ impl Follower {
         }
     }
 
-    /// Forgets what is on board: a fetch is due wherever the robot is.
+    /// Makes a fetch due wherever the robot is.
     pub fn forget(&mut self) {
         self.covered = None;
     }
@@ -111,7 +107,7 @@ impl Follower {
         (self.n_failures, self.retry_at) = (0, Duration::ZERO);
     }
 
-    /// Lets the next fetch come at once, whatever failed before: its cause may be gone.
+    /// Allows a fetch at once despite failures: their cause may be gone.
     pub fn retry(&mut self) {
         self.retry_at = Duration::ZERO;
     }
@@ -146,10 +142,9 @@ pub struct FollowStatus {
 struct Inbox {
     status: FollowStatus,
     n_posted: u64,
-    /// Whether a fetch is due at the position where the robot is.
     is_due: bool,
     is_over: bool,
-    /// Failures of the follower itself since the last fetch that ended.
+    /// The follower's own failures since the last fetch that ended.
     n_failures_in_a_row: u64,
 }
 
@@ -168,7 +163,7 @@ impl Following {
         self.changed.notify_all();
     }
 
-    /// Makes a fetch due at the robot's position: something on board was lost.
+    /// Makes a fetch due, as a file on board was lost.
     pub fn refresh(&self) {
         let mut inbox = self.lock();
         inbox.is_due = true;
@@ -176,7 +171,6 @@ impl Following {
         self.changed.notify_all();
     }
 
-    /// Ends the positions.
     pub fn close(&self) {
         self.lock().is_over = true;
         self.changed.notify_all();
@@ -186,12 +180,12 @@ impl Following {
         self.lock().status.clone()
     }
 
-    /// Returns why nothing is followed just now, if so.
+    /// Returns why following is interrupted, if it is.
     pub fn failure(&self) -> Option<String> {
         self.lock().status.failure.clone()
     }
 
-    /// Records that the follower itself failed, and returns how often it did in a row.
+    /// Records a failure of the follower itself, and returns the failures in a row.
     pub(crate) fn note_failure(&self, failure: &str) -> u64 {
         let mut inbox = self.lock();
         inbox.status.failure = Some(failure.to_owned());
@@ -207,8 +201,7 @@ impl Following {
         self.inbox.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the last position, how many were posted, and whether they are over; a fetch that is due makes the
-    /// follower forget.
+    /// Returns the last position, the number posted, and whether they ended; after a refresh the follower forgets.
     fn read(&self, follower: &mut Follower) -> (Option<Position>, u64, bool) {
         let mut inbox = self.lock();
         if std::mem::take(&mut inbox.is_due) {
@@ -225,7 +218,7 @@ impl Following {
 
     fn note(&self, outcome: &Result<FetchReport, FetchError>) {
         let mut inbox = self.lock();
-        // Whatever came of the fetch, the follower lives.
+        // Even a failed fetch shows that the follower is alive.
         inbox.n_failures_in_a_row = 0;
         let status = &mut inbox.status;
         status.failure = None;
@@ -247,8 +240,8 @@ pub struct FollowEnvironment<'a> {
     pub cancel: &'a AtomicBool,
 }
 
-/// Follows the posted positions until they end and the last one is served, or until cancelled. `request`
-/// gives everything except position and radius. Blocks.
+/// Follows the posted positions until the last one is served, or until cancelled. `request` gives everything except
+/// position and radius. Blocks.
 ///
 /// # Errors
 /// The error of the last fetch, if it was still due when positions ended; [`FetchError::Cancelled`].
@@ -262,7 +255,7 @@ pub fn follow(
     let started = Instant::now();
     let mut follower = Follower::new(settings);
     let mut manifest = None;
-    // What there was when a fetch failed for want of trust.
+    // The records at a failure for want of trust.
     let mut distrusted = None;
     loop {
         if environment.cancel.load(Ordering::Relaxed) {
@@ -321,8 +314,7 @@ fn in_world(position: Position, manifest: Option<&Manifest>) -> Option<DVec3> {
     }
 }
 
-/// Reads positions, one a line, until the end. Skips empty lines; overlong ones are not stored. `each`
-/// receives the line number, from 1.
+/// Reads positions, one a line, skipping empty lines, with bounded memory. `each` receives the line number, from 1.
 pub fn read_positions(
     mut reader: impl BufRead,
     mut each: impl FnMut(u64, Result<Position, NotAPosition>),
@@ -330,7 +322,7 @@ pub fn read_positions(
     let mut line = Vec::new();
     for number in 1.. {
         line.clear();
-        // One byte more than allowed, so that an overlong line is recognised and refused.
+        // One byte beyond the limit reveals an overlong line.
         let limit = MAX_TEXT_BYTES as u64 + 1;
         if reader.by_ref().take(limit).read_until(b'\n', &mut line)? == 0 {
             break;
@@ -400,8 +392,7 @@ mod tests {
     }
 
     proptest! {
-        /// Wherever a robot goes, the last fetch covers the radius whenever none is due, and fetches keep
-        /// their minimum interval.
+        /// Whenever no fetch is due, the last one covers the radius; fetches keep their minimum interval.
         #[test]
         fn the_radius_is_covered_whenever_nothing_is_due(
             steps in prop::collection::vec((prop::array::uniform3(-3.0..3.0f64), 0..5u64, prop::bool::weighted(0.2)), 1..200),

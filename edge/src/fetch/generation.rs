@@ -1,4 +1,4 @@
-//! Assembles the next generation: the cells whose shards are on board, and what answers for the others.
+//! Assembles the next generation: cells with shards on board, and stand-ins for the others.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +22,7 @@ pub struct Before<'a> {
     pub offer: Option<&'a Offer>,
 }
 
-/// Returns the pointer to a new generation. `bad`: objects that could not be had.
+/// Returns the pointer to a new generation. `bad`: unavailable objects.
 pub fn assemble(
     before: Before<'_>,
     offer: &Offer,
@@ -47,7 +47,7 @@ pub fn assemble(
 }
 
 impl Before<'_> {
-    /// Returns a whole shard of an earlier generation that may answer for a cell of a new one.
+    /// Returns a whole shard of an earlier generation to stand in for a cell.
     fn stand_in(&self, new: &Manifest, wanted: &Wanted, cell_id: u32) -> Option<OldShard> {
         let current = self.current.filter(|current| current.profile == wanted.profile)?;
         let Current { manifest_hash, .. } = *current;
@@ -79,8 +79,8 @@ impl Before<'_> {
     }
 }
 
-/// Records the objects of the generation on board: of all its cells if `next`, another manifest, follows, else of
-/// those that leave. `manifest`: its own. `cells`: those that stay, by id.
+/// Records the objects of the generation on board: of all cells if another manifest (`next`) follows, else of the
+/// leaving ones. `manifest`: its own. `cells`: those that stay, by id.
 pub fn remember(cache: &EdgeCache, old: &Current, manifest: &Manifest, next: Hash32, cells: &[CurrentCell]) {
     let stays = |cell: &CurrentCell| {
         let at = cells.binary_search_by_key(&cell.cell_id, |other| other.cell_id);
@@ -107,7 +107,7 @@ fn write_record(cache: &EdgeCache, record: Record) -> Result<(), FetchError> {
     };
     cache.create_dir(&history::dir(cache))?;
     let mut known = history::generations(cache);
-    // Numbers of another scene, and of a store that began anew, say nothing about this one's.
+    // Generation numbers of another scene, or of a restarted store, are not comparable.
     known.retain(|of| {
         let is_kept = *of < generation && history::read(cache, &scene, *of).is_some();
         if !is_kept && *of != generation {
@@ -121,7 +121,7 @@ fn write_record(cache: &EdgeCache, record: Record) -> Result<(), FetchError> {
     put(cache, &record.to_bytes(), &history::path(cache, generation))
 }
 
-/// Removes the records of all earlier generations: they may be lost, and a full disk needs the space. Returns whether there were any.
+/// Removes all earlier generations' records, which may be lost, to free space; returns whether there were any.
 pub fn forget_earlier(cache: &EdgeCache) -> bool {
     let known = history::generations(cache);
     for generation in &known {

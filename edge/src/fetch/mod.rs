@@ -1,12 +1,11 @@
-//! Fetch: brings the shards around the robot on board and frees those it left behind.
+//! Fetch: downloads the shards around the robot and frees those left behind.
 //!
-//! An interruption at any moment leaves the old or the new generation, whole: nothing named by `current` is
-//! touched before the new `current` is durable, and nothing unverified is used. In order:
+//! An interruption at any moment leaves the old or the new generation, whole: files of `current` are untouched until
+//! the new `current` is durable, and nothing unverified is used. In order:
 //!
 //! 0. lock; files renamed by a killed fetch are made durable before anything builds on them
-//! 1. metadata: brought up to date and recorded; manifest: hash, scene, encoder; scene and request are recorded
-//! 2. history: the objects of shards that will go are recorded (`history/`); space: shards that neither the old
-//!    nor the new generation needs are removed
+//! 1. metadata: updated and recorded; manifest: hash, scene, encoder; scene and request are recorded
+//! 2. history: objects of leaving shards are recorded (`history/`); space: shards of neither generation are removed
 //! 3. each missing shard: staged, synced, hashed, checked, renamed into `shards/`; folder synced
 //! 4. manifest: staged, synced, renamed into `manifests/`; folder synced
 //! 5. `current`: written aside, synced, renamed; folder synced: this switches generations

@@ -43,8 +43,8 @@ impl<'a> Check<'a> {
         self.cells.get(&hash).copied()
     }
 
-    /// Returns whether an object on board is what the manifest describes. It is read only where the manifest by
-    /// which it came described it otherwise: readers find what rots, and mark it.
+    /// Returns whether an object on board is what the manifest describes. It is read only if its own manifest
+    /// described it otherwise: readers find and mark rot.
     pub(crate) fn is_fit(&self, cache: &EdgeCache, on_board: Option<&Offer>, hash: Hash32) -> bool {
         let Some(cell) = self.cell(hash) else { return true };
         let described = |manifest: &Manifest| {
@@ -56,7 +56,7 @@ impl<'a> Check<'a> {
             || store::check_file(cache, &cache.shard_path(hash), cell, self.profile, self.manifest).is_ok()
     }
 
-    /// Checks that bytes are the shard, or the file of the text model, that the manifest describes.
+    /// Checks that bytes are the manifest's shard or text-model file.
     pub fn object(&self, path: &Path, hash: Hash32, bytes: &[u8]) -> Result<(), StoreError> {
         if let Some(cell) = self.cell(hash) {
             return store::check_shard(path, bytes, cell, self.profile, self.manifest).map(drop);
@@ -68,19 +68,18 @@ impl<'a> Check<'a> {
     }
 }
 
-/// Objects that could not be had, by hash, with the fault and the error; and those that are in place.
+/// Unavailable objects by hash, with fault and error; and those in place.
 #[derive(Default)]
 pub struct Downloaded {
     pub bad: BTreeMap<Hash32, (CellFault, FetchError)>,
     pub good: BTreeSet<Hash32>,
 }
 
-/// Returns the fault of a cell, if an error is about its shard alone: the store answers, but not with that
-/// shard.
+/// Returns the fault of a cell, if an error is about its shard alone: the store answers, but not with that shard.
 fn fault_of(error: &FetchError) -> Option<CellFault> {
     match error {
         FetchError::Published { .. } => Some(CellFault::Invalid),
-        // Neither read, nor replaced.
+        // Neither read nor replaced.
         FetchError::Io(e) if is_bad_medium(e) => Some(CellFault::Unreadable),
         FetchError::Download { failure, .. } => match failure {
             DownloadFailure::Hash { .. } | DownloadFailure::Length { .. } => Some(CellFault::Damaged),
@@ -92,8 +91,8 @@ fn fault_of(error: &FetchError) -> Option<CellFault> {
     }
 }
 
-/// Downloads objects, several at a time, and puts them in place durably. An object that the store does not
-/// have whole costs that object only; of several other errors, returns that of the first object.
+/// Downloads objects, several at a time, and puts them in place durably. An object that the store does not have whole
+/// costs that object only; of several other errors, returns that of the first object.
 pub fn download_all(
     cache: &EdgeCache,
     client: &Client<'_>,
@@ -152,7 +151,7 @@ fn download_one(
     client.object(cache.files(), hash, len_bytes, &part)?;
     let bytes = cache.files().read(&part, len_bytes)?;
     if let Err(source) = check.object(&part, hash, &bytes) {
-        // It would be the same the next time.
+        // It would be the same next time.
         cache.files().remove(&part)?;
         return Err(FetchError::Published { hash, source: Box::new(source) });
     }

@@ -1,5 +1,4 @@
-//! What a store offers: its metadata is brought up to date, and the manifest that it names is downloaded if it is
-//! news.
+//! A store's offer: updates its metadata, and downloads the named manifest if it is new.
 
 use slag_common::Hash32;
 use slag_common::manifest::{self, Manifest, ManifestError, TextModelRecord};
@@ -10,7 +9,7 @@ use super::error::FetchError;
 use super::records::Records;
 use crate::store::{Current, EdgeCache};
 
-/// A manifest that the store's metadata names.
+/// A manifest named by the store's metadata.
 #[derive(Clone)]
 pub(super) struct Offer {
     pub bytes: Vec<u8>,
@@ -19,7 +18,7 @@ pub(super) struct Offer {
 }
 
 impl Offer {
-    /// Reads the manifest that `current` names; `None` if it is missing or invalid.
+    /// Reads the manifest of `current`; `None` if missing or invalid.
     pub fn on_board(cache: &EdgeCache, old: &Current) -> Option<Self> {
         let manifest_hash = old.manifest_hash;
         let bytes = cache.files().read(&cache.manifest_path(manifest_hash), manifest::MAX_BYTES).ok()?;
@@ -28,8 +27,7 @@ impl Offer {
         (Hash32::of(&bytes) == manifest_hash).then_some(Self { bytes, manifest_hash, manifest })
     }
 
-    /// Brings what the robot believes of the store up to date, durably, and returns the manifest that counts.
-    /// `on_board`: used if it is that manifest.
+    /// Durably updates the store's accepted metadata; returns the manifest it names, `on_board` if that is the same.
     pub fn get(
         client: &Client<'_>,
         cache: &EdgeCache,
@@ -41,7 +39,7 @@ impl Offer {
         let mut kept = records.kept().ok_or_else(no_trust)?.clone();
         let mut source = StoreMetadata { client, failure: None };
         let trusted = refresh(&mut kept, &mut source, now_unix_secs);
-        // Also what was accepted before a failure: a root that names new keys must not be forgotten.
+        // Even before a failure: a root that names new keys must not be forgotten.
         records.keep(cache, &kept)?;
         let trusted = trusted.map_err(|e| source.failure.take().unwrap_or(e.into()))?;
         let missing = || TufError::Missing { what: format!("the target {}", manifest::TARGET) };
@@ -64,13 +62,12 @@ impl Offer {
         Ok(Self { manifest_hash: Hash32::of(&bytes), bytes, manifest })
     }
 
-    /// Returns the files of the text model that the scene carries.
     pub fn text_model(&self) -> impl Iterator<Item = Hash32> + '_ {
         let models = self.manifest.encoder.text_model.iter();
         models.flat_map(TextModelRecord::objects).map(|object| object.hash)
     }
 
-    /// Refuses a manifest of another scene than the one that the robot keeps to.
+    /// Refuses a manifest of another scene than the accepted one.
     pub fn check(&self, scene: Option<&str>) -> Result<(), FetchError> {
         let offered = &self.manifest.scene;
         match scene.filter(|expected| expected != offered) {

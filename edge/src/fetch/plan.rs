@@ -30,14 +30,11 @@ pub struct Wanted {
 
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Plan {
-    /// The cells within the radius, by id, ascending.
     pub cells: Vec<CurrentCell>,
     pub download: Vec<ObjectRecord>,
-    /// Needed objects on board.
     pub keep: BTreeSet<Hash32>,
-    /// Objects on board that are not needed but fit the budget, most recently used first.
+    /// Unneeded objects on board within the budget, most recently used first.
     pub spare: BTreeSet<Hash32>,
-    /// Objects on board to remove.
     pub free: BTreeSet<Hash32>,
 }
 
@@ -94,13 +91,11 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Returns the number and total length of the objects to download.
     pub(super) fn to_download(&self) -> Tally {
         Tally::of(self.download.iter().map(|object| object.len_bytes))
     }
 }
 
-/// Returns the cells at the given indices of a manifest with their shards of a profile.
 fn cells_at(
     manifest: &Manifest,
     profile: Profile,
@@ -121,8 +116,7 @@ fn cells_at(
     listed.collect()
 }
 
-/// Returns the objects that must be on board before these cells become current: their shards, and the text model
-/// that the scene carries.
+/// Returns the objects needed before these cells become current: their shards, and the scene's text model.
 fn objects(cells: &[CurrentCell], manifest: &Manifest) -> Result<Vec<ObjectRecord>, PlanError> {
     let mut seen = BTreeSet::new();
     let object = |cell: &CurrentCell| match seen.insert(cell.hash) {
@@ -177,7 +171,7 @@ mod tests {
             let boxes: Vec<_> = boxes.into_iter().map(|(min, size, len)| (min.into(), size.into(), len)).collect();
             let manifest = manifest(&boxes);
             let centre = DVec3::from(centre);
-            // Some of the held shards have the manifest's length, others are damaged.
+            // Some held shards have the manifest's length, others are damaged.
             let held: BTreeMap<Hash32, Held> = held.into_iter().map(|(number, (len, last_used, is_sound))| {
                 let listed = boxes.get(number as usize).map(|(_, _, len)| *len).filter(|_| is_sound);
                 (hash(number), Held { len_bytes: listed.unwrap_or(len), last_used })

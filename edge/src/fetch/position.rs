@@ -71,8 +71,7 @@ pub enum Spoken {
 impl FromStr for Position {
     type Err = NotAPosition;
 
-    /// Parses `x y z` (world frame), `lat,lon[,height]` (degrees, metres), or either as a JSON object.
-    /// Numbers must be in range.
+    /// Parses `x y z` (world frame), `lat,lon[,height]` (degrees, metres), or either as a JSON object. Checks ranges.
     fn from_str(text: &str) -> Result<Self, NotAPosition> {
         let refuse = || NotAPosition { found: text.trim().chars().take(80).collect() };
         if text.len() > MAX_TEXT_BYTES {
@@ -116,9 +115,8 @@ impl FromStr for Position {
 impl Position {
     /// Converts the position to the world frame.
     ///
-    /// A geographic position without a height gets the height of the nearest cell's centre, by horizontal
-    /// distance to its box, then to its centre, then by id. A robot that knows only latitude and longitude
-    /// thus gets the cells around it, wherever the scene's zero height lies.
+    /// A geographic position without a height gets that of the nearest cell's centre, by horizontal distance to its
+    /// box, then to its centre, then by id, so it gets the cells around it wherever the scene's zero height lies.
     pub fn in_world(self, manifest: &Manifest) -> Result<DVec3, PlanError> {
         let number = |name, value: f64, limit: f64, expected| match value.abs() <= limit {
             true => Ok(()),

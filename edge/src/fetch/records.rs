@@ -1,5 +1,4 @@
-//! What a robot believes: the metadata and the scene that it accepted. Two checksummed copies on the cache's own
-//! storage ([`Copies`]); the lock of the cache ensures one fetch at a time.
+//! The metadata and scene that a robot accepted, in two checksummed copies ([`Copies`]), under the cache's lock.
 
 use std::fs::{File, TryLockError};
 use std::io;
@@ -14,10 +13,10 @@ use super::position::Position;
 use crate::store::EdgeCache;
 use crate::store::files::Stat;
 
-/// Room for the first line of a copy.
+/// Leaves room for the first line of a copy.
 const MAX_CONTENT_BYTES: u64 = MAX_COPY_BYTES - 256;
 
-/// Wait for another fetch: a service's and a command's may meet.
+/// Wait for another fetch: a service's and a command's may overlap.
 const LOCK_TIMEOUT: Duration = Duration::from_secs(2);
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
@@ -70,13 +69,12 @@ pub struct Records {
     copies: Copies,
     version: Option<Version>,
     record: Record,
-    /// The fault, if both copies are damaged.
     damage: Option<String>,
     _lock: Lock,
 }
 
 impl Records {
-    /// Opens the records and mends a damaged copy; holds the lock until dropped.
+    /// Opens the records and repairs a damaged copy; holds the lock until dropped.
     pub fn open(cache: &EdgeCache) -> Result<Self, RecordsError> {
         let busy = || RecordsError::Busy { path: cache.dir().to_owned() };
         let lock = Lock::take(cache.dir())?.ok_or_else(busy)?;
@@ -95,7 +93,7 @@ impl Records {
                     copies.dir.display()
                 );
             }
-            // The whole copy is enough for now; a full disk must not keep a robot from fetching.
+            // One whole copy is enough for now; a full disk must not prevent a fetch.
             if let Err(e) = copies.heal(cache.files(), version) {
                 tracing::warn!("one copy cannot be written anew: {e}");
             }
@@ -125,7 +123,7 @@ impl Records {
         self.record.first_root_sha256.as_deref()
     }
 
-    /// Durably trusts a root, and forgets what was trusted before.
+    /// Durably trusts a root, replacing former trust.
     pub fn trust(&mut self, cache: &EdgeCache, kept: Kept) -> Result<(), RecordsError> {
         let first_root_sha256 = Some(sha256_hex(kept.root.as_bytes()));
         self.write(cache, Record { first_root_sha256, kept: Some(kept), ..self.record.clone() })
@@ -155,8 +153,7 @@ impl Records {
     }
 }
 
-/// Returns what a robot accepted, without the lock; `None` before the first trust, or if the records are
-/// damaged.
+/// Returns the accepted state, without the lock; `None` before the first trust, or if the records are damaged.
 pub fn accepted(cache: &EdgeCache) -> Option<Accepted> {
     match read(cache, &copies_of(cache)) {
         Ok(Read::Record(_, record)) => {
@@ -182,7 +179,7 @@ pub fn last_position(cache: &EdgeCache) -> Option<Position> {
     }
 }
 
-/// Returns what changes whenever the records do.
+/// Returns a value that changes whenever the records do.
 pub(super) fn stamp(cache: &EdgeCache) -> [Option<Stat>; 2] {
     copies_of(cache).paths().map(|path| cache.files().stat(&path).ok().flatten())
 }
@@ -201,7 +198,7 @@ fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Read> {
     Ok(match copies.read(cache.files())? {
         Found::Nothing => Read::Nothing,
         Found::Damaged(what) => Read::Damaged(what),
-        // A whole copy of another version of this program: as damaged, nothing of it counts.
+        // A copy of another version of this program counts as damaged.
         Found::Record(version) => match serde_json::from_slice(&version.content) {
             Ok(record) => Read::Record(version, Box::new(record)),
             Err(e) => Read::Damaged(e.to_string()),
@@ -214,11 +211,10 @@ fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Read> {
 struct Lock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
 
 impl Lock {
-    /// Takes the lock of a cache folder; `None` if another fetch keeps it.
     fn take(dir: &Path) -> io::Result<Option<Self>> {
         let path = dir.join("lock");
         fs_err::create_dir_all(dir)?;
-        // To read as well: a pipe in its place would keep one that only writes waiting for a reader.
+        // Also opened to read: opening a pipe only to write would wait for a reader.
         let file =
             fs_err::OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path)?;
         let file = file.into_parts().0;

@@ -1,5 +1,4 @@
-//! What a fetch is asked for, and its surroundings: clock, cancel flag, random numbers, progress and network
-//! limits.
+//! A fetch's request and environment: clock, cancel flag, random numbers, progress and network limits.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -27,8 +26,7 @@ pub struct FetchRequest {
     pub radius: f64,
     pub profile: Profile,
     pub trust_first: bool,
-    /// The only scene accepted, from now on; absent: the one accepted before or, at the first contact, the
-    /// server's.
+    /// The only scene accepted from now on; absent: the one accepted before or, at first contact, the server's.
     pub scene: Option<String>,
     /// Byte budget for shards; absent: twice the length of the needed ones.
     pub max_bytes: Option<u64>,
@@ -50,7 +48,6 @@ impl Default for FetchRequest {
     }
 }
 
-/// Receives the progress of a fetch, from any of its threads.
 pub trait Progress: Sync {
     /// Called once with the length of the shards to download.
     fn planned(&self, _bytes: u64) {}
@@ -64,13 +61,12 @@ impl Progress for () {}
 
 pub struct Environment<'a> {
     pub now_unix_secs: u64,
-    /// Set to end the fetch; the next one resumes what arrived.
+    /// Set to end the fetch; the next one resumes.
     pub cancel: &'a AtomicBool,
     pub progress: &'a dyn Progress,
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a (dyn Fn() -> f64 + Sync),
-    /// Certificates (PEM) of the authorities that may vouch for `https://` addresses; absent: those that browsers
-    /// trust.
+    /// PEM certificates of the authorities for `https://` addresses; absent: those of browsers.
     pub ca: Option<&'a Path>,
     pub limits: NetworkLimits,
 }

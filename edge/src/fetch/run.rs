@@ -1,4 +1,4 @@
-//! A fetch, phase by phase: each type is a state that only the phase before it can make.
+//! A fetch by phases: each type is a state made only by the previous phase.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -41,7 +41,7 @@ pub fn fetch(
     Ok(report)
 }
 
-/// The cache is locked, and what is on board is known.
+/// The cache is locked and its content known.
 struct Locked<'a> {
     cache: &'a EdgeCache,
     request: &'a FetchRequest,
@@ -103,7 +103,7 @@ impl<'a> Locked<'a> {
         })
     }
 
-    /// Brings metadata up to date and takes the manifest that it names, if it is of the robot's scene.
+    /// Updates metadata and takes its manifest if it is of the robot's scene.
     fn accept_offer(mut self) -> Result<Offered<'a>, FetchError> {
         let Self { cache, request, ref client, ref on_board, .. } = self;
         let records = &mut self.records;
@@ -120,7 +120,7 @@ impl<'a> Locked<'a> {
     }
 }
 
-/// The manifest that counts is known and accepted.
+/// The manifest is accepted.
 struct Offered<'a> {
     locked: Locked<'a>,
     offer: Offer,
@@ -128,8 +128,8 @@ struct Offered<'a> {
 }
 
 impl<'a> Offered<'a> {
-    /// Decides what to download, keep and free. What readers marked as damaged is downloaded again, and so is what
-    /// the manifest describes otherwise than the one by which it came.
+    /// Decides what to download, keep and free. Shards marked as damaged are downloaded again, as are those that the
+    /// manifest describes otherwise than their own did.
     fn plan(self) -> Result<Planned<'a>, FetchError> {
         let Locked { cache, request, usage, last, on_board, .. } = &self.locked;
         let manifest = &self.offer.manifest;
@@ -150,18 +150,16 @@ impl<'a> Offered<'a> {
     }
 }
 
-/// What to do with each shard is decided; nothing was removed yet.
+/// Each shard's action is decided; nothing was removed yet.
 struct Planned<'a> {
     offered: Offered<'a>,
     wanted: Wanted,
     held: std::collections::BTreeMap<Hash32, Held>,
     plan: Plan,
-    /// Shards that readers marked as damaged.
     marked: BTreeSet<Hash32>,
 }
 
 impl<'a> Planned<'a> {
-    /// Makes room, downloads what is missing and switches to the new generation.
     fn download(mut self) -> Result<Switched<'a>, FetchError> {
         let needed_bytes = self.plan.to_download().bytes;
         let switched = self.make_room().and_then(|()| self.bring());
@@ -169,7 +167,6 @@ impl<'a> Planned<'a> {
         Ok(Switched { planned: self, current, downloaded })
     }
 
-    /// Records the request, and removes what neither the old nor the new generation needs.
     fn make_room(&mut self) -> Result<(), FetchError> {
         let Offered { locked, offer, .. } = &mut self.offered;
         let cache = locked.cache;
@@ -201,7 +198,7 @@ impl<'a> Planned<'a> {
         }
     }
 
-    /// Downloads, and puts the pointer to the new generation in place. Cells that cannot be had are left out.
+    /// Downloads, and replaces `current`. Unavailable cells are left out.
     fn bring(&self) -> Result<(Current, Downloaded), FetchError> {
         let Offered { locked, offer, .. } = &self.offered;
         let cache = locked.cache;
@@ -209,7 +206,7 @@ impl<'a> Planned<'a> {
         let parallel = locked.request.parallel;
         let mut downloaded = download_all(cache, &locked.client, &check, &self.plan.download, parallel)?;
         damaged::unmark(cache, self.marked.intersection(&downloaded.good))?;
-        // Without its text model the scene would not answer; the generation on board does.
+        // Without its text model the new scene would not answer; the one on board does.
         let of_text_model = downloaded.bad.keys().find(|hash| check.is_of_text_model(**hash)).copied();
         if let Some((_, error)) = of_text_model.and_then(|hash| downloaded.bad.remove(&hash)) {
             return Err(error);
@@ -226,7 +223,7 @@ impl<'a> Planned<'a> {
                 return Err(error);
             }
         }
-        // Readers open the generation again where a file of it was replaced, be it the manifest alone.
+        // Readers reopen the generation if any file was replaced, even the manifest alone.
         let is_same = locked.current.as_ref() == Some(&current) && locked.on_board.is_some();
         if !is_same || !downloaded.good.is_empty() {
             put(cache, &offer.bytes, &cache.manifest_path(offer.manifest_hash))?;
@@ -248,7 +245,6 @@ struct Switched<'a> {
 }
 
 impl Switched<'_> {
-    /// Removes what only the old generation needed, and reports.
     fn clean_up(mut self) -> Result<FetchReport, FetchError> {
         let cache = self.planned.offered.locked.cache;
         let offer = &self.planned.offered.offer;
@@ -307,7 +303,7 @@ impl Switched<'_> {
     }
 }
 
-/// Refuses a download for which there is no space, before it begins. `other_bytes`: what is written besides.
+/// Refuses a download without enough space, before it begins. `other_bytes`: other writes.
 fn check_space(cache: &EdgeCache, download: &[ObjectRecord], other_bytes: u64) -> Result<(), FetchError> {
     let free_bytes = cache.files().free_bytes(cache.dir())?;
     let missing_bytes = |ObjectRecord { hash, len_bytes }: &ObjectRecord| {
@@ -326,7 +322,7 @@ fn disk_full(error: FetchError, needed_bytes: u64) -> FetchError {
         |e: &io::Error| matches!(e.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded);
     match error {
         FetchError::Io(source) | FetchError::Records(RecordsError::Io(source)) if is_full(&source) => {
-            // Records and manifests are written besides.
+            // Records and manifests need space, too.
             FetchError::DiskFull { needed_bytes: needed_bytes.max(1 << 20), source }
         }
         error => error,

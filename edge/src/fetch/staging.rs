@@ -21,7 +21,7 @@ pub fn part_path(cache: &EdgeCache, hash: Hash32) -> PathBuf {
     staging(cache).join(format!("{hash}.part"))
 }
 
-/// Removes a file. One whose inode cannot be read stays, and fails no fetch.
+/// Removes a file. One with an unreadable inode stays without failing the fetch.
 pub fn remove(cache: &EdgeCache, path: &Path) -> io::Result<()> {
     match cache.files().remove(path) {
         Err(e) if is_bad_medium(&e) => {
@@ -54,7 +54,7 @@ pub fn clear_manifests(cache: &EdgeCache, needed: &BTreeSet<Hash32>) -> Result<(
     Ok(())
 }
 
-/// Names that are tried in `staging/` before the medium is given up.
+/// Names tried in `staging/` before the medium counts as failed.
 const MAX_BAD_NAMES: u32 = 4;
 
 /// Replaces a small file durably: its path always holds the old or the new content, whole.
@@ -63,7 +63,7 @@ pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchErro
     loop {
         let aside = staging(cache).join(format!("put{n}"));
         match put_through(cache.files(), &aside, bytes, path) {
-            // The name stays taken where its inode cannot be read.
+            // The name stays taken if its inode cannot be read.
             Err(e) if is_bad_medium(&e) && n < MAX_BAD_NAMES => n += 1,
             other => return Ok(other?),
         }
@@ -86,7 +86,7 @@ fn path(cache: &EdgeCache) -> PathBuf {
 }
 
 impl Usage {
-    /// Reads the records; they are empty if they are missing or damaged.
+    /// Reads the records; empty if missing or damaged.
     pub fn open(cache: &EdgeCache) -> Self {
         let path = path(cache);
         let read = cache.files().read(&path, MAX_BYTES).and_then(|bytes| Ok(serde_json::from_slice(&bytes)?));
@@ -111,14 +111,14 @@ impl Usage {
                 }
                 (Err(_), Ok(_)) => remove(cache, &path)?,
                 (_, Ok(None)) => {}
-                // As if it were not there: it costs its cell only.
+                // Treated as missing: it costs its cell only.
                 (_, Err(e)) => tracing::warn!("{e}; the file system needs a check (fsck)"),
             }
         }
         Ok(held)
     }
 
-    /// Records the shards that a fetch needed; those that are no longer on board are forgotten.
+    /// Records the shards that a fetch needed; forgets those no longer on board.
     pub fn finish(mut self, cache: &EdgeCache, needed: &BTreeSet<Hash32>, on_board: &BTreeSet<Hash32>) {
         self.n_fetches = self.n_fetches.saturating_add(1);
         self.last_used.extend(needed.iter().map(|shard| (*shard, self.n_fetches)));

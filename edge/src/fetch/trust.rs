@@ -1,4 +1,4 @@
-//! First trust: the root by which a robot believes a store.
+//! First trust: the root that a robot starts from.
 
 use serde::Serialize;
 use slag_common::tuf::{Kept, MAX_ROOT_BYTES, MAX_ROOTS, TufError, sha256_hex};
@@ -11,11 +11,11 @@ use crate::store::EdgeCache;
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum FirstRoot {
-    /// Its bytes, which came by hand.
+    /// Given by hand.
     Bytes(Vec<u8>),
-    /// The store at an address has it; its SHA-256 in hex came by hand.
+    /// The first root of a store, with its SHA-256 in hex given by hand.
     Sha256 { from: String, sha256: String },
-    /// The first root of the store at an address, whoever answers there.
+    /// The first root of a store, unverified.
     Any { from: String },
 }
 
@@ -27,8 +27,8 @@ pub struct AddedRoot {
     pub is_new: bool,
 }
 
-/// Trusts a root by hand. A root that the robot began with changes nothing, so that keys which were revoked since
-/// stay revoked. `replace`: trust it in place of another one.
+/// Trusts a root by hand. The first root again changes nothing, so that revoked keys stay revoked. `replace`: trusts
+/// it in place of another root.
 pub fn add_root(
     cache: &EdgeCache,
     root: &FirstRoot,
@@ -57,7 +57,6 @@ pub fn add_root(
     Ok(AddedRoot { sha256, version, is_new })
 }
 
-/// At the first contact, trusts the store's first root; returns whether it did.
 pub(super) fn trust_first(
     client: &Client<'_>,
     cache: &EdgeCache,

@@ -11,31 +11,31 @@ use super::sight;
 use super::space::Window;
 use super::surroundings::Around;
 
-/// Points of a thing's surface that are looked at: bits of a `u128`.
+/// Sample points on a thing's surface: bits of a `u128`.
 const SAMPLES: usize = 128;
-/// Edge of the squares of which only the cheapest candidate is looked at closely, metres.
+/// Only the cheapest candidate of each square with this edge is examined, metres.
 const SQUARE_M: f64 = 0.2;
-/// Most candidates that are looked at closely: half of them the cheapest, half spread over the others.
+/// Most candidates examined: half of them the cheapest, half spread over the others.
 const MAX_CANDIDATES: usize = 256;
-/// Most candidates of any square that are looked at if none of those sees the thing, spread over all.
+/// Most candidates of any square examined if none of those sees the thing, spread over all.
 const MAX_MORE: usize = 2048;
-/// Candidates that are looked at one after the other: mostly the same hides the thing from them.
+/// Neighbouring candidates examined in sequence: mostly the same obstacle hides the thing from them.
 const NEIGHBOURS: usize = 64;
 /// Least distance between two poses of a reply, metres.
 const APART_M: f64 = 0.5;
-/// Clearance beyond the robot's radius above which more is worth nothing, metres.
+/// Clearance beyond the robot's radius above which more adds nothing, metres.
 const COMFORT_M: f64 = 0.3;
-/// Metres of way that a pose without any comfort is worse than one with all.
+/// Cost of a pose without any comfort over one with all, in metres of path.
 const CLEARANCE_WEIGHT_M: f64 = 2.0;
 /// Least visible share of a pose, relative to that of the pose that sees most.
 const SHARE_OF_BEST: f64 = 0.5;
-/// Metres of way that a pose that sees nothing would be worse than one that sees all.
+/// Cost of a pose that sees nothing over one that sees all, in metres of path.
 const SIGHT_WEIGHT_M: f64 = 4.0;
 
 #[derive(Clone, Copy)]
 struct Candidate {
     cell: usize,
-    /// Way and clearance; what is seen is not known yet.
+    /// Path and clearance; visibility is not known yet.
     cost_m: f64,
 }
 
@@ -88,8 +88,7 @@ fn place(look: &Look) -> f64 {
     look.position_in_world.x + 1e3 * look.position_in_world.y
 }
 
-/// Returns the cells with a point within a horizontal distance, and those cells alone, in the order of their
-/// numbers.
+/// Returns exactly the cells with a point within a horizontal distance, in the order of their numbers.
 fn cells_near(window: &Window, points: &[DVec3], distance: f64) -> Vec<usize> {
     let voxels: Vec<[i64; 2]> =
         points.iter().map(|point| window.voxel_of(*point)).map(|[x, y, _]| [x.into(), y.into()]).collect();
@@ -156,9 +155,8 @@ impl<'a> Target<'a> {
         Self { points, samples, thing: sight::Thing::new(around.space, points, request.stand.reach_m) }
     }
 
-    /// Returns the horizontal distance to the nearest of some points.
     fn distance(points: &[DVec3], [x, y]: [f64; 2]) -> f64 {
-        // Several minima at a time, as each waits for the one before.
+        // Eight independent minima, as each waits for its predecessor.
         let mut least = [f64::INFINITY; 8];
         for points in points.chunks(least.len()) {
             for (least, p) in least.iter_mut().zip(points) {
@@ -204,7 +202,6 @@ fn look(
     Some(Look { of, position_in_world, sensor_in_world, seen, visible_share, cost_m })
 }
 
-/// Returns the pose of a candidate that sees the thing.
 fn goal(around: &Around<'_>, target: &Target<'_>, look: &Look) -> Option<Goal> {
     let Look { of, position_in_world, sensor_in_world, seen, visible_share, cost_m } = *look;
     let [x, y] = [position_in_world.x, position_in_world.y];
@@ -225,7 +222,7 @@ fn goal(around: &Around<'_>, target: &Target<'_>, look: &Look) -> Option<Goal> {
     })
 }
 
-/// Returns why no way leads to any of the cells near a thing.
+/// Returns why no path leads to any of the cells near a thing.
 fn missing(around: &Around<'_>, near: &[usize]) -> NoGoal {
     let n_unknown = near.iter().filter(|cell| around.ground.floors[**cell] == Floor::Unknown).count();
     if near.is_empty() || 2 * n_unknown > near.len() { NoGoal::UnknownGround } else { NoGoal::Unreachable }

@@ -5,14 +5,12 @@ use slag_math::distance_transform::along_row;
 
 use super::ground::{Floor, Ground};
 
-/// Instead of the height of a cell without ground; heights are below 128.
+/// Stands for the height of a cell without ground; heights are below 128.
 const NO_GROUND: u8 = u8::MAX;
 
-/// Returns which cells the robot must not touch: those without ground, and those with a drop beside them that is
-/// higher than a step (in voxels).
+/// Returns the cells that the robot must not touch: without ground, or beside a drop higher than a step (in voxels).
 ///
-/// It is the upper side of a drop that counts, so a robot may drive along below a ledge, and never onto it or off
-/// it.
+/// The upper side of a drop counts: a robot may drive along below a ledge, but never onto or off it.
 pub fn obstacles(ground: &Ground, step: u8) -> Vec<bool> {
     let (floors, n_y) = (&ground.floors, ground.n_y);
     let mut obstacles = vec![false; floors.len()];
@@ -44,7 +42,7 @@ pub struct Clearance {
 }
 
 impl Clearance {
-    /// Measures along y; the rest is done for the cells that are asked for.
+    /// Measures along y; distances along x are computed for the cells asked for.
     pub fn new(obstacles: &[bool], n_y: usize) -> Self {
         let mut along_y = vec![0u32; obstacles.len()];
         along_y.par_chunks_mut(n_y.max(1)).zip(obstacles.par_chunks(n_y.max(1))).for_each(|(out, row)| {
@@ -61,13 +59,12 @@ impl Clearance {
         self.along_y[cell] == 0
     }
 
-    /// Returns the squared distance of a cell, in cells.
     pub fn squared(&self, cell: usize) -> u32 {
         let (x, y) = (cell / self.n_y, cell % self.n_y);
         let n_x = self.along_y.len() / self.n_y;
         let border = (x + 1).min(n_x - x);
         let mut least = (border * border) as u32;
-        // Beyond the border there is nothing nearer.
+        // The border itself is an obstacle, so nothing nearer lies beyond it.
         for distance in 0..border {
             let of_rows = (distance * distance) as u32;
             if of_rows >= least {

@@ -55,7 +55,7 @@ pub fn find(
         let points = engine.object_points(snapshot, id, MAX_POINTS, budget);
         budget.check().map_err(GoalError::spent)?;
         let chosen = choose(&mut around, request, &points);
-        // What looks end early for.
+        // Looks end early once the budget is spent.
         budget.check().map_err(GoalError::spent)?;
         match chosen {
             Ok(mut goals) => {

@@ -1,4 +1,4 @@
-//! The ground: from the surface that the robot stands on, in each column of voxels the surface that continues it.
+//! The ground: in each column of voxels, the surface that continues the one that the robot stands on.
 
 use rayon::prelude::*;
 use slag_common::occupancy::BLOCK_EDGE;
@@ -15,9 +15,8 @@ const SURFACE_VOXELS: u32 = 2;
 /// What a cell, a column of voxels, holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Floor {
-    /// Nothing that is known to be ground.
     Unknown,
-    /// Something that leaves no headroom.
+    /// Occupied without headroom.
     Blocked,
     /// Ground; its highest occupied voxel, from the window's lower side.
     At(u8),
@@ -27,11 +26,11 @@ pub struct Ground {
     /// `[n_x][n_y]`.
     pub floors: Vec<Floor>,
     pub n_y: usize,
-    /// `[n_x][n_y]`: surfaces with headroom; bit z is the surface whose highest voxel is z.
+    /// `[n_x][n_y]`: surfaces with headroom; bit z: the surface with its highest voxel at z.
     surfaces: Vec<u128>,
 }
 
-/// Half the way over which a slope is measured, metres.
+/// Half the path over which a slope is measured, metres.
 const SLOPE_REACH_M: f64 = 0.5;
 
 impl Ground {
@@ -41,22 +40,22 @@ impl Ground {
     }
 
     /// Finds the ground. `headroom`: free voxels that must lie above, 1 to 128. Columns without ground are
-    /// obstacles where their lowest surface is higher than a `step`, in voxels, or another one lies within the
-    /// headroom above it: what is higher, such as a ceiling, is in no robot's way.
+    /// obstacles if their lowest surface is higher than `step` voxels or another lies within the headroom
+    /// above it; anything higher, such as a ceiling, is in no robot's way.
     pub fn find(space: &Space, headroom: u32, step: u32) -> Self {
         let edge = BLOCK_EDGE as usize;
         let [n_columns_x, n_columns_y] = space.window.n;
         let n_y = n_columns_y * edge;
         let mut floors = vec![Floor::Unknown; n_columns_x * edge * n_y];
         let mut surfaces = vec![0u128; floors.len()];
-        // A piece for each x of the columns: four rows of cells.
+        // One chunk per x of the columns: four rows of cells.
         let rows = floors.par_chunks_mut(edge * n_y).zip(surfaces.par_chunks_mut(edge * n_y));
         rows.enumerate().for_each(|(x, (rows, of_rows))| {
             let mut last = (0, 0, (Floor::Unknown, 0));
             for y in 0..n_columns_y {
                 let voxels = voxels_of(space.column(x * n_columns_y + y));
                 for (cell, [occupied, free]) in voxels.into_iter().enumerate() {
-                    // Most columns of voxels are as the one before.
+                    // Most columns of voxels equal the one before.
                     if (occupied ^ last.0) | (free ^ last.1) != 0 {
                         let surfaces = surfaces_of(occupied, free, headroom);
                         last = (occupied, free, (floor(occupied, surfaces, headroom, step), surfaces));
@@ -69,17 +68,16 @@ impl Ground {
         Self { floors, n_y, surfaces }
     }
 
-    /// Returns the highest surface of a cell that is at most at this height.
+    /// Returns the highest surface of a cell at or below a height.
     pub(crate) fn surface_below(&self, cell: usize, height: i32) -> Option<u8> {
         let n = u32::try_from(height.checked_add(1)?).ok()?;
         let below = self.surfaces[cell] & low_bits(n.min(128));
         below.checked_ilog2().map(|z| z as u8)
     }
 
-    /// Continues a surface from a cell: whatever a robot that climbs `step` voxels gets to over neighbours is
-    /// ground at that height, even if the column has a lower surface, such as the furniture of the storey below. A
-    /// column with such a lower surface and one at the height of the robot is in its way, and no drop. Returns
-    /// which cells are ground.
+    /// Continues a surface from a cell: what a robot that climbs `step` voxels reaches over neighbours is ground,
+    /// even above a lower surface (furniture of the storey below). A column with such a lower surface and one at the
+    /// robot's height is an obstacle, not a drop. Returns which cells are ground.
     pub(crate) fn continue_from(&mut self, cell: usize, z: u8, step: u8, headroom: u32) -> Vec<bool> {
         let (n_y, n) = (self.n_y, self.floors.len());
         let mut is_met = vec![false; n];
@@ -97,7 +95,7 @@ impl Ground {
                 if is_met[to] {
                     continue;
                 }
-                // If this neighbour is too high or too low for it, another may be near enough.
+                // Another neighbour may be near enough in height.
                 if let Some(z) = self.nearest_surface(to, z, step) {
                     (self.floors[to], is_met[to]) = (Floor::At(z), true);
                     border.push_back((to, z));
@@ -118,8 +116,8 @@ impl Ground {
         (0..=step).find_map(|d| has(z.checked_sub(d)).or_else(|| has(z.checked_add(d))))
     }
 
-    /// Makes ground that is too steep for the robot an obstacle: where the ground rises or falls along a line by
-    /// more than `slope` times its length and a step besides, over at most a metre. Lines end at higher steps.
+    /// Marks ground too steep for the robot as an obstacle: where a line of at most a metre rises or falls by
+    /// more than `slope` times its length plus a step. Lines end at higher steps.
     pub(crate) fn block_slopes(&mut self, slope: f64, step: u8, voxel: f64) {
         let (n_y, floors) = (self.n_y, &self.floors);
         let n_x = floors.len() / n_y.max(1);
@@ -157,12 +155,11 @@ impl Ground {
     }
 }
 
-/// Returns occupied and free voxels of the 16 columns of voxels in a column of blocks; bit z is the voxel at
-/// height z.
+/// Returns occupied and free voxels of the 16 voxel columns in a column of blocks; bit z: the voxel at height z.
 pub fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
     // Lower and upper half, by cell.
     let (mut occupied, mut free) = ([[0u64; 16]; 2], [[0u64; 16]; 2]);
-    // Most blocks are free as a whole.
+    // Most blocks are entirely free.
     let mut all_free = 0;
     for block in blocks {
         let shift = u32::from(block.z) * BLOCK_EDGE as u32;
@@ -232,7 +229,7 @@ mod tests {
         for round in 0..20_000 {
             let headroom = 1 + (random.bits() % 12) as u32;
             let occupied = wide(&mut random) & wide(&mut random) & wide(&mut random);
-            // Mostly free, or there would hardly be headroom.
+            // Mostly free, to leave headroom.
             let unknown = wide(&mut random) & wide(&mut random) & wide(&mut random) & wide(&mut random);
             let free = !occupied & !unknown;
             let bit = |mask: u128, z: u32| z < 128 && mask >> z & 1 == 1;
@@ -255,7 +252,7 @@ mod tests {
         assert_eq!(floor(0, !0, 1, 2), Floor::Unknown, "no ground");
     }
 
-    /// By hand: nobody has looked at the air between a floor at 3 and a ceiling at 60; a wall; a kerb.
+    /// By hand: unseen air between a floor at 3 and a ceiling at 60; a wall; a kerb.
     #[test]
     fn a_ceiling_blocks_nobody() {
         assert_eq!(floor(1 << 3 | 1 << 60, 0, 10, 2), Floor::Unknown);
@@ -267,8 +264,7 @@ mod tests {
         assert_eq!(floor(1 | 1 << 127, 0, 128, 1), Floor::Blocked);
     }
 
-    /// By hand: a row of cells with a floor at 5 and, in the third, a surface at 1 below it, such as a table of
-    /// the storey below.
+    /// By hand: a row of cells with a floor at 5; the third has a surface at 1 below it (a table downstairs).
     #[test]
     fn ground_continues_at_the_robots_height() {
         let mut ground = Ground {
@@ -280,7 +276,7 @@ mod tests {
         assert_eq!(ground.surface_below(2, -1), None);
         ground.continue_from(0, 5, 1, 10);
         assert_eq!(ground.floors, [5, 5, 5, 6, 9].map(Floor::At));
-        // Above a table of the storey below: a box that is in the way, a hole, and what hangs over the robot.
+        // Above a table of the storey below: a box in the way, a hole, and something hanging over the robot.
         for (surfaces, expected) in [
             (1_u128 << 1 | 1 << 12, Floor::Blocked),
             (1 << 1, Floor::At(1)),

@@ -1,4 +1,4 @@
-//! The ground around a robot as a picture: for people, and for programs that plan by themselves.
+//! The ground around a robot as a picture, for people and for other planners.
 
 use std::io::{self, Write};
 
@@ -15,15 +15,14 @@ use crate::store::Snapshot;
 #[derive(Clone, Debug, PartialEq)]
 pub struct FloorMap {
     pub cell_m: f64,
-    /// Corner of the first cell: the least x and y.
+    /// Least x and y of the first cell.
     pub origin_in_world: DVec3,
-    /// Cells along x and y.
     pub size: [usize; 2],
-    /// `[size.y][size.x]`, as ROS numbers them: x first.
+    /// `[size.y][size.x]`, x first as in ROS.
     pub places: Vec<Place>,
 }
 
-/// Maps the ground around a robot; the request's thing counts for nothing.
+/// Maps the ground around a robot; the request's thing is ignored.
 pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) -> Result<FloorMap, GoalError> {
     request.check()?;
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
@@ -57,8 +56,7 @@ pub fn floor_map(snapshot: &Snapshot, request: &GoalRequest, budget: &Budget) ->
 }
 
 impl FloorMap {
-    /// Writes a PGM, north (y) up: unknown 128, obstacles 0, ground 200, ground that the robot reaches 255. ROS's
-    /// map_server reads it.
+    /// Writes a PGM for ROS's map_server, north (y) up: unknown 128, obstacles 0, ground 200, reachable ground 255.
     pub(crate) fn write_pgm(&self, mut out: impl Write) -> io::Result<()> {
         let [width, height] = self.size;
         write!(out, "P5\n{width} {height}\n255\n")?;

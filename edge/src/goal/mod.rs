@@ -1,5 +1,4 @@
-//! Places to stand: poses near a thing that a robot reaches, and sees the thing from. The definitions are in
-//! `docs/numerics.md`.
+//! Places to stand: reachable poses near a thing that see it. Definitions: `docs/numerics.md`.
 //!
 //! | step | result | file |
 //! |---|---|---|

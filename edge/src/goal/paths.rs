@@ -1,32 +1,29 @@
-//! The length of the way to each place.
+//! The length of the path to each place.
 
 use rayon::prelude::*;
 
 use super::ground::{Floor, Ground};
 
-/// Cost of a step to a neighbour along an axis; diagonal ones cost 17: their ratio is within 0.2 % of the square
-/// root of 2.
+/// Cost of a step along an axis; diagonal ones cost 17: the ratio is within 0.2 % of the square root of 2.
 const STRAIGHT: u32 = 12;
 const DIAGONAL: u32 = 17;
-/// No way leads here.
 pub const UNREACHED: u32 = u32::MAX;
 
-/// Most connected places, 10 square metres in voxels of 5 cm, that are looked through before a search for a way to
-/// one of them: the tops of things have no way, so the search would go everywhere.
+/// Most connected places (10 m² in voxels of 5 cm) checked before a search for a path to one of them: tops of
+/// things have none, so the search would go everywhere.
 const MAX_CONNECTED: usize = 4096;
 
-/// Height of a place where no robot's middle may be; others are below 128, and steps at most 100.
+/// Height of a place closed to the robot's middle; others are below 128, and steps at most 100.
 const CLOSED: u8 = u8::MAX;
 
-/// The ways from a robot to the places around it: shortest ones over safe cells along eight directions, whose
-/// neighbours differ by a step at most (Dijkstra's algorithm with Dial's buckets: lengths are whole numbers, and a
-/// step costs at most 17). They are found from the nearest place on, as far as they are asked for.
+/// Shortest paths from a robot over safe cells in eight directions, between neighbours at most a step apart
+/// in height: Dijkstra's algorithm with Dial's buckets, as lengths are integers and a step costs at most 17.
+/// The search advances only as far as it is asked for.
 pub struct Paths {
     /// By cell, with a border of closed ones: height of the ground.
     heights: Vec<u8>,
-    /// By cell, with the border: whether it is connected with a way or with many cells.
+    /// By cell, with the border: whether it is connected with a path or with many cells.
     is_open: Vec<bool>,
-    /// Cells along y of the grid, without the border.
     n_y: usize,
     step: u8,
     /// By cell, with the border: length in twelfths of a cell, or [`UNREACHED`]; final if below `length`.
@@ -78,7 +75,6 @@ impl Paths {
         }
     }
 
-    /// Returns the offsets to the neighbours of a cell, with the cost of a step.
     fn beside(&self) -> [(usize, u32); 8] {
         let width = self.n_y + 2;
         [
@@ -93,8 +89,7 @@ impl Paths {
         ]
     }
 
-    /// Closes the cells connected with a cell if they are at most `most` and no way has come to any of them: none
-    /// will.
+    /// Closes the cells connected with a cell if they are at most `most` and no path has reached any: none will.
     fn close_island(&mut self, cell: usize, most: usize) {
         if self.heights[cell] == CLOSED || self.is_open[cell] {
             return;
@@ -124,7 +119,7 @@ impl Paths {
         }
     }
 
-    /// Finds the ways of the next length.
+    /// Settles the cells of the next length.
     fn find_next(&mut self) {
         let beside = self.beside();
         let n_buckets = self.buckets.len();
@@ -148,7 +143,7 @@ impl Paths {
         self.length += 1;
     }
 
-    /// Returns the length of the way to a cell that was asked for, in cells; `None` if no way leads there.
+    /// Returns the length of the path to a cell, in cells; `None` if there is none.
     pub fn to(&self, cell: usize) -> Option<f64> {
         let length = self.lengths[self.bordered(cell)];
         (length != UNREACHED).then(|| f64::from(length) / f64::from(STRAIGHT))
@@ -193,7 +188,7 @@ mod tests {
                         }
                     });
                 }
-                // Asked for one by one, so the search goes on from where it was.
+                // One by one, so the search resumes each time.
                 for (cell, expected) in expected.iter().enumerate() {
                     found.find([cell]);
                     let found = found.to(cell).unwrap_or(f64::INFINITY);

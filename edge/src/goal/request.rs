@@ -14,8 +14,8 @@ pub const SENSOR_HEIGHT_M: [f64; 2] = [0.05, 2.3];
 /// Least and largest height of the robot: places are known up to 2.4 m above a surface.
 pub const HEIGHT_M: [f64; 2] = [0.05, 2.4];
 pub const STEP_M: [f64; 2] = [0.0, 0.5];
-/// Least step that shows in a scene, in its voxels: heights of surfaces are known to half a voxel, so a difference
-/// of n voxels may be n and a half high, and level ground may differ by one.
+/// Least step that shows in a scene, in its voxels: surface heights are known to half a voxel, so a
+/// difference of n voxels may be n and a half high, and level ground may differ by one.
 pub(super) const LEAST_STEP_VOXELS: f64 = 1.5;
 pub const SLOPE: [f64; 2] = [0.02, 5.0];
 pub const RANGE_M: [f64; 2] = [1.0, 50.0];
@@ -112,16 +112,16 @@ impl Default for Stand {
 #[derive(Clone, Debug, PartialEq)]
 pub struct GoalRequest {
     pub target: GoalTarget,
-    /// Where the robot is, world frame; the centre of the area on board if absent.
+    /// Robot's position, world frame; the centre of the area on board if absent.
     pub near: Option<DVec3>,
-    /// Where it looks, radians from the world's x axis towards y, for texts that depend on it.
+    /// Robot's heading, radians from the world's x axis towards y, for texts that depend on it.
     pub heading_rad: Option<f64>,
     pub robot: Robot,
     pub stand: Stand,
 }
 
 impl GoalRequest {
-    /// Asks for places to stand near a thing, for the robot that flags and parameters describe by default.
+    /// Asks for places to stand near a thing, for the default robot of flags and parameters.
     pub fn new(target: GoalTarget) -> Self {
         Self { target, near: None, heading_rad: None, robot: ROBOT, stand: STAND }
     }

@@ -1,4 +1,4 @@
-//! What a sensor sees of a thing: straight lines through free places.
+//! Visibility of a thing to a sensor: straight lines through free places.
 
 use std::collections::HashSet;
 
@@ -8,42 +8,40 @@ use slag_common::occupancy::BLOCK_EDGE;
 use super::ground::voxels_of;
 use super::space::{COLUMN_BLOCKS, Space};
 
-/// Distance from a point of the thing within which the line need not be free, in edges of a voxel: the thing's own
-/// surface, and the voxels just before it, are occupied or unknown.
+/// Distance from a point of the thing within which the line need not be free, in edges of a voxel: the
+/// thing's own surface and the voxels just before it are occupied or unknown.
 const TOLERANCE: f64 = 2.0;
-/// Distance from the sides of a voxel, in its edges, from which on a place surely lies in it: more than rounding
-/// moves one.
+/// Distance from a voxel's sides, in edges, from which a place surely lies inside: more than rounding moves one.
 const SIDE: f64 = 1e-3;
-/// Distance from a point, in edges of a voxel, beyond which a place is not within [`TOLERANCE`] of it.
+/// Distance from a point, in edges of a voxel, beyond which a place is outside its [`TOLERANCE`].
 const BEFORE: f64 = TOLERANCE + SIDE;
 const HEIGHT: i32 = COLUMN_BLOCKS * BLOCK_EDGE;
-/// Most columns of voxels that are kept at hand, 17 MB: lines to larger things look up every voxel.
+/// Most columns of voxels in the local table, 17 MB; lines to larger things look up every voxel.
 const MAX_AT_HAND: usize = 1 << 19;
 
 /// The voxels of a column, by height.
 type Bits = [u64; HEIGHT as usize / 64];
 
-/// A thing, as lines of sight meet it.
+/// A thing, prepared for tests of lines of sight.
 pub struct Thing<'a> {
     space: &'a Space,
-    /// The cells around it: first, and along x and y.
+    /// Cells of the local table: first, and along x and y.
     first: [i32; 2],
     n: [usize; 2],
-    /// By those cells: free voxels.
+    /// By local cell: free voxels.
     free: Vec<Bits>,
-    /// Voxels that its surface may occupy, those with a point of it and their neighbours. Voxels are occupied up
-    /// to 0.94 edges from a surface, so there are no others.
+    /// Voxels with a point of it and their neighbours: voxels are occupied up to 0.94 edges from a surface.
     own: Vec<Bits>,
-    /// Those outside the cells at hand.
+    /// Own voxels outside the local table.
     own_elsewhere: HashSet<[i32; 3]>,
-    /// The lowest voxel that lies wholly above its bottom.
+    /// Lowest voxel wholly above its bottom.
     first_above_bottom: i32,
     /// Height of its bottom, world frame.
     bottom: f64,
 }
 
 impl<'a> Thing<'a> {
-    /// Makes the thing with a surface at `points`, for sensors up to `reach_m` from it.
+    /// Prepares the thing with a surface at `points` for sensors up to `reach_m` from it.
     pub fn new(space: &'a Space, points: &[DVec3], reach_m: f64) -> Self {
         let window = &space.window;
         let edge = BLOCK_EDGE as usize;
@@ -93,7 +91,7 @@ impl<'a> Thing<'a> {
         thing
     }
 
-    /// Returns the cell at hand with a voxel.
+    /// Returns the cell of a voxel in the local table.
     fn cell(&self, [x, y, z]: [i32; 3]) -> Option<usize> {
         let x = x.wrapping_sub(self.first[0]) as u32 as usize;
         let y = y.wrapping_sub(self.first[1]) as u32 as usize;
@@ -119,23 +117,20 @@ impl<'a> Thing<'a> {
     }
 }
 
-/// Returns the block of a voxel, and its bit there.
 fn place(at: [i32; 3]) -> ([i32; 3], u64) {
     let [x, y, z] = at.map(|v| v.rem_euclid(BLOCK_EDGE));
     (at.map(|v| v.div_euclid(BLOCK_EDGE)), 1 << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x)))
 }
 
-/// Returns whether a point of a thing is seen by a sensor in the voxel `at`: every voxel on the line from the
-/// sensor is free until the line enters voxels that the thing's own surface may occupy, which it does not leave,
-/// or comes within [`TOLERANCE`] of the point.
+/// Returns whether a sensor in the voxel `at` sees a point of a thing: every voxel on the line is free until
+/// the line enters voxels that the thing's own surface may occupy, and stays in them, or comes within
+/// [`TOLERANCE`] of the point. Unknown voxels hide what is behind them.
 ///
-/// A sensor below the whole thing looks at the board or the table that carries it. Their highest voxels belong to
-/// both, so only those that lie wholly above the thing's bottom count as the thing's.
+/// A sensor below the whole thing looks at the board or table that carries it. Their highest voxels belong to
+/// both, so only voxels wholly above the thing's bottom count as its own.
 ///
-/// The voxels that a line passes are those of Amanatides and Woo, "A Fast Voxel Traversal Algorithm" (1987).
-/// Unknown ones hide what is behind them.
-///
-/// `hint` is looked at first and updated. It changes no result.
+/// Voxel traversal: Amanatides and Woo, "A Fast Voxel Traversal Algorithm" (1987). `hint` is tried first and
+/// updated; it changes no result.
 pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3, hint: &mut Hint) -> bool {
     let window = &thing.space.window;
     let voxel = window.voxel;
@@ -179,20 +174,19 @@ pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3, hint: 
     }
 }
 
-/// Where something hid a point: what hides it from one place often hides it from the next, behind the same plane.
+/// The plane that last hid a point: it often hides it from the next place, too.
 #[derive(Clone, Copy)]
 pub struct Hint {
     axis: usize,
-    /// Place of the plane along the axis, in voxels from the window's corner.
+    /// Position of the plane along the axis, in voxels from the window's corner.
     plane: f64,
 }
 
 impl Hint {
-    /// Nothing hid the point yet.
     pub const NONE: Self = Self { axis: 0, plane: f64::NAN };
 
-    /// Returns whether the voxel in which a line to a point meets the plane surely hides the point. `line`: from
-    /// the sensor; `point`: from the window's corner.
+    /// Returns whether the voxel in which a line to a point meets the plane surely hides the point. `line`:
+    /// from the sensor; `point`: from the window's corner.
     fn hides(self, thing: &Thing<'_>, line: DVec3, point: DVec3, lowest: i32) -> bool {
         let per_voxel = 1.0 / thing.space.window.voxel;
         let (line, point) = (line * per_voxel, point * per_voxel);
@@ -209,13 +203,11 @@ impl Hint {
     }
 }
 
-/// Goes from voxel to voxel along a line.
 struct Walk {
     at: [i32; 3],
     /// Axis along which it entered the voxel.
     axis: usize,
-    /// Distances along the line: to where it entered the voxel, to the next side across each axis, and between two
-    /// sides.
+    /// Distances along the line: to the voxel's entry, to the next side across each axis, and between two sides.
     entered: f64,
     next: [f64; 3],
     between: [f64; 3],
@@ -225,7 +217,7 @@ struct Walk {
 impl Walk {
     fn go_on(&mut self) {
         let [x, y, z] = self.next;
-        // Each axis in a branch of its own: no address to wait for.
+        // One branch per axis avoids waiting for a computed index.
         match (y < x, z < x.min(y)) {
             (_, true) => self.pass(2),
             (true, _) => self.pass(1),
@@ -251,7 +243,7 @@ mod tests {
     use crate::goal::space::Window;
     use crate::score::Budget;
 
-    /// Oracle: the states of two shards' voxels, and every point beside every voxel, at hand or not.
+    /// Oracle: the states of two shards' voxels, and every point beside every voxel, in the local table or not.
     #[test]
     fn voxels_around_a_thing_are_those_of_the_shards() {
         let mut random = Random::new(6);
@@ -304,7 +296,7 @@ mod tests {
             let centre = somewhere(0.6);
             let points: Vec<DVec3> = (0..9).map(|_| centre + somewhere(0.3)).collect();
             let thing = Thing::new(&space, &points, 0.5);
-            // Some stand beyond the window, some at the point itself, and some straight below it.
+            // Sensors also beyond the window, at the point itself, and straight below it.
             let mut sensors: Vec<DVec3> = (0..30).map(|_| somewhere(1.4)).collect();
             sensors.extend([points[0], points[0] - DVec3::Z * 0.5]);
             let mut hint = Hint::NONE;

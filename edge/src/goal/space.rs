@@ -5,15 +5,15 @@ use slag_common::occupancy::{BLOCK_EDGE, Occupancy};
 
 use crate::score::Budget;
 
-/// Blocks of a column at most: its voxels are the bits of a `u128`.
+/// Most blocks of a column: its voxels are the bits of a `u128`.
 pub const COLUMN_BLOCKS: i32 = 32;
 /// How far below the robot ground may lie, metres.
 const BELOW_M: f64 = 2.5;
-/// Share of a column that lies below the robot, at most.
+/// Largest share of a column below the robot.
 const MAX_SHARE_BELOW: f64 = 0.4;
-/// Farthest block from the world's origin that shards may store: beyond it all is unknown.
+/// Farthest block from the world's origin that shards may store; beyond it all is unknown.
 const MAX_BLOCK: f64 = (1u32 << 28) as f64;
-/// Most blocks that are looked at: 190 MB.
+/// Most blocks gathered: 190 MB.
 const MAX_BLOCKS: usize = 8 << 20;
 
 #[derive(Clone, Copy, Debug, bytemuck::Zeroable)]
@@ -28,9 +28,7 @@ pub struct Stacked {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Window {
     pub voxel: f64,
-    /// Smallest block.
     pub first: [i32; 3],
-    /// Columns along x and y.
     pub n: [usize; 2],
 }
 
@@ -79,17 +77,16 @@ impl Window {
 
 pub struct Space {
     pub window: Window,
-    /// `[columns + 1]`: where each column's blocks start.
+    /// `[columns + 1]`: start of each column's blocks.
     starts: Vec<u32>,
     /// By column, then by height.
     blocks: Vec<Stacked>,
 }
 
 impl Space {
-    /// Gathers the blocks of a window from the shards' occupancies; those with voxels of another size are left
-    /// out.
+    /// Gathers a window's blocks from the shards' occupancies, skipping those with voxels of another size.
     ///
-    /// Returns `None` if they are more than 8 million, or the budget is spent.
+    /// Returns `None` if there are more than 8 million, or the budget is spent.
     pub fn gather(window: Window, occupancies: &[Occupancy<'_>], budget: &Budget) -> Option<Self> {
         let of_lattice = || occupancies.iter().filter(|of| of.header.voxel == window.voxel);
         let n_columns = window.n[0] * window.n[1];
@@ -132,8 +129,7 @@ impl Space {
         &self.blocks[self.starts[column] as usize..self.starts[column + 1] as usize]
     }
 
-    /// Returns the free voxels of a block, counted from the window's corner: those seen through, without a
-    /// surface. Beyond the window none is known to be free.
+    /// Returns a block's free voxels (seen through, no surface), by the window's corner; none beyond the window.
     pub fn free(&self, [x, y, z]: [i32; 3]) -> u64 {
         let [n_x, n_y] = self.window.n;
         let is_inside = x >= 0 && y >= 0 && (x as usize) < n_x && (y as usize) < n_y;
@@ -166,16 +162,15 @@ impl Iterator for Masks<'_> {
 
 impl ExactSizeIterator for Masks<'_> {}
 
-/// Goes through the pieces of an occupancy's runs that lie in columns of a window: the column, the height of the
-/// first block and the masks. Ends when `visit` returns false. The time is bounded by the window and the number of
-/// runs.
+/// Visits the pieces of an occupancy's runs within a window's columns: column, height of the first block,
+/// masks. Ends when `visit` returns false. Time is bounded by the window and the number of runs.
 fn for_columns<'a>(
     occupancy: &Occupancy<'a>,
     window: &Window,
     mut visit: impl FnMut(usize, u8, Masks<'a>) -> bool,
 ) {
     let (first, [_, n_y, n_z]) = (occupancy.header.first_block, occupancy.header.n_blocks);
-    // Offsets of the window in the shard's box, at most the box.
+    // Offsets of the window in the shard's box, clipped to it.
     let clip = |axis: usize, n: i64| {
         let low = i64::from(window.first[axis]) - i64::from(first[axis]);
         let limit = i64::from(occupancy.header.n_blocks[axis]);

@@ -1,4 +1,4 @@
-//! The places around a robot: ground, obstacles, clearance and ways.
+//! The places around a robot: ground, obstacles, clearance and paths.
 
 use glam::DVec3;
 use slag_common::occupancy::Occupancy;
@@ -12,15 +12,14 @@ use crate::query::RequestError;
 use crate::score::Budget;
 use crate::store::Snapshot;
 
-/// Farthest place, metres, from which the way may begin where the robot's own place is not known to be free.
+/// Farthest start of the path from the robot if its own place is not known to be free, metres.
 pub const START_M: f64 = 0.5;
 /// Most cells of a map: 50 m around the robot in voxels of 5 cm, and some 100 MB.
 const MAX_CELLS: f64 = 4.2e6;
 
-/// Most height of what the request says of the robot above the ground that it stands on, metres: its sensor's,
-/// say.
+/// Most height of the request's position (its sensor's, say) above the robot's ground, metres.
 const MAX_HEIGHT_M: f64 = 1.5;
-/// Bytes for a cell, in all steps together.
+/// Bytes per cell, over all steps.
 const CELL_BYTES: usize = 36;
 
 pub struct Around<'a> {
@@ -32,7 +31,6 @@ pub struct Around<'a> {
 }
 
 impl Around<'_> {
-    /// Returns the distance of a cell to the nearest obstacle, metres.
     pub(crate) fn clearance(&self, cell: usize) -> f64 {
         f64::from(self.clearance.squared(cell)).sqrt() * self.space.window.voxel
     }
@@ -52,7 +50,7 @@ impl Around<'_> {
     }
 }
 
-/// The ground, and what the robot must keep clear of.
+/// The ground and the obstacles.
 pub(super) struct Surroundings<'a> {
     pub(super) space: Space,
     pub(super) ground: Ground,
@@ -60,14 +58,12 @@ pub(super) struct Surroundings<'a> {
     is_continued: Vec<bool>,
     pub(super) clearance: Clearance,
     pub(super) is_safe: Vec<bool>,
-    /// Highest step, voxels.
     pub(super) step: u8,
     budget: &'a Budget,
 }
 
-/// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`] away. If
-/// the request says where the robot is, its height counts: a table top above it is none, nor is the floor of the
-/// storey below.
+/// Returns the surface that the robot stands on: in its own column, or the nearest one up to [`START_M`] away. A
+/// position in the request excludes surfaces above it (table tops) and the floor of the storey below.
 fn own_surface(window: &Window, ground: &Ground, request: &GoalRequest, near: DVec3) -> Option<(usize, u8)> {
     let height = |offset: f64| window.voxel_of(near + DVec3::Z * offset)[2];
     let highest = height(request.robot.step_m(window.voxel) + SURFACE_DEPTH * window.voxel) - 1;
@@ -97,10 +93,11 @@ fn cells_within(window: &Window, near: DVec3, reach: f64) -> impl Iterator<Item 
 }
 
 impl<'a> Surroundings<'a> {
-    /// Looks at the places around a robot, which is at the request's `near`, or `centre` without one.
+    /// Examines the places around a robot, which is at the request's `near`, or else at `centre`.
     ///
     /// # Errors
-    /// [`GoalError::NoOccupancy`]; a range with too many places; a step that the voxels do not tell from none; the budget.
+    /// [`GoalError::NoOccupancy`]; a range with too many places; a step that the voxels do not tell from none;
+    /// the budget.
     pub(super) fn look(
         snapshot: &Snapshot,
         request: &GoalRequest,
@@ -112,7 +109,7 @@ impl<'a> Surroundings<'a> {
         Self::of(&occupancies, request, centre, budget)
     }
 
-    /// Looks at the places of some occupancies, as [`Self::look`] does.
+    /// As [`Self::look`], for given occupancies.
     pub(super) fn of(
         occupancies: &[Occupancy<'_>],
         request: &GoalRequest,
@@ -160,15 +157,14 @@ impl<'a> Surroundings<'a> {
         Ok(Self { space, ground, is_continued, clearance, is_safe, step, budget })
     }
 
-    /// Begins the ways from a safe cell.
+    /// Begins the paths from a safe cell.
     pub(super) fn around(&self, start: usize) -> Around<'_> {
         let paths = Paths::from(start, &self.is_safe, &self.ground, self.step);
         let (space, ground, clearance) = (&self.space, &self.ground, &self.clearance);
         Around { space, ground, paths, clearance, budget: self.budget }
     }
 
-    /// Returns the safe cell nearest to the robot on the ground that it stands on, at most [`START_M`] or its
-    /// radius away.
+    /// Returns the safe cell nearest to the robot on its own ground, at most [`START_M`] or its radius away.
     pub(super) fn start(&self, near: DVec3, radius_m: f64) -> Option<usize> {
         let cells = cells_within(&self.space.window, near, START_M.max(radius_m));
         let nearest = cells

@@ -11,7 +11,7 @@ use crate::score::{Budget, Pool};
 
 const VOXEL: f64 = 0.05;
 
-/// What a made world is at a point.
+/// State of a made world at a point.
 #[derive(Clone, Copy, PartialEq)]
 enum At {
     Free,
@@ -19,12 +19,12 @@ enum At {
     Unseen,
 }
 
-/// Packs a world of 6 by 6 by 1.6 m: the state of a voxel is that of its centre.
+/// Packs a world of 6 by 6 by 1.6 m by the states at voxel centres.
 fn packed(world: impl Fn(DVec3) -> At) -> BuiltOccupancy {
     packed_in(VOXEL, -0.4, world)
 }
 
-/// Packs it in voxels of another size, from a lower corner on.
+/// Packs it with another voxel size, from a lower corner on.
 fn packed_in(voxel_m: f64, low: f64, world: impl Fn(DVec3) -> At) -> BuiltOccupancy {
     let mut blocks = Vec::new();
     let block = |metres: f64| (metres / (4.0 * voxel_m)).round() as i32;
@@ -49,7 +49,7 @@ fn inside(point: DVec3, low: [f64; 3], high: [f64; 3]) -> bool {
     point.cmpge(low.into()).all() && point.cmplt(high.into()).all()
 }
 
-/// A hall of 6 by 6 m with a floor at z = 0 and a box of 0.4 m at its middle, and more.
+/// A hall of 6 by 6 m with a floor at z = 0 and a box of 0.4 m at its middle, plus `more`.
 fn hall(more: impl Fn(DVec3) -> Option<At>) -> impl Fn(DVec3) -> At {
     move |p| match () {
         () if !inside(p, [0.0, 0.0, -0.1], [6.0, 6.0, 1.5]) => At::Unseen,
@@ -74,7 +74,6 @@ fn asked(change: impl FnOnce(&mut GoalRequest)) -> GoalRequest {
     request
 }
 
-/// Finds the best poses near the thing with a surface at `points`.
 fn stand(
     world: &BuiltOccupancy,
     request: &GoalRequest,
@@ -119,7 +118,6 @@ fn poses_are_in_reach_clear_and_turned_to_the_thing() {
         let turned = glam::DQuat::from_xyzw(x, y, z, w) * DVec3::X;
         assert!((turned - heading).length() < 1e-9, "{goal:?}");
     }
-    // The best one is on the robot's side.
     assert!(found[0].position_in_world.x < 2.8, "{:?}", found[0]);
     let apart = |a: &Goal, b: &Goal| a.position_in_world.distance(b.position_in_world) >= 0.5;
     assert!((1..found.len()).all(|i| (0..i).all(|j| apart(&found[i], &found[j]))));
@@ -142,17 +140,17 @@ fn what_is_walled_off_is_unreachable() {
 
 #[test]
 fn unknown_is_never_free() {
-    // Nobody has looked at a strip of ground across the hall.
+    // An unseen strip of ground across the hall.
     let strip = |p: DVec3| inside(p, [1.5, 0.0, -0.1], [2.0, 6.0, 1.5]).then_some(At::Unseen);
     assert_eq!(goals(strip), Err(NoGoal::Unreachable));
-    // Ground that was seen, below air that was not.
+    // Seen ground below unseen air.
     let air = |p: DVec3| inside(p, [1.5, 0.0, 0.3], [2.0, 6.0, 1.5]).then_some(At::Unseen);
     assert_eq!(goals(air), Err(NoGoal::Unreachable));
     let around_thing = |p: DVec3| inside(p, [1.5, 1.5, -0.1], [4.5, 4.5, 1.5]).then_some(At::Unseen);
     assert_eq!(goals(around_thing), Err(NoGoal::UnknownGround));
     let at_robot = |p: DVec3| inside(p, [0.0, 1.5, -0.1], [2.0, 4.5, 1.5]).then_some(At::Unseen);
     assert_eq!(goals(at_robot), Err(NoGoal::UnknownGround));
-    // Fog between the robot's places and the thing hides it.
+    // Unseen air between the robot's places and the thing hides it.
     let ring = |p: DVec3| {
         let d = (p.x - 3.0).abs().max((p.y - 3.0).abs());
         (p.z > 0.05 && d > 0.3 && d < 0.45).then_some(At::Unseen)
@@ -172,8 +170,7 @@ fn a_screen_hides_the_thing_from_low_sensors() {
     goals_with(&world, &request(1.3)).expect("over the screen it is seen");
 }
 
-/// A board with a thing on it, over the whole way: the robot drives below, and sees nothing of the thing through
-/// the board.
+/// A board across the whole path with a thing on it: the robot drives below and does not see through the board.
 #[test]
 fn nothing_is_seen_through_what_a_thing_stands_on() {
     let board = |p: DVec3| inside(p, [1.4, 1.4, 0.65], [4.6, 4.6, 0.7]).then_some(At::Solid);
@@ -194,8 +191,8 @@ fn nothing_is_seen_through_what_a_thing_stands_on() {
     stand(&empty, &request, START, &on_board).expect("poses");
 }
 
-/// A plate on a wall, from below: the line to it goes along the wall, through voxels that wall and plate share,
-/// for longer than two edges. A bump of the wall below it hides it.
+/// A plate on a wall, from below: the line to it passes through voxels shared by wall and plate for longer
+/// than two edges. A bump of the wall below hides it.
 #[test]
 fn what_hangs_on_a_wall_is_seen_from_below() {
     let wall = |p: DVec3| (p.x > 4.9 && p.x < 5.1).then_some(At::Solid);
@@ -216,8 +213,8 @@ fn what_hangs_on_a_wall_is_seen_from_below() {
     assert_eq!(found, Err(NoGoal::NotVisible));
 }
 
-/// A pole behind a screen with a slit of one voxel: it is seen from a strip of 10 cm, and the cheapest place of
-/// its square is not on the strip, as the robot comes from beside it.
+/// A pole behind a screen with a slit of one voxel is seen from a strip of 10 cm; the cheapest place of its
+/// square is off the strip, as the robot comes from beside it.
 #[test]
 fn a_narrow_strip_from_which_a_thing_is_seen_is_found() {
     let screen = |slit: bool| {
@@ -257,7 +254,7 @@ fn steps_and_slopes_count() {
                 .or_else(|| (p.z < 0.3 && p.x >= 2.5 && p.x < 2.6).then_some(At::Solid))
         }
     };
-    // Up a ramp, to a drop of 0.3 m at 2.6 m: from its upper side the box is 0.5 m away, closer no way leads.
+    // Up a ramp, to a drop of 0.3 m at 2.6 m: no path leads closer than its upper side, 0.5 m from the box.
     let world = packed(hall(ramp(0.3)));
     let within = |reach_m| asked(|r| r.stand.reach_m = reach_m);
     let found = goals_with(&world, &within(0.8)).expect("poses");
@@ -271,14 +268,14 @@ fn steps_and_slopes_count() {
     let world = packed(hall(threshold(0.15)));
     let request = asked(|r| r.robot.step_m = Some(0.2));
     goals_with(&world, &request).expect("a robot that climbs 20 cm");
-    // A slope that is reached by a ramp on both sides.
+    // A slope with a ramp on both sides.
     let hill = |p: DVec3| (p.z < (0.5 - (p.x - 1.8).abs()).max(0.0) * 0.6).then_some(At::Solid);
     goals(hill).expect("over the hill");
 }
 
 #[test]
 fn tables_are_driven_under_or_around() {
-    // A table of 0.7 m over the whole way: a low robot drives below, a high one cannot.
+    // A table of 0.7 m across the whole path: a low robot drives below, a high one cannot.
     let table = |p: DVec3| inside(p, [1.4, 0.0, 0.65], [2.0, 6.0, 0.7]).then_some(At::Solid);
     let world = packed(hall(table));
     goals_with(&world, &asked(|_| {})).expect("below the table");
@@ -286,8 +283,8 @@ fn tables_are_driven_under_or_around() {
     assert_eq!(goals_with(&world, &high), Err(NoGoal::Unreachable));
 }
 
-/// The robot is told to be a little inside a coffee table, by its edge: its top is ground with room above, and
-/// nearer than the floor, but the robot's height is that of the floor.
+/// The robot's position is a little inside a coffee table, by its edge: the top is ground with room above and
+/// nearer than the floor, but the given height is the floor's.
 #[test]
 fn the_robots_height_decides_where_it_stands() {
     let table = |p: DVec3| inside(p, [1.0, 2.4, 0.0], [1.9, 3.6, 0.35]).then_some(At::Solid);
@@ -304,7 +301,7 @@ fn the_robots_height_decides_where_it_stands() {
     assert_eq!(deep, Err(NoGoal::UnknownGround), "no floor is near enough");
 }
 
-/// A storey 2.8 m below, whose cupboards and tables are within the window.
+/// A storey 2.8 m below, with cupboards and tables within the window.
 #[test]
 fn the_storey_below_is_not_the_ground() {
     let upper = hall(|_| None);
@@ -337,7 +334,7 @@ fn steep_ramps_are_not_driven() {
     goals_with(&world, &able).expect("a robot that climbs");
 }
 
-/// What voxels cannot keep is refused: a step that does not show in them.
+/// A step too small to show in the voxels is refused.
 #[test]
 fn steps_below_the_voxels_are_refused() {
     let refused = |voxel: f64, step_m: Option<f64>| {

@@ -28,21 +28,21 @@ pub struct App {
     pub(super) metrics: Metrics,
     pub(super) following: Option<Arc<Following>>,
     pub(super) listeners: Arc<Semaphore>,
-    /// Whether the service stops: what never ends by itself ends then.
+    /// Whether the service stops; ends streams that would never end.
     pub(super) stopping: watch::Sender<bool>,
     loading: Mutex<()>,
-    /// Unreadable shards for which a fetch was asked.
+    /// Unreadable shards already handed to the follower.
     asked: Mutex<BTreeSet<Hash32>>,
     n_reload_attempts: watch::Sender<u64>,
 }
 
 impl App {
-    /// Serves an engine's generation, and those that later fetches bring.
+    /// Serves an engine's generation and those of later fetches.
     pub fn new(engine: Engine, settings: Settings) -> Arc<Self> {
         Self::following(engine, settings, None)
     }
 
-    /// Serves an engine as [`App::new`] does, and hands the positions of `POST /position` to `following`.
+    /// As [`App::new`]; hands the positions of `POST /position` to `following`.
     pub fn following(engine: Engine, settings: Settings, following: Option<Arc<Following>>) -> Arc<Self> {
         let app = Self {
             engine,
@@ -61,19 +61,18 @@ impl App {
         Arc::new(app)
     }
 
-    /// Returns where the robot was last, if it is followed and the scene knows the place.
+    /// Returns the robot's last position, if it is followed and the scene can place it.
     pub(super) fn last_position(&self, manifest: &Manifest) -> Option<DVec3> {
         self.following.as_ref()?.status().position?.in_world(manifest).ok()
     }
 
-    /// Returns a counter of finished attempts to load another generation.
     #[cfg(test)]
     pub(crate) fn reload_attempts(&self) -> watch::Receiver<u64> {
         self.n_reload_attempts.subscribe()
     }
 
-    /// Loads another generation if the cache changed (one `stat` call): in the background, so that the one on
-    /// board answers meanwhile, or at once where none is on board. Blocks for the latter alone.
+    /// Loads another generation if the cache changed (one `stat` call): in the background while one on board answers,
+    /// else blocking.
     pub(super) fn reload_if_stale(self: &Arc<Self>) {
         if !self.engine.is_stale() {
             return;
@@ -98,7 +97,7 @@ impl App {
         });
     }
 
-    /// Loads the generation of the latest fetch, after a load in progress. Blocks; queries do not wait.
+    /// Loads the latest fetch's generation, after a load in progress. Blocks; queries do not wait.
     pub fn reload_now(&self) {
         let _loading = self.loading.lock().unwrap_or_else(PoisonError::into_inner);
         self.reload();
@@ -129,7 +128,7 @@ impl App {
         counter.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Has the follower fetch shards that do not open, once each.
+    /// Asks the follower to fetch shards that do not open, once each.
     fn ask_for_unreadable(&self) {
         let (Some(following), Ok(snapshot)) = (&self.following, self.engine.snapshot()) else { return };
         let unreadable: BTreeSet<Hash32> = snapshot.unreadable().collect();
@@ -149,9 +148,8 @@ impl App {
         tokio::task::spawn_blocking(move || work(&app)).await.unwrap_or_else(|e| Err(Problem::internal(e)))
     }
 
-    /// Runs work within the limits of a query, on the newest generation: one permit of those for queries in
-    /// progress, which ends with the work, and a budget of memory and time. `time`: the most that the client gives
-    /// it.
+    /// Runs work within the limits of a query, on the newest generation: holds one query permit until the work ends,
+    /// with a budget of memory and time. `time`: the client's own limit.
     pub(super) async fn within_limits<T: Send + 'static>(
         self: &Arc<Self>,
         time: Option<Duration>,
@@ -177,32 +175,31 @@ impl App {
     }
 }
 
-/// Time that work over its budget has to answer with what to ask for instead.
+/// Grace for work over its budget to answer with a suggestion.
 const TO_SAY_SO: Duration = Duration::from_millis(100);
 
-/// Time for a request and for sending its answer, besides that for the query.
+/// Time for a request and for sending its answer, besides the query's.
 const STALL_BEYOND_QUERY: Duration = Duration::from_secs(50);
 
 #[derive(Clone, Debug)]
 pub struct Settings {
     pub connections: ConnectionLimits,
     pub access: Access,
-    /// Queries in progress; further ones get 503.
+    /// Concurrent queries; further ones get 503.
     pub max_queries: usize,
     /// Clients of `GET /v1/events`; further ones get 503.
     pub max_listeners: usize,
-    /// Time until an answer must begin, else 503; and what a query may compute for.
+    /// Time until an answer must begin, else 503; also the query's computing time.
     pub query_timeout: Duration,
-    /// Memory that a query may use; one that needs more gets 422.
+    /// Memory of a query; one that needs more gets 422.
     pub query_bytes: u64,
-    /// Memory that all queries in progress may use; one that exceeds it gets 503.
+    /// Memory of all queries in progress; one that exceeds it gets 503.
     pub all_queries_bytes: u64,
     pub stream_timeout: Duration,
 }
 
 impl Settings {
-    /// Returns bounds for a machine with a few cores, with a budget of memory and time for each query. All queries
-    /// together may use four times the memory.
+    /// Returns limits for a machine with a few cores. All queries together may use four times the memory of one.
     pub(crate) fn with_budget(query_bytes: u64, query_timeout: Duration) -> Self {
         let connections = ConnectionLimits {
             n_connections: 512,
@@ -236,10 +233,9 @@ const QUERY_BOUNDS_SECS: [f64; 11] =
 
 pub struct Metrics {
     pub responses: Arc<ResponseCounts>,
-    /// Times of queries, refused ones too.
+    /// Times of queries, including refused ones.
     pub query_times: Histogram,
     pub empty_answers: AtomicU64,
-    /// Generations put in place.
     pub reloads: AtomicU64,
     pub reload_failures: AtomicU64,
 }
@@ -257,7 +253,6 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// Returns the scrape, with gauges of the loaded generation and of following.
     pub fn render(
         &self,
         n_in_progress: usize,

@@ -93,7 +93,6 @@ pub struct ShortParams {
 }
 
 impl AskParams {
-    /// Returns the questions as the body of a POST asks them.
     pub fn ask(self, area: AreaParams) -> Result<Ask, RequestError> {
         let near = forms::point(self.near, self.near_lat_lon)?;
         let ball = match (self.radius, near) {
@@ -126,7 +125,6 @@ impl AskParams {
 }
 
 impl ShortParams {
-    /// Returns the questions of `/query`: what `/v1/query` takes, with answers that come at once.
     pub fn ask(self, params: AskParams, area: AreaParams, headers: &HeaderMap) -> Result<Ask, RequestError> {
         let mut ask = params.ask(area)?;
         let twice = |parameter: &str, other: &str| {
@@ -155,7 +153,6 @@ impl ShortParams {
     }
 }
 
-/// Returns the format of `Accept`: columns if it lists them, JSON otherwise.
 #[cfg_attr(
     not(feature = "arrow"),
     expect(unused_variables, reason = "JSON is the only format that it names")

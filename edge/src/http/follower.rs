@@ -1,5 +1,4 @@
-//! The service's work in the background: a follower, which begins again after a panic, and a scrubber, which finds
-//! rot before an answer needs it.
+//! Background work of the service: a follower, restarted after a panic, and a scrubber, which finds rot early.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -12,14 +11,14 @@ use super::app::App;
 use crate::fetch::follow::Following;
 use crate::store::Scrubber;
 
-/// Pauses before a follower that failed begins again.
+/// Pauses before a failed follower is restarted.
 pub const RESTARTS: Backoff = Backoff { first: Duration::from_secs(1), longest: Duration::from_secs(60) };
 /// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(50);
 
-/// Runs `follow` until it returns. If it panics, `following` says so (and with it `/readyz`, `/position`,
-/// `/status` and `/metrics`) until a fetch of its successor ends, and `follow` runs again after a pause that
-/// doubles with each failure in a row. Returns `None` if cancelled in a pause.
+/// Runs `follow` until it returns. After a panic, `following` (and with it `/readyz`, `/position`, `/status` and
+/// `/metrics`) reports the failure until a fetch of the restarted follower ends; pauses between restarts double with
+/// each failure in a row. Returns `None` if cancelled in a pause.
 pub fn keep_following<T>(
     following: &Following,
     restarts: Backoff,
@@ -27,7 +26,7 @@ pub fn keep_following<T>(
     mut follow: impl FnMut() -> T,
 ) -> Option<T> {
     loop {
-        // What it leaves half done is either its own, and dropped with it, or behind a lock that recovers.
+        // Its unfinished state is either its own, and dropped with it, or behind a lock that recovers.
         let panic = match catch_unwind(AssertUnwindSafe(&mut follow)) {
             Ok(ended) => return Some(ended),
             Err(panic) => panic,
@@ -51,8 +50,7 @@ fn text_of(panic: &(dyn Any + Send)) -> &str {
 /// Pause while no scene is loaded.
 const IDLE: Duration = Duration::from_secs(1);
 
-/// Reads every shard on board once in `round`, evenly, until `cancel` is set. A damaged one is marked, the
-/// generation is opened again without it, and a follower fetches it.
+/// Reads every shard on board once per `round`, evenly, until `cancel` is set; damaged ones are fetched again.
 pub fn keep_scrubbing(app: &App, round: Duration, cancel: &AtomicBool) {
     let mut scrubber = Scrubber::default();
     while !cancel.load(Ordering::Relaxed) {
@@ -65,7 +63,7 @@ pub fn keep_scrubbing(app: &App, round: Duration, cancel: &AtomicBool) {
     }
 }
 
-/// Sleeps; returns early, and true, once `cancel` is set.
+/// Sleeps; returns true early once `cancel` is set.
 fn is_cancelled_within(pause: Duration, cancel: &AtomicBool) -> bool {
     let mut left = pause;
     while !left.is_zero() && !cancel.load(Ordering::Relaxed) {

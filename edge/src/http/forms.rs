@@ -1,4 +1,4 @@
-//! Values of parameters that have a form of their own, and parameters that several routes have.
+//! Parameter values with a syntax of their own, and parameters shared by routes.
 
 use glam::DVec3;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
@@ -13,11 +13,11 @@ use crate::query::{
 };
 use crate::score::{MAX_COORDINATE, MAX_CORNERS};
 
-/// A number as it stands between commas.
+/// A number between commas.
 const NUMBER: &str = r"-?[0-9]{1,9}(\.[0-9]{1,9})?";
 const LAT_LON: &str = r"-?[0-8]?[0-9](\.[0-9]{1,9})?,-?(1[0-7][0-9]|[0-9]{1,2})(\.[0-9]{1,9})?";
 
-/// Defines types of texts of a form: the value, the form as a regular expression, and the parser.
+/// Defines types of texts with a syntax: the value, its regular expression, and the parser.
 macro_rules! texts {
     ($($name:ident($value:ty), $form:expr, $parse:expr;)+) => { $(
         pub struct $name(pub $value);
@@ -55,7 +55,7 @@ texts! {
     NegativesText(Negatives), r"^[^\u0000-\u001f\u007f-\u009f]+$", str::parse;
 }
 
-/// Returns the form of `least` to `most` values with commas between them.
+/// Returns the regular expression of `least` to `most` comma-separated values.
 fn several(value: &str, least: usize, most: usize) -> String {
     format!("^{value}(,{value}){{{},{}}}$", least - 1, most - 1)
 }
@@ -92,7 +92,6 @@ fn id(text: &str) -> Result<u64, &'static str> {
     parse_public_id(text).ok_or("o and 16 hex digits")
 }
 
-/// Returns the point that is given in one of two ways.
 pub fn point(near: Option<XyzText>, near_lat_lon: Option<LatLonText>) -> Result<Option<Point>, RequestError> {
     let world = near.map(|XyzText(point)| Point::World(point.to_array()));
     match (world, near_lat_lon.map(|LatLonText(point)| Point::Geographic(point))) {
@@ -118,7 +117,7 @@ pub struct AreaParams {
 }
 
 impl AreaParams {
-    /// Returns the area of a ball, if there is one, and of these.
+    /// Returns the area, with the ball if there is one.
     pub fn area(self, ball: Option<(Point, f64)>) -> Result<Area, RequestError> {
         let corner = |corner: DVec3| Point::World(corner.to_array());
         let polygon = match (self.polygon, self.polygon_lat_lon) {

@@ -1,4 +1,4 @@
-//! What a refused part of a request is called: the engine has one name for it, and each face has its own.
+//! Names of refused parts of a request: the engine's name of each, translated for the query string or JSON.
 
 use axum::extract::Request;
 use axum::middleware::Next;
@@ -7,7 +7,7 @@ use slag_service::problem::Problem;
 
 use crate::query::Ask;
 
-/// Calls what is refused as the query string does that asked for it.
+/// Names refused parameters as the query string does.
 pub async fn as_in_query(request: Request, next: Next) -> Response {
     let query = request.uri().query().map(str::to_owned);
     let mut response = next.run(request).await;
@@ -20,7 +20,7 @@ pub async fn as_in_query(request: Request, next: Next) -> Response {
     response
 }
 
-/// Returns another name of a parameter, if the query string does not have the parameter itself.
+/// Returns another name of a parameter if the query string does not contain it.
 fn in_query(parameter: &str, query: &str) -> Option<&'static str> {
     let has = |wanted: &str| query.split('&').any(|pair| pair.split('=').next() == Some(wanted));
     match parameter {
@@ -35,7 +35,7 @@ fn in_query(parameter: &str, query: &str) -> Option<&'static str> {
     }
 }
 
-/// Returns a function that calls what is refused as the JSON does that asked for it.
+/// Returns a function that names refused members as the JSON does.
 pub fn as_in_json(ask: &Ask) -> impl Fn(Problem) -> Problem + use<> {
     let of_words = if ask.texts.is_empty() && !ask.phrases.is_empty() { "phrases" } else { "texts" };
     move |mut problem| {

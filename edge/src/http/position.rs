@@ -1,4 +1,4 @@
-//! `POST /position`: where the robot is.
+//! `POST /position`: receives the robot's position.
 
 use std::sync::Arc;
 
@@ -40,7 +40,7 @@ pub async fn position(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Acc
     let text = String::from_utf8_lossy(&body);
     let refused = |e: NotAPosition| RequestError::new("body", &e.found, EXPECTED);
     let position: Position = text.parse().map_err(refused)?;
-    // Kept even if nobody follows just now: the next follower starts from it.
+    // Kept even while nobody follows: the next follower starts from it.
     following.post(position);
     match following.failure() {
         Some(failure) => Err(follower_failed(&failure)),

@@ -1,4 +1,4 @@
-//! The errors of this service.
+//! Errors of this service.
 
 use std::time::Duration;
 
@@ -14,9 +14,9 @@ use crate::query::{QueryError, RequestError};
 use crate::score::{OverBudget, ScoreError};
 use crate::text::TextError;
 
-/// Time after which a request beyond a limit may succeed.
+/// `Retry-After` of requests beyond a limit.
 const RETRY_SECS: u32 = 1;
-/// Time after which a follower that failed may follow again.
+/// `Retry-After` while a failed follower restarts.
 const FOLLOWER_RETRY_SECS: u32 = 5;
 
 pub const SCENE: [(u16, &str); 2] = [
@@ -26,16 +26,16 @@ pub const SCENE: [(u16, &str); 2] = [
         "No scene is loaded, too much is asked at once, or the answer took too long; Retry-After has the pause before the next attempt.",
     ),
 ];
-/// Errors of whatever asks the text model.
+/// Errors of routes that use the text model.
 pub const TEXTS: [(u16, &str); 2] = [
     (409, "The text model does not fit the scene."),
     (422, "The text model does not know the words, or the answer needs more memory or time than its budget."),
 ];
-/// Error of whatever a client may give a time.
+/// Error of routes that take a time budget.
 pub const TIME_BUDGET: (u16, &str) = (504, "The time that the request gives is spent.");
-/// Error of whatever needs more memory or time than its budget.
+/// Error of routes with a budget of memory and time.
 pub const BUDGET: (u16, &str) = (422, "The answer needs more memory or time than its budget.");
-/// Error of whatever needs to know which places are free.
+/// Error of routes that need occupancy.
 pub const NO_PLACES: (u16, &str) =
     (409, "No shard on board says which places are free, or the scene has no objects.");
 
@@ -77,7 +77,7 @@ pub fn timeout(limit: Duration) -> Problem {
     Problem::timeout(detail, RETRY_SECS)
 }
 
-/// The time that the client itself gives its question is spent; asking again does not help.
+/// The client's own time budget is spent; asking again does not help.
 pub fn out_of_time(given: Duration) -> Problem {
     let detail = format!(
         "no answer within the {} s that the request gives; give it more, or ask for a smaller region",

@@ -1,4 +1,4 @@
-//! `GET /query`, `GET` and `POST /v1/query`: short answers whole, long ones piece by piece.
+//! `GET /query`, `GET` and `POST /v1/query`: short answers whole, long ones streamed.
 
 use std::io;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ use crate::query::{AnswersOrBatch, Ask, Format, Page, RequestError};
 
 /// Longest body: 32 vectors of 2048 components as text.
 pub const MAX_BODY_BYTES: usize = 1 << 20;
-/// Longest reason why a body is no request.
+/// Longest reason for refusing a body.
 const MAX_REASON_CHARS: usize = 300;
 /// Pieces made ahead of the client.
 const PIECES_AHEAD: usize = 2;
@@ -35,7 +35,7 @@ const PIECES_AHEAD: usize = 2;
 const ARROW: &str = "Columns question (u32, of a batch), x, y, z (f64), score (f32), cell, index (u32). Metadata: scene, generation, frame, unit, score_kind, threshold, score_error_bound, questions (JSON: Answers of each text, without answers), geo_reference.";
 const PLY: &str = "format=ply: a binary little-endian PLY with an element vertex of uint question (of a batch), answer (rank of the answer, from 1), double x, y, z, float score, uint cell, index, and input_index (in the input splat file) if every shard knows it. Comments: text, scene, generation, unit.";
 
-/// Reads the query string of `/query`, without the checks that a scene is needed for.
+/// Parses the query string of `/query`, without the checks that need a scene.
 ///
 /// # Errors
 /// The first wrong parameter, or the string if it is no query string.
@@ -71,7 +71,7 @@ pub async fn post(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Json<Pa
     answer(&app, Ok(ask)).await.map(As::new).map_err(named)
 }
 
-/// Returns the problem of a body that is no request: what serde says names the member, and the names it may have.
+/// Returns the problem of an invalid body; serde's text names the member and its allowed names.
 fn unreadable(error: &serde_json::Error) -> Problem {
     let (mut text, expected) = (error.to_string(), "a request as GET /openapi.json describes it");
     for (type_in_rust, in_words) in
@@ -97,7 +97,7 @@ async fn answer(app: &Arc<App>, ask: Result<Ask, Problem>) -> Result<Response, P
 
 async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Problem> {
     let format = ask.format;
-    // Before time runs: a budget of nothing is refused, not overrun.
+    // Before the clock starts: a budget of zero is refused, not overrun.
     let answering = app.within_limits(ask.time_budget()?, move |app, budget| {
         let reply = app.engine.ask(ask, budget).map_err(query_problem)?;
         let n_empty = reply.outcomes.iter().filter(|outcome| outcome.is_empty()).count();
@@ -108,7 +108,7 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
         let mut pieces = reply.pieces(format).peekable();
         let first = pieces.next().transpose().map_err(Problem::internal)?.unwrap_or_default();
         let is_whole = pieces.peek().is_none();
-        // What the answers take counts until they are sent.
+        // The answers' bytes stay charged until they are sent.
         Ok((first, (!is_whole).then(|| (pieces, budget.clone()))))
     });
     let (first, rest) = answering.await?;
@@ -121,7 +121,6 @@ async fn answer_within_limits(app: &Arc<App>, ask: Ask) -> Result<Response, Prob
                 let _held = budget;
                 send_all(first, pieces, sender, deadline).await;
             });
-            // A cut-off answer must not look complete.
             Body::from_stream(try_unfold(receiver, |mut pieces| async move {
                 match pieces.recv().await {
                     Some(piece) => Ok(piece.map(|piece| (piece, pieces))),
@@ -155,9 +154,9 @@ impl Described for Formats {
     }
 }
 
-/// Sends the pieces and then `None`; each is made off the async threads once the client took those before.
+/// Sends the pieces and then `None`; each is made off the async threads once the client took the previous one.
 ///
-/// It gives up at the deadline: a slow or silent client does not hold the answers for longer.
+/// Gives up at the deadline: a slow or silent client must not hold the answers longer.
 async fn send_all(
     first: Vec<u8>,
     pieces: impl Iterator<Item = io::Result<Vec<u8>>> + Send + 'static,

@@ -16,7 +16,7 @@ use super::problem::{Members, SCENE, TEXTS, TIME_BUDGET};
 use super::{named, position, query, status, v1};
 use crate::fetch::Spoken;
 
-/// This service, as its help text and description name it.
+/// This service in its help text and description.
 pub(super) const ABOUT: About = About {
     name: "slag-edge",
     version: env!("CARGO_PKG_VERSION"),
@@ -67,7 +67,6 @@ pub(super) fn described() -> (Router<Arc<App>>, Vec<Route>) {
     routes().described::<Members>(ABOUT)
 }
 
-/// Returns the service, without a listener.
 pub(super) fn router(app: Arc<App>) -> Router {
     let (router, table) = described();
     let reads = table.iter().filter(|route| route.reads).map(|route| route.path).collect();

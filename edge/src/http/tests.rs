@@ -90,7 +90,7 @@ fn assert_refused((status, _, body): &Answered, parameter: &str, asked: &str) {
     assert_eq!((status.as_u16(), &body["parameter"]), (400, &json!(parameter)), "{asked}: {body}");
 }
 
-/// A failed test must end too: the runtime waits for every task at the gate.
+/// A failed test must end, too: the runtime waits for every task at the gate.
 impl Drop for Service {
     fn drop(&mut self) {
         open_gate(&self.gate);
@@ -109,7 +109,6 @@ async fn read(response: Response) -> Answered {
     (head.status, head.headers, serde_json::from_slice(&bytes).unwrap_or(Value::String(text)))
 }
 
-/// Lets a request run until it waits for its answer.
 async fn start(response: &mut std::pin::Pin<Box<impl Future<Output = Response>>>) {
     tokio::select! {
         biased;
@@ -242,7 +241,7 @@ async fn the_first_scene_is_served_at_once() {
     assert_eq!((status, &body["generation"]), (StatusCode::OK, &1.into()), "{body}");
 }
 
-/// The time that a client gives is its own: asking again does not help, as it does where the service is slow.
+/// The client's own time limit gives an error without retry, unlike a slow service.
 #[tokio::test]
 async fn a_clients_own_time_is_its_own() {
     let service = Service::with_chair();
@@ -278,7 +277,7 @@ async fn too_many_questions_are_turned_away() {
     assert_eq!(service.get("/query?text=0").await.0, StatusCode::OK);
 }
 
-/// A query that timed out counts against the limit until its work ends.
+/// A query that timed out keeps its permit until its work ends.
 #[tokio::test]
 async fn a_slow_answer_is_cut_off_and_keeps_its_place() {
     let settings =
@@ -382,7 +381,6 @@ async fn an_expired_scene_answers_and_the_status_says_so() {
     }
 }
 
-/// Has a cache remember a timestamp that expires at a time.
 fn keep_timestamp(dir: &std::path::Path, expires_unix_secs: u64) {
     let key = generate_key();
     let files = one_key_repository(&key, 1, "manifest", b"");

@@ -1,4 +1,4 @@
-//! Draws the cells on board, to verify the pose of a photo.
+//! Renders the cells on board to verify the pose of a photo.
 
 use glam::{DAffine3, DVec3};
 use rayon::prelude::*;
@@ -12,25 +12,25 @@ use slag_raster::{PreparedScene, RasterView, check_view};
 use crate::score::Budget;
 use crate::store::Snapshot;
 
-/// Bytes for each Gaussian that is drawn: as one of a scene and on the screen, and its places in tiles.
+/// Bytes per rendered Gaussian: in the scene, on the screen, and in tiles.
 const BYTES_PER_GAUSSIAN: usize = 320;
-/// Bytes for each Gaussian on board: its place in the list of those that are seen, which grows by doubling.
+/// Bytes per Gaussian on board: its entry in the list of visible ones, which grows by doubling.
 const BYTES_PER_GAUSSIAN_ON_BOARD: usize = 2 * size_of::<u32>();
-/// Bytes for each pixel: colour, depth and coverage, then grey and its features.
+/// Bytes per pixel: colour, depth and coverage, then grey and its features.
 const BYTES_PER_PX: usize = 160;
-/// Standard deviations of a Gaussian within which it may be seen.
+/// Standard deviations within which a Gaussian may be visible.
 const REACH_SIGMAS: f64 = 3.4;
-/// Where a Gaussian's centre may lie beside the picture, as a share of its size, besides its own reach.
+/// Distance of a Gaussian's centre beside the picture, as a share of its size, besides its own reach.
 const MARGIN: f64 = 0.1;
 
-/// The cells on board that tell how their Gaussians look.
+/// The cells on board with an appearance.
 pub(super) struct OnBoard<'a> {
     cells: Vec<(ShardView<'a>, Appearance<'a>)>,
     budget: &'a Budget,
 }
 
 impl<'a> OnBoard<'a> {
-    /// Returns the cells with an appearance, if there are any. Drawings are charged to the budget.
+    /// Returns the cells with an appearance, if any. Renderings are charged to the budget.
     pub(super) fn of(snapshot: &'a Snapshot, budget: &'a Budget) -> Option<Self> {
         let cells =
             snapshot.shards.iter().filter_map(|shard| Some((shard.view(), shard.additions().appearance?)));
@@ -38,7 +38,7 @@ impl<'a> OnBoard<'a> {
         (!cells.is_empty()).then_some(Self { cells, budget })
     }
 
-    /// Returns the Gaussians that a camera may see; `None` where the budget does not allow them.
+    /// Returns the Gaussians a camera may see; `None` if over budget.
     pub(super) fn seen(&self, view: &RasterView) -> Option<Gaussians> {
         let n_on_board: usize = self.cells.iter().map(|(shard, _)| shard.header.n_gaussians as usize).sum();
         let n_px = view.intrinsics.width_px as usize * view.intrinsics.height_px as usize;
@@ -81,7 +81,6 @@ impl Renderer for OnBoard<'_> {
     }
 }
 
-/// What a camera may see.
 struct Frustum<'a> {
     view: &'a RasterView,
     /// Lowest and highest x / z and y / z.
@@ -102,8 +101,7 @@ impl<'a> Frustum<'a> {
         Self { view, tangents }
     }
 
-    /// Returns whether a Gaussian may reach into the picture: its centre is before the camera, and beside the
-    /// picture by no more than its reach.
+    /// Returns whether a Gaussian is before the camera and may reach into the picture.
     fn may_see(&self, mean_in_world: DVec3, max_size: f32) -> bool {
         let DVec3 { x, y, z } = self.view.camera_from_world.transform_point3(mean_in_world);
         let reach = REACH_SIGMAS * f64::from(max_size);

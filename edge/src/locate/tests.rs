@@ -17,7 +17,7 @@ use crate::score::Pool;
 use crate::store::EdgeCache;
 use crate::testing::{BuiltShard, Member, TestShard, write_cache};
 
-/// A cache whose one shard has landmarks of a version, or none.
+/// A cache with one shard, with landmarks of a version, or none.
 fn on_board(dir: &Path, version: Option<u32>) -> Snapshot {
     let plain = TestShard::new(vec![vec![member([0; 3])]]).build(false);
     let landmark = |x: f64| Landmark { position_in_world: DVec3::splat(x), code: 3, view: 0 };
@@ -63,17 +63,16 @@ fn what_cannot_be_matched_is_told() {
     let snapshot = on_board(&dir.path().join("some"), Some(CODE_VERSION));
     let lost = answer(&snapshot, &photo).expect("an answer");
     assert_eq!(lost, reason(Reason::FewFeatures { found: 0 }));
-    // Hostile files: text, a cut picture, and three that state gigantic sizes.
+    // Hostile files: text, a truncated picture, and three with gigantic stated sizes.
     let stating = |width: u32, height: u32| {
         let mut bytes = photo.clone();
         bytes[16..20].copy_from_slice(&width.to_be_bytes());
         bytes[20..24].copy_from_slice(&height.to_be_bytes());
-        // The checksum of the head, whose type and 13 bytes it covers.
         let checksum = crc32(&bytes[12..29]);
         bytes[29..33].copy_from_slice(&checksum.to_be_bytes());
         bytes
     };
-    // What decoders take for a photo, or do not name: a copy that was cut, and what stands in a photo's place.
+    // Photos that decoders may accept or misname: a truncated copy, and other data in a photo's place.
     let jpeg = written(&image::RgbImage::new(64, 48).into(), image::ImageFormat::Jpeg);
     let cases = [
         (jpeg[..jpeg.len() - 20].to_vec(), "ends before"),
@@ -91,7 +90,7 @@ fn what_cannot_be_matched_is_told() {
         let error = answer(&snapshot, &bytes).expect_err("no picture").to_string();
         assert!(error.contains(expected), "{error}");
     }
-    // Colours that nobody sees have no features: noise below one white pixel.
+    // Invisible colours have no features: noise below one white pixel.
     let mut random = Random::new(1);
     let mut hidden = image::RgbaImage::from_fn(640, 480, |_, _| {
         let [r, g, b] = [(); 3].map(|()| random.bits() as u8);
@@ -123,8 +122,8 @@ fn written(photo: &DynamicImage, format: image::ImageFormat) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// By hand: of 12 megapixels the grey takes 48 MB, halved once 12 MB; halved twice, doubled, and in ten pictures
-/// 120 MB. Decoding takes 144 MB before that.
+/// By hand: of 12 megapixels the grey takes 48 MB, halved once 12 MB; halved twice, doubled, and in ten pictures 120
+/// MB; before that, decoding takes 144 MB.
 #[test]
 fn the_memory_of_a_photo_is_known_before_it_is_read() {
     let bytes = png(4000, 3000);
@@ -135,8 +134,7 @@ fn the_memory_of_a_photo_is_known_before_it_is_read() {
     assert!((640 * 480 * 100..640 * 480 * 180).contains(&photo.working_bytes()), "{}", photo.working_bytes());
 }
 
-/// By hand: a camera at (1, 2, 3) that looks along the world's x with its top up stands as REP-103 stands: its
-/// rotation is none.
+/// By hand: a camera at (1, 2, 3) looking along the world's x with its top up has REP-103's orientation: no rotation.
 #[test]
 fn the_body_of_a_level_camera_is_not_turned() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -156,7 +154,7 @@ fn the_body_of_a_level_camera_is_not_turned() {
     assert_eq!(geographic, None);
 }
 
-/// Culling changes no bit of a drawing, and nothing is drawn beyond the budget.
+/// Culling changes no bit of a rendering, and nothing is rendered beyond the budget.
 #[test]
 fn what_is_beside_a_picture_is_not_drawn() {
     let random = &mut Random::new(3);
@@ -194,7 +192,7 @@ fn what_is_beside_a_picture_is_not_drawn() {
     assert!(seen.coverage.iter().any(|coverage| *coverage > 0.9));
     assert_eq!((seen.rgb, seen.depth, seen.coverage), (all.rgb, all.depth, all.coverage));
 
-    // Refused before the list of what is seen, and after it.
+    // Refused before the list of visible Gaussians, and after it.
     for bytes in [10_000, 2000 * 8 + 64 * 48 * 160] {
         let budget = Budget::new(bytes, Duration::from_secs(60), &Pool::new(1 << 30));
         let on_board = OnBoard::of(&snapshot, &budget).expect("an appearance");

@@ -22,15 +22,14 @@ use crate::score::{
 use crate::store::{BadCell, cell_of};
 use slag_common::manifest::Manifest;
 
-/// Names of questions, and their vectors, each with those of its negatives.
+/// Names of the questions, and their vectors, each with its negatives.
 type Questions<'a> = (&'a [&'a str], &'a [Question]);
 
-/// Answers a checked request about a scene: one answer for each question, in their order.
+/// Answers a checked request about a scene: one answer for each question, in their order. Without a kind, a question
+/// that no object answers is answered by clusters.
 ///
-/// Without a kind, a question that no object answers is answered by clusters.
-///
-/// The same scene, vectors and request give the same answers for any number of threads, asked alone or
-/// together. `scratch`: buffers of earlier answers, or new ones, and what the request may use.
+/// The result depends neither on the number of threads nor on the other questions. `scratch`: buffers to reuse, and
+/// the budget.
 /// # Errors
 /// [`ScoreError`]; one is a request that needs more than its budget.
 pub fn answer(
@@ -42,7 +41,7 @@ pub fn answer(
     Answering { scene, request, budget: scratch.budget().clone() }.answers(scratch, questions)
 }
 
-/// A request, the scene that it is about, and what it may use.
+/// A request, its scene and its budget.
 pub(super) struct Answering<'a> {
     pub(super) scene: &'a Scene<'a>,
     pub(super) request: &'a QueryRequest,
@@ -72,13 +71,13 @@ impl Answering<'_> {
         if open.is_empty() {
             return Ok(answers);
         }
-        // Ground is no object, and neither is what few photos outline.
+        // Ground is no object; nor is a thing that few photos outline.
         let (labels, questions): (Vec<&str>, Vec<Question>) =
             open.iter().map(|at| (asked.0[*at], asked.1[*at].clone())).unzip();
         let clusters = self.by_gaussians(scratch, (&labels, &questions), AnswerKind::Clusters)?;
         for (at, clusters) in open.into_iter().zip(clusters) {
             match (&mut answers[at].reason, &clusters.reason) {
-                // Neither answers: both say why.
+                // Neither answers: report both reasons.
                 (Some(of_objects), Some(of_clusters)) => {
                     let detail = format!("{}; {}", of_objects.detail, of_clusters.detail);
                     // Where there is no object, Gaussians have the nearest miss.
@@ -110,8 +109,7 @@ impl Answering<'_> {
         self.each(asked, &searches, |text, question, search| self.gaussians((text, kind), question, search))
     }
 
-    /// Answers each question from what was scored for it; of the bytes of each only those of its answers stay
-    /// charged.
+    /// Answers each question from its scores; only the bytes of its answers stay charged.
     fn each<S>(
         &self,
         (labels, questions): Questions<'_>,
@@ -141,9 +139,8 @@ impl Answering<'_> {
         let key = |object: &FoundObject<'_>| (scale.shown(object.score), object.extent().position_in_world);
         let order = Order::new(scale.base(calibration), manifest, request);
         let ranked = order.rank(found, key);
-        // Members are runs, at most one for each Gaussian; their positions are needed for the box.
+        // Members: at most one run per Gaussian; the box needs their positions.
         let of_gaussian = size_of::<DVec3>() + if request.members { size_of::<Run>() } else { 0 };
-        // Describes only the objects that are returned.
         let described = ranked.into_par_iter().filter_map(|ranked| {
             let bytes = ranked.found.n_gaussians as usize * of_gaussian + size_of::<ClusterAnswer>();
             let score = scale.shown(ranked.found.score);
@@ -173,7 +170,6 @@ impl Answering<'_> {
         }
     }
 
-    /// Answers a question by the Gaussians that match, or by clusters of them.
     fn gaussians(&self, asked: (&str, AnswerKind), question: &Question, search: &Search<'_>) -> Answers {
         let (manifest, scale) = (self.scene.manifest, Scale::of(question));
         let (threshold, source) = scale.threshold(self.request, manifest, manifest.encoder.calibration);
@@ -184,7 +180,7 @@ impl Answering<'_> {
             }
             _ => self.clusters(search, scale, threshold),
         };
-        // Gaussians of exact shards are listed with their own scores, clusters with their centroids'.
+        // Exact shards: Gaussians are listed with their own scores, clusters with their centroids'.
         let score_error_bound = scale.error_bound(match (search.is_exact(), asked.1) {
             (true, AnswerKind::Gaussians) => question.rounding_bound(),
             _ => search.score_error_bound(),
@@ -218,7 +214,6 @@ impl Answering<'_> {
         let n_searched: usize = search.searched().map(|shard| shard.n_with_evidence()).sum();
         self.budget.take(limit.min(n_searched) * size_of::<Hit>());
         let mut hits = search.best(limit, score_threshold, self.request.near);
-        // If all are listed, their number is known.
         let is_whole = hits.len() < limit;
         let n_matching =
             if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
@@ -260,7 +255,7 @@ impl Answering<'_> {
         (cluster(scene.shards, &matches.runs, &grouping, &self.budget), matches.n_gaussians)
     }
 
-    /// Returns the clusters of things anywhere on board, which phrases are about where no object answers.
+    /// Returns the clusters of things anywhere on board, for the parts of a phrase that no object answers.
     pub(super) fn clusters_of_things(
         &self,
         scratch: &mut Scratch,
@@ -279,7 +274,7 @@ impl Answering<'_> {
         questions.iter().zip(&searches).map(of_thing).collect()
     }
 
-    /// Returns the answers to a phrase as answers to a text: without degrees, and without what they are related to.
+    /// Returns the answers to a phrase as those to a text, without degrees and witnesses.
     pub(super) fn of_related(&self, text: &str, related: RelatedAnswers, question: &Question) -> Answers {
         let (scene, scale) = (self.scene, Scale::of(question));
         let threshold = scale.threshold(self.request, scene.manifest, objects::calibration(scene.objects));
@@ -339,8 +334,7 @@ fn bad_cells(scene: &Scene<'_>, region: &Region) -> Vec<BadCellAnswer> {
     scene.bad_cells.iter().filter(touches).map(described).collect()
 }
 
-/// Returns whether the whole region asked for was fetched: certainly if all of the ball or all of the box
-/// was, since only their intersection is asked for.
+/// Returns whether the whole region was fetched: surely if all of ball or box was, as their intersection counts.
 fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Option<bool> {
     let region = &request.region;
     let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);

@@ -16,24 +16,23 @@ use super::request::{AnswerKind, Asked, QueryRequest, unit_vector};
 use super::scene::Scene;
 use crate::score::{Budget, Question, Region, ScoreError, Scratch, score_objects};
 
-/// Memory for the candidates of a thing: 256 of a kilobyte.
+/// Memory for the candidates of a thing: 256 of 1 kB.
 const CANDIDATES_BYTES: usize = 256 << 10;
 
 impl Engine {
-    /// Answers questions from the loaded generation. Blocks for milliseconds of computing, at most as long as the
-    /// budget says.
+    /// Answers questions from the loaded generation. Blocks for milliseconds of computing, within the budget's time.
     pub fn ask(&self, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
         self.ask_on(&self.on_board()?, ask, budget)
     }
 
-    /// Answers as [`Engine::ask`] does, from a generation that may be loaded no more.
+    /// As [`Engine::ask`], from a generation that may already be replaced.
     pub(crate) fn ask_on(&self, on_board: &OnBoard, ask: Ask, budget: &Budget) -> Result<Reply, QueryError> {
         on_board.check()?;
         let request = ask.understand(&on_board.snapshot)?;
         self.answer_on(on_board, request, budget)
     }
 
-    /// Answers a request that is in the world frame already, as [`Engine::ask`] does.
+    /// As [`Engine::ask`], for a request already in the world frame.
     pub fn answer(&self, mut request: QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
@@ -112,7 +111,7 @@ impl Engine {
     }
 }
 
-/// Returns what is asked in place of the things of a question, and of its negatives, that the model does not know.
+/// Returns the texts that replace things and negatives with words unknown to the model.
 fn asked_as(on_board: &OnBoard, asked: &Asked, request: &QueryRequest) -> BTreeMap<String, String> {
     let things: Vec<String> = match asked {
         Asked::Text(text) => vec![relations::asked_thing(text).unwrap_or_else(|| text.clone())],
@@ -124,7 +123,7 @@ fn asked_as(on_board: &OnBoard, asked: &Asked, request: &QueryRequest) -> BTreeM
     things.into_iter().chain(negatives).filter_map(asked_as).collect()
 }
 
-/// Returns the vector of a question that is one, at unit length.
+/// Returns the vector of a vector question, at unit length.
 fn vector_of(vector: &[f32], dim: u32) -> Result<Arc<[f32]>, QueryError> {
     if vector.len() != dim as usize {
         let found = format!("{} components", vector.len());

@@ -116,7 +116,6 @@ enum AnyAnswer {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Found {
     Clusters(Vec<ClusterAnswer>),
-    /// Gaussians; [`GaussianAnswer::new`] describes one.
     Gaussians(Vec<Hit>),
 }
 

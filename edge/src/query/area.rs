@@ -51,7 +51,7 @@ pub struct AreaBox {
 
 slag_common::named_members!(Area, AreaBall, AreaBox; Serialize);
 
-/// Reads the corners of a polygon; none would be the whole scene.
+/// Reads the corners of a polygon; none is an error, as it would mean the whole scene.
 fn corners<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<Corner>, D::Error> {
     let corners = Vec::deserialize(from)?;
     if corners.is_empty() {
@@ -62,7 +62,7 @@ fn corners<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<Corner>, D::Error> 
 }
 
 impl Area {
-    /// Returns the region in the world frame. Errors name the member that is wrong.
+    /// Returns the region in the world frame. Errors name the invalid member.
     pub(crate) fn in_world(&self, manifest: &Manifest) -> Result<Region, RequestError> {
         let ball = self.ball.map(|AreaBall { centre, radius }| {
             Ok::<_, RequestError>(Ball { centre_in_world: centre.in_world("centre", manifest)?, radius })

@@ -23,10 +23,9 @@ use arrow_schema::{ArrowError, DataType, Field, Schema};
 use super::answers::Found;
 use super::reply::Reply;
 
-/// Rows of a batch: half a megabyte.
+/// Rows per batch: half a megabyte.
 const BATCH_ROWS: usize = 16 << 10;
 
-/// The pieces of a reply as a stream: the schema, batches, the end.
 pub struct Pieces {
     reply: Reply,
     schema: Arc<Schema>,

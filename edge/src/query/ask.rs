@@ -88,7 +88,7 @@ impl Ask {
         }
     }
 
-    /// Understands the questions for a generation. Where it has no objects, texts that name relations stay texts.
+    /// Interprets the questions for a generation. Texts with relations stay plain texts where it has no objects.
     pub(super) fn understand(self, snapshot: &Snapshot) -> Result<QueryRequest, RequestError> {
         let n = self.texts.len() + self.vectors.len() + self.phrases.len();
         if !(1..=MAX_TEXTS).contains(&n) {

@@ -1,4 +1,4 @@
-//! What changed between two generations that the robot has had.
+//! Changes between two generations that the robot has had.
 
 use glam::DVec3;
 use slag_api::FRAME;
@@ -17,13 +17,13 @@ use crate::store::{EdgeCache, Snapshot};
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ChangesRequest {
-    /// The earlier generation; the newest before `to` that is remembered if absent.
+    /// The earlier generation; if absent, the newest remembered one before `to`.
     pub from: Option<u64>,
-    /// The later one; that on board if absent.
+    /// The later one; if absent, the one on board.
     pub to: Option<u64>,
-    /// Only changes within this distance of a point; of a move, one end counts.
+    /// Only changes within this distance of a point; one end of a move suffices.
     pub ball: Option<(DVec3, f64)>,
-    /// Kinds of things: each changed thing is given the one that it is most like.
+    /// Kinds of things: each changed thing gets its most similar one.
     pub texts: Vec<String>,
 }
 
@@ -49,7 +49,7 @@ fn list(generations: &[u64]) -> String {
 }
 
 impl ChangesError {
-    /// Returns the stable name of the error's kind, for programs.
+    /// Stable name of the error's kind, for programs.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Query(error) => error.kind(),
@@ -61,8 +61,8 @@ impl ChangesError {
 }
 
 impl Engine {
-    /// Compares two generations that the robot has had. What only one of them knows is not called changed. Blocks
-    /// for milliseconds; for a second where thousands of things changed.
+    /// Compares two generations that the robot has had, in areas that both know. Blocks for milliseconds; for a second
+    /// if thousands of things changed.
     ///
     /// # Errors
     /// [`ChangesError`]. That nothing is remembered yet is a reply.
@@ -75,7 +75,7 @@ impl Engine {
         }
         let texts = request.texts.iter().map(|text| Ok((text.clone(), on_board.encode(text)?.to_vec())));
         let words = Words(texts.collect::<Result<_, QueryError>>()?);
-        // Two records, and the reply.
+        // Two records and the reply.
         let of_thing =
             size_of::<Thing>() + size_of::<ChangedThing>() + size_of::<f64>() * manifest.encoder.dim as usize;
         budget.take(2 * of_thing * snapshot.objects.len());
@@ -128,7 +128,7 @@ fn generation(
     let is_own = |cell_id: u32| !bad_cells.iter().any(|bad| bad.cell_id == cell_id);
     let shards = snapshot.shards.iter().map(|shard| &**shard).filter(|shard| is_own(shard.cell.cell_id));
     let on_board = Record::collect(manifest, current.centre_in_world, shards);
-    // What it left behind in this generation counts as well.
+    // Things left behind in this generation count, too.
     match (remembered, on_board) {
         (Some(remembered), Some(on_board)) => Ok(remembered.with(on_board)),
         (None, Some(record)) | (Some(record), None) => Ok(record),
@@ -191,7 +191,7 @@ fn reply(
     reply
 }
 
-/// The request's texts and their vectors, of unit length.
+/// The request's texts and their unit vectors.
 struct Words(Vec<(String, Vec<f32>)>);
 
 impl Words {

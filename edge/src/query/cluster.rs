@@ -1,11 +1,11 @@
-//! Clusters matching Gaussians: Gaussians in the same voxel or in touching voxels (26 neighbours) of a
-//! world-aligned grid belong together, unless only a thin bridge joins them.
+//! Clusters matching Gaussians: those in the same voxel or in touching voxels (26 neighbours) of a world-aligned grid
+//! belong together, unless only a thin bridge joins them.
 //!
-//! A voxel's mass is the number of its Gaussians, each weighted by its margin over the threshold. Voxels join
-//! from the heaviest to the lightest, each to its heaviest neighbour. A voxel that touches two groups joins
-//! them if its mass is at least a twentieth of the lesser group's peak (clustering by prominence: Chazal et
-//! al. 2013, "Persistence-based clustering in Riemannian manifolds"). A string of floaters therefore does not
-//! join two things, however dense or sparse these are.
+//! A voxel's mass is the number of its Gaussians, each weighted by its margin over the threshold. Voxels join from
+//! the heaviest to the lightest, each to its heaviest neighbour. A voxel that touches two groups joins them if its
+//! mass is at least a twentieth of the lesser group's peak (clustering by prominence: Chazal et al. 2013,
+//! "Persistence-based clustering in Riemannian manifolds"). A string of floaters therefore joins no two things, dense
+//! or sparse.
 
 use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
@@ -17,10 +17,10 @@ use slag_math::union_find::UnionFind;
 use super::oriented::{Extent, TRIMMED, box_around};
 use crate::score::{Budget, Run};
 
-/// Bits of a voxel coordinate in its key; three of them fill a `u64`.
+/// Bits of a voxel coordinate; three fill a `u64` key.
 const AXIS_BITS: u32 = 21;
-/// Least mass of a voxel that joins two groups, as a share of the lesser group's heaviest voxel. Things fill
-/// their voxels with tens of Gaussians, floaters with one or two.
+/// Least mass of a voxel that joins two groups, as a share of the lesser group's heaviest voxel. Things fill voxels
+/// with tens of Gaussians, floaters with one or two.
 const BRIDGE_SHARE: f64 = 0.05;
 /// Weight of a Gaussian that just reaches the threshold; the best one weighs 1.
 const LEAST_WEIGHT: f64 = 0.1;
@@ -45,11 +45,10 @@ pub struct Cluster {
     /// Mean of the members' scores.
     pub score: f32,
     pub best_score: f32,
-    /// Where its members' means are.
     pub extent: Extent,
-    /// Box along axes of its own, those of the members inside the extent's box.
+    /// Box along its own axes, those of the members inside the extent's box.
     pub oriented_box: OrientedBox,
-    /// Its members, in storage order; empty unless they are asked for.
+    /// Members in storage order; empty unless asked for.
     pub members: Vec<Run>,
 }
 
@@ -79,7 +78,6 @@ struct Span {
     end: u32,
 }
 
-/// Numbers voxels so that keys of neighbours differ by constants.
 struct Grid {
     inverse_voxel: f64,
     base: I64Vec3,
@@ -118,12 +116,12 @@ fn forward_neighbours() -> impl Iterator<Item = u64> {
     all.map(|(x, y, z)| (x << (2 * AXIS_BITS)) + (y << AXIS_BITS) + z).filter(|d| *d > 0).map(|d| d as u64)
 }
 
-/// Bytes of a voxel while voxels are joined: its key, mass, rank, order, group, and where its spans are.
+/// Bytes of a voxel during joining: key, mass, rank, order, group, and range of its spans.
 const VOXEL_BYTES: usize = 48;
-/// Bytes of a member while its cluster is described: its point, and its coordinate along an axis.
+/// Bytes of a member while its cluster is described: its point and a coordinate along an axis.
 const MEMBER_BYTES: usize = size_of::<DVec3>() + size_of::<f64>();
 
-/// Clusters the members of disjoint runs. If the budget is spent the result is of no use: ask [`Budget::check`].
+/// Clusters the members of disjoint runs. Check the budget afterwards: if it is spent, the result is invalid.
 pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping, budget: &Budget) -> Clusters {
     let Grouping { mut voxel, min_count, threshold, .. } = *grouping;
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
@@ -169,7 +167,7 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping, budg
         groups.into_iter().partition(|group| count(group) >= min_count);
     result.n_small = small.len() as u64;
     result.n_gaussians_in_small = small.into_iter().map(count).sum();
-    // Twice: once found, once ranked.
+    // Twice: found and ranked.
     budget.take(large.len() * 2 * size_of::<Cluster>());
     result.clusters = large
         .into_par_iter()
@@ -202,7 +200,7 @@ fn spans_of(
             }
         }
     }
-    // Twice: those of this chunk, and all in one list.
+    // Twice: in this chunk and in the full list.
     budget.take(2 * size_of_val(&spans[..]));
     spans
 }
@@ -217,10 +215,9 @@ fn weight_of_score(runs: &[Run], threshold: f32) -> impl Fn(f32) -> f64 {
     }
 }
 
-/// Returns for each voxel (by key, ascending) the number of its group; `None` if the budget is spent. `masses`:
-/// `[voxels]`.
+/// Returns the group of each voxel (by key, ascending); `None` if the budget is spent. `masses`: `[voxels]`.
 fn connect(voxels: &[&[Span]], masses: &[f64], budget: &Budget) -> Option<Vec<u32>> {
-    // From here on voxels go by rank, heaviest first; a group's root is its heaviest voxel.
+    // From here on voxels are ranked, heaviest first; a group's root is its heaviest voxel.
     let mut by_rank: Vec<u32> = (0..voxels.len() as u32).collect();
     let mass = |voxel: u32| masses[voxel as usize];
     by_rank.par_sort_unstable_by(|a, b| mass(*b).total_cmp(&mass(*a)).then(a.cmp(b)));
@@ -232,7 +229,7 @@ fn connect(voxels: &[&[Span]], masses: &[f64], budget: &Budget) -> Option<Vec<u3
     let keys: Vec<u64> = voxels.iter().map(|spans| spans[0].voxel_key).collect();
     for difference in forward_neighbours() {
         let n_before = joints.len();
-        // Keys ascend, so the wanted neighbours do too: one pass finds them all.
+        // Keys and wanted neighbours both ascend: one pass finds them all.
         let mut other = 0;
         for at in 0..keys.len() {
             let wanted = keys[at] + difference;
@@ -279,7 +276,7 @@ fn members(runs: &[Run], spans: &[Span]) -> Vec<Run> {
 }
 
 fn summarise(shards: &[ShardView<'_>], runs: &[Run], mut spans: Vec<Span>, grouping: &Grouping) -> Cluster {
-    // Members in storage order, so that sums do not depend on the voxels.
+    // In storage order, so that sums do not depend on the voxels.
     spans.sort_unstable_by_key(|span| (span.run, span.start));
     let mut points: Vec<DVec3> = Vec::new();
     let (mut score_sum, mut best_score, mut first) = (0.0, f32::NEG_INFINITY, (u32::MAX, u32::MAX));

@@ -1,5 +1,4 @@
-//! Query engine: a cache, a text model, and the questions asked of them. Shared by the HTTP service and the
-//! command line.
+//! Query engine: a cache and a text model, shared by the HTTP service and the command line.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
@@ -21,10 +20,9 @@ use crate::store::files::Stat;
 use crate::store::{EdgeCache, Snapshot, StoreError, damaged};
 use crate::text::{EncoderInfo, TextError, TextOpenError, TextService};
 
-/// Most bytes that an answer may have used for its buffers to be kept.
+/// Buffers of answers that used more are dropped.
 const KEPT_BYTES: u64 = 32 << 20;
-/// Time after which a failed load is tried again even if `current` is unchanged: the disk may have been full,
-/// or too many files open.
+/// Retry interval of a failed load while `current` is unchanged: disk full, too many open files.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
 #[derive(Debug, thiserror::Error)]
@@ -46,7 +44,6 @@ pub enum QueryError {
 }
 
 impl QueryError {
-    /// Returns the stable name of the error's kind, for programs.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Request(_) => "bad-parameter",
@@ -70,22 +67,20 @@ impl QueryError {
 struct Loaded {
     text: Arc<TextService>,
     snapshot: Option<Arc<Snapshot>>,
-    /// What is known of its things since it was asked for.
     listed: Arc<Listed>,
     /// State of `current` at the last attempt to load it.
     tried: Option<Stat>,
     failed_at: Option<Instant>,
 }
 
-/// A generation, and the text model that was in use with it: a reload replaces both at once, and a question must
-/// not take the vectors of one model to the scene of another.
+/// A generation and its text model, replaced together: vectors of one model must not meet another's scene.
 pub struct OnBoard {
     pub snapshot: Arc<Snapshot>,
     pub(super) text: Arc<TextService>,
     pub(super) listed: Arc<Listed>,
 }
 
-/// The names of a generation's things, and their boxes along axes of their own, in the order of the index.
+/// The names of a generation's things and their oriented boxes, in index order.
 #[derive(Default)]
 pub(super) struct Listed {
     pub(super) names: OnceLock<Names>,
@@ -123,7 +118,7 @@ impl OnBoard {
     }
 }
 
-/// Opens the text model that a scene carries; one that does not open is logged.
+/// Opens the text model that a scene carries; failure is logged.
 fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
     open_text_model(cache, manifest, options).unwrap_or_else(|error| {
         tracing::warn!("the scene's text model does not open: {}", crate::error_line(&error));
@@ -134,16 +129,15 @@ fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions
 /// Answers questions from the newest generation of a cache.
 pub struct Engine {
     cache: EdgeCache,
-    /// Options to open the text models with that scenes carry; absent if the text model is given.
+    /// Session options for the text models that scenes carry; absent if the text model is given.
     carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
     pub(super) words: Mutex<Option<Arc<Words>>>,
-    /// Buffers of finished answers, one for each answer computed at a time.
+    /// Buffers of finished answers, one per concurrent answer.
     idle: Mutex<Vec<Scratch>>,
 }
 
 impl Engine {
-    /// Makes an engine of a text model without loading a scene yet.
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
         let (text, listed) = (Arc::new(text), Arc::default());
         let loaded = Loaded { text, snapshot: None, listed, tried: None, failed_at: None };
@@ -156,7 +150,7 @@ impl Engine {
         }
     }
 
-    /// Makes an engine that takes the text model of each scene which carries one, and that of `otherwise` before.
+    /// Makes an engine that uses each scene's own text model if it has one, else that of `otherwise`.
     ///
     /// # Errors
     /// Those of `otherwise`. A carried model that does not open is logged.
@@ -185,16 +179,15 @@ impl Engine {
         Arc::clone(&self.loaded.read().unwrap_or_else(PoisonError::into_inner).text)
     }
 
-    /// Returns whether the cache's `current` differs from the one loaded (one `stat` call), or loading it
-    /// failed a while ago.
+    /// Returns whether the cache's `current` differs from the loaded one (one `stat`), or a load is to be retried.
     pub(crate) fn is_stale(&self) -> bool {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
         let retry = loaded.failed_at.is_some_and(|at| at.elapsed() >= RETRY_AFTER);
         retry || self.cache.current_stat().is_ok_and(|stat| stat != loaded.tried)
     }
 
-    /// Opens the cache's current generation and makes it the one in use; questions in progress keep theirs. If it
-    /// does not open, the previous one stays in use. A text model that the scene carries comes into use with it.
+    /// Opens the cache's current generation, with the text model it carries, and makes it current; questions in
+    /// progress keep theirs. If opening fails, the previous one stays in use.
     pub fn reload(&self) -> Result<(), StoreError> {
         let tried = self.cache.current_stat().ok().flatten();
         let before = self.snapshot().ok();
@@ -240,7 +233,7 @@ impl Engine {
         Ok(OnBoard { snapshot, text: Arc::clone(&loaded.text), listed: Arc::clone(&loaded.listed) })
     }
 
-    /// Runs work on a generation, with buffers of earlier answers.
+    /// Runs work on a generation, reusing buffers.
     pub(super) fn on_scene<T>(
         &self,
         snapshot: &Snapshot,
@@ -259,7 +252,6 @@ impl Engine {
         scratch.set_budget(budget.clone());
         let done = work(&mut scratch, &scene);
         scratch.set_budget(Budget::default());
-        // The buffers of an unusually large answer are not kept.
         if budget.used_bytes() <= KEPT_BYTES {
             idle().push(scratch);
         }
@@ -270,7 +262,6 @@ impl Engine {
 /// Longest description read; those of public models take two thousand bytes.
 const MAX_DESCRIPTION_BYTES: u64 = 1 << 20;
 
-/// Reasons for which a scene's text model does not open.
 #[derive(Debug, thiserror::Error)]
 pub enum CarriedError {
     #[error(transparent)]
@@ -312,7 +303,7 @@ fn open_text_model(
     })
 }
 
-/// Marks the files that are not as listed; the next fetch downloads them again.
+/// Marks the files that differ from the record; the next fetch downloads them again.
 fn mark_damaged(cache: &EdgeCache, record: &TextModelRecord) {
     for object in record.objects() {
         let read = cache.files().read(&cache.shard_path(object.hash), object.len_bytes);
@@ -340,8 +331,7 @@ mod tests {
         Loaded { text, snapshot, listed: Arc::default(), tried: None, failed_at: None }
     }
 
-    /// While generations of two encoders replace each other, no question takes the text model of one to the scene
-    /// of the other.
+    /// While generations of two encoders alternate, no question mixes one's text model with the other's scene.
     #[test]
     fn a_scene_is_asked_with_its_own_text_model() {
         let (mut other, first) = (loaded(8), loaded(7));

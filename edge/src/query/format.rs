@@ -40,8 +40,8 @@ impl Format {
 }
 
 impl Reply {
-    /// Returns the Gaussians of all answers as a PLY of points, in the same pieces as [`Reply::pieces`] does.
-    /// Clusters and objects need [`QueryRequest::members`](super::QueryRequest::members).
+    /// Returns the Gaussians of all answers as a PLY of points, in the pieces of [`Reply::pieces`]. Clusters and
+    /// objects need [`QueryRequest::members`](super::QueryRequest::members).
     pub fn ply(&self) -> impl Iterator<Item = io::Result<Vec<u8>>> {
         ply::Pieces::new(self)
     }

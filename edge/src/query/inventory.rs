@@ -1,4 +1,4 @@
-//! The things on board, and the area that they lie in.
+//! The things on board and their area.
 
 use std::cmp::Reverse;
 use std::sync::OnceLock;
@@ -22,7 +22,7 @@ use super::scene::{Scene, alignment, default_voxel, unit};
 use crate::score::{Budget, Region, Run, ScoreError};
 use crate::store::Snapshot;
 
-// The description says how many names there are.
+// The API's description states the number of names.
 const _: () = assert!(MAX_NAMES == slag_models::names::MAX_NAMES);
 
 pub const OBJECT_ID: &str = "^o[0-9a-f]{16}$";
@@ -49,7 +49,7 @@ pub struct ObjectFilter {
 }
 
 impl Engine {
-    /// Returns the objects on board that pass a filter, at most `limit`; waits at most `wait` for their names.
+    /// Returns at most `limit` objects on board that pass a filter; waits at most `wait` for their names.
     pub fn objects(
         &self,
         on_board: &OnBoard,
@@ -84,7 +84,7 @@ impl Engine {
         Ok(found)
     }
 
-    /// Returns the small picture of an object on board, a JPEG file; the outer `None`: there is no such object.
+    /// Returns an object's thumbnail, a JPEG file; outer `None`: no such object.
     pub fn thumbnail(
         &self,
         snapshot: &Snapshot,
@@ -100,9 +100,8 @@ impl Engine {
         Ok(picture)
     }
 
-    /// Returns the positions of Gaussians of an object on board, evenly spread over their order, at most `limit`:
-    /// those of its largest cluster, inside the cluster's box. Objects have stray Gaussians, too, some nearly as
-    /// many as their own.
+    /// Returns at most `limit` positions of an object's Gaussians on board, evenly spread over their order: those of
+    /// its largest cluster inside the cluster's box. Some objects have nearly as many stray Gaussians as their own.
     pub(crate) fn object_points(
         &self,
         snapshot: &Snapshot,
@@ -122,7 +121,7 @@ impl Engine {
     }
 }
 
-/// Takes the memory that the positions of an object's Gaussians need; returns whether the work may go on.
+/// Charges the memory for the positions of an object's Gaussians; returns whether the work may go on.
 fn take_points(scene: &Scene<'_>, object: usize, budget: &Budget) -> bool {
     let n_gaussians = objects::count_in(scene, object, &Region::default());
     budget.take(n_gaussians as usize * size_of::<DVec3>())
@@ -180,7 +179,7 @@ fn page(
             at.ok_or_else(refused)? + 1
         }
     };
-    // Positions are needed for one at a time, and once.
+    // Positions are needed for one object at a time.
     let described = |at: &usize| {
         let (used_bytes, measured) = (budget.used_bytes(), &boxes[*at]);
         let may_go_on = measured.get().is_some() || take_points(scene, *at, budget);
@@ -205,7 +204,7 @@ fn page(
     })
 }
 
-/// Sorts objects that are in order of their ids.
+/// Sorts objects that arrive in order of their ids.
 fn sort(scene: &Scene<'_>, names: Option<&Names>, order: ObjectOrder, all: &mut [usize]) {
     match (order, names) {
         (ObjectOrder::Id, _) | (ObjectOrder::Name, None) => {}
@@ -226,7 +225,7 @@ fn sort(scene: &Scene<'_>, names: Option<&Names>, order: ObjectOrder, all: &mut 
     }
 }
 
-/// Describes an object. `measured`: its box along axes of its own, if that was measured before.
+/// Describes an object. `measured`: its oriented box if known.
 fn describe(
     scene: &Scene<'_>,
     names: Option<&Names>,

@@ -21,7 +21,7 @@ pub enum ListFormat {
     Geojson,
 }
 
-/// The header of a table. Names, best first, with their confidences; positions and lengths in the unit of the scene.
+/// Table header. Names best first, with confidences; positions and lengths in the scene's unit.
 const COLUMNS: &str = "id,name,confidence,name_2,confidence_2,name_3,confidence_3,x,y,z,latitude_deg,longitude_deg,height_m,size_x,size_y,size_z,n_gaussians,photo";
 const N_NAMES: usize = 3;
 
@@ -34,7 +34,7 @@ impl ListFormat {
         }
     }
 
-    /// Returns an error if a scene's objects cannot be told so.
+    /// Returns an error if the format cannot describe the scene's objects.
     pub fn check(self, manifest: &Manifest) -> Result<(), RequestError> {
         if self == Self::Geojson && manifest.geo_reference.is_none() {
             let expected = "json or csv, because the scene has no place on the earth";
@@ -74,7 +74,6 @@ fn csv(page: &ObjectPage) -> String {
     text
 }
 
-/// Returns a cell of a table.
 fn quoted(text: &str) -> String {
     match text.contains([',', '"', '\r', '\n']) {
         true => format!("\"{}\"", text.replace('"', "\"\"")),

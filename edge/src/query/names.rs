@@ -1,5 +1,4 @@
-//! What the things on board are called. The words are encoded once a text model, beside questions, and scored once a
-//! generation; requests then only read.
+//! Names of the things on board. Words are encoded once per text model and scored once per generation.
 
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -14,18 +13,18 @@ use crate::store::EdgeCache;
 use crate::store::words::{self, WordVector};
 use crate::text::{TextError, TextService};
 
-/// Words that are scored at a time: bounds the scores in memory.
+/// Words scored at a time: bounds the scores in memory.
 const WORDS_TOGETHER: usize = 16;
-/// One of so many words tells how all score.
+/// Scores are measured over one in so many words.
 const MEASURED: usize = 4;
-/// Pause after a text model turned a word away.
+/// Pause after the text model refused a word.
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
-/// Words that took less are not kept on disk.
+/// Words encoded faster are not kept on disk.
 const WORTH_KEEPING: Duration = Duration::from_secs(2);
 
 pub struct Names {
     words: Arc<[WordVector]>,
-    /// By object, in the order of the index: words and their confidences, best first.
+    /// By object, in index order: words and confidences, best first.
     of_object: Vec<Vec<(u32, f32)>>,
 }
 
@@ -73,7 +72,7 @@ impl Names {
     }
 }
 
-/// The words that things are named by, while they are encoded and after.
+/// Words for naming things, possibly still being encoded.
 pub struct Words {
     encoder_id: Hash32,
     state: Mutex<Progress>,
@@ -89,7 +88,7 @@ enum Progress {
 }
 
 impl Words {
-    /// Begins to encode the words of a text model, on a thread of their own.
+    /// Starts encoding a text model's words on a separate thread.
     pub fn begin(cache: &EdgeCache, text: &Arc<TextService>) -> Arc<Self> {
         let (state, is_over) = (Mutex::new(Progress::Encoding), Condvar::new());
         let words = Arc::new(Self { encoder_id: text.info().id, state, is_over });
@@ -102,13 +101,12 @@ impl Words {
         words
     }
 
-    /// Returns whether these are, or will be, the words of an encoder.
     pub fn are_of(&self, encoder_id: Hash32) -> bool {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         self.encoder_id == encoder_id && !matches!(*state, Progress::Failed)
     }
 
-    /// Waits for the words; `None` if they take longer.
+    /// Waits for the words; `None` on timeout.
     pub fn wait(&self, longest: Duration) -> Option<Arc<[WordVector]>> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let waiting = |state: &mut Progress| matches!(state, Progress::Encoding);
@@ -126,7 +124,7 @@ impl Words {
     }
 }
 
-/// Encodes the words that a text model knows, or reads what was kept of them.
+/// Encodes the words that a text model knows, or reads them from disk.
 fn encode(cache: &EdgeCache, text: &TextService) -> Option<Vec<WordVector>> {
     let nouns = Some(text.nouns()).filter(|nouns| !nouns.is_empty());
     let (asked, info) = (words_of(nouns), text.info());

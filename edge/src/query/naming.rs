@@ -1,4 +1,4 @@
-//! The names of the generation on board: made when they are first asked for, then only read.
+//! The names of the generation on board: made on first request, then only read.
 
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
@@ -8,12 +8,12 @@ use super::names::{Names, Words};
 use crate::score::Budget;
 use crate::text::TextService;
 
-/// Longest wait of a request for the words to be encoded.
+/// Longest wait of a request for the words.
 pub(crate) const NAMES_WAIT: Duration = Duration::from_millis(500);
 
 impl Engine {
-    /// Returns the names of the things on board, for whose words it waits at most `wait`; `None` if the text model
-    /// still encodes them then, has stopped, or is not the scene's.
+    /// Returns the names of the things on board, waiting at most `wait` for the words; `None` if the text model is
+    /// still encoding them, has stopped, or is not the scene's.
     pub(crate) fn names<'a>(
         &self,
         on_board: &'a OnBoard,
@@ -42,7 +42,7 @@ impl Engine {
         }
     }
 
-    /// Returns the words of a text model, which are encoded on a thread of their own at first.
+    /// Returns a text model's words; first starts their encoding.
     fn words(&self, text: &Arc<TextService>) -> Arc<Words> {
         let encoder_id = text.info().id;
         let mut kept = self.words.lock().unwrap_or_else(PoisonError::into_inner);
@@ -64,7 +64,7 @@ mod tests {
         CALIBRATION, Gate, Member, TestObject, TestShard, axes_service, open_gate, write_cache,
     };
 
-    /// While the text model answers a question there are no names; then each word was encoded once, for all asked.
+    /// No names while the text model answers a question; then each word is encoded once, for all callers.
     #[test]
     fn names_come_once_the_words_are_encoded() {
         let dir = tempfile::tempdir().expect("a folder");

@@ -1,7 +1,6 @@
 //! Answers made of objects, which are scored as a whole.
 //!
-//! An object that reaches into several cells is stored in all of their shards. It is scored once, and its
-//! Gaussians are those on board in the region asked for.
+//! An object in several cells is stored in all their shards and scored once, with its Gaussians in the region.
 
 use glam::DVec3;
 use slag_api::objects::{Alignment, Evidence, OrientedBox};
@@ -18,14 +17,14 @@ pub struct FoundObject<'a> {
     pub object: usize,
     pub record: &'a ObjectRecord,
     pub score: f32,
-    /// Its Gaussians on board, in the region asked for.
+    /// Gaussians on board in the region.
     pub n_gaussians: u64,
-    /// Where these are, if the region cuts the object.
+    /// Their extent if the region cuts the object.
     pub cut: Option<Extent>,
 }
 
 impl FoundObject<'_> {
-    /// Returns where the part in the region asked for is.
+    /// Returns the extent of the part in the region.
     pub fn extent(&self) -> Extent {
         let whole =
             || Extent { position_in_world: self.record.position(), box_in_world: self.record.bounds() };
@@ -52,13 +51,12 @@ pub fn calibration(objects: &[Option<Objects<'_>>]) -> Option<Calibration> {
     Some(Calibration { score_mean: header.score_mean, score_spread: header.score_spread })
 }
 
-/// Returns the object with the best score, the first among equals.
 pub fn best(scores: &[f32]) -> Option<usize> {
     (0..scores.len()).reduce(|best, object| if scores[object] > scores[best] { object } else { best })
 }
 
-/// A scene's objects with the scores of a question. Only those with at least `min_count` Gaussians (and at least one) in
-/// the region count.
+/// A scene's objects with their scores for a question. Only those with at least `min_count` Gaussians (and at least
+/// one) in the region count.
 #[derive(Clone, Copy)]
 pub struct ScoredObjects<'s, 'a> {
     pub scene: &'s Scene<'a>,
@@ -74,7 +72,6 @@ impl<'a> ScoredObjects<'_, 'a> {
         reaching.filter_map(|object| self.found(object)).collect()
     }
 
-    /// Returns the one with the best score, the first among equals.
     pub fn best(&self) -> Option<FoundObject<'a>> {
         let mut best: Option<usize> = None;
         for (object, score) in self.scores.iter().enumerate() {
@@ -121,7 +118,6 @@ pub fn thumbnail<'a>(scene: &Scene<'a>, object: usize) -> Option<&'a [u8]> {
     scene.index.parts(object).iter().find_map(of_part)
 }
 
-/// Returns a box around an object's Gaussians in a region.
 pub fn oriented_box(
     scene: &Scene<'_>,
     found: &FoundObject<'_>,
@@ -150,8 +146,7 @@ pub fn members(scene: &Scene<'_>, object: usize, region: &Region, score: f32) ->
     members
 }
 
-/// Returns the number of a part's Gaussians in a region; examines them only if the region's border crosses
-/// the shard.
+/// Returns the number of a part's Gaussians in a region; examines them only if the region's border crosses the shard.
 fn count(scene: &Scene<'_>, part: Part, region: &Region) -> u64 {
     let reach = scene.shards[part.shard as usize].position_box();
     if !region.touches(&reach) {

@@ -6,10 +6,10 @@ use slag_common::frames::Aabb;
 use slag_math::eigen::eigen_symmetric;
 use slag_math::stats::trimmed_range;
 
-/// Returns the box of a set of points: axes from the points inside `core`, extents from the `trimmed` to
-/// the `1 - trimmed` quantile of all points.
+/// Returns the box of a set of points: axes from the points inside `core`, extents from the `trimmed` to the `1 -
+/// trimmed` quantile of all points.
 ///
-/// `core` keeps floaters out of the axes: their leverage grows with the square of their distance.
+/// `core` excludes floaters from the axes: their leverage grows with the square of their distance.
 pub fn box_around(
     points: &[DVec3],
     core: impl Fn(&DVec3) -> bool,
@@ -55,8 +55,7 @@ fn axes_of(points: &[DVec3], alignment: Alignment) -> DMat3 {
     }
 }
 
-/// Makes the box unique: orders the axes by length, longest first (an upright box keeps z), flips each so
-/// that its largest component is positive, and makes them right-handed.
+/// Makes the box unique: longest axis first (an upright box keeps z), largest components positive, right-handed.
 fn longest_first(axes: DMat3, min: DVec3, max: DVec3, alignment: Alignment) -> (DMat3, DVec3, DVec3) {
     let size = max - min;
     let mut order = [0, 1, 2];
@@ -72,30 +71,30 @@ fn longest_first(axes: DMat3, min: DVec3, max: DVec3, alignment: Alignment) -> (
         (out.1[to], out.2[to]) = if sign < 0.0 { (-max[from], -min[from]) } else { (min[from], max[from]) };
     }
     if out.0.determinant() < 0.0 {
-        // Not the third, which may have to point up.
+        // The third may have to point up.
         *out.0.col_mut(1) *= -1.0;
         (out.1.y, out.2.y) = (-out.2.y, -out.1.y);
     }
     out
 }
 
-/// Share of points that a box leaves out at either end of each axis, so that a few floaters do not inflate it.
+/// Share of points outside a box at either end of each axis, so that a few floaters do not inflate it.
 pub const TRIMMED: f64 = 0.02;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Extent {
     pub position_in_world: DVec3,
-    /// From the 2nd to the 98th percentile along each axis (all points if they are fewer than 51).
+    /// 2nd to 98th percentile along each axis (all points if fewer than 51).
     pub box_in_world: Aabb,
 }
 
 impl Extent {
-    /// Measures points; at least one.
+    /// At least one point is required.
     pub fn of(points: &[DVec3]) -> Self {
         let box_in_world = trimmed_box(points);
         let inside = points.iter().filter(|point| box_in_world.contains(**point));
         let (sum, n) = inside.fold((DVec3::ZERO, 0u64), |(sum, n), point| (sum + *point, n + 1));
-        // Trimming leaves out at most 4 % per axis, so some point is inside along all three.
+        // Trimming excludes at most 4 % per axis, so some point is inside along all three.
         Self { position_in_world: sum / n as f64, box_in_world }
     }
 }
@@ -200,7 +199,7 @@ mod tests {
             let mut far = || f64::from(random.signed()) * 40.0;
             points.push(DVec3::new(far(), far(), far()));
         }
-        // The core that clusters use: between quantiles along the world's axes.
+        // The core of clusters: quantiles along the world's axes.
         let range = |axis: usize| {
             trimmed_range(&mut points.iter().map(|p| p[axis]).collect::<Vec<_>>(), 0.02).expect("has points")
         };

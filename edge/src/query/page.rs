@@ -1,4 +1,4 @@
-//! A page of answers: the one shape of reply of version 1.
+//! A page of answers: version 1's only reply type.
 
 use std::collections::BTreeMap;
 
@@ -132,7 +132,7 @@ struct AnsweredThing<'a> {
 }
 
 impl<'a> Page<'a> {
-    /// Describes a reply, of the answers those in its page.
+    /// Describes a reply with the answers of its page.
     pub fn of(reply: &'a Reply) -> Self {
         let manifest = reply.manifest();
         let results = reply.request.asked.iter().zip(&reply.outcomes);

@@ -1,4 +1,4 @@
-//! The Gaussians of a reply as a PLY of points, in pieces of limited size however many they are.
+//! The Gaussians of a reply as a PLY of points, in pieces of bounded size.
 
 use std::borrow::Borrow;
 use std::io;
@@ -13,8 +13,7 @@ use crate::score::Run;
 /// A piece ends with the first point past this size.
 const PIECE_BYTES: usize = 256 << 10;
 
-/// The pieces of a reply as a PLY. Points are in the order of questions, of answers, and of storage within an
-/// answer.
+/// The pieces of a reply as a PLY. Points are ordered by question, answer, and storage.
 pub struct Pieces<R> {
     reply: R,
     properties: PointProperties,
@@ -99,7 +98,7 @@ impl<R: Borrow<Reply>> Iterator for Pieces<R> {
     }
 }
 
-/// Returns a run of an answer; a Gaussian is an answer of one run.
+/// Returns a run of an answer; a Gaussian has one run.
 fn run(answers: &Answers, answer: usize, run: usize) -> Option<Run> {
     match &answers.answers {
         Found::Clusters(clusters) => clusters.get(answer)?.members.get(run).copied(),

@@ -1,4 +1,4 @@
-//! The order of answers: by score, and if there is an asker, nearer ones first.
+//! The order of answers: by score, and with an asker, nearer ones first.
 
 use glam::DVec3;
 use slag_common::manifest::Manifest;
@@ -11,9 +11,8 @@ const VOXELS_TO_HALF_RELEVANCE: f64 = 40.0;
 
 /// Returns the ranking key of an answer: `(score - base) / (1 + distance / half)`, and 0 below `base`.
 ///
-/// `base`: the score of what has nothing to do with the question. Neither the threshold, which only filters, nor
-/// another parameter of a request changes it. Rounded to f32, so that the last bits of a machine's division do not
-/// show.
+/// `base`: the score of an unrelated thing. Neither the threshold, which only filters, nor another parameter changes
+/// it. Rounded to f32 to hide the last bits of a machine's division.
 pub fn relevance(score: f32, base: f32, distance: Option<f64>, half: f64) -> f32 {
     let margin = (f64::from(score) - f64::from(base)).max(0.0);
     (margin / (1.0 + distance.unwrap_or(0.0) / half)) as f32
@@ -39,8 +38,7 @@ impl Order {
         Self { base, half, near: request.near, limit: request.n_ranked() }
     }
 
-    /// Ranks answers, keeps equals in their order, and returns as many as are asked for. `key`: score as reported,
-    /// and position.
+    /// Ranks answers, ties in their given order, and keeps as many as asked for. `key`: reported score and position.
     pub fn rank<T>(&self, found: Vec<T>, key: impl Fn(&T) -> (f32, DVec3)) -> Vec<Ranked<T>> {
         let weighed = found.into_iter().map(|found| {
             let (score, position_in_world) = key(&found);

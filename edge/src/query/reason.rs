@@ -11,10 +11,10 @@ use super::scale::Scale;
 use super::scene::Scene;
 use crate::score::{Region, Search};
 
-/// A region was looked at if views saw at least this share of its Gaussians.
+/// Least share of a region's Gaussians in views for the region to count as seen.
 const MIN_SEEN: f64 = 0.5;
 
-/// Returns the share of the Gaussians on board in a region that a used view saw; `None` where there are none.
+/// Returns the share of a region's Gaussians on board seen by a used view; `None` without Gaussians.
 fn seen_share(shards: &[ShardView<'_>], region: &Region) -> Option<f64> {
     let (mut n_seen, mut n_unseen) = (0, 0);
     for shard in shards.iter().filter(|shard| region.touches(&shard.position_box())) {
@@ -31,7 +31,7 @@ fn seen_share(shards: &[ShardView<'_>], region: &Region) -> Option<f64> {
     (n > 0).then(|| n_seen as f64 / n as f64)
 }
 
-/// Says in a reason which share of the region views saw. Where that is too little for a no, kind and detail say so.
+/// Adds the seen share of the region to a reason; if too small for a no, kind and detail say so.
 pub fn add_seen(reason: &mut Reason, shards: &[ShardView<'_>], region: &Region) {
     reason.seen_share = seen_share(shards, region);
     let seen = reason.seen_share.filter(|seen| *seen < MIN_SEEN);
@@ -43,7 +43,7 @@ pub fn add_seen(reason: &mut Reason, shards: &[ShardView<'_>], region: &Region) 
     }
 }
 
-/// `best`: score and position of the best miss.
+/// `best`: score and position of the nearest miss.
 fn reason((kind, detail): (ReasonKind, String), best: Option<(f32, DVec3)>) -> Reason {
     let (best_score, best_position_in_world) = best.unzip();
     Reason { best_score, best_position_in_world, ..Reason::new(kind, detail) }
@@ -52,13 +52,12 @@ fn reason((kind, detail): (ReasonKind, String), best: Option<(f32, DVec3)>) -> R
 /// The best object in the region asked for.
 pub struct BestObject {
     pub score: f32,
-    /// Whether it would answer if it had enough Gaussians there.
+    /// Whether it reaches the threshold, and only lacks Gaussians there.
     pub reaches: bool,
-    /// Where the part in the region is.
     pub position_in_world: DVec3,
 }
 
-/// Returns what to do where nothing is. `area_fetched`: whether all of the region was fetched; `None` if nobody knows.
+/// Returns a hint for an empty region. `area_fetched`: whether all of the region was fetched; `None` if unknown.
 fn elsewhere(region: &Region, area_fetched: Option<bool>) -> &'static str {
     match area_fetched {
         Some(true) => "search elsewhere",

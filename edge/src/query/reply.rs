@@ -11,11 +11,11 @@ use super::request::QueryRequest;
 use crate::score::Hit;
 use crate::store::Snapshot;
 
-/// The answers to a request, and the generation they refer to.
+/// The answers to a request and their generation.
 pub struct Reply {
     pub(super) snapshot: Arc<Snapshot>,
     pub(super) request: QueryRequest,
-    /// One for each question, in their order.
+    /// By question.
     pub outcomes: Vec<Outcome>,
 }
 
@@ -24,7 +24,6 @@ impl Reply {
         &self.snapshot.manifest
     }
 
-    /// Returns the answers to texts and vectors, in their order.
     pub fn answers(&self) -> impl Iterator<Item = &Answers> {
         self.outcomes.iter().filter_map(|outcome| match outcome {
             Outcome::Plain(answers) => Some(answers),
@@ -32,7 +31,6 @@ impl Reply {
         })
     }
 
-    /// Describes an answer's Gaussians; empty for other kinds.
     pub fn gaussians(&self, answers: &Answers) -> Vec<GaussianAnswer> {
         let Found::Gaussians(hits) = &answers.answers else { return Vec::new() };
         hits.iter().enumerate().map(|(at, hit)| self.gaussian(at, hit)).collect()
@@ -51,16 +49,15 @@ pub enum Outcome {
 }
 
 pub struct RelatedAnswers {
-    /// What was asked in place of words that the model does not know.
+    /// Replacements of words that the model does not know.
     pub asked_as: BTreeMap<String, String>,
     pub parts: Vec<relations::Found>,
     pub miss: Option<Reason>,
-    /// The answers, best first, each with its degree and what it is related to.
+    /// Best first, each with its degree and its witnesses.
     pub answers: Vec<(ClusterAnswer, f64, Vec<Witness>)>,
 }
 
 impl Outcome {
-    /// Returns what was asked in place of words that the model does not know.
     pub fn asked_as(&self) -> &BTreeMap<String, String> {
         match self {
             Self::Plain(answers) => &answers.asked_as,

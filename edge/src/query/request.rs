@@ -17,7 +17,7 @@ pub use slag_service::params::RequestError;
 
 /// Most clusters or objects in a request, over all its texts.
 pub const MAX_CLUSTERS: usize = 10_000;
-/// Most Gaussians in a request, over all its texts: 12 MB while they are sent.
+/// Most Gaussians in a request, over all its texts: 12 MB during sending.
 pub const MAX_GAUSSIANS: usize = 1_000_000;
 /// Most answers in a page, over all questions.
 pub const MAX_PAGE: usize = MAX_CLUSTERS;
@@ -25,9 +25,9 @@ pub const MAX_TEXTS: usize = 32;
 pub const MAX_NEGATIVES: usize = 16;
 /// LERF's canonical negatives (Kerr et al. 2023, section 3.3).
 pub const CANONICAL_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
-/// Answers to each text unless the request sets a limit.
+/// Default number of answers to each text.
 pub const DEFAULT_LIMIT: usize = 10;
-/// Least members of a cluster unless the request sets another number.
+/// Default least members of a cluster.
 pub const DEFAULT_MIN_COUNT: u64 = 10;
 
 /// Kind of answers.
@@ -76,15 +76,15 @@ impl FromStr for Negatives {
     }
 }
 
-/// Reads numbers with commas between them.
+/// Parses comma-separated numbers.
 pub fn numbers(text: &str) -> Option<Vec<f64>> {
     text.split(',').map(|number| number.trim().parse().ok()).collect()
 }
 
-/// The lengths that [`is_length`] takes, in words.
+/// The range of [`is_length`], in words.
 pub const LENGTHS: &str = "more than 0, at most 1e9";
 
-/// Returns whether a radius, a margin or an edge is one that every face of this program takes.
+/// Returns whether a radius, margin or edge is valid, for HTTP and the command line.
 pub fn is_length(length: f64) -> bool {
     length > 0.0 && length <= MAX_COORDINATE
 }
@@ -101,9 +101,9 @@ fn is_within(point: DVec3) -> bool {
     point.is_finite() && point.abs().max_element() <= MAX_COORDINATE
 }
 
-/// Checks a region, the same for questions and lists. A polygon is sound if there is one.
+/// Checks a region of a question or list, including its polygon.
 pub fn check_region(region: &Region) -> Result<(), RequestError> {
-    // In a flat box lies nothing.
+    // A flat box is empty.
     let is_box = |b: &Aabb| b.min.cmplt(b.max).all() && is_within(b.min) && is_within(b.max);
     if let Some(bounds) = region.bounds.filter(|bounds| !is_box(bounds)) {
         let found = format!("{} to {}", bounds.min, bounds.max);
@@ -142,12 +142,12 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Asked {
     Text(String),
-    /// A vector of the scene's embedding space, by its place in the request; its length does not count.
+    /// A vector of the scene's embedding space, by its place in the request; its length is ignored.
     Vector {
         at: usize,
         vector: Vec<f32>,
     },
-    /// Things by their relations, and the text that was understood so.
+    /// A phrase, and the text that it was parsed from.
     Phrase {
         text: Option<String>,
         phrase: Phrase,
@@ -155,7 +155,7 @@ pub enum Asked {
 }
 
 impl Asked {
-    /// Returns what stands for the question where a text is expected.
+    /// Returns the question's name for messages.
     pub fn label(&self) -> &str {
         match self {
             Self::Text(text) => text,
@@ -204,24 +204,23 @@ pub fn unit_vector(vector: &[f32]) -> Option<Vec<f32>> {
         .then(|| vector.iter().map(|v| (f64::from(*v) / length) as f32).collect())
 }
 
-/// Questions that share everything but what is looked for, as the engine understands them: in the world frame.
+/// Questions with shared settings, as the engine interprets them: in the world frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueryRequest {
-    /// What is looked for; each is answered separately.
+    /// Each is answered separately.
     pub asked: Vec<Asked>,
     pub negatives: Negatives,
     /// Most answers to each question; [`DEFAULT_LIMIT`] if absent.
     pub limit: Option<usize>,
-    /// Whether answers come in pages: `offset` is allowed, and one more answer is ranked than a page has, which
-    /// tells whether there is a next one.
+    /// Whether answers are paged: `offset` is allowed, and an extra answer is ranked to detect a next page.
     pub paged: bool,
     /// Answers to each question before the page.
     pub offset: usize,
     /// Least score of a match: a cosine, or with negatives a relevancy; the scene's own if absent.
     pub threshold: Option<f32>,
-    /// Position of the asker: answers carry their distance from it, and nearer ones rank higher.
+    /// Asker's position: answers carry their distance from it, and nearer ones rank higher.
     pub near: Option<DVec3>,
-    /// The asker's heading, from x towards y, radians.
+    /// Asker's heading, from x towards y, radians.
     pub heading_rad: Option<f64>,
     pub region: Region,
     /// Kind of answers; if absent, objects, and clusters for a question that no object answers.
@@ -230,14 +229,11 @@ pub struct QueryRequest {
     pub voxel: Option<f64>,
     /// Least members of a cluster; smaller ones are only counted.
     pub min_count: u64,
-    /// Which data scores come from.
     pub precision: Precision,
-    /// Whether clusters and objects list their Gaussians.
     pub members: bool,
 }
 
 impl QueryRequest {
-    /// Makes a request for a text, with defaults otherwise.
     pub fn new(text: impl Into<String>) -> Self {
         Self {
             asked: vec![Asked::Text(text.into())],
@@ -257,7 +253,7 @@ impl QueryRequest {
         }
     }
 
-    /// Understands texts that name a relation, where answers are objects and the generation has them.
+    /// Parses texts with relations, if answers are objects and the generation has them.
     ///
     /// # Errors
     /// A text names more things than a phrase may have: without its relations it would ask for something else.
@@ -268,11 +264,11 @@ impl QueryRequest {
         for asked in &mut self.asked {
             let Asked::Text(text) = asked else { continue };
             match relations::understand(text) {
-                // It is the text that is too long: nobody gave a phrase.
+                // The text is too long: nobody gave a phrase.
                 Some(phrase) if phrase.n_things() > relations::MAX_THINGS => {
                     phrase.check().map_err(|error| RequestError { parameter: "text".to_owned(), ..error })?;
                 }
-                // A phrase that breaks another limit is one text for the text model, as one without relations is.
+                // A phrase that breaks another limit stays one text for the text model.
                 Some(phrase) if phrase.check().is_ok() => {
                     *asked = Asked::Phrase { text: Some(std::mem::take(text)), phrase };
                 }
@@ -334,7 +330,7 @@ impl QueryRequest {
             return Err(RequestError::new("negatives", &n_of_them(negatives.len()), expected));
         }
         negatives.iter().try_for_each(|text| check_text("negatives", text))?;
-        // Everything is as near to a text as to itself.
+        // A text equal to its negative scores the same everywhere.
         let mut texts = self.asked.iter().filter(|of| !matches!(of, Asked::Vector { .. })).map(Asked::label);
         match texts.find(|text| negatives.iter().any(|of| of.trim() == text.trim())) {
             Some(text) => Err(RequestError::new("negatives", text, "words other than those asked for")),
@@ -379,7 +375,7 @@ pub struct Words(
     String,
 );
 
-/// Checks a text that the text model is to encode. `parameter`: its name, for the error.
+/// Checks a text for the text model. `parameter`: its name, for the error.
 pub fn check_text(parameter: &str, text: &str) -> Result<(), RequestError> {
     if text.len() > MAX_TEXT_BYTES {
         let found = format!("{} bytes", text.len());

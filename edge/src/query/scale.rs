@@ -1,4 +1,4 @@
-//! The scale on which scores are reported: cosines, or relevancies where there are negatives.
+//! The scale of reported scores: cosines, or relevancies with negatives.
 
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -25,8 +25,7 @@ impl Scale {
         Self(if question.negatives.is_empty() { ScoreKind::Cosine } else { ScoreKind::Relevancy })
     }
 
-    /// Returns the threshold and its source. `calibration`: mean and spread of a bank of texts' scores over
-    /// whatever is scored.
+    /// Returns the threshold and its source. `calibration`: mean and spread of a bank of texts' scores.
     pub fn threshold(
         self,
         request: &QueryRequest,
@@ -44,8 +43,8 @@ impl Scale {
         }
     }
 
-    /// Returns the reported score of what has nothing to do with the question: 0 for a relevancy; for a cosine the
-    /// mean of a bank of texts' scores over whatever is scored, or 0 if it was not measured.
+    /// Returns the reported score of an unrelated thing: 0 for a relevancy; for a cosine the mean of a bank of texts'
+    /// scores over whatever is scored, or 0 if not measured.
     pub fn base(self, calibration: Option<Calibration>) -> f32 {
         match self.0 {
             ScoreKind::Cosine => calibration.map_or(0.0, |measured| measured.score_mean),
@@ -76,15 +75,14 @@ impl Scale {
     }
 }
 
-/// Spreads above the mean at which a scene's own threshold lies. On the labelled house with ConSE vectors
-/// (1,500 Gaussians, 1,612 texts: mean 0.002, spread 0.118) the mean F1 over its words peaks at 3 spreads,
-/// 0.355, where 1.2 % of all pairs of text and Gaussian match.
+/// Spreads above the mean of a scene's own threshold. On the labelled house with ConSE vectors (1,500 Gaussians,
+/// 1,612 texts: mean 0.002, spread 0.118) the mean F1 over its words peaks at 3 spreads, 0.355, where 1.2 % of all
+/// pairs of text and Gaussian match.
 const SPREADS_ABOVE_MEAN: f32 = 3.0;
 /// A smaller spread is unusable: all Gaussians look alike, or hardly any were scored.
 const MIN_SPREAD: f32 = 1e-3;
 
-/// Threshold for questions with negatives: the thing asked for is closer than any negative (LERF's own
-/// choice).
+/// Threshold for questions with negatives: the thing asked for is closer than any negative (LERF's own choice).
 pub const RELEVANCY_THRESHOLD: f32 = 0.5;
 
 /// Source of a threshold.
@@ -101,8 +99,7 @@ pub enum ThresholdSource {
     Relevancy,
 }
 
-/// Returns the default cosine threshold: three spreads above the scene's mean, or the encoder's own default
-/// if the scene has no usable calibration.
+/// Returns the default cosine threshold: three spreads above the scene's mean; if uncalibrated, the encoder's.
 pub fn calibrated_threshold(encoder_default: f32, scene: Option<Calibration>) -> (f32, ThresholdSource) {
     let of_scene = |c: Calibration| c.score_mean + SPREADS_ABOVE_MEAN * c.score_spread;
     let usable = scene.filter(|c| c.score_spread >= MIN_SPREAD && (-1.0..=1.0).contains(&of_scene(*c)));
@@ -115,8 +112,8 @@ mod tests {
 
     use super::*;
 
-    /// Background scores are shifted and stretched as different encoders do, with 40 Gaussians each of 5
-    /// things six spreads above: the threshold finds nearly all of those and hardly anything else.
+    /// Background scores are shifted and stretched as by different encoders, with 40 Gaussians each of 5 things six
+    /// spreads above: the threshold finds nearly all of those and hardly anything else.
     #[test]
     fn follows_the_encoder_that_scored() {
         let mut random = Random::new(6);

@@ -11,10 +11,9 @@ use slag_math::stats::median;
 use crate::store::BadCell;
 use crate::store::objects::ObjectIndex;
 
-/// Edge of the voxels in a metric scene, metres. Parts of one piece of furniture are closer to each other
-/// than two edges; two pieces of furniture mostly are not.
+/// Voxel edge in a metric scene, metres: parts of a piece of furniture are within two edges, two pieces mostly not.
 const METRIC_VOXEL_M: f64 = 0.25;
-/// Voxels per middle edge of the median cell, in a scene that is not metric.
+/// Voxels per middle edge of the median cell, in a non-metric scene.
 const VOXELS_PER_CELL: f64 = 64.0;
 
 pub struct Scene<'a> {
@@ -24,17 +23,16 @@ pub struct Scene<'a> {
     pub index: &'a ObjectIndex,
     pub manifest: &'a Manifest,
     pub fetched: (DVec3, f64),
-    /// Cells within it whose shards could not be fetched.
+    /// Cells whose shards could not be fetched.
     pub bad_cells: &'a [BadCell],
 }
 
-/// Returns the unit of a scene's positions and lengths.
 pub fn unit(manifest: &Manifest) -> &'static str {
     UNITS[usize::from(!manifest.metric)]
 }
 
-/// Returns the default edge of the voxels: 0.25 m in a metric scene, else a 64th of the median cell's middle
-/// edge (sky and ground make the longest and shortest edges meaningless).
+/// Returns the default edge of the voxels: 0.25 m in a metric scene, else a 64th of the median cell's middle edge
+/// (sky and ground make the longest and shortest edges meaningless).
 pub fn default_voxel(manifest: &Manifest) -> f64 {
     if manifest.metric {
         return METRIC_VOXEL_M;
@@ -45,7 +43,7 @@ pub fn default_voxel(manifest: &Manifest) -> f64 {
     if voxel > 0.0 && voxel.is_finite() { voxel } else { 1.0 }
 }
 
-/// Returns the permitted orientations of boxes: a metric or geo-referenced world has z up (`frames.rs`).
+/// Returns the permitted box orientations: a metric or geo-referenced world has z up (`frames.rs`).
 pub(super) fn alignment(manifest: &Manifest) -> Alignment {
     let z_is_up = manifest.metric || manifest.geo_reference.is_some();
     if z_is_up { Alignment::Gravity } else { Alignment::Principal }

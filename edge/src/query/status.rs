@@ -103,7 +103,7 @@ impl Status {
     }
 }
 
-/// Describes a snapshot. `now_unix_secs`: the clock. `expires_unix_secs`: when the store's timestamp expires.
+/// Describes a snapshot. `expires_unix_secs`: when the store's timestamp expires.
 pub fn map_status(snapshot: &Snapshot, now_unix_secs: u64, expires_unix_secs: Option<u64>) -> MapStatus {
     let Snapshot { current, manifest, .. } = snapshot;
     let bad =

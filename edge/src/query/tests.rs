@@ -11,7 +11,7 @@ use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
 mod budget;
 mod objects;
 
-/// A cell with a single centroid of `n` Gaussians at a place, 1 cm apart, at a given cosine to axis 0.
+/// A cell with a single centroid of `n` Gaussians, 1 cm apart, at a given cosine to axis 0.
 fn thing(cell_id: u32, at: DVec3, n: u16, cosine: f32) -> TestShard {
     let embedding = normalised(vec![cosine, (1.0 - cosine * cosine).sqrt()]);
     let members = (0..n).map(|i| Member { steps: [i, 0, 0], embedding: embedding.clone() }).collect();
@@ -22,7 +22,7 @@ fn ask(built: &[BuiltShard], edit: impl FnOnce(&mut QueryRequest, &mut Manifest)
     ask_about(built, &[Question::new([1.0, 0.0])], edit).remove(0)
 }
 
-/// Also checks that centroids are scored for the kinds that need them, and where no object answers.
+/// Also checks that centroids are scored exactly for kinds that need them, and where no object answers.
 fn ask_about(
     built: &[BuiltShard],
     questions: &[Question],
@@ -89,7 +89,7 @@ fn clusters_are_ranked_nearest_best() {
         (None, None, false)
     );
     let found = clusters(&answers);
-    // Equal things and no place to measure from: ordered by first Gaussian. The four Gaussians are too few.
+    // Equal things without an asker: ordered by first Gaussian. Four Gaussians are too few.
     assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0", "5-0"]);
     let clustering = answers.searched.clustering.as_ref().expect("clusters");
     assert_eq!((clustering.n_small_clusters, clustering.n_gaussians_in_small_clusters), (1, 4));
@@ -115,7 +115,7 @@ fn clusters_are_ranked_nearest_best() {
     }
 }
 
-/// If it is near enough, a worse thing beats a better one far away.
+/// A worse thing beats a better one far away if it is near enough.
 #[test]
 fn distance_and_score_are_weighed() {
     let yard = yard();
@@ -123,7 +123,7 @@ fn distance_and_score_are_weighed() {
         |near: DVec3| clusters(&ask(&yard, |request, _| request.near = Some(near)))[0].id.clone();
     assert_eq!(first_from(DVec3::new(0.0, 30.0, 0.0)), "5-0");
     assert_eq!(first_from(DVec3::new(0.0, 10.0, 0.0)), "4-0");
-    // Where nothing scores better than what has nothing to do with the question, score and distance are left.
+    // With no score above the base, score and distance are left.
     for (x, first) in [(30.0, "3-0"), (-30.0, "4-0")] {
         let answers = ask(&yard, |request, manifest| {
             (request.threshold, request.near) = (Some(0.5), Some(DVec3::new(x, 0.0, 0.0)));
@@ -133,7 +133,7 @@ fn distance_and_score_are_weighed() {
     }
 }
 
-/// A threshold filters and a voxel groups; neither moves what it leaves.
+/// A threshold filters and a voxel groups; neither reorders the rest.
 #[test]
 fn neither_threshold_nor_voxel_changes_the_order() {
     let yard = yard();
@@ -193,7 +193,7 @@ fn empty_answers_say_why() {
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
 }
 
-/// Ten Gaussians that views saw, and six, five metres away, that none saw: counted by hand.
+/// Ten Gaussians seen by views, and six unseen, five metres away: counted by hand.
 #[test]
 fn no_is_said_only_where_views_looked() {
     let unseen = (0..6).map(|i| [500 + i, 0, 0]).collect();
@@ -212,7 +212,7 @@ fn no_is_said_only_where_views_looked() {
         (around(0.0, 60.0), ReasonKind::BelowThreshold, Some(10.0 / 16.0)),
         (around(0.0, 1.0), ReasonKind::BelowThreshold, Some(1.0)),
         (around(5.0, 1.0), ReasonKind::NotLookedThere, Some(0.0)),
-        // Two of those that were seen, and all others.
+        // Two of the seen and all unseen ones.
         (around(5.0, 4.925), ReasonKind::NotLookedThere, Some(2.0 / 8.0)),
         (around(30.0, 1.0), ReasonKind::NothingThere, None),
     ];
@@ -233,8 +233,7 @@ fn gaussians_come_best_then_nearest_first() {
     });
     let found = described(&yard, &answers, Some(near));
     let names: Vec<(u32, u32)> = found.iter().map(|g| (g.cell_id, g.index)).collect();
-    // Cell 6 has the best scores, its Gaussians in order of x; then the two things tie, and the nearer one
-    // comes first.
+    // Cell 6 has the best scores, its Gaussians in order of x; then the two things tie, the nearer one first.
     assert_eq!(names, [(6, 3), (6, 2), (6, 1), (6, 0), (3, 35), (3, 36), (3, 34)]);
     assert_eq!(
         (answers.searched.n_matching, found[0].input_index, answers.searched.clustering.is_none()),
@@ -256,7 +255,7 @@ fn exact_shards_answer_exactly() {
     assert_eq!((found.len(), found[2].input_index), (DEFAULT_LIMIT, Some(7)));
 }
 
-/// With centroids only, exact shards answer as compact ones do, and report that.
+/// With centroids only, exact shards answer as compact ones do, and say so.
 #[test]
 fn exactness_is_a_choice() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
@@ -313,8 +312,7 @@ fn negatives_make_relevancies() {
     assert!((f64::from(none.best_score.expect("the best")) - expected(0.95)).abs() <= bound);
 }
 
-/// Relevancies are steepest half way between question and negative: there the members of a centroid differ
-/// from it by nearly the whole bound.
+/// Relevancies are steepest half way between question and negative: there errors nearly reach the bound.
 #[test]
 fn relevancies_keep_within_their_bound_and_use_it() {
     let angles = |turn: f64| [-turn, turn].map(|turn| turn + std::f64::consts::FRAC_PI_4);
@@ -400,7 +398,7 @@ fn answers_carry_the_place_on_earth() {
     let origin = Geographic { latitude_deg: 46.8, longitude_deg: -92.0, height_m: 180.0 };
     let answers = ask(&yard(), |_, manifest| manifest.geo_reference = Some(GeoReference { origin }));
     let north = clusters(&answers)[2].geographic.expect("geo-referenced");
-    // 30 m north; a degree of latitude has 111.2 km there.
+    // 30 m north, at 111.2 km per degree of latitude.
     assert!((north.latitude_deg - 46.8 - 30.0 / 111_200.0).abs() < 1e-6, "{north:?}");
 }
 

@@ -1,4 +1,4 @@
-//! What the page needs to draw the Gaussians on board, and to colour them by a question.
+//! Messages for the page that draws the Gaussians on board and colours them by a question.
 
 use glam::{DVec3, Vec3};
 use slag_common::shard::ShardView;
@@ -19,7 +19,6 @@ const BELOW_ALL: f32 = -4.0;
 const PROGRAM: &str = "slag-edge";
 
 impl Engine {
-    /// Describes the scene on board. `robot_in_world`: where the robot is, if that is known.
     pub fn view(
         &self,
         robot_in_world: impl Fn(&Snapshot) -> Option<DVec3>,
@@ -69,8 +68,7 @@ impl Engine {
         })
     }
 
-    /// Returns the message of a cell's Gaussians, all or every few, or nothing if the cell is not on board or of
-    /// another generation than `generation`, where that is given.
+    /// Returns the message of a cell's Gaussians (one in `step`), if on board and of `generation` or that is absent.
     pub(crate) fn view_cell(
         &self,
         cell_id: u32,
@@ -90,8 +88,8 @@ impl Engine {
         Ok(Some(cell_message(&positions, shard.additions().appearance, step)))
     }
 
-    /// Returns what the things on board are called, each name with the number of things whose best one it is; then
-    /// the other words of a model that knows some and not others.
+    /// Returns the names of the things on board, each with the number of things it is best for; then the remaining
+    /// words of a model with a limited vocabulary.
     pub(crate) fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
         let on_board = self.on_board()?;
         on_board.check()?;
@@ -103,7 +101,6 @@ impl Engine {
         Ok(Words::new(generation, best, on_board.text.nouns()))
     }
 
-    /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.
     pub(crate) fn view_scores(
         &self,
         text: String,
@@ -137,7 +134,6 @@ fn scores_message(
     budget.take(ScoresMessage::len(cells.len(), cells.iter().map(|(_, n)| *n as usize).sum()));
     let search = Search::reusing(scratch, shards, question, Region::default(), Precision::Centroids)?;
     let mut runs = search.matching(BELOW_ALL).runs;
-    // A search that runs out of its budget stops early.
     budget.check()?;
     if !question.negatives.is_empty() {
         runs.iter_mut().for_each(|run| run.score = relevancy(run.score));

@@ -1,7 +1,7 @@
-//! What a request may use: bytes and time, checked while it is scored and clustered.
+//! A request's budget of bytes and time, checked during scoring and clustering.
 //!
-//! Work that fans out over threads cannot return an error from every loop, so a budget latches: once it is spent,
-//! loops end early, and whoever started the work asks [`Budget::check`] before it uses the result.
+//! Work on several threads cannot return an error from every loop, so a budget latches: once it is spent, loops end
+//! early, and the caller checks [`Budget::check`] before using the result.
 
 use std::sync::atomic::AtomicU64;
 use std::sync::atomic::Ordering::Relaxed;
@@ -41,7 +41,7 @@ impl Pool {
     }
 }
 
-/// What a request may still use; without bounds by default. Clones share it.
+/// The remaining budget of a request; unlimited by default. Clones share it.
 #[derive(Clone, Debug, Default)]
 pub struct Budget(Option<Arc<Account>>);
 
@@ -56,13 +56,12 @@ struct Account {
 }
 
 impl Budget {
-    /// Makes the budget of a request that begins now.
     pub fn new(bytes: u64, time: Duration, pool: &Arc<Pool>) -> Self {
         let (started, pool, used) = (Instant::now(), Arc::clone(pool), AtomicU64::new(0));
         Self(Some(Arc::new(Account { bytes, time, started, pool, used, spent: OnceLock::new() })))
     }
 
-    /// Takes bytes. Returns whether the work may go on.
+    /// Takes bytes. Returns whether work may go on.
     pub fn take(&self, bytes: usize) -> bool {
         let Some(account) = &self.0 else { return true };
         let bytes = bytes as u64;
@@ -76,7 +75,7 @@ impl Budget {
         self.goes_on()
     }
 
-    /// Takes bytes where there is room for them and time. Returns whether it did.
+    /// Takes bytes if both bytes and time allow it; returns whether it did.
     pub fn try_take(&self, bytes: usize) -> bool {
         let Some(account) = &self.0 else { return true };
         let left = |limit: u64, used: &AtomicU64| limit.saturating_sub(used.load(Relaxed)) >= bytes as u64;
@@ -88,7 +87,7 @@ impl Budget {
         self.0.as_ref().map_or(0, |account| account.used.load(Relaxed))
     }
 
-    /// Gives back what was taken since `used_bytes` was this, except `kept` bytes.
+    /// Returns the bytes taken since `used_bytes` had this value, except `kept`.
     pub(crate) fn give_back_to(&self, used_bytes: u64, kept: usize) {
         let Some(account) = &self.0 else { return };
         let bytes = self.used_bytes().saturating_sub(used_bytes.saturating_add(kept as u64));
@@ -96,7 +95,6 @@ impl Budget {
         account.pool.used.fetch_sub(bytes, Relaxed);
     }
 
-    /// Returns whether the work may go on: neither bytes nor time are spent.
     pub fn goes_on(&self) -> bool {
         let Some(account) = &self.0 else { return true };
         if account.spent.get().is_none() && account.started.elapsed() > account.time {
@@ -105,7 +103,7 @@ impl Budget {
         account.spent.get().is_none()
     }
 
-    /// Returns what is spent, if anything is.
+    /// Returns an error if bytes or time are spent.
     pub fn check(&self) -> Result<(), OverBudget> {
         match self.0.as_ref().filter(|_| !self.goes_on()).and_then(|account| account.spent.get()) {
             Some(spent) => Err(spent.clone()),
@@ -127,8 +125,7 @@ impl Drop for Account {
     }
 }
 
-/// Largest coordinate of a scene, world units. Larger ones (a hundred times the earth's diameter) are
-/// refused, because computations with them would overflow.
+/// Largest coordinate, world units: a hundred times the earth's diameter; computations with more would overflow.
 pub const MAX_COORDINATE: f64 = 1e9;
 
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

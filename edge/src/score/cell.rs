@@ -1,4 +1,4 @@
-//! One question's view of one shard: which data decide its members' scores, and bounds on those scores.
+//! One question's view of one shard: the data that decide members' scores, and bounds on those scores.
 
 use half::f16;
 use slag_common::shard::{ExactColumns, Residuals, ShardView};
@@ -9,16 +9,15 @@ use super::project::Projection;
 use super::question::Precision;
 use super::region::Region;
 
-/// Number of mean measured errors within which a score counts as undecided and is refined. With 9, answers
-/// hold 0.99 and more of a generated field's best 1,000 to 100,000; with 6, the best 1,000 of a few texts
-/// fall short, because so few scores have the largest errors.
+/// Number of mean measured errors within which a score is undecided and refined. With 9, answers hold 0.99 and more
+/// of a generated field's best 1,000 to 100,000; with 6, the best 1,000 of a few texts fall short, because so few
+/// scores have the largest errors.
 pub(super) const UNDECIDED: f32 = 9.0;
 
-/// How far an f16-rounded unit embedding may lie from the unrounded one that its centroid's radius was measured
-/// to: half a step of f16 at 1 (2^-11), plus the steps of components too small for f16's exponents.
+/// Largest distance of an f16-rounded unit embedding from the unrounded one that its centroid's radius refers to: half
+/// a step of f16 at 1 (2^-11), plus the steps of components too small for f16's exponents.
 pub(super) const F16_ROUNDING: f32 = 5e-4;
 
-/// The data that members are scored by, beyond their centroid.
 #[derive(Clone, Copy)]
 pub(super) enum Detail<'a> {
     Nothing,
@@ -54,7 +53,6 @@ impl<'a> Measured<'a> {
     }
 }
 
-/// One question's view of a shard.
 pub(super) struct Cell<'a> {
     pub at: u32,
     pub shard: &'a ShardView<'a>,
@@ -129,7 +127,6 @@ impl Cell<'_> {
         self.asked.places.iter().map(|place| &self.scores.projections[*place])
     }
 
-    /// Computes the values that depend on the question and the residual code only.
     fn measure(&mut self, residuals: &Residuals<'_>) {
         // Components outside all subspaces do not take part.
         let n_coded = residuals.subspace_starts.last().map_or(0, |end| *end as usize);
@@ -165,7 +162,6 @@ impl Cell<'_> {
         apart * (1.0 + 4.0 * f32::EPSILON) + self.rounding(centroid, residuals)
     }
 
-    /// Bounds the error of rounding a member's score to f32.
     fn rounding(&self, centroid: usize, residuals: &Residuals<'_>) -> f32 {
         let of_centroids: f32 =
             self.asked.places.iter().map(|place| self.scores.centroids[*place][centroid].abs()).sum();
@@ -219,8 +215,7 @@ impl Cell<'_> {
         errors.next().unwrap_or(0.0) + errors.fold(0.0, f32::max)
     }
 
-    /// Bounds the error of the centroid's score, or of its members' scores where a residual code gives them
-    /// their own.
+    /// Bounds the error of the centroid's score, or of its members' scores if a residual code gives them their own.
     pub fn score_error(&self, centroid: usize) -> f32 {
         let of_centroids = self.asked.steepness * self.shard.radii[centroid] + self.centroid_error(centroid);
         let of_codes = |residuals: &Residuals<'_>| {

@@ -11,7 +11,6 @@ use super::project::{Projection, Vector};
 use super::question::{Precision, Question};
 use super::region::Region;
 
-/// Scores of one or several questions, centroid by centroid.
 #[derive(Default)]
 pub(super) struct CentroidScores {
     /// The distinct vectors of all questions.
@@ -26,7 +25,6 @@ pub(super) struct AskedQuestion<'a> {
     pub region: Region,
     pub precision: Precision,
     pub scored: Arc<CentroidScores>,
-    /// What finding matches may use.
     pub budget: Budget,
     /// Indices of its vectors among those scored: its own, then its negatives.
     pub places: Vec<usize>,
@@ -38,19 +36,17 @@ pub(super) struct AskedQuestion<'a> {
 
 #[derive(Default)]
 pub(super) struct ShardScores {
-    /// Whether the shard reaches into the region. If not, the other fields are left over from an earlier
-    /// search.
+    /// Whether the shard reaches into the region; otherwise the other fields are stale.
     pub is_searched: bool,
     pub projections: Vec<Projection>,
     /// `[vectors][centroids]`.
     pub centroids: Vec<Vec<f32>>,
-    /// `[questions][centroids]`: scores less those of the negatives; empty for questions without negatives.
+    /// `[questions][centroids]`: scores minus those of the negatives; empty for questions without negatives.
     pub combined: Vec<Vec<f32>>,
 }
 
 impl CentroidScores {
-    /// Scores the centroids of the shards that reach into the region. Returns the indices of each question's
-    /// vectors, its own first.
+    /// Scores the centroids of shards in the region. Returns the indices of each question's vectors, its own first.
     pub fn score(
         &mut self,
         shards: &[ShardView<'_>],
@@ -73,8 +69,7 @@ impl CentroidScores {
     }
 }
 
-/// Returns the distinct vectors of some questions, and the indices of each question's vectors among them, its
-/// own first.
+/// Returns the distinct vectors of some questions, and the indices of each question's vectors, its own first.
 pub(super) fn distinct(questions: &[Question]) -> (Vec<&[f32]>, Vec<Vec<usize>>) {
     let mut distinct: Vec<&[f32]> = Vec::new();
     let mut place = |vector| {
@@ -132,8 +127,7 @@ impl ShardScores {
     }
 }
 
-/// Returns a product less the largest of its negatives' products. Never -0, which would sort after 0 though
-/// it is equal.
+/// Returns a product minus the largest of its negatives' products. Never -0, which would sort after 0.
 pub(super) fn combine(own: f32, negatives: impl Iterator<Item = f32>) -> f32 {
     negatives.reduce(f32::max).map_or(own, |worst| own - worst) + 0.0
 }

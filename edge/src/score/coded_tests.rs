@@ -35,7 +35,7 @@ fn shards_of(
     (dim, n_components, has_basis, n_subspaces): (usize, usize, bool, usize),
     is_exact: bool,
 ) -> Vec<BuiltShard> {
-    // Centroids that end inside blocks, at block ends, and that span several blocks.
+    // Centroids that end inside blocks or at block ends, or span several blocks.
     let lens = [&[1, 31, 32, 33, 70, 64, 5][..], &[1], &[3; 40]];
     let mut build = |(at, lens): (usize, &[usize])| {
         let cell_id = 9 - at as u32;
@@ -47,7 +47,7 @@ fn shards_of(
     lens.into_iter().enumerate().map(&mut build).collect()
 }
 
-/// Scores a Gaussian as the format and the module define it, from the rounded parts, one by one.
+/// Scores a Gaussian by the definitions of format and module, from the rounded parts.
 fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
     let shard = &search.shards()[shard_at];
     let (centroid, scores) = (shard.centroid_of(index), &search.asked.scored.shards[shard_at]);
@@ -187,8 +187,8 @@ fn answers_are_those_of_brute_force() {
     assert!(n_scanned * 20 > n_all, "hardly any code was read: {n_scanned} of {n_all}");
 }
 
-/// Oracle: each Gaussian's scores by code, fine residual and embedding, as the format and the module define
-/// them, and the matches that follow.
+/// Oracle: each Gaussian's scores by code, fine residual and embedding, as the format and the module define them, and
+/// the resulting matches.
 #[test]
 fn measured_errors_decide_as_defined() {
     let mut random = Random::new(24);

@@ -13,30 +13,29 @@ use super::matches::{Matches, Run};
 use super::region::Region;
 use super::simd::{BlockSums, FindSums, LastBlock, SomeRowsTimesVector};
 
-/// Number of bins; a score at a given rank is located by counting before anything is sorted.
+/// Number of bins; counting locates a rank's score before anything is sorted.
 pub(super) const BINS: usize = 4096;
 
-/// Returns the bin of a score. It never falls as the score rises.
+/// Returns the bin of a score; monotonic.
 pub(super) fn bin_of(score: f32) -> usize {
     // Few scores lie outside -1..1; they share the first and the last bin.
     ((score + 1.0) * (BINS as f32 / 2.0)).clamp(0.0, (BINS - 1) as f32) as usize
 }
 
-/// Returns a score that no score of a bin lies below.
+/// Returns a lower bound on the scores of a bin.
 pub(super) fn edge_of(bin: usize) -> f32 {
     // The first bin also holds all lower scores. Otherwise a little below the edge, because `bin_of` rounds.
     let edge = bin as f32 / (BINS as f32 / 2.0) - 1.0;
     if bin == 0 { f32::NEG_INFINITY } else { edge - 4.0 * f32::EPSILON }
 }
 
-/// Runs found so far, and buffers kept from one answer to the next.
+/// Runs found so far, and buffers reused between answers.
 #[derive(Default)]
 pub(super) struct Gather {
     /// By index in the slice of shards.
     pub shards: Vec<ShardGather>,
 }
 
-/// Bounds on the scores to gather.
 #[derive(Clone, Copy)]
 pub(super) struct Cut {
     pub score: f32,
@@ -57,10 +56,10 @@ pub(super) struct ShardGather {
     pub bins: Vec<u32>,
 }
 
-/// Buffers for the members of one centroid that are refined.
+/// Buffers for refining members of one centroid.
 #[derive(Default)]
 struct Refine {
-    /// Members with the scores of their codes, later with refined ones.
+    /// Members with code scores, later refined ones.
     members: Vec<(u32, f32)>,
     /// Undecided members: index in `members`, and the score of the code.
     undecided: Vec<(usize, f32)>,
@@ -71,8 +70,7 @@ struct Refine {
 }
 
 impl AskedQuestion<'_> {
-    /// Gathers the Gaussians that reach a threshold. `each`: scores members one by one even where the
-    /// centroid alone decides, in shards that can.
+    /// Gathers the Gaussians that reach a threshold. `each`: scores members individually wherever the shard can.
     pub(super) fn collect(&self, gather: &mut Gather, cut: Cut, each: bool) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
@@ -85,8 +83,7 @@ impl AskedQuestion<'_> {
         });
     }
 
-    /// Counts the Gaussians that reach a threshold by their own scores, in centroids that score at least
-    /// `floor`.
+    /// Counts the Gaussians that reach a threshold by their own scores, in centroids that score at least `floor`.
     pub(super) fn count(&self, gather: &mut Gather, threshold: f32, floor: f32) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
@@ -246,8 +243,7 @@ impl Cell<'_> {
         found.runs.extend(refine.members.iter().map(run));
     }
 
-    /// Refines the scores of undecided members by fine residuals and embeddings, and drops those that fall
-    /// out.
+    /// Refines the scores of undecided members by fine residuals and embeddings, and drops non-matches.
     fn refine(&self, gather: &mut ShardGather, measured: &Measured<'_>, centroid: usize, cut: Cut) {
         let ShardGather { refine, found, .. } = gather;
         let Refine { members, undecided, which, products, scores } = refine;
@@ -293,8 +289,7 @@ impl Cell<'_> {
                 found.effort.n_embeddings_read += 1;
                 *score = self.exact_score(measured.exact.embeddings, *at as usize);
             }
-            // A member that its code let in stays unless it is below the minimum: the number found then
-            // equals the number asked for.
+            // Accepted members stay unless below the minimum, so that the number found equals the number asked for.
             let is_out = *of_code < cut.score && *score < cut.score - measured.fine_margin;
             if is_out || *score < cut.least {
                 *score = f32::NEG_INFINITY;
@@ -304,8 +299,7 @@ impl Cell<'_> {
     }
 }
 
-/// Returns the least sum with a score `own + step * sum` at or above a threshold; `None` if no sum up to
-/// `most` has one.
+/// Returns the least sum up to `most` with `own + step * sum` at or above a threshold, if any.
 fn least_sum(own: f32, step: f32, most: u16, threshold: f32) -> Option<u16> {
     let reaches = |sum: u16| own + step * f32::from(sum) >= threshold;
     if !reaches(most) {
@@ -328,7 +322,6 @@ fn least_sum(own: f32, step: f32, most: u16, threshold: f32) -> Option<u16> {
     Some(low)
 }
 
-/// Returns the parts of a range of Gaussians that lie in the region.
 pub(super) fn runs_inside(
     shard: &ShardView<'_>,
     filter: Option<&Region>,

@@ -5,14 +5,14 @@ use slag_math::simd::Work;
 
 use super::simd::Kernels;
 
-/// Partial sums kept apart until the end: one AVX register, two of SSE or NEON.
+/// Independent partial sums: one AVX register, two of SSE or NEON.
 const LANES: usize = 8;
 /// Components multiplied at a time; their products stay in the L1 cache.
 const BLOCK: usize = 512;
 
-/// Converts a finite f16 to f32, exactly, with operations that every vector unit has: shifts the bits into
-/// place and corrects the exponent bias by 127 - 15 = 112. (Conversion instructions would need a runtime
-/// check every few components.)
+/// Converts a finite f16 to f32, exactly, with operations of every vector unit: shifts the bits into place and
+/// corrects the exponent bias by 127 - 15 = 112. (Conversion instructions would need a runtime check every few
+/// components.)
 #[inline(always)]
 pub(super) fn widen(value: f16) -> f32 {
     const BIAS: f32 = f32::from_bits((127 + 112) << 23);
@@ -20,17 +20,15 @@ pub(super) fn widen(value: f16) -> f32 {
     f32::from_bits((bits & 0x8000) << 16 | (bits & 0x7fff) << 13) * BIAS
 }
 
-/// Returns `embedding · vector`, summed in f32 in a fixed order: the same bits on every machine and for any
-/// number of threads. Ignores components past the end of the shorter vector. The embedding must be finite, as
-/// those of a checked shard are.
+/// Returns `embedding · vector`, summed in f32 in a fixed order: the same bits on every machine and for any number of
+/// threads. Ignores components beyond the shorter vector. The embedding must be finite, as in checked shards.
 #[inline(always)]
 pub fn dot(embedding: &[f16], vector: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
     let mut products = [0.0f32; BLOCK];
     for (embedding, vector) in embedding.chunks(BLOCK).zip(vector.chunks(BLOCK)) {
         let n = embedding.len().min(vector.len());
-        // One plain loop each for the products and for every halving: the compiler vectorises those, but not
-        // a single loop over eight running sums.
+        // Plain loops for products and halvings: the compiler vectorises these, but not one over eight running sums.
         for ((product, a), b) in products.iter_mut().zip(embedding).zip(vector) {
             *product = widen(*a) * b;
         }
@@ -63,9 +61,9 @@ impl<K: Kernels> Work<K> for EmbeddingTimesVector<'_> {
     }
 }
 
-/// Bounds the error of [`dot`] for unit vectors: each product passes at most 1 + 6 roundings in its block,
-/// one per block and 3 at the end, of 2^-24 each, and the absolute products sum to at most 1. The bound is
-/// doubled, because a stored embedding may be a little longer than 1.
+/// Bounds the error of [`dot`] for unit vectors: each product passes at most 1 + 6 roundings in its block, one per
+/// block and 3 at the end, of 2^-24 each, and the absolute products sum to at most 1. Doubled, because a stored
+/// embedding may be slightly longer than 1.
 pub fn rounding_bound(dim: usize) -> f32 {
     (dim.div_ceil(BLOCK) + 10) as f32 * f32::EPSILON
 }

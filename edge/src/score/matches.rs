@@ -1,13 +1,11 @@
-//! Gaussians found by a search, and the work it took.
+//! Gaussians found by a search, and its cost.
 
-/// One Gaussian and its score.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Index of the shard in the searched slice.
     pub shard: u32,
     pub index: u32,
-    /// The Gaussian's own score where the shard holds a code or embedding and the precision uses it; else its
-    /// centroid's.
+    /// The Gaussian's own score if the shard has a code or embedding that the precision uses; else its centroid's.
     pub score: f32,
 }
 
@@ -19,11 +17,10 @@ pub struct Run {
     pub start: u32,
     /// One past the last member.
     pub end: u32,
-    /// Score of the centroid, or of the Gaussian itself where it was scored alone.
+    /// Score of the centroid, or of a Gaussian scored individually.
     pub score: f32,
 }
 
-/// Gaussians that reach a threshold.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Matches {
     /// Disjoint runs, by shard and start, ascending.
@@ -36,7 +33,6 @@ pub struct Matches {
 }
 
 impl Matches {
-    /// Empties the list and keeps its memory.
     pub fn clear(&mut self) {
         let mut runs = std::mem::take(&mut self.runs);
         runs.clear();

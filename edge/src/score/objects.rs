@@ -1,9 +1,9 @@
 //! Scores questions against the objects of a generation, each object once.
 //!
-//! With `q^` and `y^` as in `project.rs`, a vector `v` of an object scores `mean . q + step * v . y^`: an
-//! integer product, scaled once. A stored vector has length at most 1 + e, where e is the quantisation error
-//! bound stated by its shard. Rounding the question therefore changes the score by at most `|q - q^| (1 + e +
-//! |mean|) + step * |v| * |y - y^|` (Cauchy-Schwarz); the bounds returned are the sum of that and e.
+//! With `q^` and `y^` as in `project.rs`, a vector `v` of an object scores `mean . q + step * v . y^`: an integer
+//! product, scaled once. A stored vector has length at most 1 + e, with the shard's stated quantisation error bound
+//! e. Rounding the question therefore changes the score by at most `|q - q^| (1 + e + |mean|) + step * |v| * |y -
+//! y^|` (Cauchy-Schwarz); the bounds returned are the sum of that and e.
 
 use rayon::prelude::*;
 use slag_common::objects::{MAX_VECTORS, Objects, object_score};
@@ -29,11 +29,9 @@ pub struct ObjectScores {
     pub error_bound: f32,
 }
 
-/// Scores all objects: [`object_score`] of the question's vector, less the largest score of its negatives.
-/// `objects` and `index` belong to the shards.
+/// Scores the shards' objects: [`object_score`] of the question's vector, minus the largest of its negatives'.
 ///
-/// Negatives that questions share are multiplied once. Scores are the same for any number of threads and on
-/// every processor.
+/// Shared negatives are multiplied once. Scores are the same for any number of threads and on every processor.
 pub fn score_objects(
     shards: &[ShardView<'_>],
     objects: &[Option<Objects<'_>>],
@@ -71,7 +69,7 @@ pub fn score_objects(
     Ok(all)
 }
 
-/// Combines the scores of a question's vector and of its negatives, which `places` lists in this order.
+/// Combines the scores of a question's vector and its negatives, listed by `places` in this order.
 fn of_question(scored: &[ObjectScores], places: &[usize]) -> ObjectScores {
     let (own, negatives) = (&scored[places[0]], &places[1..]);
     let of = |(at, own): (usize, &f32)| combine(*own, negatives.iter().map(|n| scored[*n].scores[at]));
@@ -171,8 +169,8 @@ mod tests {
         shard.with_objects(&objects.collect::<Vec<_>>(), CALIBRATION)
     }
 
-    /// Oracle: the format's definition in float64, in the first shard that has the object. The bound holds
-    /// without the share for quantisation, which no vector here needs.
+    /// Oracle: the format's definition in float64, in the first shard with the object. The bound holds without the
+    /// share for quantisation, which no vector here needs.
     #[test]
     fn each_object_scores_as_defined_within_the_bound_and_at_every_level() {
         let mut random = Random::new(41);

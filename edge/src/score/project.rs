@@ -1,5 +1,4 @@
-//! A question's vector in a cell's terms: rounded to 16 bits, projected on the cell's basis, and tabulated
-//! for codes.
+//! A question's vector in a cell's terms: rounded to 16 bits, projected on the cell's basis, tabulated for codes.
 //!
 //! With `q^` the question's vector `q` rounded to 16 bits and `y[c] = basis_steps[c] * basis[c] . q^`, a
 //! centroid scores `mean . q + centroid_step * centroids[r] . y^`, where `y^` is `y` rounded to 16 bits;
@@ -31,8 +30,7 @@ pub struct Rounded {
 }
 
 impl Rounded {
-    /// Rounds finite values with the smallest step that keeps every product with 8-bit centroids within 32
-    /// bits.
+    /// Rounds finite values with the smallest step that keeps all products with 8-bit centroids within 32 bits.
     pub fn set(&mut self, values: &[f64]) {
         let largest = values.iter().fold(0.0f64, |most, v| most.max(v.abs()));
         let sum: f64 = values.iter().map(|v| v.abs()).sum();
@@ -57,7 +55,6 @@ impl Rounded {
 pub struct Vector {
     /// `[dim]`.
     pub exact: Vec<f64>,
-    /// The same, quantised to 16 bits.
     pub rounded: Rounded,
     pub length: f64,
 }
@@ -71,7 +68,6 @@ impl Vector {
     }
 }
 
-/// Products of a residual code's codewords, in 8 bits.
 #[derive(Clone, Debug, Default)]
 pub struct Tables {
     /// `[S / 2]`: values of the even subspaces' codewords, twice over.
@@ -93,16 +89,14 @@ pub struct Projection {
     pub base: f64,
     /// `[m]`: products with the basis vectors, or the vector's own components.
     pub components: Vec<f64>,
-    /// The same, quantised to 16 bits.
     pub rounded: Rounded,
     /// Rounding error of a centroid's score for each unit of the centroid's distance from the mean.
     pub error_per_length: f32,
     /// Rounding error of a centroid's score that does not depend on that distance.
     pub error: f32,
     pub mean_length: f32,
-    /// Tables of the residual code, in cells that have one.
     pub tables: Tables,
-    /// The vector that fine residuals are multiplied with, in cells that have them.
+    /// Multiplier of fine residuals, in cells that have them.
     pub fine: Rounded,
     /// The same in float64.
     fine_components: Vec<f64>,
@@ -160,7 +154,6 @@ impl Projection {
         });
     }
 
-    /// Builds the vector that fine residuals are multiplied with.
     pub(crate) fn set_fine(&mut self, fine: &Fine<'_>) {
         self.fine_components.clear();
         self.fine_components
@@ -211,13 +204,12 @@ impl Projection {
     }
 }
 
-/// Returns the least power of two at or above a positive number.
 fn power_of_two_from(value: f64) -> f64 {
     const MANTISSA: u64 = (1 << 52) - 1;
     f64::from_bits((value.to_bits() + MANTISSA) & !MANTISSA)
 }
 
-/// Rounds to the nearest integer. (Without SSE 4.1 the standard rounding is a function call.)
+/// Rounds to nearest. (Without SSE 4.1 the standard rounding is a function call.)
 fn nearest(value: f64) -> i32 {
     (value + 0.5f64.copysign(value)) as i32
 }
@@ -226,7 +218,6 @@ pub fn length(vector: &[f64]) -> f64 {
     vector.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// Rounds a bound up to f32.
 pub fn up(bound: f64) -> f32 {
     (bound * (1.0 + f64::from(f32::EPSILON))) as f32
 }

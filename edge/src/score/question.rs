@@ -15,9 +15,8 @@ use super::dot::rounding_bound;
 
 pub use slag_math::relevancy::{RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 
-/// A question as vectors. A Gaussian's score is `q · E_k`, or with negatives `q · E_k - max_j n_j · E_k`: how
-/// much closer it is to the thing asked for than to the closest negative (LERF, Kerr et al. 2023, section
-/// 3.3; [`relevancy`] maps it to 0..1).
+/// A question as vectors. A Gaussian's score is `q · E_k`, or with negatives `q · E_k - max_j n_j · E_k`: its margin
+/// over the closest negative (LERF, Kerr et al. 2023, section 3.3; [`relevancy`] maps it to 0..1).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
     /// `[dim]`, unit length.
@@ -27,7 +26,6 @@ pub struct Question {
 }
 
 impl Question {
-    /// Makes a question without negatives.
     pub fn new(vector: impl Into<Arc<[f32]>>) -> Self {
         Self { vector: vector.into(), negatives: Vec::new() }
     }
@@ -37,7 +35,6 @@ impl Question {
         std::iter::once(&*self.vector).chain(self.negatives.iter().map(|negative| &**negative))
     }
 
-    /// Checks that every vector has `dim` components and unit length.
     fn check(&self) -> Result<(), ScoreError> {
         let dim = self.vector.len();
         for vector in self.vectors() {
@@ -53,8 +50,8 @@ impl Question {
         Ok(())
     }
 
-    /// Returns the most that a score changes when an embedding moves by 1: the length of `q`, or of the
-    /// longest `q - n_j`, because the score is the minimum of all `(q - n_j) · E`.
+    /// Returns the most that a score changes when an embedding moves by 1: the length of `q`, or of the longest `q -
+    /// n_j`, because the score is the minimum of all `(q - n_j) · E`.
     pub(crate) fn steepness(&self) -> f32 {
         let own = length(self.vector.iter().copied());
         let apart = |n: &Arc<[f32]>| length(self.vector.iter().zip(&**n).map(|(q, n)| q - n));
@@ -69,7 +66,7 @@ impl Question {
     }
 }
 
-/// Checks that questions can be asked of shards: dimensions, unit lengths, and the extent of positions.
+/// Checks questions and shards: dimensions, unit lengths, and the extent of positions.
 pub(super) fn check(shards: &[ShardView<'_>], questions: &[Question]) -> Result<(), ScoreError> {
     for question in questions {
         question.check()?;

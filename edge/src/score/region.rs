@@ -1,4 +1,4 @@
-//! The part of space that a question asks about.
+//! The region of a question.
 
 use std::fmt;
 use std::sync::Arc;
@@ -20,8 +20,7 @@ impl Ball {
     }
 }
 
-/// A ball, a box and a polygon, each optional. A Gaussian lies inside if its mean lies in all of them; the borders
-/// of ball and box are included.
+/// A ball, box and polygon, each optional; a mean must lie in all. The borders of ball and box are included.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Region {
     pub ball: Option<Ball>,
@@ -48,8 +47,8 @@ impl Region {
             && self.polygon.as_ref().is_none_or(|polygon| polygon.covers(of))
     }
 
-    /// Returns whether a point of a box can lie inside. May be true although none does, if ball and bounds
-    /// touch the box in different places.
+    /// Returns whether a point of a box can lie inside. May be true although none does, if ball and bounds touch the
+    /// box in different places.
     pub fn touches(&self, of: &Aabb) -> bool {
         let near = |ball: Ball| ball.contains(ball.centre_in_world.clamp(of.min, of.max));
         self.ball.is_none_or(near)
@@ -75,7 +74,7 @@ impl fmt::Display for Region {
 
 pub const MAX_CORNERS: usize = 256;
 
-/// A polygon in the world's x and y, of any height. It may be concave; where it crosses itself, even-odd counts.
+/// A polygon in the world's x and y, unbounded in height. May be concave; self-intersections count even-odd.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Polygon {
     corners: Vec<DVec2>,
@@ -84,8 +83,7 @@ pub struct Polygon {
 }
 
 impl Polygon {
-    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for another number, corners out of bounds or
-    /// all on one line, which has no inside.
+    /// Takes 3 to [`MAX_CORNERS`] corners, in either direction; `None` for others, out of bounds, or all on one line.
     pub fn new(corners: Vec<DVec2>) -> Option<Self> {
         let is_within = |corner: &DVec2| corner.is_finite() && corner.abs().max_element() <= MAX_COORDINATE;
         if !(3..=MAX_CORNERS).contains(&corners.len()) || !corners.iter().all(is_within) {
@@ -113,8 +111,8 @@ impl Polygon {
         (0..n).map(move |at| (self.corners[at], self.corners[(at + 1) % n]))
     }
 
-    /// Returns whether a point lies inside: a ray along x crosses an odd number of edges. A point on the border
-    /// may lie on either side.
+    /// Returns whether a point lies inside: a ray along x crosses an odd number of edges. Borders may count either
+    /// way.
     pub fn contains(&self, point: DVec2) -> bool {
         let crosses = |(a, b): (DVec2, DVec2)| {
             (a.y > point.y) != (b.y > point.y) && point.x < (b.x - a.x) * (point.y - a.y) / (b.y - a.y) + a.x
@@ -172,19 +170,19 @@ mod tests {
             prop_assert!(lattice.iter().all(|p| region.contains(*p) == inside(p)));
             prop_assert!(!region.covers(&of) || lattice.iter().all(inside));
             prop_assert!(region.touches(&of) || !lattice.iter().any(inside));
-            // Corners decide, and they are in the lattice.
+            // Corners decide, and the lattice includes them.
             prop_assert_eq!(region.covers(&of), lattice.iter().all(inside));
         }
     }
 
-    /// Returns how often a polygon winds around a point: the sum of the angles of its edges, seen from there.
+    /// Returns the winding number of a polygon around a point, from the angles of its edges.
     fn turns(polygon: &Polygon, point: DVec2) -> i64 {
         let angle = |(a, b): (DVec2, DVec2)| (a - point).angle_to(b - point);
         (polygon.edges().map(angle).sum::<f64>() / std::f64::consts::TAU).round() as i64
     }
 
     proptest! {
-        /// Oracle: winding numbers, which are odd where even-odd says inside; boxes by their lattice points.
+        /// Oracle: winding numbers, odd where even-odd says inside; boxes by their lattice points.
         #[test]
         fn points_are_inside_as_the_winding_number_says(
             corners in prop::collection::vec(prop::array::uniform2(-4.0f64..4.0), 3..9),

@@ -15,8 +15,7 @@ use super::question::{Precision, Question, check};
 use super::region::Region;
 use super::select::AnswerBuffers;
 
-/// What a search may use: a budget, and buffers that the next search reuses, so that it allocates little but its
-/// answers.
+/// A search's budget, and buffers for the next search to reuse, so that little but answers is allocated.
 #[derive(Default)]
 pub struct Scratch {
     budget: Budget,
@@ -25,7 +24,7 @@ pub struct Scratch {
 }
 
 impl Scratch {
-    /// Sets what the searches to come may use; without bounds by default.
+    /// Sets the budget of later searches; unlimited by default.
     pub(crate) fn set_budget(&mut self, budget: Budget) {
         self.budget = budget;
     }
@@ -34,7 +33,7 @@ impl Scratch {
         &self.budget
     }
 
-    /// Takes the bytes of the centroids' scores from the budget.
+    /// Charges the centroids' scores to the budget.
     fn take_scores(&self, shards: &[ShardView<'_>], questions: &[Question]) -> Result<(), ScoreError> {
         let n_centroids: usize = shards.iter().map(|shard| shard.header.n_centroids as usize).sum();
         let n_vectors: usize = questions.iter().map(|question| question.vectors().count()).sum();
@@ -42,12 +41,11 @@ impl Scratch {
         Ok(self.budget.check()?)
     }
 
-    /// Returns buffers that no search uses: those of the last search if it is over, else new ones.
+    /// Returns unshared buffers: those of the last search if it is over, else new ones.
     fn take(&mut self) -> &mut CentroidScores {
         if Arc::get_mut(&mut self.scored).is_none() {
             *self = Self { budget: std::mem::take(&mut self.budget), ..Self::default() };
         }
-        // New if it was shared.
         Arc::get_mut(&mut self.scored).unwrap_or_else(|| unreachable!("the only owner"))
     }
 
@@ -55,14 +53,13 @@ impl Scratch {
         Search { asked, buffers: Arc::clone(&self.buffers) }
     }
 
-    /// Returns whether no centroids were scored in these buffers yet.
     #[cfg(test)]
     pub(crate) fn is_untouched(&self) -> bool {
         self.scored.shards.is_empty()
     }
 }
 
-/// One question's centroid scores over a set of shards; gives several kinds of answers without scoring twice.
+/// One question's centroid scores over a set of shards, reusable for several kinds of answers.
 pub struct Search<'a> {
     pub(super) asked: AskedQuestion<'a>,
     /// Shared by the searches of a batch.
@@ -70,7 +67,7 @@ pub struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    /// Scores the centroids of the shards that reach into the region: [`Search::batch`] for one question.
+    /// [`Search::batch`] for one question.
     pub fn new(
         shards: &'a [ShardView<'a>],
         question: &'a Question,
@@ -94,8 +91,8 @@ impl<'a> Search<'a> {
 
     /// Scores the centroids for several questions in one pass; returns a search for each, in their order.
     ///
-    /// Costs one product per centroid, component and distinct vector (negatives that questions share are
-    /// multiplied once), in parallel by shard. Reuses the buffers of earlier searches if those are over.
+    /// Costs one product per centroid, component and distinct vector (shared negatives are multiplied once), in
+    /// parallel by shard. Reuses the buffers of earlier searches if those are over.
     pub fn batch(
         scratch: &mut Scratch,
         shards: &'a [ShardView<'a>],
@@ -140,8 +137,8 @@ impl<'a> Search<'a> {
         all
     }
 
-    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from
-    /// `near`, then by cell and index. The selection is exact with respect to the scores returned.
+    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from `near`,
+    /// then by cell and index. The selection is exact with respect to the scores returned.
     pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
         let mut buffers = self.take_buffers();
         let hits = self.asked.best(&mut buffers, limit, threshold, near);
@@ -149,7 +146,7 @@ impl<'a> Search<'a> {
         hits
     }
 
-    /// Takes the shared buffers, or empty ones while another search of the batch holds them. (A lock held over
+    /// Takes the shared buffers, or empty ones while another search of the batch uses them. (A lock held over
     /// parallel work would block the thread that the other search is scheduled on.)
     fn take_buffers(&self) -> AnswerBuffers {
         std::mem::take(&mut *self.buffers.lock().unwrap_or_else(PoisonError::into_inner))
@@ -164,15 +161,13 @@ impl<'a> Search<'a> {
         self.asked.shards
     }
 
-    /// Returns the shards that were searched; the others lie outside the region.
     pub fn searched(&self) -> impl Iterator<Item = &'a ShardView<'a>> {
         let searched =
             self.asked.shards.iter().zip(&self.asked.scored.shards).filter(|(_, scores)| scores.is_searched);
         searched.map(|(shard, _)| shard)
     }
 
-    /// Bounds the error of every score: the difference between the score of a centroid or Gaussian and that
-    /// of any embedding it stands for.
+    /// Bounds every score's difference from the score of any embedding that the centroid or Gaussian represents.
     pub fn score_error_bound(&self) -> f32 {
         let cells = (0..self.asked.shards.len()).into_par_iter().filter_map(|at| self.asked.cell(at));
         let of_cell = |cell: Cell<'_>| {
@@ -181,9 +176,8 @@ impl<'a> Search<'a> {
         cells.map(of_cell).reduce(|| 0.0, f32::max)
     }
 
-    /// Returns the score errors that were measured over a bank of texts, each the maximum over the shards
-    /// searched, so that the likely one holds for each of them; `None` if answers are exact, or if a shard lacks
-    /// measurements for the data read.
+    /// Returns the score errors measured over a bank of texts, each the maximum over the shards searched, so that the
+    /// likely one holds for each; `None` if answers are exact, or a shard lacks measurements for the data read.
     pub(crate) fn measured_errors(&self) -> Option<ScoreErrors> {
         let mut largest: Option<ScoreErrors> = None;
         for shard in self.searched() {
@@ -207,8 +201,7 @@ impl<'a> Search<'a> {
         largest
     }
 
-    /// Returns whether membership is exact: exact embeddings are asked for, and every shard searched has
-    /// them.
+    /// Returns whether membership is exact: exact embeddings are asked for and present in every shard searched.
     pub fn is_exact(&self) -> bool {
         self.asked.precision == Precision::Exact && self.searched().all(|shard| shard.exact.is_some())
     }

@@ -19,7 +19,6 @@ struct Order {
     parts: Vec<Part>,
     runs: Vec<Run>,
     keys: Vec<u64>,
-    /// Hits of one score, with their distances.
     tied: Vec<(f64, Hit)>,
 }
 
@@ -31,7 +30,6 @@ struct Part {
 }
 
 impl AskedQuestion<'_> {
-    /// Returns the `limit` best Gaussians that reach a threshold; see [`super::Search::best`].
     pub(super) fn best(
         &self,
         buffers: &mut AnswerBuffers,
@@ -46,8 +44,7 @@ impl AskedQuestion<'_> {
         let AnswerBuffers { gather, order } = buffers;
         let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
         let cut = if has_detail {
-            // Ranks half as many again by centroid scores: members that rank last by their own scores are
-            // then not among the best.
+            // Half as many again: members ranking last by their own scores are then not among the best.
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
             let floor = self.centroid_score_at(order, enough, f32::NEG_INFINITY);
             self.count(gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
@@ -60,8 +57,8 @@ impl AskedQuestion<'_> {
         hits
     }
 
-    /// Returns the lowest centroid score that must be included for the members of centroids at or above it to
-    /// number `limit` or more; `None` if too few centroids reach the threshold.
+    /// Returns the highest centroid score such that centroids at or above it have `limit` members or more; `None` if
+    /// too few centroids reach the threshold.
     fn centroid_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
         let cells: Vec<Option<Cell<'_>>> = (0..self.shards.len()).map(|at| self.cell(at)).collect();
         let scores = |at: usize| {
@@ -80,7 +77,6 @@ impl AskedQuestion<'_> {
         order.score_at(limit, self.shards.len(), scores, count)
     }
 
-    /// Sorts the gathered runs.
     fn rank(
         &self,
         gather: &Gather,
@@ -97,7 +93,7 @@ impl AskedQuestion<'_> {
         keys.clear();
         // Equal scores keep the order of the runs, which is that of cells and indices.
         keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
-        // No two keys are equal.
+        // All keys differ.
         keys.par_sort_unstable();
         for ties in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
             let first = hits.len();
@@ -129,8 +125,8 @@ impl AskedQuestion<'_> {
 impl Order {
     /// Returns the score of the Gaussian at a rank, counted from 1 for the best; `None` if there are fewer.
     ///
-    /// `scores` gives the scores at each of `n_places`; `count` gives the number of Gaussians with each. A
-    /// histogram locates the bin of the rank, and only that bin is sorted.
+    /// `scores`: by place, of `n_places`; `count`: the number of Gaussians with each. Sorts only the rank's bin,
+    /// found by a histogram.
     fn score_at<I: Iterator<Item = (f32, usize)>>(
         &mut self,
         rank: usize,

@@ -1,4 +1,4 @@
-//! The two integer loops in which queries spend their time, for every supported instruction set.
+//! The two integer loops that dominate queries, for every supported instruction set.
 //!
 //! All sums are integers and none can overflow, so every instruction set gives the same bits.
 
@@ -11,21 +11,21 @@ use pulp::Scalar;
 use slag_common::shard::BLOCK;
 use slag_math::simd::Work;
 
-/// Vectors are zero-padded to a multiple of this many components: the width of the widest instruction set.
+/// Vectors are zero-padded to a multiple of this many components, the width of the widest instruction set.
 pub const PAD: usize = 32;
-/// Rows multiplied together, so that their sums are reduced together.
+/// Rows multiplied at a time, so that their sums are reduced together.
 pub const ROWS: usize = 4;
 
 /// One byte column of a block of Gaussians, or the codewords of a subspace for each half of a byte shuffle.
 pub type Column = [u8; BLOCK];
 
 pub trait Kernels: Copy {
-    /// Returns the products of rows with a vector. All have the same length, a multiple of [`PAD`].
+    /// Returns the products of rows, all of the same length, a multiple of [`PAD`], with a vector.
     fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];
 
-    /// Returns, for each Gaussian of a block, the sum of the values that its codes select. `low`, `high`: for
-    /// each byte column the 16 values of the subspace in the low and in the high half, twice over. With at
-    /// most 64 columns no sum exceeds 16 bits.
+    /// Returns, for each Gaussian of a block, the sum of the values selected by its codes. `low`, `high`: for each
+    /// byte column the 16 values of the subspace in the low and in the high half, twice over. With at most 64 columns
+    /// no sum exceeds 16 bits.
     fn block_sums(self, columns: &[Column], low: &[Column], high: &[Column]) -> [u16; BLOCK];
 
     /// Returns one bit for each sum of a block, lowest bit first: whether the sum is at least `least`.
@@ -62,7 +62,6 @@ fn dot(row: &[i8], vector: &[i16]) -> i32 {
     row.iter().zip(vector).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
 }
 
-/// Multiplies every row of a matrix with a vector; the products come in the order of the rows.
 pub struct MatrixTimesVector<'a, F> {
     /// `[n][n_components]`.
     pub rows: &'a [i8],
@@ -79,10 +78,9 @@ impl<K: Kernels, F: FnMut(usize, i32)> Work<K> for MatrixTimesVector<'_, F> {
     #[inline(always)]
     fn run(self, kernels: K) {
         let Self { rows, n_components, vector, mut put } = self;
-        // Rows without components have no products, and their number is unknown.
+        // Without components there are no products, and the number of rows is unknown.
         let Some(n_rows) = rows.len().checked_div(n_components) else { return };
-        // Components read past a row's end meet the padding's zeros. The last rows cannot be read
-        // past their end.
+        // Components read past a row's end meet the padding's zeros. The last rows cannot be read past their end.
         let n_padded = (rows.len() + n_components).saturating_sub(vector.len()) / n_components;
         let n_together = n_padded.min(n_rows) / ROWS * ROWS;
         for at in (0..n_together).step_by(ROWS) {
@@ -101,7 +99,6 @@ impl<K: Kernels, F: FnMut(usize, i32)> Work<K> for MatrixTimesVector<'_, F> {
     }
 }
 
-/// Sums the values of a block's codes, see [`Kernels::block_sums`].
 pub struct BlockSums<'a> {
     pub columns: &'a [Column],
     /// Values of the subspaces in the low halves.
@@ -119,7 +116,6 @@ impl<K: Kernels> Work<K> for BlockSums<'_> {
     }
 }
 
-/// The sums of the block read last.
 #[derive(Clone, Debug, Default)]
 pub struct LastBlock {
     pub block: Option<usize>,
@@ -210,8 +206,7 @@ mod tests {
     use slag_math::random::Random;
     use slag_math::simd::InstructionSet;
 
-    /// Oracle: plain 64-bit sums. Covers lengths around every width, extreme values, and the last rows,
-    /// which cannot be read past their end.
+    /// Oracle: plain 64-bit sums. Lengths around every width, extreme values, rows that end the matrix.
     #[test]
     fn products_are_the_sums_with_every_instruction_set() {
         let mut random = Random::new(11);

@@ -13,8 +13,8 @@ use slag_math::random::Random;
 /// Positions spread over all 16 bits, so that a ball can cover a shard.
 const STEPS_PER_UNIT: f64 = 5000.0;
 
-/// Shards whose scores by [`exact_question`] are exact in f32, in f64 and in any order of addition:
-/// components are multiples of 1/2. Ties are frequent.
+/// Shards whose scores by [`exact_question`] are exact in f32, in f64 and in any order of addition: components are
+/// multiples of 1/2. Ties are frequent.
 fn exact_shards() -> impl Strategy<Value = Vec<TestShard>> {
     let component = (-2i32..=2).prop_map(|v| v as f32 / 2.0);
     let member = (prop::array::uniform3(0u16..13), prop::collection::vec(component, 4))
@@ -116,15 +116,13 @@ pub(super) fn views(built: &[BuiltShard]) -> Vec<ShardView<'_>> {
 }
 
 proptest! {
-    /// Oracle: every Gaussian scored in f64; exact arithmetic, so the sets and orders must be equal, for
-    /// each question of a batch and for one asked alone.
+    /// Oracle: every Gaussian scored in f64. Arithmetic is exact, so sets and orders are equal, in a batch and alone.
     #[test]
     fn equals_brute_force(
         shards in exact_shards(), is_exact in any::<bool>(), centroids_only in any::<bool>(),
         questions in prop::collection::vec(exact_question(), 1..4), threshold in -16i32..16, limit in 0usize..30,
         region in region(), near in prop::option::of(prop::array::uniform3(-20i32..20)),
     ) {
-        // Cells come in any order: ids and indices differ.
         let built: Vec<_> = shards.iter().rev().map(|s| s.build(is_exact)).collect();
         let views = views(&built);
         let threshold = threshold as f32 / 8.0;
@@ -177,8 +175,7 @@ fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: u
     (0..n_shards).map(&mut shard).collect()
 }
 
-/// The bound holds for every Gaussian's unrounded embedding. Compact membership is wrong only within the
-/// bound, exact membership only in the last bits.
+/// The bound holds for every unrounded embedding. Compact membership errs within the bound, exact in the last bits.
 #[test]
 fn answers_keep_within_the_stated_bound() {
     let mut random = Random::new(1);

@@ -1,4 +1,4 @@
-//! Cells whose shards could not be fetched, or not be opened: each costs that cell only.
+//! Cells with shards that could not be fetched or opened: each costs that cell only.
 
 use std::fmt;
 
@@ -70,8 +70,8 @@ pub fn cell_of(manifest: &Manifest, cell_id: u32) -> Option<&CellRecord> {
     manifest.cells.get(position).filter(|cell| cell.cell_id == cell_id)
 }
 
-/// Returns whether an earlier generation's shard of a cell may stand beside the shards of a new one: both
-/// describe the same Gaussians, in the same frame and embedding space.
+/// Returns whether an earlier generation's shard of a cell may be used with a new generation: both describe the same
+/// Gaussians, in the same frame and embedding space.
 pub fn can_stand_in(old: &Manifest, new: &Manifest, cell_id: u32) -> bool {
     let is_same_scene = old.scene == new.scene
         && (old.encoder.id, old.encoder.dim) == (new.encoder.id, new.encoder.dim)

@@ -43,7 +43,6 @@ impl Current {
         self.cells.iter().map(|cell| cell.hash).chain(old)
     }
 
-    /// Returns the shards of earlier generations that answer for bad cells.
     pub(crate) fn old_shards(&self) -> impl Iterator<Item = (u32, OldShard)> + '_ {
         self.bad_cells.iter().filter_map(|bad| Some((bad.cell_id, bad.old?)))
     }
@@ -83,8 +82,8 @@ impl EdgeCache {
         &*self.files
     }
 
-    /// Creates a folder of the cache, durably. A file in its place is removed, as a folder in a file's place is; what
-    /// the user named stays, and so do links.
+    /// Creates a folder of the cache, durably. A file in its place is removed, as is a folder in a file's place; the
+    /// user's own path and links stay.
     pub fn create_dir(&self, dir: &Path) -> io::Result<()> {
         let made = self.files.create_dir(dir);
         let is_taken = made.as_ref().is_err_and(|e| e.kind() == io::ErrorKind::AlreadyExists);
@@ -111,7 +110,7 @@ impl EdgeCache {
         self.dir.join("manifests").join(hash.to_string())
     }
 
-    /// Returns the state of `current` without opening it; it changes whenever a fetch replaces the file.
+    /// Returns the state of `current` without opening it; changes with every replacement by a fetch.
     pub fn current_stat(&self) -> Result<Option<Stat>, StoreError> {
         Ok(self.files.stat(&self.current_path())?)
     }

@@ -1,6 +1,5 @@
-//! Shards on board that a reader found damaged. Readers hold no lock, so that they only leave a mark: an empty
-//! file `damaged/HASH`. A marked shard is not opened any more, and the next fetch downloads it again, unread: a
-//! sector that cannot be read would end the program that maps it.
+//! Shards on board found damaged. Readers hold no lock, so they only leave a mark, `damaged/HASH` (empty). Marked
+//! shards are not opened, and the next fetch replaces them unread: mapping an unreadable sector ends the program.
 
 use std::collections::BTreeSet;
 
@@ -21,12 +20,11 @@ pub fn mark(cache: &EdgeCache, hash: Hash32) {
 }
 
 pub fn marked(cache: &EdgeCache) -> BTreeSet<Hash32> {
-    // Without a folder nothing is marked.
     let names = cache.files().list(&cache.damaged_dir()).unwrap_or_default();
     names.iter().filter_map(|name| name.parse().ok()).collect()
 }
 
-/// Removes marks: the shards are replaced, or no longer on board.
+/// Removes marks of shards that were replaced or are no longer on board.
 pub fn unmark<'a>(cache: &EdgeCache, hashes: impl IntoIterator<Item = &'a Hash32>) -> std::io::Result<()> {
     let dir = cache.damaged_dir();
     hashes.into_iter().try_for_each(|hash| cache.files().remove(&dir.join(hash.to_string())))

@@ -38,14 +38,13 @@ pub enum StoreError {
 
 impl From<io::Error> for StoreError {
     fn from(e: io::Error) -> Self {
-        // `InvalidData`: the file is longer than it may be.
+        // `InvalidData`: the file is too long.
         let is_damaged = is_bad_medium(&e) || e.kind() == io::ErrorKind::InvalidData;
         if is_damaged { Self::Unreadable(e) } else { Self::Io(e) }
     }
 }
 
 impl StoreError {
-    /// Returns whether a file is damaged, so that the next fetch must replace it.
     pub(crate) fn is_damage(&self) -> bool {
         use StoreError::{Hash, Mismatch, Shard, Unreadable};
         matches!(self, Shard { .. } | Mismatch { .. } | Hash { .. } | Unreadable(_))

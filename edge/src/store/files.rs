@@ -10,7 +10,7 @@ use slag_common::container::AlignedBytes;
 
 use super::mmap::{self, FileBytes};
 
-/// The medium does not give a file back: a bad sector, a broken inode.
+/// The medium cannot read a file: a bad sector, a broken inode.
 #[derive(Debug, thiserror::Error)]
 #[error("{path} cannot be read: {source}", path = path.display())]
 struct BadMedium {
@@ -18,15 +18,14 @@ struct BadMedium {
     source: io::Error,
 }
 
-/// Returns whether the medium failed: reading again does not help, and neither do other rights or more space.
+/// Returns whether the medium failed: retries, permissions or space do not help.
 pub fn is_bad_medium(e: &io::Error) -> bool {
     e.get_ref().is_some_and(|inner| inner.is::<BadMedium>())
 }
 
-/// Returns a function that adds a path to an error of the system.
 fn at(path: &Path) -> impl Fn(io::Error) -> io::Error {
-    // What file systems and block devices answer with. Linux: EIO, ENXIO, EBADE, ENODATA, ENOLINK, EBADMSG,
-    // EILSEQ, ETIMEDOUT, EUCLEAN (a broken inode), EREMOTEIO.
+    // Error codes of file systems and block devices. Linux: EIO, ENXIO, EBADE, ENODATA, ENOLINK, EBADMSG, EILSEQ,
+    // ETIMEDOUT, EUCLEAN (a broken inode), EREMOTEIO.
     let codes: &[i32] = match cfg!(target_os = "linux") {
         true => &[5, 6, 52, 61, 67, 74, 84, 110, 117, 121],
         false => &[5],
@@ -37,8 +36,7 @@ fn at(path: &Path) -> impl Fn(io::Error) -> io::Error {
     }
 }
 
-/// Opens a file of the cache to read. What else stands at its place is refused: a pipe keeps its reader waiting,
-/// perhaps for ever.
+/// Opens a file of the cache to read. Other kinds are refused: a pipe could block its reader for ever.
 fn open(path: &Path) -> io::Result<File> {
     let flags = rustix::fs::OFlags::NONBLOCK.bits() as i32;
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path).map_err(at(path))?;
@@ -49,18 +47,16 @@ fn open(path: &Path) -> io::Result<File> {
     Err(bad_medium(path, io::Error::new(io::ErrorKind::InvalidData, what)))
 }
 
-/// Removes what is no file from a file's place: a rename does not replace a folder, and a pipe keeps its writer
-/// waiting. Links stay.
+/// Removes a folder, which a rename does not replace, or a pipe, which blocks its writer. Links stay.
 fn make_way(path: &Path) -> io::Result<()> {
     match fs::symlink_metadata(path) {
         Ok(about) if about.is_dir() => fs::remove_dir_all(path).map_err(at(path)),
         Ok(about) if !about.is_file() && !about.is_symlink() => fs::remove_file(path).map_err(at(path)),
-        // What is wrong with the path, its user tells.
+        // The user of the path reports its errors.
         _ => Ok(()),
     }
 }
 
-/// Returns the error of a medium that does not give a file back.
 pub fn bad_medium(path: &Path, source: io::Error) -> io::Error {
     io::Error::new(source.kind(), BadMedium { path: path.to_owned(), source })
 }
@@ -70,20 +66,19 @@ pub struct Stat {
     pub len_bytes: u64,
     /// Time of the last change, if the file system records it.
     pub modified: Option<SystemTime>,
-    /// Inode number.
     pub inode: u64,
 }
 
 /// File operations of the cache.
 ///
-/// Errors are those of the file system, with the path. All paths are the cache's own: a folder, a pipe or a device in
-/// a file's place is not read, and is removed where a file is written, renamed or removed. Nothing is durable before [`Files::sync`] of the file
-/// and [`Files::sync_dir`] of its folder.
+/// Errors are those of the file system, with the path. All paths are the cache's own: a folder, pipe or device in a
+/// file's place is never read, and removed where a file is written, renamed or removed. Nothing is durable before
+/// [`Files::sync`] of the file and [`Files::sync_dir`] of its folder.
 pub trait Files: Send + Sync {
     /// Creates a folder and its parents, durably.
     fn create_dir(&self, dir: &Path) -> io::Result<()>;
-    /// Writes at an offset, creating the file if necessary, and truncates it behind the new bytes. Bytes
-    /// between the old end and the offset are zero.
+    /// Writes at an offset, creating the file if necessary, and truncates it after the new bytes. Bytes between the
+    /// old end and the offset are zero.
     fn write_from(&self, path: &Path, offset_bytes: u64, bytes: &[u8]) -> io::Result<()>;
     fn sync(&self, path: &Path) -> io::Result<()>;
     /// Renames within the cache, replacing the target.
@@ -95,15 +90,15 @@ pub trait Files: Send + Sync {
     /// Returns the names of the files in a folder, sorted; skips names that are not UTF-8.
     fn list(&self, dir: &Path) -> io::Result<Vec<String>>;
     fn read(&self, path: &Path, max_bytes: u64) -> io::Result<AlignedBytes>;
-    /// Maps an immutable file. A page that cannot be read then ends the program: read the file before.
+    /// Maps an immutable file. An unreadable page then ends the program: read the file first.
     fn map(&self, path: &Path) -> io::Result<FileBytes>;
     /// Returns a file's metadata; `None` if it does not exist.
     fn stat(&self, path: &Path) -> io::Result<Option<Stat>>;
-    /// Returns the free space of the file system that holds a folder, as far as this user may use it.
+    /// Returns the free space for this user on a folder's file system.
     fn free_bytes(&self, dir: &Path) -> io::Result<u64>;
 }
 
-/// Replaces a small file durably by way of one aside: its path always holds the old or the new content, whole.
+/// Replaces a small file durably by renaming another: its path always holds the old or the new content, whole.
 pub fn put_through(files: &dyn Files, aside: &Path, bytes: &[u8], path: &Path) -> io::Result<()> {
     files.write_from(aside, 0, bytes)?;
     files.sync(aside)?;
@@ -159,7 +154,7 @@ impl Files for DiskFiles {
         let mut names = Vec::new();
         for entry in fs::read_dir(dir).map_err(at(dir))? {
             let entry = entry.map_err(at(dir))?;
-            // An entry whose kind cannot be read is a file that cannot be read.
+            // An entry of unreadable kind is listed, as an unreadable file.
             if entry.file_type().is_ok_and(|kind| !kind.is_file()) {
                 continue;
             }
@@ -179,7 +174,7 @@ impl Files for DiskFiles {
             );
             return Err(io::Error::new(io::ErrorKind::InvalidData, what));
         }
-        // Whatever the code: the file is open, and it does not give its bytes.
+        // Whatever the code: the file is open, but its bytes cannot be read.
         AlignedBytes::read_from(file, len_bytes as usize).map_err(|e| bad_medium(path, e))
     }
 

@@ -1,9 +1,7 @@
-//! The objects of generations that the robot has had: a small record of each, `history/GENERATION`, so that
-//! generations can be compared after their shards are gone.
+//! Objects of earlier generations, `history/GENERATION`, to compare generations after their shards are gone.
 //!
-//! A record is a container (`slag_common::container`) of JSON, vectors (`[n][dim]` i8) and their steps (`[n]`
-//! f32). It may be lost at any time: one that is missing or damaged only means that its generation is not
-//! compared.
+//! A record is a container (`slag_common::container`) of JSON, vectors (`[n][dim]` i8) and their steps (`[n]` f32).
+//! Without it, or if it is damaged, its generation is merely not compared.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -19,17 +17,16 @@ use slag_common::objects::{Place, Thing, is_unchanged, quantise_vectors};
 use super::cache::EdgeCache;
 use super::shard::OpenShard;
 
-/// Generations that are remembered, the newest.
+/// Newest generations kept.
 pub const MAX_GENERATIONS: usize = 8;
-/// Things of a generation that are remembered: those of the cells nearest to the fetch's centre.
+/// Most objects kept of a generation: those of the cells nearest to the fetch's centre.
 const MAX_THINGS: usize = 4096;
-/// Cells that are listed, those with a shard and those without; a generation with more is not remembered.
+/// Most cells listed, with or without a shard; a generation with more is not recorded.
 const MAX_CELLS: usize = 16_384;
-/// A longer record is not read: 4096 things with 1,024 components and long names take less.
+/// A longer record is ignored: 4096 objects with 1,024 components and long names take less.
 const MAX_BYTES: u64 = 8 << 20;
 const MAGIC: [u8; 8] = *b"SLAGHIST";
 const VERSION: u32 = 1;
-/// Section ids.
 const ABOUT: u32 = 1;
 const VECTORS: u32 = 2;
 const STEPS: u32 = 3;
@@ -61,8 +58,7 @@ struct Missing {
 }
 
 impl Record {
-    /// Collects the objects of shards of one generation, those nearest to `centre` first if they are too many.
-    /// `None`: there are none, or there is too much to remember.
+    /// Collects one generation's objects, those nearest to `centre` if too many; `None`: none, or too much to record.
     pub fn collect<'a>(
         manifest: &Manifest,
         centre: DVec3,
@@ -102,7 +98,7 @@ impl Record {
         (!known.is_empty() && is_small).then_some(record)
     }
 
-    /// Adds a record of the same generation, made elsewhere. If both are too much together, the newer one is kept.
+    /// Adds another record of the same generation. If both are too much together, the newer one is kept.
     #[must_use]
     pub fn with(self, newer: Self) -> Self {
         let mut things: BTreeMap<u64, Thing> = self.things.into_iter().map(|of| (of.id, of)).collect();
@@ -119,14 +115,13 @@ impl Record {
         Self { missing, places, things: things.into_values().collect(), ..newer }
     }
 
-    /// Returns whether a thing of another generation that is not in this one is not there: its box touches no cell
-    /// whose objects are not known, and the splat there is not the other's.
+    /// Returns whether a thing of another generation that is missing here is gone: its box touches no cell with
+    /// unknown objects, and the splat there is not the other's.
     pub fn tells_of(&self, thing: &Thing, other: &[Place]) -> bool {
         !self.missing.iter().any(|cell| cell.bounds.touches(&thing.box_in_world))
             && !is_unchanged(thing, other, &self.places)
     }
 
-    /// Returns the cells whose objects are known.
     pub fn places(&self) -> &[Place] {
         &self.places
     }
@@ -186,7 +181,7 @@ pub fn generations(cache: &EdgeCache) -> Vec<u64> {
     generations
 }
 
-/// Returns the record of a generation of a scene; `None` if it is missing, damaged, or of another scene.
+/// Returns the record of a generation of a scene; `None` if missing, damaged, or of another scene.
 pub fn read(cache: &EdgeCache, scene: &str, generation: u64) -> Option<Record> {
     let bytes = cache.files().read(&path(cache, generation), MAX_BYTES).ok()?;
     let record = Record::parse(&bytes).inspect_err(|e| {

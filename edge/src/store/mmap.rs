@@ -26,13 +26,12 @@ impl Deref for FileBytes {
     }
 }
 
-/// Maps a file that is opened to read. `path`: its, for errors.
+/// Maps a file opened for reading. `path`: for errors.
 ///
-/// The file must not change any more: shards never do once they are renamed into place, and a staged file is
-/// mapped only after its last write, by the process that holds the cache's lock.
+/// The file must not change any more: shards never do once renamed into place, and a staged file is mapped only after
+/// its last write, by the holder of the cache's lock.
 #[expect(unsafe_code, reason = "mapping a file is unsafe by nature; every other module is safe")]
 pub fn map(file: &File, path: &Path) -> io::Result<FileBytes> {
-    // Not every system can map an empty file.
     if file.metadata()?.len() == 0 {
         return Ok(FileBytes::Read(AlignedBytes::default()));
     }

@@ -1,4 +1,4 @@
-//! The cache on the robot: its files, and how a consistent set of them is opened.
+//! The cache on the robot: its files, and how readers open a consistent set.
 //!
 //! | path | content | changed by |
 //! |---|---|---|
@@ -13,8 +13,7 @@
 //! | `usage.json` | when each shard was needed last; may be lost | fetch: replaced whole |
 //! | `lock` | locked by the one fetch | |
 //!
-//! Readers need no lock: they read `current` and the files it names, and start over if a fetch replaces it
-//! meanwhile.
+//! Readers need no lock: they read `current` and the files it names, and start over if a fetch replaces it meanwhile.
 
 mod bad_cell;
 mod cache;

@@ -1,7 +1,7 @@
 //! Index of the objects on board: the shards and Gaussians of each, built once when a generation is opened.
 //!
-//! An object that reaches into several cells is stored in all of their shards. Vectors, records and run ends
-//! stay there; the index takes 4 bytes for a run of Gaussians and about 30 for an object.
+//! An object in several cells is stored in all of their shards. Vectors, records and run ends stay there; the index
+//! takes 4 bytes for a run of Gaussians and about 30 for an object.
 
 use std::ops::Range;
 
@@ -9,7 +9,6 @@ use slag_common::objects::{NO_OBJECT, Objects};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Part {
-    /// Index of the shard in the generation.
     pub shard: u32,
     pub number: u32,
 }
@@ -17,9 +16,8 @@ pub struct Part {
 /// The objects of a generation, by id, ascending.
 #[derive(Debug, Default)]
 pub struct ObjectIndex {
-    /// `[n + 1]`: where each object's parts start.
+    /// `[n + 1]`: starts of the objects' parts.
     starts: Vec<u32>,
-    /// By object, then by shard.
     parts: Vec<Part>,
     shards: Vec<ShardIndex>,
 }
@@ -28,7 +26,7 @@ pub struct ObjectIndex {
 struct ShardIndex {
     /// Objects without a part in an earlier shard: their number in this shard, ascending, and the object.
     first: Vec<(u32, u32)>,
-    /// `[n + 1]`: where each object's runs start.
+    /// `[n + 1]`: starts of the objects' runs.
     run_starts: Vec<u32>,
     /// Runs, ordered by object number.
     runs: Vec<u32>,
@@ -68,8 +66,8 @@ impl ObjectIndex {
         &self.parts[self.starts[object] as usize..self.starts[object + 1] as usize]
     }
 
-    /// Returns the objects with their first part in a shard: their number there, ascending, and the object.
-    /// Every object is in exactly one shard's list.
+    /// Returns the objects with their first part in this shard (each is in exactly one shard's list): their number
+    /// there, ascending, and the object.
     pub(crate) fn first_in(&self, shard: usize) -> &[(u32, u32)] {
         &self.shards[shard].first
     }

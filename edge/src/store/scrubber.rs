@@ -1,4 +1,4 @@
-//! Reads shards on board again, one at a time, and marks those that rotted.
+//! Rereads shards on board, one at a time, and marks rotten ones.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -18,16 +18,15 @@ pub struct Scrubber {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scrubbed {
     pub cell_id: u32,
-    /// Its part of all bytes on board, above 0 up to 1.
+    /// Its share of all bytes on board, above 0 up to 1.
     pub share: f64,
-    /// Whether its bytes have their hash; otherwise it is marked.
+    /// Whether the hash matches; otherwise it is marked.
     pub is_sound: bool,
 }
 
 impl Scrubber {
-    /// Reads the shard of a generation that was read longest ago; `None` if it has none. Takes as much memory as
-    /// the shard meanwhile: a sector that cannot be read is an error of `read`, but ends a program that reads it
-    /// through a map.
+    /// Reads the shard of a generation that was read longest ago; `None` if it has none. Takes the shard's length in
+    /// memory: an unreadable sector is an error of `read`, but would end a program that maps it.
     pub fn step(&mut self, cache: &EdgeCache, snapshot: &Snapshot) -> Option<Scrubbed> {
         let hashes = || snapshot.shards.iter().map(|shard| (shard.hash(), shard));
         let n_before = self.read.len();
@@ -47,7 +46,7 @@ impl Scrubber {
         self.n_steps += 1;
         match is_sound {
             true => drop(self.read.insert(hash, self.n_steps)),
-            // Read again at once if it is still in use then.
+            // Read again at once if still in use.
             false => {
                 let error =
                     read.err().map_or_else(|| "its bytes have another hash".to_owned(), |e| e.to_string());

@@ -52,7 +52,7 @@ impl OpenShard {
         let is_listed = cell_of(manifest, at.cell_id) == Some(&self.cell) && self.profile == profile;
         let is_named = self.hash() == Some(at.hash);
         let is_readable = (header.dim, header.encoder_id) == (manifest.encoder.dim, manifest.encoder.id.0);
-        // Storage without times cannot show that a file was replaced.
+        // Without timestamps, storage cannot show that a file was replaced.
         let is_unchanged = self.stat.is_some_and(|stat| stat.modified.is_some())
             && cache.files().stat(&cache.shard_path(at.hash)).is_ok_and(|stat| stat == self.stat);
         is_listed && is_named && is_readable && is_unchanged
@@ -69,7 +69,7 @@ impl OpenShard {
         let stat = cache.files().stat(&path)?;
         let (cell, layout) = check_file(cache, &path, at, profile, manifest)?;
         let bytes = match cache.files().map(&path) {
-            // A fetch may remove it between the two.
+            // A fetch may remove it in between.
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
             other => other?,
         };
@@ -80,8 +80,7 @@ impl OpenShard {
     }
 }
 
-/// Reads a file and checks it as [`check_shard`] does. Not through a map, where a page that cannot be read ends
-/// the program.
+/// Reads a file and checks it as [`check_shard`] does. Not through a map, where an unreadable page ends the program.
 pub fn check_file<'a>(
     cache: &EdgeCache,
     path: &Path,
@@ -98,7 +97,7 @@ pub fn check_file<'a>(
     check_shard(path, &bytes, at, profile, manifest)
 }
 
-/// Checks that bytes are an intact shard, and the one that a manifest lists for a cell.
+/// Checks that bytes are an intact shard, and the manifest's shard of a cell.
 pub fn check_shard<'a>(
     path: &Path,
     bytes: &[u8],

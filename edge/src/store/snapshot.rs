@@ -19,7 +19,7 @@ use super::shard::OpenShard;
 /// Attempts of a reader while fetches replace `current`.
 const MAX_RACES: usize = 16;
 
-/// An open generation: immutable however many fetches follow.
+/// An open generation, unaffected by later fetches.
 #[derive(Debug)]
 pub struct Snapshot {
     pub current: Current,
@@ -28,10 +28,9 @@ pub struct Snapshot {
     pub manifest: Manifest,
     /// The shards, by cell id, ascending; shared with snapshots of other generations that list them.
     pub shards: Vec<Arc<OpenShard>>,
-    /// Cells within the radius whose shards could not be fetched or opened; some have an earlier generation's
-    /// shard.
+    /// Cells within the radius with unavailable shards; some have an earlier generation's shard.
     pub bad_cells: Vec<BadCell>,
-    /// Whether a shard could not be opened for a reason that may pass, such as too many open files.
+    /// Whether a shard failed to open for a passing reason, such as too many open files.
     pub may_recover: bool,
     pub objects: ObjectIndex,
 }
@@ -41,20 +40,20 @@ impl Snapshot {
     /// and is marked for the next fetch.
     ///
     /// # Errors
-    /// [`StoreError`]; that of the first shard if none opens. A fetch that replaces `current` meanwhile is not an error.
+    /// [`StoreError`]; that of the first shard if none opens. A fetch that replaces `current` meanwhile is not an
+    /// error.
     pub fn open(cache: &EdgeCache) -> Result<Self, StoreError> {
         Self::open_after(cache, None)
     }
 
-    /// Opens the current generation as [`Snapshot::open`] does, and takes over the shards that a snapshot of
-    /// the same cache has open: they are neither mapped nor checked again.
+    /// As [`Snapshot::open`], but shards that a snapshot of the same cache has open are not mapped or checked again.
     pub fn open_after(cache: &EdgeCache, before: Option<&Self>) -> Result<Self, StoreError> {
         let mut seen = None;
         for _ in 0..MAX_RACES {
             let current_stat = cache.current_stat()?;
             let current =
                 cache.current()?.ok_or_else(|| StoreError::Empty { path: cache.dir().to_owned() })?;
-            // A fetch removes the files of the old `current` after it has put the new one in place.
+            // A fetch removes the old files after replacing `current`.
             let is_settled = seen.as_ref() == Some(&current);
             match Self::open_current(cache, current.clone(), current_stat, before, is_settled) {
                 Err(StoreError::Missing { .. }) if !is_settled => seen = Some(current),
@@ -81,7 +80,7 @@ impl Snapshot {
         for (cell, opened) in current.cells.iter().zip(opened) {
             match opened {
                 Ok(shard) => shards.push(shard),
-                // Not the shard's fault, but that of `current`; or that of a reader who is late.
+                // The fault of `current`, or of a late reader, not of the shard.
                 Err(e @ StoreError::Unlisted { .. }) => return Err(e),
                 Err(e @ StoreError::Missing { .. }) if !is_settled => return Err(e),
                 Err(e) => failures.push((cell, e)),
@@ -126,7 +125,7 @@ struct Opener<'a> {
     cache: &'a EdgeCache,
     profile: Profile,
     marked: BTreeSet<Hash32>,
-    /// Shards that an earlier snapshot has open, by cell.
+    /// Open shards of an earlier snapshot, by cell.
     held: &'a [Arc<OpenShard>],
 }
 
@@ -152,7 +151,7 @@ impl Opener<'_> {
             let may_stand_in = can_stand_in(&of_old, manifest, bad.cell_id);
             may_stand_in.then(|| self.open(&of_old, &cell)).transpose()
         });
-        // Less to answer from; the next fetch tries the cell again.
+        // One cell fewer; the next fetch retries it.
         let warn = |e: &StoreError| {
             tracing::warn!("cell {} has no shard: {}", bad.cell_id, crate::error_line(e));
         };
@@ -160,10 +159,9 @@ impl Opener<'_> {
     }
 }
 
-/// Runs work in parallel on a pool of its own, half as large as the number of cores.
+/// Runs work in parallel on a separate pool of half the cores.
 ///
-/// Queries are split over the global pool; a query queued there behind the checks of many shards would wait
-/// for all of them.
+/// Queries use the global pool; a query queued there behind the checks of many shards would wait for all of them.
 pub(crate) fn beside_queries<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     static POOL: OnceLock<Option<rayon::ThreadPool>> = OnceLock::new();
     let pool = POOL.get_or_init(|| {
@@ -172,7 +170,7 @@ pub(crate) fn beside_queries<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     });
     match pool {
         Some(pool) => pool.install(work),
-        // Slower, if there is no memory for threads.
+        // Serial, if there is no memory for threads.
         None => work(),
     }
 }

@@ -1,7 +1,7 @@
-//! The vectors of the words that things are named by, `words/ENCODER`: large text models take a minute for them.
+//! Vectors of the words for naming, `words/ENCODER`: large text models take a minute for them.
 //!
-//! A container (`slag_common::container`) of the words that were to be encoded and those that the model knew, a line
-//! each, and the latter's vectors, `[n][dim]` f32. It may be lost or damaged at any time: then they are encoded again.
+//! A container (`slag_common::container`) of the requested and the known words, a line each, and the latter's
+//! vectors, `[n][dim]` f32. If missing or damaged, they are encoded again.
 
 use std::io;
 use std::path::PathBuf;
@@ -12,11 +12,10 @@ use slag_common::container::{self, Layout};
 
 use super::cache::EdgeCache;
 
-/// A longer file is not read: 4,096 words with 2,048 components take less.
+/// A longer file is ignored: 4,096 words with 2,048 components take less.
 const MAX_BYTES: u64 = 64 << 20;
 const MAGIC: [u8; 8] = *b"SLAGWORD";
 const VERSION: u32 = 1;
-/// Section ids.
 const ASKED: u32 = 1;
 const KNOWN: u32 = 2;
 const VECTORS: u32 = 3;
@@ -27,7 +26,7 @@ fn path(cache: &EdgeCache, encoder_id: Hash32) -> PathBuf {
     cache.dir().join("words").join(encoder_id.to_string())
 }
 
-/// Returns those of some words that an encoder knows; `None` if they were not kept, or other words were.
+/// Returns the known ones of some words for an encoder; `None` unless kept for exactly these words.
 pub fn read(cache: &EdgeCache, encoder_id: Hash32, dim: usize, asked: &[String]) -> Option<Vec<WordVector>> {
     let bytes = cache.files().read(&path(cache, encoder_id), MAX_BYTES).ok()?;
     let layout = Layout::check(&bytes, MAGIC, VERSION).ok()?;
@@ -42,7 +41,7 @@ pub fn read(cache: &EdgeCache, encoder_id: Hash32, dim: usize, asked: &[String])
     Some(words.map(|(word, vector)| (word.to_owned(), vector.into())).collect())
 }
 
-/// Keeps the words that an encoder knows, in place of those of other encoders.
+/// Keeps the words that an encoder knows, in place of other encoders' words.
 pub fn write(
     cache: &EdgeCache,
     encoder_id: Hash32,
@@ -84,7 +83,6 @@ mod tests {
         write(&cache, Hash32([6; 32]), &asked, &known).expect("kept");
         write(&cache, id, &asked, &known).expect("kept");
         assert_eq!(read(&cache, id, 2, &asked), Some(known));
-        // Other words, another encoder or other vectors, and a file that was cut off.
         assert_eq!(read(&cache, id, 2, &asked[..2]), None);
         assert_eq!(read(&cache, id, 3, &asked), None);
         assert_eq!(read(&cache, Hash32([6; 32]), 2, &asked), None);

@@ -19,8 +19,8 @@ pub struct CodedShard {
     pub has_basis: bool,
     /// 0: no residual code.
     pub n_subspaces: usize,
-    /// Whether exact embeddings are beside the code, and fine residuals: any, for nothing is decided by what is
-    /// not measured, and these errors are stated: [`CODE_ERROR`] and [`FINE_ERROR`].
+    /// Whether exact embeddings and fine residuals accompany the code. The latter are arbitrary: errors of both are
+    /// stated, not measured ([`CODE_ERROR`], [`FINE_ERROR`]).
     pub is_exact: bool,
     pub centroid_lens: Vec<usize>,
     pub origin: DVec3,
@@ -30,7 +30,6 @@ pub struct CodedShard {
 pub const CODE_ERROR: f32 = 0.0033;
 pub const FINE_ERROR: f32 = 0.001;
 
-/// The columns of a shard but the exact ones.
 struct Columns {
     header: ShardHeader,
     positions: Vec<[u16; 3]>,
@@ -48,7 +47,7 @@ struct Columns {
 }
 
 impl CodedShard {
-    /// Writes the shard and reads it back. Embeddings are what it decodes to, off by a little, of unit length.
+    /// Writes the shard and reads it back. Embeddings are the decoded ones, slightly perturbed, of unit length.
     pub fn build(&self, random: &mut Random) -> BuiltShard {
         let mut columns = self.columns(random);
         let (k, m, n) = (columns.residual_scales.len(), self.n_components, columns.positions.len());
@@ -68,7 +67,6 @@ impl CodedShard {
         BuiltShard::read(&bytes, embeddings)
     }
 
-    /// Returns random columns, without radii and reaches.
     fn columns(&self, random: &mut Random) -> Columns {
         let (dim, m) = (self.dim, self.n_components);
         let (k, n) = (self.centroid_lens.len(), self.centroid_lens.iter().sum::<usize>());
@@ -82,7 +80,7 @@ impl CodedShard {
         let (vectors, basis_step) = quantise(&floats(m * dim, 1.2 / (dim as f32).sqrt()));
         let steps = floats(m, 0.5).iter().map(|v| basis_step * (1.0 + v)).collect();
         let mean = floats(dim, 0.5 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
-        // The last component is left without a codeword where there is room.
+        // The last component has no codeword if possible.
         let n_coded = if m > self.n_subspaces { m - 1 } else { m };
         let subspace_starts =
             (0..=self.n_subspaces).map(|g| (n_coded * g / self.n_subspaces.max(1)) as u32).collect();
@@ -139,7 +137,6 @@ impl CodedShard {
         }
     }
 
-    /// Makes embeddings, and measures radii and reaches.
     fn measure(&self, columns: &mut Columns, random: &mut Random) -> Vec<Vec<f32>> {
         let measured = self.view(columns);
         let (mut radii, mut reaches) = (columns.radii.clone(), columns.reaches.clone());

@@ -15,8 +15,8 @@ use super::{Robot, assert_holds};
 use slag_math::random::Random;
 use slag_test_support::trials;
 
-/// Damages one copy of what the robot believes, or neither: the medium rots while the power is off. Only if the
-/// power cut damaged none: together they would be two faults.
+/// Damages one copy of the trust records, or neither: the medium rots while the power is off. Only if the power cut
+/// damaged none: together they would be two faults.
 pub fn rot_one_copy(files: &SimFiles, cache: &Path, seed: u64) {
     let mut random = Random::new(seed ^ 0x726f_7474);
     let copies = ["0", "1"].map(|name| cache.join("trust").join(name));
@@ -63,12 +63,12 @@ impl Trial {
     fn cut(&self, step: u64, seed: u64) -> bool {
         let files = Arc::new(self.before.fork(Some(step), seed));
         let (_, result) = self.fetch(&files, 1);
-        // The records of use come last, and fail no fetch.
+        // Usage records come last, and fail no fetch.
         assert!(result.is_err() || files.n_steps() == step, "step {step} seed {seed}: the cut came too late");
         self.recover(&files, seed, &format!("step {step} seed {seed}"))
     }
 
-    /// Restores the power, checks that a whole generation is there and that the next fetch works.
+    /// Restores the power; checks for a whole generation and that the next fetch works.
     fn recover(&self, files: &SimFiles, seed: u64, context: &str) -> bool {
         let files = Arc::new(files.after_power_cut(seed));
         let robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
@@ -106,7 +106,7 @@ fn a_power_cut_at_any_step_leaves_a_whole_generation() {
     assert!(n_new > 0 && n_new < n_steps * 6, "{n_new} of {n_steps} steps: both outcomes are seen");
 }
 
-/// A killed process leaves unsynced data behind; the next fetch must not build on it.
+/// A killed process leaves unsynced data; the next fetch must not rely on it.
 #[test]
 fn a_power_cut_after_a_killed_fetch() {
     let trial = Trial::new();
@@ -116,7 +116,7 @@ fn a_power_cut_after_a_killed_fetch() {
         for seed in kill_step * 100..kill_step * 100 + trials(2, 8) {
             let killed = Arc::new(trial.before.fork(Some(kill_step), seed));
             let _ = trial.fetch(&killed, 1);
-            // The step may come after the second fetch; then the power fails after it.
+            // If the step comes after the second fetch, the power fails after it.
             let cut_step = 1 + Random::new(seed).below(files.n_steps());
             let second = Arc::new(killed.fork(Some(cut_step), seed));
             let outcome = trial.fetch(&second, 1).1;
@@ -126,7 +126,7 @@ fn a_power_cut_after_a_killed_fetch() {
     }
 }
 
-/// The very first fetch: nothing, or the whole generation.
+/// The very first fetch leaves nothing, or the whole generation.
 #[test]
 fn a_power_cut_in_the_first_fetch() {
     let scene = Published::new(1, &[0; 3], 100);
@@ -148,7 +148,7 @@ fn a_power_cut_in_the_first_fetch() {
     }
 }
 
-/// The free space is known, or other programs use it up meanwhile.
+/// With known free space, and with other programs using it up meanwhile.
 #[test]
 fn a_full_disk_leaves_the_old_generation() {
     let trial = Trial::new();
@@ -172,7 +172,7 @@ fn a_full_disk_leaves_the_old_generation() {
                     assert!(is_known && staged.is_empty(), "nothing is begun: {staged:?}");
                     assert!(needed_bytes > free_bytes, "{needed_bytes} are needed of {free_bytes}");
                 }
-                // The record of trust comes before the look at the free space.
+                // The trust record precedes the check of free space.
                 Err(FetchError::DiskFull { .. }) if !is_known || free_bytes < 8000 => {}
                 Err(e) => panic!("space for {free_bytes}: {e}"),
             }

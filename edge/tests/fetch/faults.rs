@@ -1,6 +1,6 @@
 //! Storage and network fail together, in a thousand trials (a quarter of them outside the nightly checks;
 //! `SLAG_TRIALS=10000`: more). After each, the old or the new generation answers a real query, whole. Storage
-//! includes the two copies of the trust state, and the records of use.
+//! includes the two copies of the trust state, and the usage records.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -27,17 +27,17 @@ use slag_test_support::trials;
 
 const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
 const N_THREADS: u64 = 4;
-/// Gaussians of a cell: its shard arrives in several pieces.
+/// Gaussians per cell: its shard arrives in several pieces.
 const N: u32 = 60;
 
-/// Longest silence of a store that a robot waits for in a trial.
+/// A robot's network timeout in a trial.
 const SILENCE: Duration = Duration::from_millis(80);
 
 fn n_trials() -> u64 {
     std::env::var("SLAG_TRIALS").map_or(trials(250, 1000), |n| n.parse().expect("SLAG_TRIALS is a number"))
 }
 
-/// Encodes every text as the first axis; every centroid of these scenes has a cosine of 0.5 with it.
+/// Encodes every text as the first axis, at a cosine of 0.5 to every centroid of these scenes.
 struct FirstAxis;
 
 impl TextEncoder for FirstAxis {
@@ -62,7 +62,7 @@ pub fn text_service() -> TextService {
     TextService::start(info, Box::new(FirstAxis)).expect("a thread")
 }
 
-/// Asks for everything; returns the generation that answered and the positions found.
+/// Queries everything; returns the generation and the positions found.
 fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     let engine = Engine::new(cache, text_service());
     engine.reload().map_err(|e| slag_edge::error_line(&e))?;
@@ -87,8 +87,7 @@ fn expected(published: &Published, cell_ids: std::ops::Range<u32>) -> BTreeSet<P
     cell_ids.flat_map(of_cell).collect()
 }
 
-/// Starting point of a thread's trials: generation 2 on board, generation 3 offered, generation 1 for
-/// replays.
+/// Start of a thread's trials: generation 2 on board, 3 offered, 1 for replays.
 struct Stage {
     dir: tempfile::TempDir,
     server: Server,
@@ -99,7 +98,7 @@ struct Stage {
     is_key_change: bool,
 }
 
-/// Counts of outcomes: a harness in which fetches never fail, or always do, tests nothing.
+/// Counts of outcomes: a harness where fetches always fail, or never, tests nothing.
 #[derive(Debug, Default)]
 struct Outcomes {
     worked: AtomicU64,
@@ -110,7 +109,7 @@ struct Outcomes {
 
 impl Stage {
     fn new(is_key_change: bool) -> Self {
-        // In memory if possible: the records there are not under test.
+        // In memory if possible: these records are not under test.
         let shm = Path::new("/dev/shm");
         let dir = if shm.is_dir() { tempfile::tempdir_in(shm) } else { tempfile::tempdir() };
         let dir = dir.expect("temporary folder");
@@ -127,7 +126,7 @@ impl Stage {
         Self { dir, server, stale, old, new, before: files.fork(None, 0), is_key_change }
     }
 
-    /// Oracle: what a generation answers with, if these cells are bad.
+    /// Oracle: positions of a generation without these bad cells.
     fn expected(&self, generation: u64, bad_cells: &[BadCell]) -> BTreeSet<Place> {
         if generation == 2 {
             return expected(&self.old, 0..3);
@@ -147,12 +146,10 @@ impl Stage {
         robot
     }
 
-    /// Chooses what happens to each request.
     fn network(&self, seed: u64) -> impl FnMut(&Seen) -> Fault + Send + 'static {
         let mut random = Random::new(seed ^ 0x6e65_7477);
-        // Calm, breezy, stormy.
         let one_in = [u64::MAX, 6, 3][random.below(3) as usize];
-        // A shard that the store never has whole.
+        // A shard that is never served whole.
         let bad = (random.below(4) == 0).then(|| {
             let hash = self.new.hash(2 + random.below(3) as u32, Profile::Compact);
             let fault = [Fault::Status(404), Fault::Corrupt(700)][random.below(2) as usize].clone();
@@ -169,7 +166,7 @@ impl Stage {
             if let Some((_, fault)) = bad.as_ref().filter(|(path, _)| *path == seen.path) {
                 return fault.clone();
             }
-            // Metadata that is refused is not asked for again, so most of it comes through.
+            // Refused metadata is not requested again, so most of it is spared.
             let is_spared = !seen.path.contains("objects") && random.below(4) != 0;
             if is_spared || random.below(one_in) != 0 {
                 return Fault::None;
@@ -181,7 +178,7 @@ impl Stage {
                 14 => Fault::Redirect("http://127.0.0.1:1/".into()),
                 15 => Fault::ShiftedRange(1 + random.below(600) as usize),
                 0 | 1 => Fault::Cut(random.below(1500) as usize),
-                // Truncated, with an announced length to match.
+                // Truncated, with a matching announced length.
                 2 => Fault::Length(-(1 + random.below(200) as i64)),
                 3 => Fault::Length(1 + random.below(200) as i64),
                 4 => Fault::Delay(Duration::from_millis(1 + random.below(4))),
@@ -190,7 +187,7 @@ impl Stage {
                 7 => Fault::IgnoreRange,
                 8 => Fault::ShiftedRange(random.below(100) as usize),
                 9 => Fault::RetryAfter(503, 1),
-                // An old state replayed; or an intact shard of the same cell and length under another hash.
+                // A replayed old state; or an intact shard of the same cell and length under another hash.
                 _ if seen.path.ends_with("timestamp.json") => {
                     Fault::Instead(stale.metadata["timestamp.json"].clone())
                 }
@@ -242,7 +239,7 @@ impl Stage {
             "{context}: generation {generation} answers with {} places",
             found.len()
         );
-        // Cell 1 is on board unchanged; of cell 2 an old copy is.
+        // Cell 1 is on board unchanged, cell 2 as an old copy.
         let has_stand_in = |bad: &BadCell| bad.cell_id > 1 && bad.old.is_some() == (bad.cell_id == 2);
         assert!(bad_cells.iter().all(has_stand_in), "{context}: {bad_cells:?}");
         match (&result, generation) {
@@ -257,7 +254,7 @@ impl Stage {
         }
 
         self.server.faults(|_| Fault::None);
-        // One copy of the trust state is whole, and it is not that of before the fetch.
+        // One copy of the trust state is whole and updated.
         if result.is_ok() && seed.is_multiple_of(2) {
             self.check_trust(&robot, &context);
         }
@@ -270,7 +267,7 @@ impl Stage {
         }
     }
 
-    /// The robot has gone over to the new state, whatever happened: old keys and old states are refused.
+    /// The robot accepted the new state in any case: old keys and old states are refused.
     fn check_trust(&self, robot: &Robot, context: &str) {
         let published = if self.is_key_change { Published::new(9, &[0; 7], N) } else { self.old.clone() };
         self.server.publish(published);

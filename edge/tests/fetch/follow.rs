@@ -1,4 +1,4 @@
-//! A moving robot: what is on board around it, and what that costs.
+//! A moving robot: cells on board around it, and the number of fetches.
 
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
@@ -16,7 +16,7 @@ use super::{Robot, assert_holds, at, cells};
 
 const N_CELLS: usize = 30;
 
-/// Follows positions, one a second, and returns the seconds at which a fetch was made.
+/// Follows positions, one a second, and returns the times of fetches, seconds.
 fn drive(robot: &mut Robot, follower: &mut Follower, start: u64, xs: impl Iterator<Item = f64>) -> Vec<u64> {
     let mut fetched_at = Vec::new();
     for (second, x) in (start..).zip(xs) {
@@ -41,8 +41,8 @@ fn settings() -> FollowSettings {
 #[test]
 fn going_to_and_fro_over_an_edge_costs_one_fetch() {
     let (server, mut robot) = Robot::started(Published::new(1, &[0; N_CELLS], 20));
-    // Cells end at multiples of ten. For the first fetch the critical edge is also at 100 + 18 = 118: there
-    // every step changes the set of cells in reach.
+    // Cells end at multiples of ten. For the first fetch the critical edge is also at 100 + 18 = 118: there every
+    // step changes the set of cells in reach.
     for edge in [100.0, 102.0] {
         let mut follower = Follower::new(settings());
         let to_and_fro = (0..200).map(|i| edge + if i % 2 == 0 { -2.5 } else { 0.4 });
@@ -160,8 +160,7 @@ fn following_survives_the_loss_of_the_network() {
     assert_eq!(scene.hash(6, Profile::Compact), robot.snapshot().current.cells[0].hash);
 }
 
-/// A follower that was not told whom to trust tries again when the robot moves, and when somebody tells it: the
-/// pause after a failure would be an hour.
+/// Without trust it retries when the robot moves or a root is added; the pause after failures would be an hour.
 #[test]
 fn a_follower_waits_for_trust_and_not_for_time() {
     let scene = Published::new(1, &[0; 3], 20);

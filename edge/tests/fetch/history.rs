@@ -1,4 +1,4 @@
-//! What changed between the generations that a robot has had, whatever happens to it meanwhile.
+//! Changes between a robot's generations, whatever happens in between.
 
 use std::sync::Arc;
 
@@ -18,9 +18,8 @@ fn thing(id: u64, x: f64, axis: usize) -> TestThing {
     TestThing { cell_id: (x / 10.0) as u32, id, x, axis }
 }
 
-/// Seven cells, of which the robot at x = 5 holds three.
+/// Seven cells; the robot at x = 5 holds three.
 fn published(generation: u64, things: &[TestThing]) -> Published {
-    // Another splat each time.
     Published::new(generation, &[generation; 7], 20).with_things(things)
 }
 
@@ -28,8 +27,7 @@ fn before() -> Published {
     published(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1), thing(3, 25.0, 2), thing(9, 55.0, 0)])
 }
 
-/// By hand: 1 stays, 2 goes, 3 moves to x = 5, 5 appears. 9, beyond the robot's cells, goes as well, and 10
-/// appears there.
+/// By hand: 1 stays, 2 goes, 3 moves to x = 5, 5 appears. Beyond the robot's cells, 9 goes and 10 appears.
 fn after() -> Published {
     published(2, &[thing(1, 2.0, 0), thing(4, 5.0, 2), thing(5, 18.0, 3), thing(10, 45.0, 3)])
 }
@@ -40,7 +38,7 @@ fn changes(robot: &Robot, from: Option<u64>) -> Result<ChangesReply, ChangesErro
     engine.changes(&ChangesRequest { from, ..ChangesRequest::default() }, &Budget::default())
 }
 
-/// Returns the ids that appeared, that went, and that things had and have which moved.
+/// Returns the ids that appeared, that went, and the earlier and later ids of those that moved.
 fn ids(reply: &ChangesReply) -> (Vec<u64>, Vec<u64>, Vec<(u64, u64)>) {
     let id = |text: &str| u64::from_str_radix(&text[1..], 16).expect("hex digits");
     let of = |things: &[ChangedThing]| things.iter().map(|thing| id(&thing.id)).collect();
@@ -62,7 +60,7 @@ fn changes_are_told_where_both_generations_are_known() {
     server.publish(after());
     robot.fetch().expect("works");
     assert_changed(&robot, "after the fetch");
-    // It leaves; what it knew of both generations is still compared, what it knows of one alone is not.
+    // After it leaves, what it knew of both generations is still compared; what it knew of one alone is not.
     robot.go(55.0, 14.0, &after(), 4..7);
     robot.fetch().expect("works");
     let on_board = cells(&robot.snapshot());
@@ -83,7 +81,7 @@ fn changes_are_told_where_both_generations_are_known() {
     fs_err::write(&path, of_others.to_bytes()).expect("writes");
     assert_eq!(changes(&robot, Some(1)).expect_err("refused").kind(), "encoders-differ");
     fs_err::write(&path, record.to_bytes()).expect("writes");
-    // A damaged record is as none.
+    // A damaged record counts as missing.
     let mut bytes = fs_err::read(&path).expect("there");
     bytes[200] ^= 1;
     fs_err::write(&path, bytes).expect("writes");
@@ -91,7 +89,7 @@ fn changes_are_told_where_both_generations_are_known() {
     assert!(reply.none.is_some_and(|none| none.kind == "no-earlier-generation"));
 }
 
-/// The robot had the places of 1, 2 and 3 on board in the earlier generation alone, that of 10 in the later one.
+/// The earlier generation alone had the places of 1, 2 and 3 on board, the later one alone that of 10.
 #[test]
 fn what_is_left_behind_has_not_gone() {
     let (server, mut robot) = Robot::fetched(before());
@@ -103,7 +101,7 @@ fn what_is_left_behind_has_not_gone() {
     assert_eq!(reply.n_not_compared, 4, "{reply:?}");
 }
 
-/// Of the same splat: another outline is neither a thing that came nor one that went.
+/// With the same splat, another outline is neither an added nor a removed thing.
 #[test]
 fn where_the_splat_is_the_same_nothing_changed() {
     let of = |generation, things: &[TestThing]| Published::new(generation, &[0; 7], 20).with_things(things);
@@ -115,8 +113,7 @@ fn where_the_splat_is_the_same_nothing_changed() {
     assert_eq!((reply.n_same, reply.n_not_compared), (1, 2), "{reply:?}");
 }
 
-/// The records are written before anything goes: at whatever step the power fails, they are there after the next
-/// fetch.
+/// The records are written before removals: whenever the power fails, they are there after the next fetch.
 #[test]
 fn a_power_cut_loses_no_history() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -154,7 +151,7 @@ fn history_is_bounded_and_of_one_scene() {
     assert_eq!((reply.n_same, reply.n_stayed), (1, 1), "{reply:?}");
     let newest = changes(&robot, None).expect("a reply").from.map(|from| from.generation);
     assert_eq!(newest, Some(11), "without a number the newest before");
-    // Another scene: its generations are none of these.
+    // Another scene: its generations are not these.
     server.publish(published(13, &[thing(1, 2.0, 0)]).edited(|manifest| manifest.scene = "house".into()));
     robot.request.scene = Some("house".into());
     robot.fetch().expect("works");

@@ -50,7 +50,7 @@ fn endless_bodies_are_cut_off() {
     robot.limits.chunk_bytes = 1 << 16;
     server.publish(Published::new(2, &[0; 1], 50));
     for (part, expected) in [("", "timestamp.json"), ("/targets/", "manifest")] {
-        // An announced length above the limit is believed at once.
+        // An announced length above the limit fails at once.
         for fault in [Fault::Endless, Fault::Length(1 << 30)] {
             server.fault_at(part, fault);
             let error = robot.fetch().expect_err("refused");
@@ -62,7 +62,6 @@ fn endless_bodies_are_cut_off() {
     }
 }
 
-/// Redirects to another server are not followed, for no kind of file.
 #[test]
 fn redirects_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
@@ -91,7 +90,7 @@ fn lasting_faults_are_given_up_and_told() {
         (Fault::Length(1), 3, |f| matches!(f, DownloadFailure::Length { .. })),
         (Fault::Corrupt(900), 3, |f| matches!(f, DownloadFailure::Hash { .. })),
         (Fault::Cut(0), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
-        // A little progress each time, but less than counts as progress.
+        // Progress each time, but too little to count.
         (Fault::Cut(100), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
     ];
     for (fault, expected_attempts, is_expected) in cases {
@@ -99,7 +98,7 @@ fn lasting_faults_are_given_up_and_told() {
         server.fault_at("objects", fault.clone());
         let count = Count::default();
         let error = robot.fetch_watched(&count, &AtomicBool::new(false)).expect_err("lasting");
-        // What is wrong is dropped.
+        // Invalid bytes are dropped.
         assert_eq!(error.to_string().contains("are kept"), fault == Fault::Cut(100), "{fault:?}: {error}");
         match error {
             FetchError::Download { attempts, failure, .. } => {
@@ -115,7 +114,7 @@ fn lasting_faults_are_given_up_and_told() {
     }
 }
 
-/// A signed manifest may be wrong too: nothing of it reaches `current`.
+/// A signed manifest may be wrong, too: nothing of it reaches `current`.
 #[test]
 fn signed_nonsense_is_refused() {
     let scene = Published::new(1, &[0; 2], 50);
@@ -125,7 +124,7 @@ fn signed_nonsense_is_refused() {
         assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
         error
     };
-    // Of one cell: the other is good.
+    // One bad cell; the other is good.
     let without_a_cell = |published: Published, bad_id: u32| {
         let (_server, robot) = Robot::started(published);
         let bad = BadCell { cell_id: bad_id, fault: CellFault::Invalid, old: None };
@@ -143,7 +142,7 @@ fn signed_nonsense_is_refused() {
     }));
     assert!(matches!(error, FetchError::Plan(PlanError::Conflict { .. })), "{error}");
 
-    // An object that is not a shard; one without bytes; one longer than any disk.
+    // An object that is not a shard; an empty one; one longer than any disk.
     let mut junk = scene.clone();
     let hash = Hash32::of(b"junk");
     junk.objects.insert(hash, b"junk".to_vec());
@@ -214,7 +213,6 @@ fn names_that_are_paths_are_refused() {
         let error = robot.fetch().expect_err("refused");
         assert!(matches!(error, FetchError::Manifest(ManifestError::Content { .. })), "{path}: {error}");
 
-        // The same in the files on board.
         server.publish(scene.clone().signed_by(&[FIRST], 2));
         robot.fetch().expect("works");
         let current = fs_err::read_to_string(robot.cache.current_path()).expect("there");

@@ -1,4 +1,4 @@
-//! A medium that fails: a sector or an inode that cannot be read costs its cell only, and ends no program.
+//! A failing medium: an unreadable sector or inode costs its cell only, and ends no program.
 
 use slag_common::shard::Profile;
 use slag_edge::fetch::Records;
@@ -9,9 +9,8 @@ use super::scene::Published;
 use super::server::Server;
 use super::{Robot, assert_holds, cells};
 
-/// More than 12 blocks a shard.
+/// A shard has more than 12 blocks.
 const N: u32 = 4000;
-/// Of a shard.
 const BLOCK: usize = 15;
 
 struct Trial {
@@ -46,7 +45,7 @@ fn a_sector_that_cannot_be_read_costs_its_cell_and_is_fetched_again() {
     assert_holds(&robot.snapshot(), scene, 0..3);
 }
 
-/// Whoever meets the sector first: the record of the objects that go, or the scrub.
+/// Either reader may meet the sector first: the record of leaving objects, or the scrub.
 #[needs_loop_disk]
 #[test]
 fn fetches_and_scrubs_read_and_do_not_map() {
@@ -62,8 +61,7 @@ fn fetches_and_scrubs_read_and_do_not_map() {
     assert!(Scrubber::default().step(&robot.cache, &snapshot).is_some_and(|step| step.is_sound));
 }
 
-/// ext4 neither reads, removes nor replaces it: the cell stays away until somebody checks the disk, the others go
-/// on.
+/// ext4 neither reads, removes nor replaces it: the cell is missing until the disk is checked; the others go on.
 #[needs_loop_disk]
 #[test]
 fn an_inode_that_cannot_be_read_fails_no_fetch() {
@@ -79,9 +77,9 @@ fn an_inode_that_cannot_be_read_fails_no_fetch() {
     server.publish(second.clone());
     assert_eq!(robot.fetch().expect("works").bad_cells, []);
     assert_holds(&robot.snapshot(), &second, 0..3);
-    // One copy of what the robot believes: the other counts, and is written on.
+    // One copy of the trust records: the other counts, and is written from then on.
     drop(Records::open(&robot.cache).expect("free"));
-    // What a crash left under the name that files are written by.
+    // A crash left a file under the staging name.
     let left = robot.cache.dir().join("staging/put0");
     std::fs::write(&left, "half").expect("written");
     disk.break_inode(&left);

@@ -63,14 +63,13 @@ impl Robot {
         Self { _dir: None, cache, request, now_unix_secs: NOW, limits }
     }
 
-    /// Makes a robot in a folder of its own.
     fn of(server: &Server) -> Self {
         let dir = tempfile::tempdir().expect("temporary folder");
         let robot = Self::on_disk(dir.path(), &server.url());
         Self { _dir: Some(Arc::new(dir)), ..robot }
     }
 
-    /// Serves a scene, for a robot that has nothing yet.
+    /// Serves a scene, for a robot without any.
     fn started(scene: Published) -> (Server, Self) {
         let server = Server::start(scene);
         let robot = Self::of(&server);
@@ -92,7 +91,7 @@ impl Robot {
         Self::new(EdgeCache::with_files(dir.join("cache"), files), from)
     }
 
-    /// Moves it to a place, with room for the cells of a scene that are needed there.
+    /// Moves it to a place, with space for the cells needed there.
     fn go(&mut self, x: f64, radius: f64, scene: &Published, cell_ids: std::ops::Range<u32>) {
         self.request.at = Some(at(x));
         self.request.radius = radius;

@@ -9,7 +9,6 @@ use super::Robot;
 use super::scene::Published;
 use super::server::{Fault, Seen};
 
-/// Misbehaves for the compact shards of these cells.
 fn at_cells(
     scene: &Published,
     cells: &[usize],
@@ -21,7 +20,7 @@ fn at_cells(
     move |seen| if bad.contains(&seen.path) { fault.clone() } else { Fault::None }
 }
 
-/// Returns the cells that answer, with the hash of each shard's content.
+/// Returns the answering cells, with the hash of each shard's content.
 pub fn answering(snapshot: &Snapshot) -> Vec<(u32, Hash32)> {
     let hash = |shard: &slag_edge::store::OpenShard| {
         let view = shard.view();
@@ -31,7 +30,7 @@ pub fn answering(snapshot: &Snapshot) -> Vec<(u32, Hash32)> {
     snapshot.shards.iter().map(|shard| hash(shard)).collect()
 }
 
-/// Oracle: the same of whole scenes that were fetched without faults.
+/// Oracle: the same of whole scenes fetched without faults.
 fn whole(scene: &Published) -> Vec<(u32, Hash32)> {
     let (_server, robot) = Robot::fetched(scene.clone());
     answering(&robot.snapshot())
@@ -88,7 +87,7 @@ fn a_bad_cell_costs_that_cell_only() {
         let manifests = robot.cache.files().list(&robot.cache.dir().join("manifests")).expect("there");
         assert_eq!(manifests, [Hash32::of(&third.listed).to_string()], "the old manifest is gone");
 
-        // A scene without a good cell brings nothing.
+        // A scene without a good cell changes nothing.
         let fourth = Published::new(4, &[9; 3], 40);
         server.publish(fourth.clone());
         server.faults(at_cells(&fourth, &[0, 1, 2], &fault));
@@ -123,7 +122,7 @@ fn an_old_copy_answers_only_where_it_belongs() {
     }
 }
 
-/// A network that fails is not a cell that is bad: the old generation stays, and what arrived is kept.
+/// A failing network is no bad cell: the old generation stays, and arrived bytes are kept.
 #[test]
 fn a_network_that_fails_publishes_nothing() {
     let (first, second) = (Published::new(1, &[0; 3], 40), Published::new(2, &[7; 3], 40));

@@ -20,7 +20,7 @@ use super::{Robot, assert_holds, at, cells};
 
 const UNREADABLE: BadCell = BadCell { cell_id: 1, fault: CellFault::Unreadable, old: None };
 
-/// Flips a bit of a file, and leaves its time as it was: no fetch would read it before a day has passed.
+/// Flips a bit of a file, keeping its time: no fetch would read it within a day.
 fn flip_unseen(path: &Path) {
     let modified = fs_err::metadata(path).expect("there").modified().expect("known");
     let mut bytes = fs_err::read(path).expect("there");
@@ -41,7 +41,7 @@ fn a_rotten_shard_costs_its_cell_only() {
     ];
     for (name, damage) in faults {
         damage();
-        // However often it is opened, and whatever an earlier snapshot holds.
+        // Whenever it is opened, and whatever an earlier snapshot holds.
         let mut before: Option<Snapshot> = None;
         for _ in 0..2 {
             let snapshot = Snapshot::open_after(&robot.cache, before.as_ref()).expect(name);
@@ -62,8 +62,7 @@ fn a_rotten_shard_costs_its_cell_only() {
     }
 }
 
-/// Each file of the generation on board, and what may stand in its place. A reader comes first: it waits for nobody,
-/// and marks what it finds.
+/// Each file on board, and substitutes for it. A reader comes first: it never blocks, and marks its finds.
 #[test]
 fn whatever_is_lost_is_put_back() {
     let scene = Published::new(1, &[0; 3], 40);
@@ -97,7 +96,7 @@ fn whatever_is_lost_is_put_back() {
             heal(&context);
         }
     }
-    // Files in the places of folders: a shard is damaged, and has no place for its mark at first.
+    // Files in the places of folders: a damaged shard cannot be marked at first.
     for name in ["damaged", "history", "manifests", "shards", "staging"] {
         let folder = robot.cache.dir().join(name);
         drop(std::fs::remove_dir_all(&folder));
@@ -113,8 +112,7 @@ fn whatever_is_lost_is_put_back() {
     heal("a pipe for a lock");
 }
 
-/// Whichever bit of whichever shards flips: the others answer, and so does a rotten one whose columns are whole
-/// (padding).
+/// Whichever bit of whichever shards flips: the others answer, as does a rotten one with whole columns (padding).
 #[test]
 fn any_rot_costs_its_cells_only() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -153,7 +151,7 @@ fn any_rot_costs_its_cells_only() {
     assert!(n_lost > 100, "{n_lost}");
 }
 
-/// All shards are read in turn, the one that rotted is marked, and no snapshot takes it over.
+/// All shards are read in turn, the rotten one is marked, and no snapshot takes it over.
 #[test]
 fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
     let scene = Published::new(1, &[0; 3], 40);
@@ -173,7 +171,7 @@ fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
     assert_holds(&robot.snapshot(), &scene, 0..3);
 }
 
-/// A new generation shares the open shards of the one before, except those that were replaced.
+/// A new generation shares the previous one's open shards, except replaced ones.
 #[test]
 fn open_shards_are_shared_by_generations() {
     let (server, robot) = Robot::fetched(Published::new(1, &[0; 3], 40));
@@ -185,7 +183,7 @@ fn open_shards_are_shared_by_generations() {
     let is_shared = |at: usize| Arc::ptr_eq(&first.shards[at], &second.shards[at]);
     assert_eq!([0, 1, 2].map(is_shared), [true, false, true]);
     assert_holds(&second, &next, 0..3);
-    // A file that was replaced is opened anew, whatever its name says.
+    // A replaced file is opened anew, even under the same name.
     std::thread::sleep(Duration::from_millis(20));
     let path = robot.cache.shard_path(second.current.cells[0].hash);
     let copy = path.with_extension("copy");
@@ -195,7 +193,7 @@ fn open_shards_are_shared_by_generations() {
     assert!(!Arc::ptr_eq(&second.shards[0], &third.shards[0]));
 }
 
-/// A robot in service finds rot by itself and fetches the shard, although nothing else makes a fetch due.
+/// A robot in service finds rot by itself and fetches the shard, although no other fetch is due.
 #[test]
 fn a_robot_in_service_heals_rot() {
     let scene = Published::new(1, &[0; 3], 40);

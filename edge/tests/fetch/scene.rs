@@ -20,7 +20,7 @@ pub const DIM: u32 = 4;
 pub const ENCODER: Hash32 = Hash32([9; 32]);
 pub const NOW: u64 = 1_800_000_000;
 
-/// The keys of a root, by seeds: its own, and that of the other roles.
+/// The keys of a root, by seeds: its own, and those of the other roles.
 #[derive(Clone, Copy, Debug)]
 pub struct RootKeys {
     pub root: u8,
@@ -78,7 +78,6 @@ pub struct TestThing {
     pub id: u64,
     /// Middle of its box, which is 1 wide; y and z are those of the row.
     pub x: f64,
-    /// The only axis of its vector.
     pub axis: usize,
 }
 
@@ -105,7 +104,6 @@ fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
 }
 
 impl Published {
-    /// Gives every shard the things of its cell.
     pub fn with_things(mut self, things: &[TestThing]) -> Self {
         let mut objects = BTreeMap::new();
         let mut manifest = self.manifest.clone();
@@ -146,7 +144,6 @@ impl Published {
         Self { manifest, listed, metadata, objects }.edited(|_| ())
     }
 
-    /// Changes the manifest and signs it again.
     pub fn edited(mut self, edit: impl FnOnce(&mut Manifest)) -> Self {
         edit(&mut self.manifest);
         self.listed = self.manifest.to_bytes();
@@ -173,7 +170,7 @@ impl Published {
     }
 }
 
-/// Returns metadata files by name. Roots are each signed by the one before, too. `expires`: of the timestamp.
+/// Returns metadata files by name. Each root is also signed by its predecessor. `expires`: of the timestamp.
 fn metadata(roots: &[RootKeys], version: u64, expires: u64, target: &[u8]) -> BTreeMap<String, Vec<u8>> {
     let lasting = NOW + 1_000_000;
     let mut files = BTreeMap::new();

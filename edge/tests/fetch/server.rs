@@ -15,29 +15,26 @@ use super::scene::Published;
 #[derive(Clone, Debug, PartialEq)]
 pub enum Fault {
     None,
-    /// Closes the connection after so many body bytes.
+    /// Closes the connection after this many body bytes.
     Cut(usize),
-    /// Flips a bit of the body's byte there.
+    /// Flips a bit of this byte of the body.
     Corrupt(usize),
     /// Ignores the range and answers with the whole body.
     IgnoreRange,
-    /// Answers with this status and no body.
     Status(u16),
-    /// Answers with this status, no body, and `Retry-After` in seconds.
+    /// `Retry-After` in seconds.
     RetryAfter(u16, u64),
     Delay(Duration),
     Redirect(String),
-    /// Sends the body and then continues for ever, in chunks.
+    /// Sends the body, then continues for ever, in chunks.
     Endless,
     /// Announces this many bytes more than it sends.
     Length(i64),
-    /// Answers with the range that begins so many bytes later.
+    /// Answers with a range that begins this many bytes later.
     ShiftedRange(usize),
     /// Answers a range as if it were the whole file, with status 200.
     Slice,
-    /// Sends other bytes.
     Instead(Vec<u8>),
-    /// Sends nothing until the client goes away.
     Stall,
 }
 
@@ -100,17 +97,15 @@ impl Server {
         *self.shared.chooser.lock().expect("sound") = Box::new(chooser);
     }
 
-    /// Answers requests whose path contains `part` with this fault, and the others rightly.
+    /// Answers requests with `part` in their path with this fault.
     pub fn fault_at(&self, part: &'static str, fault: Fault) {
         self.faults(move |seen| if seen.path.contains(part) { fault.clone() } else { Fault::None });
     }
 
-    /// Returns the requests since the last call.
     pub fn take_seen(&self) -> Vec<Seen> {
         std::mem::take(&mut self.shared.seen.lock().expect("sound"))
     }
 
-    /// Returns the requests for objects since the last call.
     pub fn take_objects(&self) -> Vec<Seen> {
         self.take_seen().into_iter().filter(|seen| seen.path.contains("objects")).collect()
     }
@@ -119,7 +114,6 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.shared.is_over.store(true, Ordering::Relaxed);
-        // Wakes the accept loop.
         let woken = TcpStream::connect(self.address);
         if let (Ok(_), Some(thread)) = (woken, self.thread.take()) {
             thread.join().expect("the server does not panic");
@@ -228,7 +222,6 @@ fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
         std::thread::sleep(by);
     }
     if fault == Fault::Stall {
-        // Ends when the client closes.
         return reader.read_line(&mut String::new()).map(drop);
     }
     let is_endless = fault == Fault::Endless && status < 300;

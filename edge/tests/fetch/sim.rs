@@ -11,7 +11,7 @@ use slag_edge::store::mmap::FileBytes;
 
 use slag_math::random::Random;
 
-/// Smallest piece of unsynced content that is lost or kept on its own.
+/// Smallest piece of unsynced content lost or kept on its own.
 const SECTOR_BYTES: usize = 128;
 
 #[derive(Clone, Default)]
@@ -46,7 +46,6 @@ struct Disk {
     inodes: Vec<Inode>,
     live: BTreeMap<PathBuf, usize>,
     durable: BTreeMap<PathBuf, usize>,
-    /// By number, in order.
     pending: BTreeMap<usize, Change>,
     n_changes: usize,
     n_steps: u64,
@@ -54,7 +53,7 @@ struct Disk {
     fail_at: Option<u64>,
     is_cut: bool,
     capacity_bytes: Option<u64>,
-    /// Whether the free space is unknown before it is used up.
+    /// Whether free space is reported as unknown.
     hides_free_space: bool,
     random: u64,
 }
@@ -63,15 +62,14 @@ struct Disk {
 pub struct SimFiles(Mutex<Disk>);
 
 impl SimFiles {
-    /// Returns a copy that loses power at a step (counted from 1), which may or may not still take effect. A
-    /// copy of storage that lost power is in the state a killed process leaves: with everything that
-    /// happened, synced or not.
+    /// Returns a copy that loses power at a step (counted from 1), which may still take effect. A copy of storage
+    /// that lost power is in the state left by a killed process: with everything that happened, synced or not.
     pub fn fork(&self, cut_at: Option<u64>, seed: u64) -> Self {
         let state = self.0.lock().expect("sound").clone();
         Self(Mutex::new(Disk { n_steps: 0, cut_at, is_cut: false, random: seed, ..state }))
     }
 
-    /// Lets one step from now on fail once with an I/O error; it may or may not take effect.
+    /// Makes one later step fail once with an I/O error; it may still take effect.
     pub fn fail_at(&self, step: Option<u64>) {
         self.0.lock().expect("sound").fail_at = step;
     }
@@ -91,7 +89,7 @@ impl SimFiles {
         (state.capacity_bytes, state.hides_free_space) = (Some(capacity_bytes), true);
     }
 
-    /// Flips a bit of a file, if there is one: the medium rots.
+    /// Flips a bit of a file, if it exists: the medium rots.
     pub fn flip(&self, path: &Path, random: &mut Random) {
         let mut state = self.0.lock().expect("sound");
         let Some(inode) = state.live.get(path).copied() else { return };
@@ -186,7 +184,7 @@ impl Disk {
 }
 
 impl SimFiles {
-    /// Takes one step, unless the power is cut; at the cut it may or may not take effect.
+    /// Takes one step, unless the power is cut; the step of the cut may still take effect.
     fn step(&self, work: impl FnOnce(&mut Disk) -> io::Result<()>) -> io::Result<()> {
         let mut state = self.0.lock().expect("sound");
         state.check_power()?;
@@ -215,7 +213,6 @@ impl SimFiles {
 }
 
 impl Files for SimFiles {
-    /// Folders always exist.
     fn create_dir(&self, _dir: &Path) -> io::Result<()> {
         self.look(|_| Ok(()))
     }

@@ -1,4 +1,4 @@
-//! Fetches without faults or with transient ones: what they download, keep and free.
+//! Fetches without faults or with transient ones: downloads, kept and freed shards.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -30,8 +30,8 @@ fn the_second_fetch_brings_only_the_difference() {
     assert_holds(&robot.snapshot(), &first, 0..3);
     let stat = robot.cache.current_stat().expect("readable");
 
-    // Nothing new: three small requests (is there another root, timestamp, targets), and nothing written. Source
-    // and position are those of the last fetch.
+    // Nothing new: three small requests (is there another root, timestamp, targets), and nothing written. Source and
+    // position are those of the last fetch.
     robot.request = FetchRequest { from: None, at: None, ..robot.request };
     let report = robot.fetch().expect("works");
     assert_eq!((report.downloaded.n_shards, report.kept.n_shards, report.freed.n_shards), (0, 3, 0));
@@ -104,8 +104,7 @@ fn an_interrupted_download_goes_on_where_it_ended() {
     assert!(robot.staged().is_empty());
 }
 
-/// One transient fault of each kind on every object, in one fetch: it succeeds, and each retry resumes the
-/// last attempt.
+/// One transient fault of each kind on every object, in one fetch: it succeeds, each retry resuming the last.
 #[test]
 fn passing_faults_are_overcome() {
     let faults = [
@@ -137,7 +136,7 @@ fn passing_faults_are_overcome() {
 }
 
 /// The partial file has other content, or the server or a proxy ignores ranges or answers them wrongly, once or
-/// always: then the part is dropped, and the whole file asked for.
+/// always: then the part is dropped, and the whole file is requested.
 #[test]
 fn resuming_never_mixes_contents() {
     let once = [Fault::None, Fault::IgnoreRange, Fault::ShiftedRange(1), Fault::Status(416)];
@@ -166,7 +165,7 @@ fn resuming_never_mixes_contents() {
     }
 }
 
-/// Hosts of files that say 403 or 410 where there is none: no newer root is there.
+/// Static hosts answer 403 or 410 if there is no newer root.
 #[test]
 fn a_root_that_is_not_there_may_be_refused() {
     for status in [403, 404, 410] {
@@ -213,13 +212,12 @@ fn one_fetch_at_a_time() {
     let (_server, robot) = Robot::fetched(Published::new(1, &[0; 3], 10));
     let records = Records::open(&robot.cache).expect("free");
     assert!(matches!(robot.fetch(), Err(FetchError::Records(RecordsError::Busy { .. }))));
-    // Reading needs no lock.
     robot.snapshot();
     drop(records);
     robot.fetch().expect("free again");
 }
 
-/// A shard of another cell or encoder under the right name is refused when it is opened.
+/// A shard of another cell or encoder under the right name is refused on opening.
 #[test]
 fn a_shard_that_the_manifest_does_not_describe_is_refused() {
     // Alone, so that nothing else answers.
@@ -238,7 +236,7 @@ fn a_shard_that_the_manifest_does_not_describe_is_refused() {
     }
 }
 
-/// Readers that keep opening snapshots while fetches replace them always get a whole one.
+/// Readers that reopen snapshots during fetches always get a whole one.
 #[test]
 fn readers_get_a_whole_generation_during_fetches() {
     let scene = Published::new(1, &[0; 8], 50);

@@ -1,4 +1,4 @@
-//! First trust, and attacks on what a robot remembers: damaged and lost records, other roots, other scenes.
+//! First trust, and attacks on a robot's records: damaged and lost ones, other roots, other scenes.
 
 use std::path::PathBuf;
 
@@ -81,7 +81,7 @@ fn an_old_state_is_refused_even_if_the_new_one_never_arrived() {
     robot.fetch().expect("accepted");
 }
 
-/// A flipped bit in any file of records neither stops a robot nor brings old keys back.
+/// A flipped bit in any file of records neither stops a robot nor restores old keys.
 #[test]
 fn a_flipped_bit_in_the_records_costs_nothing() {
     let rotated = Rotated::new();
@@ -102,8 +102,7 @@ fn a_flipped_bit_in_the_records_costs_nothing() {
     assert!(n_trials >= n_flips, "{n_trials}");
 }
 
-/// A script that adds the first root again, after its keys were revoked, changes nothing; another root needs
-/// --replace.
+/// Adding the first root again after its keys were revoked changes nothing; another root needs --replace.
 #[test]
 fn adding_the_first_root_again_does_not_bring_its_keys_back() {
     let rotated = Rotated::new();
@@ -124,7 +123,7 @@ fn adding_the_first_root_again_does_not_bring_its_keys_back() {
     assert_eq!(rotated.robot.fetch().expect("the other store").generation, 1);
 }
 
-/// Without a step that says so, nobody is trusted.
+/// Without explicit trust, no store is trusted.
 #[test]
 fn first_trust_is_a_step_of_its_own() {
     let published = of(2, &[FIRST, SECOND]);
@@ -156,7 +155,7 @@ fn first_trust_is_a_step_of_its_own() {
     assert_eq!(kept.root_sha256, sha256_hex(&second_root));
 }
 
-/// Both copies are damaged: nobody is believed until a root is added by hand.
+/// With both copies damaged, no store is trusted until a root is added by hand.
 #[test]
 fn without_a_whole_copy_no_store_is_believed() {
     let mut rotated = Rotated::new();
@@ -176,7 +175,7 @@ fn without_a_whole_copy_no_store_is_believed() {
     rotated.accepts_the_new_keys("the record is written anew");
 }
 
-/// Records that are gone are no first contact by themselves.
+/// Missing records alone are no first contact.
 #[test]
 fn a_robot_without_records_asks_for_a_root() {
     let rotated = Rotated::new();
@@ -187,7 +186,7 @@ fn a_robot_without_records_asks_for_a_root() {
     assert_holds(&rotated.robot.snapshot(), &of(2, &[FIRST, SECOND]), 0..3);
 }
 
-/// A store is trusted for one scene: another one could bring an older map without a word.
+/// A store is trusted for one scene: another one could silently bring an older map.
 #[test]
 fn another_scene_of_the_same_root_is_refused() {
     let (server, robot) = Robot::fetched(of(2, &[FIRST]));
@@ -201,7 +200,7 @@ fn another_scene_of_the_same_root_is_refused() {
     assert!(error.contains("\"barn\"") && error.contains("\"yard\"") && error.contains("--scene"), "{error}");
     assert_holds(&robot.snapshot(), &of(2, &[FIRST]), 0..3);
 
-    // To go there is a step of its own; and so is the way back.
+    // Changing the scene is explicit, and so is the way back.
     let mut moved = robot.clone();
     moved.request.scene = Some("shed".into());
     let error = moved.fetch().expect_err("a third scene").to_string();

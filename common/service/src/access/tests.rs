@@ -65,7 +65,7 @@ fn a_rebound_name_is_refused() {
     assert_eq!(status(&access.clone().with_any_host(), Method::GET, &[("host", "evil.example")]), 200);
 }
 
-/// The attack: a host that the check does not see, but a program on the way or the handler does.
+/// The attack: a host hidden from the check, but not from a proxy or the handler.
 #[test]
 fn hosts_that_hide_are_refused() {
     let access = access("127.0.0.1:7734", &[], &[], None).expect("sound");
@@ -89,7 +89,7 @@ fn hosts_that_hide_are_refused() {
     assert_eq!(of("http://evil.example/status", &[]), 421);
 }
 
-/// The attack: a page of another site asks, from a person's browser.
+/// The attack: a page of another site sends requests from a person's browser.
 #[test]
 fn pages_of_others_are_refused_unless_they_are_given() {
     let access = access("127.0.0.1:7734", &[], &["https://map.example"], None).expect("sound");

@@ -20,7 +20,6 @@ const REQUEST: &str = "GET /quick HTTP/1.1\r\nHost: localhost\r\n\r\n";
 /// More than the sockets' buffers hold.
 const LONG_BYTES: usize = 40_000_000;
 
-/// A running service: its address, its stop, and its end.
 struct Running {
     address: SocketAddr,
     stop: oneshot::Sender<()>,
@@ -54,7 +53,7 @@ async fn connect(address: SocketAddr, text: &str) -> TcpStream {
 
 const HALF_A_BODY: &str = "POST /things HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{\"x\"";
 
-/// Sends a request and returns all that comes back until the other end closes.
+/// Sends a request and returns all bytes received until the other end closes.
 async fn ask_once(address: SocketAddr, text: &str) -> String {
     let mut stream = connect(address, text).await;
     let mut received = Vec::new();
@@ -63,7 +62,7 @@ async fn ask_once(address: SocketAddr, text: &str) -> String {
     String::from_utf8_lossy(&received).into_owned()
 }
 
-/// The attack: sockets that send half a body take every place.
+/// The attack: sockets with half a body take every place.
 #[tokio::test]
 async fn half_bodies_leave_room_for_health_and_end() {
     let body_timeout = Duration::from_millis(1500);
@@ -111,7 +110,7 @@ async fn bodies_are_whole_json_and_short() {
     }
 }
 
-/// A client that sends its whole body before it reads, as Python's does, reads why the body was refused.
+/// A client that sends its whole body before reading, as Python's does, learns why the body was refused.
 #[tokio::test]
 async fn refused_bodies_are_drained() {
     let running = start(ConnectionLimits::default()).await;
@@ -125,7 +124,7 @@ async fn refused_bodies_are_drained() {
         );
         let mut stream = connect(running.address, &head).await;
         for piece in &pieces {
-            // Long enough for the answer to be sent and the connection closed.
+            // Long enough for sending the answer and closing the connection.
             tokio::time::sleep(Duration::from_millis(60)).await;
             stream.write_all(piece).await.unwrap_or_else(|e| panic!("{status}: {e}"));
         }
@@ -134,7 +133,7 @@ async fn refused_bodies_are_drained() {
         tokio::time::timeout(Duration::from_secs(5), whole).await.expect("ends").expect("an answer");
         assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{answer}");
     }
-    // The attack: a body that never ends is left after a second.
+    // The attack: an endless body is dropped after a second.
     let head = "POST /nowhere HTTP/1.1\r\nHost: localhost\r\nContent-Length: 400000\r\n\r\n";
     let started = tokio::time::Instant::now();
     assert!(ask_once(running.address, head).await.starts_with("HTTP/1.1 404"));
@@ -196,7 +195,7 @@ async fn long_heads_are_refused() {
     assert!(received.starts_with(b"HTTP/1.1 431"), "{}", String::from_utf8_lossy(&received));
 }
 
-/// A client that does not read holds up the stop until the deadline, one that does not ask not at all.
+/// A client that does not read delays the stop until the deadline, an idle one not at all.
 #[tokio::test]
 async fn stopping_has_a_deadline() {
     let drain_timeout = Duration::from_millis(60);

@@ -9,14 +9,14 @@ use serde_json::{Map, Value, json};
 
 use crate::replies::{Reply, SchemaOf};
 
-/// Where a description keeps its schemas.
+/// Path of the schemas in a description.
 const SCHEMAS: &str = "#/components/schemas/";
-/// Where those of requests are under construction.
+/// Path of requests' schemas under construction.
 const REQUESTS: &str = "#/requests/";
-/// Ends the name of a request's schema that differs from the reply's of the same type.
+/// Suffix of a request's schema that differs from the reply's of the same type.
 const SUFFIX: &str = "Request";
 
-/// Schemas under construction. A type may have two: what may be left out of a request is always there in a reply.
+/// Schemas under construction. A type may have two: members optional in requests are always present in replies.
 pub struct Schemas {
     replies: SchemaGenerator,
     requests: SchemaGenerator,
@@ -41,7 +41,7 @@ impl Schemas {
         tidied(self.replies.subschema_for::<T>(), true)
     }
 
-    /// Returns the successful replies of a handler, without their schemas' details.
+    /// Returns a handler's successful replies, with their schemas as references.
     pub fn replies(&mut self, of: fn(&mut SchemaGenerator) -> Vec<Reply>) -> Vec<Reply> {
         of(&mut self.replies)
     }
@@ -50,13 +50,13 @@ impl Schemas {
         tidied(of(&mut self.requests), false)
     }
 
-    /// Puts the named schemas into a document, and their final names into its references.
+    /// Moves the named schemas into a document, and their final names into its references.
     pub fn finish(mut self, document: &mut Value) {
         let mut named = self.replies.take_definitions(true);
         let requests = self.requests.take_definitions(true);
         let mut names: BTreeMap<String, String> =
             requests.keys().map(|name| (name.clone(), name.clone())).collect();
-        // Whoever refers to a schema that is renamed differs as well.
+        // A schema that refers to a renamed one differs as well.
         loop {
             let differs = |name: &str| {
                 let mut schema = requests[name].clone();
@@ -77,7 +77,7 @@ impl Schemas {
     }
 }
 
-/// Gives references to requests' schemas their final names.
+/// Replaces references to requests' schemas by their final names.
 fn refer(value: &mut Value, names: &BTreeMap<String, String>) {
     match value {
         Value::Object(members) => {
@@ -93,13 +93,13 @@ fn refer(value: &mut Value, names: &BTreeMap<String, String>) {
     }
 }
 
-/// Finishes a schema that is not among the named ones.
+/// Finishes an unnamed schema.
 pub fn tidied(mut schema: Schema, is_reply: bool) -> Value {
     Tidy { is_reply }.transform(&mut schema);
     schema.to_value()
 }
 
-/// Shortens a type's schema and closes it: members that it does not list are not allowed.
+/// Shortens a type's schema and closes it: unlisted members are not allowed.
 #[derive(Clone, Copy)]
 struct Tidy {
     is_reply: bool,
@@ -110,7 +110,7 @@ impl Transform for Tidy {
         transform_subschemas(self, schema);
         let Some(members) = schema.as_object_mut() else { return };
         join_names(members);
-        // The lines of a doc comment are one text.
+        // Joins the lines of a doc comment.
         if let Some(Value::String(text)) = members.get_mut("description") {
             *text = text.split_whitespace().collect::<Vec<_>>().join(" ");
         }
@@ -122,7 +122,7 @@ impl Transform for Tidy {
             .filter_map(|name| Some(name.as_str()?.to_owned()))
             .collect();
         let Some(Value::Object(properties)) = members.get_mut("properties") else { return };
-        // A member that may be absent is so instead of null.
+        // Absent members are omitted instead of null.
         let optional = properties.iter_mut().filter(|(name, _)| !required.contains(*name));
         optional.for_each(|(_, property)| without_null(property));
         if self.is_reply {
@@ -131,7 +131,7 @@ impl Transform for Tidy {
     }
 }
 
-/// Makes one list of the names that an enum allows, with their meanings in the description.
+/// Merges an enum's names into one list, with their meanings in the description.
 fn join_names(members: &mut Map<String, Value>) {
     let Some(Value::Array(variants)) = members.get("oneOf") else { return };
     let Some(names) = variants.iter().map(|variant| variant["const"].as_str()).collect::<Option<Vec<_>>>()

@@ -152,7 +152,6 @@ fn operations_come_from_routes() {
 fn schemas_come_from_types() {
     let schemas = &described()["components"]["schemas"];
     let names: Vec<&String> = schemas.as_object().expect("schemas").keys().collect();
-    // Of the enum, requests and replies have the same.
     assert_eq!(names, ["Place", "Problem", "Thing", "ThingRequest", "Things"]);
     let place = json!({
         "type": "string", "enum": ["on-top", "alone"],
@@ -174,7 +173,7 @@ fn schemas_come_from_types() {
             },
         })
     };
-    // What a request may leave out is always there in a reply.
+    // Members optional in a request are always present in a reply.
     assert_eq!(schemas["ThingRequest"], thing("ThingRequest", &["name"]));
     assert_eq!(schemas["Thing"], thing("Thing", &["name", "number"]));
     let next = &schemas["Things"]["properties"]["next"];

@@ -68,7 +68,7 @@ async fn every_error_is_a_problem_with_the_id_of_its_request() {
     );
 }
 
-/// Paths with parameters count as their route, unknown ones as one.
+/// Paths with parameters count as their route, all unknown paths as one.
 #[tokio::test]
 async fn responses_are_counted_by_route() {
     let responses = Arc::default();

@@ -35,7 +35,7 @@ impl Authority {
         std::fs::write(&files.cert, certificate.pem()).expect("written");
     }
 
-    /// Asks a service over TLS; returns the certificate that it showed, and the answer.
+    /// Sends a request over TLS; returns the server's certificate, and the answer.
     fn ask(&self, address: &str, name: &str) -> Result<(Vec<u8>, String), io::Error> {
         let mut roots = RootCertStore::empty();
         roots.add(self.certificate.clone()).expect("a root");
@@ -57,20 +57,18 @@ impl Authority {
     }
 }
 
-/// A folder, and the files of a certificate there.
 fn folder() -> (tempfile::TempDir, TlsFiles) {
     let dir = tempfile::tempdir().expect("a folder");
     let [cert, key] = ["cert.pem", "key.pem"].map(|name| dir.path().join(name));
     (dir, TlsFiles { cert, key })
 }
 
-/// Serves with a certificate; returns the address.
 async fn start(files: &TlsFiles, limits: ConnectionLimits) -> String {
     let any_port: Listen = "127.0.0.1:0".parse().expect("an address");
     let listener = bind(&any_port).await.expect("binds");
     let listener = listener.with_tls(Some(Tls::open(files.clone()).expect("a certificate")));
     let url = listener.url().expect("bound");
-    // Longer than a record of TLS.
+    // Longer than a TLS record.
     let router = Router::new().route("/quick", get(async || "done".repeat(20_000)));
     tokio::spawn(serve(router, listener, limits, std::future::pending()));
     url.strip_prefix("https://").expect("TLS").to_owned()
@@ -89,14 +87,14 @@ async fn a_renewed_certificate_is_used_and_half_a_renewal_is_not() {
     let refused = authority.ask(&address, "elsewhere").expect_err("another name");
     assert!(refused.to_string().contains("not valid for name"), "{refused}");
 
-    // A new certificate, and the old key still: not a pair.
+    // A new certificate with the old key: not a pair.
     let old_key = std::fs::read(&files.key).expect("there");
     authority.issue("localhost", &files);
     let new_key = std::fs::read(&files.key).expect("there");
     std::fs::write(&files.key, old_key).expect("written");
     assert_eq!(authority.ask(&address, "localhost").expect("the first is used on").0, first);
     std::fs::write(&files.key, new_key).expect("written");
-    // Lengths may be the same, and the clock of the file system coarse.
+    // Lengths may be equal, and the file system's clock coarse.
     let later = SystemTime::now() + Duration::from_secs(5);
     std::fs::File::options()
         .write(true)

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use crate::Index;
 use crate::dump::Dump;
 
-/// Sums that are formed side by side, so that the compiler uses vector instructions.
+/// Sums formed side by side, so that the compiler uses vector instructions.
 const LANES: usize = 16;
 
 pub struct Dense {

@@ -14,8 +14,8 @@ pub struct Meta {
     pub n_queries: usize,
 }
 
-/// A dump on disk: little-endian `vectors.f32` `[n][dim]`, `queries.f32` `[n_queries][dim]` and `meta.json`;
-/// vectors are of unit length.
+/// A dump on disk, unit vectors: little-endian `vectors.f32` `[n][dim]`, `queries.f32` `[n_queries][dim]`,
+/// `meta.json`.
 pub struct Dump {
     pub meta: Meta,
     vectors: Mmap,
@@ -63,7 +63,7 @@ impl Dump {
         bytemuck::cast_slice(&self.vectors)
     }
 
-    /// Forgets the vectors, so that only an index has them, and returns the queries.
+    /// Drops the vectors, so that only an index has them, and returns the queries.
     pub fn into_queries(self) -> Vec<Vec<f32>> {
         self.queries.chunks_exact(self.meta.dim).map(<[f32]>::to_vec).collect()
     }

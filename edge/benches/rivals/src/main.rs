@@ -1,5 +1,5 @@
-//! Times an engine on vectors and queries that `slag-lab bench query --dump DIR` wrote. `slag-lab bench robot`
-//! runs it once an engine, so that the memory of one engine is not counted for the next, and judges the answers.
+//! Times an engine on vectors and queries written by `slag-lab bench query --dump DIR`. `slag-lab bench robot` runs
+//! it once per engine, so that memory is not shared, and judges the answers.
 
 mod dense;
 mod dump;

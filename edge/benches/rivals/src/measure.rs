@@ -39,7 +39,6 @@ struct Search {
     max_ms: f64,
 }
 
-/// Builds the engine's index of a dump and times its searches.
 pub fn run(args: &Args, dump: Dump) -> Result<Report> {
     let meta = dump.meta;
     let work = args.work.clone().unwrap_or_else(|| args.dump.join(args.engine.name()));

@@ -13,13 +13,12 @@ use qdrant_edge::{
 use crate::dump::Dump;
 use crate::{Engine, Index};
 
-/// Edges of a graph's node, and candidates while it is built.
+/// Edges of a graph's node, and candidates during its construction.
 const EDGES: usize = 16;
 const CANDIDATES: usize = 100;
 /// Points in one insert: 16 MB of vectors at 512 components.
 const INSERT: usize = 8192;
 
-/// A shard in a folder.
 pub struct Qdrant {
     shard: EdgeShard,
     engine: Engine,
@@ -37,7 +36,7 @@ impl Qdrant {
             let points = PointInsertOperations::PointsList(points.collect());
             shard.update(UpdateOperation::PointOperation(PointOperations::UpsertPoints(points)))?;
         }
-        // Moves the points into immutable segments, with graph and quantised vectors where they are asked for.
+        // Moves the points into immutable segments, with graph and quantised vectors if configured.
         shard.optimize()?;
         shard.flush();
         Ok(Self { shard, engine })

@@ -36,7 +36,7 @@ fn the_line_comes_before_the_environment_and_that_before_the_file() {
         ("slag-edge serve", &environment[..0], "radius", &["7.5"][..]),
         ("slag-edge serve", &environment, "radius", &["8"]),
         ("slag-edge serve --radius 9", &environment, "radius", &["9"]),
-        // The environment's value for all comes before the file's for this command.
+        // The environment's value for all precedes the file's for this command.
         ("slag-edge serve", &environment[..0], "host", &["a", "b"]),
         ("slag-edge serve", &environment, "host", &["c", "d"]),
         ("slag-edge serve --host e", &environment, "host", &["e"]),
@@ -48,10 +48,10 @@ fn the_line_comes_before_the_environment_and_that_before_the_file() {
         ("slag-edge serve", &environment, "trust_first", &["true"]),
         ("slag-edge serve", &[("SLAG_EDGE_TRUST_FIRST", "false")], "trust_first", &["false"]),
         ("slag-edge serve", &environment, "refresh_secs", &["9"]),
-        // A value of the file does not stand beside another of the line that excludes it.
+        // The line's value drops a file's value that it excludes.
         ("slag-edge fetch", &environment, "at", &["1,2,3"]),
         ("slag-edge fetch --at-geo 4,5", &environment, "at", &[]),
-        // One name for all commands that have different values there; what the file switches on is switched off.
+        // One name with different values per command; the line switches off the file's flag.
         ("slag-edge fetch", &[("SLAG_EDGE_FROM", "http://a:1")], "from", &["http://a:1"]),
         ("slag-edge changes", &[("SLAG_EDGE_FROM", "http://a:1")], "from", &[]),
         ("slag-edge changes", &[("SLAG_EDGE_FROM", "7")], "from", &["7"]),
@@ -91,11 +91,11 @@ fn flags_of_a_file_need_and_exclude_others() {
     for (line, environment, file, id, expected) in [
         ("slag-edge query chair --near 1,2,3", &radius[..], "", "radius", &["0.5"][..]),
         ("slag-edge list", &[], "[list]\nradius = 3\nnear = '1,2,3'", "radius", &["3"]),
-        // One for all commands: fetches alone have a radius without a position.
+        // For all commands: only fetches accept a radius without a position.
         ("slag-edge fetch", &[], "radius = 3", "radius", &["3"]),
         ("slag-edge list", &[], "radius = 3", "radius", &[]),
         ("slag-edge list --near 1,2,3 --radius 4", &[], "radius = 3", "radius", &["4"]),
-        // What is switched off on the line hides nothing that follows.
+        // A flag switched off on the line does not hide later ones.
         (
             "slag-edge fetch --trust-first=false --at-geo 4,5",
             &[],
@@ -103,11 +103,10 @@ fn flags_of_a_file_need_and_exclude_others() {
             "at",
             &[],
         ),
-        // The environment comes before the file.
         ("slag-edge fetch", &here, "[fetch]\nat = '1,2,3'", "at", &[]),
         ("slag-edge fetch", &here, "[fetch]\nat = '1,2,3'", "at_geo", &["4,5"]),
         ("slag-edge list", &[], "[list]\nformat = 'csv'\njson = false", "format", &["csv"]),
-        // Those of other commands may be completed by their lines.
+        // Other commands' lines may complete their flags.
         ("slag-edge status", &[], "[list]\nradius = 3", "cache", &[]),
     ] {
         let matches = parsed(line, environment, file).unwrap_or_else(|e| panic!("{line}: {e}"));
@@ -147,9 +146,9 @@ fn errors_name_the_file_and_the_key() {
         ("config = 'x'", "config", "no flag of this name"),
         ("[fetsch]\nradius = 1", "fetsch", "tables: fetch, serve"),
         ("[query]\ntext = 'chair'", "query.text", "no flag of this name"),
-        // First trust is a step that somebody takes.
+        // First trust is a deliberate step.
         ("[trust.add]\ntrust-first = true", "trust.add.trust-first", "no flag of this name"),
-        // Commands that are not asked for are checked as well.
+        // Tables of other commands are checked, too.
         ("[trust.show]\njson = 7", "trust.show.json", "expected true or false"),
     ] {
         let error = parsed("slag-edge status", &[], file).expect_err(file).to_string();
@@ -176,7 +175,7 @@ fn errors_name_the_file_and_the_key() {
     assert!(error.to_string().len() < 120, "a hint, not all flags: {error}");
 }
 
-/// Returns the keys of all flags that a file may set, as `serve.listen`.
+/// Returns the keys of all flags in a file, as `serve.listen`.
 fn keys(command: &Command, path: &str) -> BTreeSet<String> {
     let own = flags(command).filter_map(|arg| arg.get_long()).map(|long| format!("{path}{long}"));
     let below =
@@ -213,8 +212,8 @@ fn the_sample_has_every_flag() {
     }
 }
 
-/// By default all queries together may use four times the budget of one; the unit's limit has room for that, half
-/// as much again for what no budget counts, and the program itself.
+/// By default all queries together may use four times the budget of one; the unit's limit has room for that, half as
+/// much again for uncounted memory, and the program itself.
 #[test]
 fn the_unit_has_room_for_all_queries() {
     let unit = include_str!("../../../../jetson/slag-edge.service");

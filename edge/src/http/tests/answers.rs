@@ -26,7 +26,7 @@ async fn pieces(response: Response) -> Result<Vec<Vec<u8>>, axum::Error> {
     soon(body.map_ok(|piece| piece.to_vec()).try_collect()).await
 }
 
-/// A long answer comes in short pieces: JSON of 60,000 Gaussians in pieces of 64 KiB.
+/// A long answer is streamed: JSON of 60,000 Gaussians in pieces of 64 KiB.
 #[tokio::test]
 async fn long_answers_come_in_small_pieces() {
     let service = Service::new(Some(&many()), Settings::default());
@@ -39,7 +39,7 @@ async fn long_answers_come_in_small_pieces() {
     let answers = body["answers"].as_array().expect("a list");
     assert_eq!((answers.len(), &body["n_matching"]), (60_000, &60_000.into()));
     for (at, answer) in answers.iter().enumerate() {
-        // The scores tie in each cell, the nearest to the origin come first.
+        // The scores tie in each cell; the nearest to the origin come first.
         let (cell, index) = if at < 40_000 { (5, at) } else { (9, at - 40_000) };
         assert_eq!(
             (&answer["rank"], &answer["cell_id"], &answer["index"]),
@@ -147,8 +147,7 @@ async fn formats_are_negotiated() {
     assert!(reader.next().is_none());
 }
 
-/// A client that does not read holds no permit, so that others are answered; its cut-off answer does not look
-/// complete, and gives its memory back.
+/// A client that does not read holds no permit; its answer is visibly cut off and releases its memory.
 #[tokio::test]
 async fn answers_that_nobody_reads_stop_nobody() {
     let settings = Settings { max_queries: 1, stream_timeout: Duration::from_secs(1), ..Settings::default() };

@@ -1,4 +1,4 @@
-//! What was tried against the service, and what stops it.
+//! Attacks on the service, and their defences.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
@@ -33,7 +33,7 @@ fn following_app(service: &Service, access: Access) -> (Arc<App>, Arc<Following>
     (App::following(engine, settings, Some(Arc::clone(&following))), following)
 }
 
-/// A web page posts to the robot, or reads it by a name that it lets resolve to the robot.
+/// A web page posts to the robot, or reads it through a name that resolves to it (DNS rebinding).
 #[tokio::test]
 async fn web_pages_neither_write_nor_read() {
     let service = Service::with_chair();
@@ -80,7 +80,7 @@ async fn web_pages_neither_write_nor_read() {
     assert_eq!(ask(&app, "POST", "/position", &[json, ("origin", "http://127.0.0.1:7734")]).await.0, 202);
 }
 
-/// A question in JSON changes nothing: it is admitted as GET is, with and without a token.
+/// A question in JSON only reads: it is admitted as GET is, with and without a token.
 #[tokio::test]
 async fn questions_in_json_are_reads() {
     let service = Service::with_chair();
@@ -94,15 +94,14 @@ async fn questions_in_json_are_reads() {
         let access = Access::new(&listen.parse().expect("an address"), settings).expect("sound");
         let (app, _) = following_app(&service, access);
         assert_eq!(ask(&app, "POST", "/position", &json).await.0, refused, "{listen}");
-        // The body is a position: it is read, and refused for what it says.
+        // The body is a position: it is read, but is no valid query.
         assert_eq!(ask(&app, "POST", "/v1/query", &json).await.0, 400, "{listen}");
         let foreign = [json[0], ("origin", "https://evil.example")];
         assert_eq!(ask(&app, "POST", "/v1/query", &foreign).await.0, 403, "{listen}");
     }
 }
 
-/// Every route that is described, with either method, either answers in a size and a time that the cells on board
-/// bound, or charges what it allocates and looks at the clock.
+/// Every described route is bounded in size and time by the cells on board, or charges its budget.
 #[tokio::test]
 async fn every_route_keeps_within_its_budget() {
     let room = super::v1::room_with(Some(&super::goal::places()));
@@ -162,7 +161,7 @@ async fn every_route_keeps_within_its_budget() {
             let kind = answer["type"].as_str().unwrap_or_default();
             let context = format!("{spent}: {uri} {}: {answer}", String::from_utf8_lossy(body));
             let says_so = answer["detail"].as_str().is_some_and(|detail| detail.contains(spent));
-            // Where the machine is busy, the clock outside of the work comes first.
+            // On a busy machine the outer timeout comes first.
             let is_late =
                 spent.ends_with(" s") && (status.as_u16(), kind) == (503, "urn:slag:problem:timeout");
             let is_spent = (status.as_u16(), kind) == (422, "urn:slag:problem:over-budget") && says_so;
@@ -192,12 +191,11 @@ async fn an_origin_that_was_given_may_ask_and_read() {
         assert_eq!((header("vary"), header("x-request-id")), (Some("origin"), Some("map-17")));
         assert_eq!(header("access-control-allow-methods").is_some(), status == 204);
     }
-    // Without an origin nothing is said about any.
     let (_, headers, _) = service.get("/query?text=0").await;
     assert!(!headers.contains_key("access-control-allow-origin"));
 }
 
-/// The follower panics: nothing claims that the robot is followed until it is again.
+/// After a panic of the follower, nothing claims that the robot is followed until it is again.
 #[tokio::test]
 async fn a_follower_that_panics_is_reported_and_begins_again() {
     let service = Service::with_chair();

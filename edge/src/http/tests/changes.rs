@@ -1,4 +1,4 @@
-//! What changed between generations: `GET /v1/changes`.
+//! Changes between generations: `GET /v1/changes`.
 
 use slag_common::frames::{GeoReference, Geographic};
 use slag_common::manifest::Manifest;
@@ -9,8 +9,8 @@ use crate::query::MAX_TEXTS;
 use crate::store::{BadCell, CellFault, OldShard, Snapshot, history};
 use crate::testing::{CALIBRATION, TestObject, manifest_of, write_manifest};
 
-/// 20 Gaussians at x = 3, and objects at x = their ids, each along the axis of its id modulo 3. Other things are of
-/// another splat.
+/// 20 Gaussians at x = 3, and objects at x = their ids, each along the axis of its id modulo 3. Different objects
+/// come from different splats.
 fn shards(ids: &[u64]) -> [BuiltShard; 1] {
     [with_things(&cell(1, 3.0, ids), ids, |id| (0..3).map(|axis| f32::from(axis == id % 3)).collect())]
 }
@@ -25,7 +25,7 @@ fn with_things(shard: &BuiltShard, ids: &[u64], vector: impl Fn(u64) -> Vec<f32>
     shard.with_objects(&objects.collect::<Vec<_>>(), CALIBRATION)
 }
 
-/// 20 Gaussians of axis 0 in a cell of 656 units from x on, elsewhere for other things.
+/// 20 Gaussians of axis 0 in a cell of 656 units from x on; another splat for other objects.
 fn cell(cell_id: u32, x: f64, ids: &[u64]) -> BuiltShard {
     at(cell_id, x, ids).build(false)
 }
@@ -63,8 +63,8 @@ async fn generations_are_compared_over_http() {
         );
         assert!(read.vector.iter().zip(&written.vector).all(|(a, b)| (a - b).abs() < 0.01), "{read:?}");
     }
-    // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor. The clock
-    // of the machine that encoded has gone back: generations count by their numbers.
+    // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor. The encoder's
+    // clock has gone back: generations are ordered by number.
     let later = shards(&[6, 22, 33]);
     let manifest = Manifest { created_unix_secs: record.created_unix_secs - 60, ..manifest_of(&later, 2) };
     write_manifest(service.dir.path(), &later, manifest);
@@ -94,12 +94,12 @@ async fn generations_are_compared_over_http() {
         [&went["box_min_in_world"], &went["box_max_in_world"], &went["n_gaussians_in_scene"], &went["photo"]],
         [&json!([19.0, -1.0, -1.0]), &json!([21.0, 1.0, 1.0]), &json!(40), &json!("20.jpg")]
     );
-    // Of a move, one end in the ball counts.
+    // One end of a move in the ball suffices.
     let (_, near) = get("?near=10,0,0&radius=2").await;
     assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");
     let (_, near) = get("?near=22,0,0&radius=1").await;
     assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");
-    // Places on the earth are in the world frame where the scene has an origin; this one has none.
+    // This scene has no origin, so latitude and longitude are refused.
     assert_refused(&service.get("/v1/changes?near_lat_lon=46,7&radius=2").await, "near_lat_lon", "no origin");
     // Texts are axes: 33 is along axis 0, 20 along axis 2.
     let (_, named) = get("?text=0&text=2").await;
@@ -120,8 +120,8 @@ async fn generations_are_compared_over_http() {
     }
 }
 
-/// Cell 2 of the second generation did not come: its shard of the first stands in. By hand: 10 went from cell 1;
-/// whether 1002 is still in cell 2 is not known, although the old shard on board has it.
+/// Cell 2 of the second generation is missing: its shard of the first stands in. By hand: 10 went from cell 1;
+/// whether 1002 is still in cell 2 is unknown, although the old shard on board has it.
 #[tokio::test]
 async fn shards_that_stand_in_say_nothing_of_their_generation() {
     let axis_0 = |_| vec![1.0, 0.0, 0.0];
@@ -172,7 +172,7 @@ async fn changes_are_placed_on_the_earth() {
         assert_eq!(status, StatusCode::OK, "{body:#}");
         body["went"].clone()
     };
-    // 10 m east of the origin lies what went.
+    // 10 m east of the origin lies the object that went.
     let thing = &went("near_lat_lon=46,7&radius=11").await[0];
     assert_eq!(thing["id"], "o000000000000000a");
     let east = thing["geographic"]["longitude_deg"].as_f64().expect("a number") - 7.0;
@@ -198,7 +198,7 @@ async fn likeness_is_a_cosine_whatever_the_lengths() {
     assert!(like["text"] == "1" && (score - std::f64::consts::FRAC_1_SQRT_2).abs() < 0.01, "{body:#}");
 }
 
-/// Vectors of another encoder do not compare with a text's; things alone still compare.
+/// Vectors of another encoder do not compare with a text's; objects alone still compare.
 #[tokio::test]
 async fn texts_need_the_encoder_of_the_scene() {
     let of = |ids: &[u64]| {

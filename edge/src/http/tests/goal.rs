@@ -6,8 +6,7 @@ use super::openapi::{check, description};
 use super::v1::room_with;
 use super::*;
 
-/// The places of the room with two mugs and a table: a floor from -1 to 5 m along x and to 4 m along y, and their
-/// boxes.
+/// Occupancy of the room: a floor from -1 to 5 m along x and to 4 m along y, and the boxes of two mugs and a table.
 pub(super) fn places() -> BuiltOccupancy {
     let voxel = 0.1;
     let inside = |p: glam::DVec3, low: [f64; 3], high: [f64; 3]| {
@@ -47,8 +46,7 @@ fn is_as_described(path: &str, body: &Value) {
 async fn poses_or_reasons_are_given() {
     let shards = room_with(Some(&places()));
     let service = Service::new(Some(&shards), Settings::default());
-    // The mug on the floor is seen; that on the table is too high for the sensor, and is named as missed or comes
-    // second.
+    // The mug on the floor is seen; the one on the table is too high, and is named as missed or comes second.
     let (status, _, body) = service.get("/v1/goal?id=o0000000000000002&near=2,3,0&step_m=0.15").await;
     assert_eq!(status, StatusCode::OK, "{body:#}");
     is_as_described("/v1/goal", &body);
@@ -69,14 +67,14 @@ async fn poses_or_reasons_are_given() {
         .get("/v1/goal?id=o0000000000000001&near=2,3,0&step_m=0.15&sensor_height_m=1.2&reach_m=1")
         .await;
     assert!(over["goals"][0]["visible_share"].as_f64() > Some(0.1), "{over:#}");
-    // By text: of both mugs the one that is seen.
+    // By text: of both mugs the visible one.
     let (_, _, text) = service.get("/v1/goal?text=0&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &text);
     assert_eq!(text["thing"]["id"], "o0000000000000002", "{text:#}");
     let (_, _, none) = service.get("/v1/goal?text=2&near=2,3,0&step_m=0.15").await;
     is_as_described("/v1/goal", &none);
     assert_eq!(none["none"]["kind"], "no-such-thing", "{none:#}");
-    // Which side is left depends on where the robot looks.
+    // "Left of me" depends on the robot's heading.
     let of_side = "/v1/goal?text=0+left+of+me&near=2,3,0&step_m=0.15";
     assert_refused(&service.get(of_side).await, "heading_rad", "nothing");
     let mut kinds = Vec::new();
@@ -113,8 +111,8 @@ async fn the_floor_is_mapped() {
     assert_eq!(n.values().sum::<usize>(), size[0] * size[1]);
     let seen = n.iter().filter(|(kind, _)| **kind != 'u').map(|(_, n)| n).sum::<usize>();
     assert_eq!(seen, 60 * 50, "{n:?}");
-    // The edge of the table's 16 x 9 cells, and the mug on it; the mug on the floor is as high as a step. The
-    // table's top is ground that nobody reaches.
+    // The edge of the table's 16 x 9 cells, and the mug on it; the mug on the floor is as high as a step. The table's
+    // top is unreachable ground.
     assert_eq!(n[&'o'], 47, "{n:?}");
     assert!(n[&'r'] > 2000 && n[&'g'] > 16 * 9 - 47, "{n:?}");
 }

@@ -1,4 +1,4 @@
-//! The things on board: what they are called, in which order, where, and as tables and maps.
+//! The objects on board: names, order, positions, tables and maps.
 
 use slag_common::container::AlignedBytes;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
@@ -13,10 +13,9 @@ use crate::testing::{manifest_of, write_manifest};
 const FIRST: &str = "o0000000000000001";
 const SECOND: &str = "o0000000000000002";
 const THIRD: &str = "o0000000000000003";
-/// The second one's.
 const PICTURE: [u8; 6] = [0xff, 0xd8, 0xff, 0xe0, 1, 2];
 
-/// Three things along x, by their ids: two of axis 1 and one of axis 0. The second has the largest face, the third the
+/// Three objects along x, by id: two of axis 1 and one of axis 0. The second has the largest face, the third the
 /// largest volume.
 fn things() -> [BuiltShard; 1] {
     let [room] = room_with(None);
@@ -45,7 +44,7 @@ fn things() -> [BuiltShard; 1] {
     [BuiltShard { bytes, layout, embeddings: room.embeddings.clone() }]
 }
 
-/// Of three things one has a picture.
+/// One of three objects has a thumbnail.
 #[tokio::test]
 async fn things_have_their_own_pictures() {
     let service = Service::new(Some(&things()), Settings::default());
@@ -75,7 +74,7 @@ async fn ids_of(service: &Service, query: &str) -> Vec<String> {
     objects.iter().map(|object| object["id"].as_str().expect("an id").to_owned()).collect()
 }
 
-/// Each thing is called by its axis, and nothing by the third.
+/// Each object is named by its axis, and none by the third.
 #[tokio::test]
 async fn things_have_their_best_names() {
     let service = Service::new(Some(&things()), Settings::default());
@@ -100,7 +99,7 @@ async fn things_are_sorted_and_paged() {
     assert_eq!(ids_of(&service, "sort=name").await, [THIRD, FIRST, SECOND]);
     assert_eq!(ids_of(&service, &format!("sort=area&limit=1&after={SECOND}")).await, by_area[1..2]);
     assert_eq!(ids_of(&service, &format!("sort=area&after={}", by_area[2])).await, [""; 0]);
-    // By id, any id is a place to begin at.
+    // By id, any id is a valid start.
     assert_eq!(ids_of(&service, "after=o0000000000000000").await.len(), 3);
     for bad in ["sort=area&after=o0000000000000000", "sort=size", "format=xml"] {
         assert_eq!(service.get(&format!("/v1/objects?{bad}")).await.0, StatusCode::BAD_REQUEST, "{bad}");
@@ -117,7 +116,7 @@ async fn things_are_listed_by_region() {
     assert_eq!(service.get("/v1/objects?near_lat_lon=46,7&radius=1").await.0, StatusCode::BAD_REQUEST);
 }
 
-/// A line and a point for each thing; the middle of the map is the scene's origin.
+/// A line and a point for each object; the middle of the map is the scene's origin.
 #[tokio::test]
 async fn things_become_tables_and_maps() {
     let shards = things();
@@ -126,7 +125,7 @@ async fn things_become_tables_and_maps() {
     assert_eq!((status, &headers["content-type"]), (StatusCode::OK, &"text/csv".parse().expect("a value")));
     let lines = table.as_str().expect("text").split_terminator("\r\n");
     let lines: Vec<Vec<&str>> = lines.map(|line| line.split(',').collect()).collect();
-    // The name of each photo has a comma, and so is quoted.
+    // Each photo's name has a comma, and so is quoted.
     assert!(lines.len() == 4 && lines[1..].iter().all(|line| line.len() == lines[0].len() + 1), "{table}");
     assert_eq!(lines[1][17..], ["\"1", " \"\"a\"\".jpg\""]);
     let (_, _, page) = service.get("/v1/objects").await;

@@ -62,7 +62,7 @@ async fn photos_are_lost_or_refused() {
     assert_eq!(refused.0, StatusCode::PAYLOAD_TOO_LARGE);
 }
 
-/// Noise does not compress: a file as long as a camera's, 3 MB.
+/// Noise does not compress: a file of a camera's length, 3 MB.
 #[tokio::test]
 async fn long_photos_are_taken() {
     let mut random = slag_math::random::Random::new(3);
@@ -74,7 +74,7 @@ async fn long_photos_are_taken() {
     assert_eq!((status, &body["state"]), (StatusCode::OK, &json!("lost")), "{body:#}");
 }
 
-/// A picture of one colour is short as a file: what it takes is refused before it is read.
+/// A picture of one colour is short as a file: its memory is refused before it is read.
 #[tokio::test]
 async fn memory_is_bounded() {
     let with =
@@ -84,7 +84,7 @@ async fn memory_is_bounded() {
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body:#}");
     let (status, _) = post(&service, "focal_px=500", "image/png", png(64, 48)).await;
     assert_eq!(status, StatusCode::OK);
-    // What stands before the pixels may inflate: it is not opened where there is no room for that.
+    // Data before the pixels may inflate: the file is not opened without memory for that.
     let (status, body) = post(&with(10 << 20), "focal_px=500", "image/png", b"no photo".to_vec()).await;
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body:#}");
 }

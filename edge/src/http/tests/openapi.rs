@@ -19,7 +19,7 @@ fn names<'a>(names: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
     names.into_iter().collect()
 }
 
-/// Checks a value against a schema: types, names (none undescribed, none of the required missing), enums.
+/// Checks a value against a schema: types, names (none undescribed, no required one missing), enums.
 pub(super) fn check(schema: &Value, value: &Value, at: &str) -> Result<(), String> {
     if let Some(name) = schema["$ref"].as_str() {
         let schema = description().pointer(name.trim_start_matches('#')).cloned();
@@ -88,7 +88,7 @@ async fn every_route_and_parameter_is_described() {
         let described = api["paths"][path][&method]["parameters"].as_array().cloned().unwrap_or_default();
         let of_path = described.iter().filter(|p| p["in"] == "path").count();
         assert_eq!(of_path, path.matches('{').count(), "{path}");
-        // What nobody reads is refused.
+        // Unknown parameters are refused.
         if !described.iter().any(|parameter| parameter["in"] == "query") {
             let refused = read(service.send(route.method.as_str(), &format!("{uri}?x=1")).await).await;
             assert_eq!(
@@ -100,7 +100,7 @@ async fn every_route_and_parameter_is_described() {
     }
     let described = api["paths"]["/query"]["get"]["parameters"].as_array().expect("parameters");
     let known: Vec<&str> = described.iter().filter_map(|parameter| parameter["name"].as_str()).collect();
-    // By hand: what /query has, with what only /v1/query had before.
+    // By hand.
     let expected = "box format heading_rad kind limit min_count min_score near near_lat_lon negative negatives \
                     offset polygon polygon_lat_lon precision radius relations text threshold time_budget_ms voxel";
     assert_eq!(names(known.iter().copied()), names(expected.split_whitespace()));
@@ -132,7 +132,7 @@ async fn every_route_and_parameter_is_described() {
     assert!(table.iter().all(listed), "{help}");
 }
 
-/// Descriptions come from doc comments: they must make sense to someone who does not see the program.
+/// Descriptions come from doc comments: they must make sense to clients.
 #[test]
 fn descriptions_are_for_clients() {
     fn walk(value: &Value, at: &str, found: &mut impl FnMut(&str, &str, &Value)) {
@@ -153,7 +153,6 @@ fn descriptions_are_for_clients() {
             n_refs += 1;
             assert!(api.pointer(to.trim_start_matches('#')).is_some_and(Value::is_object), "{at}: {to}");
         }
-        // The only member of a variant is described with the variant.
         ("properties", Value::Object(properties))
             if !at.ends_with("/properties") && !at.ends_with("/oneOf") =>
         {

@@ -1,11 +1,11 @@
-//! `format=ply`: the points are the Gaussians of the answers that JSON describes.
+//! `format=ply`: the points are the Gaussians of the answers in JSON.
 
 use std::collections::BTreeMap;
 
 use super::*;
 use crate::testing::{CALIBRATION, TestObject};
 
-/// Two things, 20 m apart. Each lies in two cells: in one every Gaussian matches, in the other every second.
+/// Two things, 20 m apart, each in two cells: in one every Gaussian matches, in the other every second.
 fn two_things(has_packed_indices: bool) -> [BuiltShard; 2] {
     [(5u32, 0u16), (9, 2_000)].map(|(cell_id, x)| {
         let member = |i: u16| {
@@ -20,10 +20,9 @@ fn two_things(has_packed_indices: bool) -> [BuiltShard; 2] {
     })
 }
 
-/// A point by property name; every property is read as a number.
 type Point = BTreeMap<String, f64>;
 
-/// Reads a PLY by its own header: comments and points.
+/// Parses a PLY by its own header: comments and points.
 fn points(bytes: &[u8]) -> (Vec<String>, Vec<Point>) {
     let end = bytes.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
     let header = std::str::from_utf8(&bytes[..end]).expect("ASCII");
@@ -72,7 +71,7 @@ async fn points_are_the_gaussians_of_the_answers() {
         assert_eq!(of.len() as u64, answer["n_gaussians"].as_u64().expect("a number"));
         for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
             let (low, high) = (&answer["box_min_in_world"][axis], &answer["box_max_in_world"][axis]);
-            // The box leaves out two percent at either end.
+            // The box excludes two percent at either end.
             let inside = |p: &&&Point| Some(p[name]) >= low.as_f64() && Some(p[name]) <= high.as_f64();
             assert!(of.iter().filter(inside).count() >= of.len() * 9 / 10, "{name}");
         }
@@ -114,7 +113,7 @@ async fn shards_without_indices_have_points_without() {
     assert!(points.len() == 90 && points.iter().all(|point| !point.contains_key("input_index")));
 }
 
-/// An object's points are its runs in the region, not the Gaussians that match.
+/// An object's points are its runs in the region, not only matching Gaussians.
 #[tokio::test]
 async fn objects_have_their_own_gaussians() {
     let [first, _] = two_things(true);

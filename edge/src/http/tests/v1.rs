@@ -1,4 +1,4 @@
-//! Version 1 of the API: one shape of reply, areas, pages, relations, the things on board, events.
+//! Version 1 of the API: reply type, areas, pages, relations, objects on board, events.
 
 use futures_util::StreamExt;
 use slag_common::occupancy::BuiltOccupancy;
@@ -24,13 +24,13 @@ fn lattice(from: [u16; 3], to: [u16; 3], n: [u16; 3], axis: usize) -> Vec<Member
     members
 }
 
-/// Two mugs (axis 0), one of them on a table (axis 1), and nothing of axis 2. Metres: the table is 1.6 x 0.9 x
-/// 0.74 in a corner of the world, the other mug stands 3 m along x on the floor.
+/// Two mugs (axis 0), one on a table (axis 1), and nothing of axis 2. Metres: the table is 1.6 x 0.9 x 0.74 in a
+/// corner of the world, the other mug stands 3 m along x on the floor.
 fn room() -> [BuiltShard; 1] {
     room_with(None)
 }
 
-/// The same, with its free and occupied places.
+/// The same, with occupancy.
 pub(super) fn room_with(places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
     let mugs = [
         lattice([50, 40, 75], [60, 50, 88], [4, 4, 4], 0),
@@ -78,7 +78,7 @@ async fn get_and_post_answer_in_one_shape() {
     assert_eq!(ids(&got["results"][0]), [MUG_ON_TABLE, MUG_ON_FLOOR]);
     let answer = &got["results"][0]["answers"][0];
     assert_eq!((&answer["frame"], &answer["generation"]), (&json!("world"), &json!(1)));
-    // The same vector without the text model; its length does not count.
+    // The same vector without the text model; its length is ignored.
     let (status, _, vector) =
         post(&service, &json!({"vectors": [[5.0, 0.0, 0.0], [0.0, 0.5, 0.0]], "near": [0, 0, 0]})).await;
     assert_eq!(status, StatusCode::OK, "{vector}");
@@ -154,7 +154,7 @@ async fn relations_are_answered_and_say_what_failed() {
     assert_eq!(result["answers"][0]["related_to"][0]["id"], TABLE);
     let (_, _, posted) = post(&service, &json!({"phrases": [phrase]})).await;
     assert_eq!(posted["results"][0]["answers"], result["answers"]);
-    // The text alone, as it is.
+    // The plain text, unparsed.
     let (_, _, plain) = service.get("/v1/query?text=0%20on%20the%201&relations=off").await;
     assert_eq!(ids(&plain["results"][0]).len(), 2);
     let asks = [
@@ -184,8 +184,8 @@ async fn relations_are_answered_and_say_what_failed() {
     }
 }
 
-/// The room with a lamp (axis 2) on the table that is no object, and with the mug on the floor as three objects in a row,
-/// the last of which touches the others.
+/// The room with a lamp (axis 2) on the table that is no object, and with the mug on the floor as three objects in a
+/// row, the last of which touches the others.
 fn room_in_pieces() -> [BuiltShard; 1] {
     let pieces = [
         (lattice([50, 40, 75], [60, 50, 88], [4, 4, 4], 0), Some((1, 0))),
@@ -209,7 +209,7 @@ fn room_in_pieces() -> [BuiltShard; 1] {
     [TestShard::new(members).build(false).with_objects(&objects, CALIBRATION)]
 }
 
-/// What no object answers, clusters do, in phrases as in plain questions; pieces that touch are counted once.
+/// Clusters answer where no object does, in phrases as in plain questions; touching pieces count once.
 #[tokio::test]
 async fn phrases_take_clusters_and_whole_things() {
     let service = Service::new(Some(&room_in_pieces()), Settings::default());
@@ -300,7 +300,7 @@ async fn wrong_requests_are_refused_by_name() {
     assert_refused(&service.get("/v1/objects?near_lat_lon=47,8&radius=1").await, "near_lat_lon", "a list");
     let (status, _, body) = post(&service, &json!({"texts": ["sofa"]})).await;
     assert_eq!((status.as_u16(), &body["parameter"]), (422, &json!("texts")), "{body}");
-    // What serde says is whole: it ends with the place, and lists the names.
+    // serde's message is complete: it ends with the position, and lists the names.
     let (_, _, body) = post(&service, &json!({"texts": ["0"], "colour": 1})).await;
     let detail = body["detail"].as_str().expect("text");
     assert!(detail.starts_with("body: unknown field `colour`, expected one of `texts`"), "{detail}");
@@ -315,7 +315,7 @@ async fn wrong_requests_are_refused_by_name() {
     assert_eq!(post(&empty, &json!({"texts": ["0"]})).await.0, StatusCode::SERVICE_UNAVAILABLE);
 }
 
-/// One text of 45 kB, or a phrase as deep, must end neither a thread nor the process.
+/// A text of 45 kB, or a phrase as deep, must end neither a thread nor the process.
 #[tokio::test]
 async fn long_and_deep_questions_are_refused() {
     let service = Service::new(Some(&room_with(Some(&super::goal::places()))), Settings::default());
@@ -341,7 +341,7 @@ async fn long_and_deep_questions_are_refused() {
     }
 }
 
-/// An array in the place of an object would be read in the order of its members: GeoJSON has longitude first.
+/// Arrays in place of objects are refused: they would be read in member order, and GeoJSON has longitude first.
 #[tokio::test]
 async fn members_have_names() {
     let service = Service::new(Some(&room()), Settings::default());
@@ -408,7 +408,7 @@ async fn things_on_board_are_listed_in_pages() {
         (&map["n_objects"], &map["cells"][0]["generation"], &map["missing"], &map["z_is_up"]),
         (&json!(3), &json!(1), &json!([]), &json!(true))
     );
-    // Before a generation's time, as where the robot's clock is behind, it has no age.
+    // Before the generation's time (the robot's clock is behind) there is no age.
     let snapshot = service.app.engine.snapshot().expect("loaded");
     let made = snapshot.manifest.created_unix_secs;
     let at = |now| map_status(&snapshot, now, Some(made + 30));

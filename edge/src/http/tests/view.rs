@@ -1,4 +1,4 @@
-//! The messages of the page, read as the page reads them and compared with the other routes.
+//! The page's messages, decoded as the page does and compared with the other routes.
 
 use std::path::PathBuf;
 
@@ -29,7 +29,7 @@ fn f16_at(bytes: &[u8], at: usize) -> f64 {
     f16::from_le_bytes([bytes[at], bytes[at + 1]]).to_f64()
 }
 
-/// Two cells: 20 Gaussians of axis 0 and 5 between the axes 0 and 1; then 7 of axis 1 and one that no view shows.
+/// Two cells: 20 Gaussians of axis 0 and 5 between the axes 0 and 1; then 7 of axis 1 and one in no view.
 fn two_cells() -> [BuiltShard; 2] {
     let along = |n: u16, embedding: [f32; 3]| -> Vec<Member> {
         (0..n).map(|i| Member { steps: [i, 2 * i, 3], embedding: embedding.to_vec() }).collect()
@@ -105,7 +105,7 @@ async fn appearances_on_board_are_handed_on() {
     assert!(gaussians[32 + 9 * 25..32 + 10 * 25].iter().all(|opacity| *opacity == 128));
     let sizes: Vec<u8> = gaussians[32 + 10 * 25..32 + 13 * 25].chunks(3).map(|of| of[0]).collect();
     assert!(sizes.is_sorted() && sizes[0] < sizes[24]);
-    // Every eighth, where and as they are among all, but for their sizes.
+    // Every eighth Gaussian, unchanged but for its size.
     let (_, few) = bytes_of(&service, "/v1/view/cells/1?generation=1&step=8").await;
     assert_eq!((u32_at(&few, 8), u32_at(&few, 28), few.len()), (4, 8, 32 + 16 * 4));
     for (at, of) in [0, 8, 16, 24].into_iter().enumerate() {

@@ -20,9 +20,9 @@ use crate::http::problem::too_many_listeners;
 use slag_api::FRAME;
 
 const MEDIA_TYPE: &str = "text/event-stream";
-/// Time between looks at what is on board.
+/// Interval of looks at the state on board.
 const TICK: Duration = Duration::from_millis(500);
-/// Time without an event after which a comment is sent: a client that is gone is noticed.
+/// Silence after which a comment is sent, to notice clients that are gone.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 const EVENTS_AHEAD: usize = 4;
 
@@ -51,7 +51,7 @@ pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> 
                 text.push_str(": still here\n\n");
             }
             quiet = if text.is_empty() { quiet + TICK } else { Duration::ZERO };
-            // A client that takes nothing is cut off by the connection's own limit.
+            // The connection's own limit cuts off a client that takes nothing.
             if !text.is_empty() && sender.send(text.into()).await.is_err() {
                 return;
             }
@@ -67,7 +67,6 @@ pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> 
         (header::CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE)),
         (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
     ];
-    // It ends when the service stops.
     let events = unfold(receiver, |mut events| async move {
         let event = events.recv().await?;
         Some((Ok::<_, Infallible>(event), events))
@@ -83,7 +82,7 @@ struct Told {
 }
 
 impl Told {
-    /// Returns what has changed, as events; at first everything.
+    /// Returns the changes as events; at first everything.
     fn news(&mut self, app: &App) -> String {
         let mut text = String::new();
         let snapshot = app.engine.snapshot().ok();

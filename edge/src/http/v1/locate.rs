@@ -47,7 +47,7 @@ pub struct LocateParams {
 }
 
 impl LocateParams {
-    /// Returns the camera, and the place it may be at with its standard deviation.
+    /// Returns the camera, and its prior position with standard deviation.
     fn camera(self) -> Result<(Camera, Option<(Point, f64)>), RequestError> {
         let focal_px = self.focal_px;
         if !(1.0..=MAX_COORDINATE).contains(&focal_px) {

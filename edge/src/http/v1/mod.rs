@@ -87,7 +87,6 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .errors(&[(503, "Too many clients listen to events.")])
 }
 
-/// Adds what the page asks for.
 fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
     to.get(
         "/v1/view",

@@ -100,7 +100,6 @@ impl Described for ListFormats {
     }
 }
 
-/// Returns the object that a path names.
 fn wanted(id: &str) -> Result<u64, RequestError> {
     parse_public_id(id).ok_or_else(|| RequestError::new("id", id, "o and 16 hex digits"))
 }

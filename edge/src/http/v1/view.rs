@@ -1,4 +1,4 @@
-//! `GET /v1/view` and below: what the page needs to draw the scene and to colour it by a question.
+//! `GET /v1/view` and below: data for the page that draws the scene and colours it by a question.
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ use crate::http::problem::query_problem;
 use crate::query::{MAX_NEGATIVES, QueryError, RequestError, Words};
 use crate::score::Budget;
 
-/// Largest generation that a request can name: the largest integer that every client of JSON keeps.
+/// Largest generation in a request: the largest integer that every JSON client keeps.
 const MAX_GENERATION: u64 = (1 << 53) - 1;
 
 /// The question that the scene is coloured by.

@@ -11,7 +11,7 @@ const GROUPING: Grouping = Grouping {
     with_members: false,
 };
 
-/// Clusters points on a lattice of 5 cm, each list with a score of its own.
+/// Clusters points on a lattice of 5 cm; each list has its own score.
 fn clusters_of(lists: &[(f32, Vec<[u16; 3]>)]) -> Vec<Cluster> {
     let centroids = lists.iter().map(|(_, points)| {
         points.iter().map(|at| Member { steps: *at, embedding: vec![1.0, 0.0] }).collect()
@@ -46,7 +46,7 @@ fn a_string_of_floaters_joins_nothing() {
     let found = clusters_of(&[(0.5, [one.clone(), string(), other.clone()].concat())]);
     let counts: Vec<u64> = found.iter().map(|c| c.n_gaussians).collect();
     assert_eq!((counts.len(), counts.iter().sum::<u64>()), (2, 2006), "{counts:?}");
-    // The string belongs to one of the two, and that one's box leaves it out.
+    // The string belongs to one of the two, but lies outside its box.
     for (cluster, x) in found.iter().zip([0.225, 2.225]) {
         assert!(
             (cluster.extent.position_in_world - DVec3::new(x, 0.225, 0.225)).length() < 0.05,
@@ -73,8 +73,8 @@ fn sparse_things_hold_together() {
     assert_eq!(clusters_of(&[(0.5, [string(), string()].concat())]).len(), 1);
 }
 
-/// Voxels as coordinates and lists, heaviest first; each joins the voxels it touches, its heaviest
-/// neighbour's group first. `weights`: of the points.
+/// Oracle: voxels as coordinates and lists, heaviest first; each joins its touching voxels, the heaviest neighbour's
+/// group first. `weights`: of the points.
 fn brute_force(points: &[DVec3], weights: &[f64], voxel: f64) -> Vec<Vec<usize>> {
     let mut voxels: Vec<(I64Vec3, f64, Vec<usize>)> = Vec::new();
     for (at, point) in points.iter().enumerate() {
@@ -86,7 +86,7 @@ fn brute_force(points: &[DVec3], weights: &[f64], voxel: f64) -> Vec<Vec<usize>>
         }
     }
     voxels.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.to_array().cmp(&b.0.to_array())));
-    // Each group: its voxels, the heaviest first.
+    // Each group's voxels, heaviest first.
     let mut groups: Vec<Vec<usize>> = Vec::new();
     for at in 0..voxels.len() {
         groups.push(vec![at]);
@@ -133,7 +133,7 @@ proptest! {
         let mut points = Vec::new();
         let mut names = Vec::new();
         let mut runs = Vec::new();
-        // Weights of 1/8 to 1 have exact sums; the first is the best, so that weights equal scores.
+        // Weights of 1/8 to 1 have exact sums; the first is the best, so weights equal scores.
         let score_of = |point: usize| if point == 0 { 1.0 } else { (-levels[point] as f32).exp2() };
         for (at, view) in views.iter().enumerate() {
             let n = view.header.n_gaussians;

@@ -1,4 +1,4 @@
-//! What may be meant by the words of a phrase: objects, or groups of Gaussians where no object reaches the threshold.
+//! Candidates for the things of a phrase: objects, or clusters where no object reaches the threshold.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -14,33 +14,30 @@ use crate::query::scale::Scale;
 use crate::query::scene::{Scene, alignment, default_voxel};
 use crate::score::{ObjectScores, Question, Region};
 
-/// Most candidates that are weighed for a thing, best first.
+/// Most candidates per thing, best first.
 const MAX_CANDIDATES: usize = 256;
 
-/// Metres by which a piece may stick out of the thing that it is a piece of.
+/// Metres by which a piece may stick out of its thing.
 const PIECE_SLACK_M: f64 = 0.1;
-/// Things and pieces with less than this share of the best one's score are too doubtful to be compared with it: a doubtful
-/// large thing must not win over a sure one.
+/// Candidates below this share of the best score are not compared: a doubtful large thing must not beat a sure one.
 pub(super) const SURE: f64 = 0.65;
-/// Distance, in metres, up to which things of the same words are pieces of one.
+/// Distance, metres, up to which things of the same words are pieces of one.
 const TOUCHES_M: f64 = 0.05;
-/// The same for a thing above another, such as the back of a chair above its seat.
+/// As [`TOUCHES_M`], for a thing above another, such as the back of a chair above its seat.
 const ABOVE_M: f64 = 0.25;
-/// Default voxels in a metre of a metric scene; in others as many stand for a metre.
+/// Default voxels in a metre of a metric scene; in others this many stand for a metre.
 const VOXELS_PER_METRE: f64 = 4.0;
 
-/// What may be meant. Pieces of a better candidate of the same words are left out: they must not be counted, or
-/// compared with it.
+/// A candidate for a thing. Pieces of better candidates of the same words are excluded: neither counted nor compared.
 pub struct Candidate<'a> {
     pub of: CandidateOf<'a>,
-    /// Its public id.
     pub id: String,
     /// With its pieces.
     pub solid: Solid,
     pub score: f32,
-    /// From 0, the score of what has nothing to do with the words, to 1, the best score on board.
+    /// 0: an unrelated thing's score; 1: the best score on board.
     pub confidence: f64,
-    /// Whether it has enough Gaussians in the region asked for.
+    /// Whether it has enough Gaussians in the region.
     pub is_inside: bool,
 }
 
@@ -59,11 +56,11 @@ impl Candidate<'_> {
     }
 }
 
-/// The clusters of a thing, with the threshold that their Gaussians reach.
+/// The clusters of a thing and their threshold.
 pub struct ClustersOfThing {
     pub clusters: Vec<Cluster>,
     pub threshold: f32,
-    /// What has nothing to do with the words.
+    /// Score of an unrelated thing.
     pub base: f32,
 }
 
@@ -100,7 +97,6 @@ impl<'a> Things<'a> {
         Self { of: of.collect() }
     }
 
-    /// Returns the numbers of things without a candidate.
     pub fn open(&self) -> Vec<usize> {
         (0..self.of.len()).filter(|at| self.of[*at].1.is_empty()).collect()
     }
@@ -128,7 +124,7 @@ impl<'a> Things<'a> {
         self.of.iter().map(|(found, _)| found.clone()).collect()
     }
 
-    /// Returns the candidates of a thing, none for a thing that was not asked for.
+    /// Returns the candidates of a thing; none for one that was not asked for.
     pub(in crate::query) fn of(&self, thing: &str) -> &[Candidate<'a>] {
         let of = self.of.iter().find(|(found, _)| found.thing == thing);
         of.map_or(&[], |(_, candidates)| candidates)
@@ -171,14 +167,14 @@ fn candidates<'a>(
     (Found { thing: thing.to_owned(), n_found, threshold, best_score }, candidates)
 }
 
-/// Returns how surely a score names a thing, 0 to 1, between what has nothing to do with the words and the best.
+/// Returns the confidence of a score: 0 at `base`, 1 at the best.
 fn confidence(score: f32, best: f32, base: f32) -> f64 {
     let margin = f64::from(best - base).max(f64::MIN_POSITIVE);
     (f64::from(score - base) / margin).clamp(0.0, 1.0)
 }
 
-/// Leaves out candidates, best first, that are pieces of better ones: those inside one, and those that touch one or lie
-/// close above or below it, which grows by them, because masks split some things and relations are of whole ones.
+/// Merges candidates, best first, into better ones that contain, touch or lie close above or below them, because
+/// masks split some things and relations are of whole ones.
 fn whole<'a>(candidates: impl IntoIterator<Item = Candidate<'a>>, metre: f64) -> Vec<Candidate<'a>> {
     let mut things: Vec<Candidate<'a>> = Vec::new();
     for piece in candidates {
@@ -204,7 +200,7 @@ fn whole<'a>(candidates: impl IntoIterator<Item = Candidate<'a>>, metre: f64) ->
     things
 }
 
-/// Returns a metre in world units; in a scene that is not metric, what stands for one.
+/// Returns a metre in world units, or its substitute in a scene that is not metric.
 pub fn metre(manifest: &Manifest) -> f64 {
     if manifest.metric { 1.0 } else { VOXELS_PER_METRE * default_voxel(manifest) }
 }

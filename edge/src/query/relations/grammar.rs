@@ -6,14 +6,14 @@
 //! place    = relation phrase | "between" phrase "and" phrase | ("from" | "to") phrase
 //! ```
 //!
-//! Articles count for nothing. The leftmost relation divides a phrase, so relations nest to the right: "mug on the
-//! table near the window" is a mug on (a table near the window). A text of more than [`MAX_TEXT_BYTES`] is no phrase:
-//! this bounds time and recursion for every caller.
+//! Articles are ignored. The leftmost relation divides a phrase, so relations nest to the right: "mug on the table
+//! near the window" is a mug on (a table near the window). Texts over [`MAX_TEXT_BYTES`] are no phrases, which bounds
+//! time and recursion.
 
 use super::phrase::{By, Phrase, Pick, Place, Relation};
 use crate::text::MAX_TEXT_BYTES;
 
-/// The words of each relation; where several begin at a word, the longest counts.
+/// The words of each relation; the longest match counts.
 const RELATIONS: [(&str, Relation); 31] = [
     ("on top of", Relation::On),
     ("on", Relation::On),
@@ -60,7 +60,7 @@ const PICKS: [(&str, By); 8] = [
 const NTH: [&str; 10] =
     ["first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"];
 const ARTICLES: [&str; 4] = ["the", "a", "an", "my"];
-/// What people put before the thing that they look for.
+/// Words before the thing asked for.
 const OPENINGS: [&str; 10] = [
     "where is",
     "where are",
@@ -74,8 +74,8 @@ const OPENINGS: [&str; 10] = [
     "take me to",
 ];
 
-/// Returns the meaning of a text, or `None` if it names no relation and no pick, or is too long: it is one thing then,
-/// for the text model. [`Phrase::check`] says whether it keeps the limits.
+/// Parses a text as a phrase; `None` if it names no relation and no pick, or is too long: it is then one thing, for
+/// the text model. [`Phrase::check`] checks the limits.
 pub fn understand(text: &str) -> Option<Phrase> {
     if text.len() > MAX_TEXT_BYTES {
         return None;
@@ -86,8 +86,7 @@ pub fn understand(text: &str) -> Option<Phrase> {
     (!phrase.is_asker() && (phrase.pick.is_some() || phrase.relation.is_some())).then_some(phrase)
 }
 
-/// Returns the thing that a text asks for, such as "sofa" for "Where is the sofa?"; `None` where nothing stands before
-/// a thing.
+/// Returns the thing asked for ("sofa" for "Where is the sofa?"); `None` without words before a thing.
 pub fn asked_thing(text: &str) -> Option<String> {
     let lower = text.to_lowercase();
     let words = words(&lower);
@@ -98,13 +97,12 @@ pub fn asked_thing(text: &str) -> Option<String> {
     (!thing.is_empty()).then(|| thing.join(" "))
 }
 
-/// Returns the words of a text without the signs around them.
+/// Returns the words of a text without surrounding punctuation.
 fn words(lower: &str) -> Vec<&str> {
     let words = lower.split_whitespace().map(|word| word.trim_matches(['.', ',', '?', '!', '"']));
     words.filter(|word| !word.is_empty()).collect()
 }
 
-/// Returns the number of words before the thing.
 fn opening(words: &[&str]) -> usize {
     OPENINGS.iter().filter_map(|opening| starts(words, opening)).max().unwrap_or(0)
 }
@@ -126,7 +124,7 @@ fn without_article<'a, 'b>(words: &'a [&'b str]) -> &'a [&'b str] {
     &words[n_articles..]
 }
 
-/// Reads a phrase; `None` if it is none. Each level of recursion names a thing.
+/// Parses a phrase, or `None`. Each level of recursion names a thing.
 fn phrase(words: &[&str]) -> Option<Phrase> {
     let words = without_article(words);
     let (nth, rest) = nth(words);
@@ -136,14 +134,14 @@ fn phrase(words: &[&str]) -> Option<Phrase> {
         Some(by) => by.is_distance() && matches!(head[at], "from" | "to"),
         None => nth.is_some() && head[at] == "from",
     };
-    // The thing itself takes at least one word, and so does what follows the relation.
+    // The thing itself takes at least one word, as does the part after the relation.
     let at = (1..head.len().saturating_sub(1)).find(|at| is_from(*at) || relation(&head[*at..]).is_some());
     let pick = |from: Option<Phrase>| -> Option<Pick> {
         let by = by.or(from.is_some().then_some(By::Nearest))?;
         Some(Pick { by, n: nth.unwrap_or(1), from: from.map(Box::new) })
     };
     let Some(at) = at else {
-        // "First aid box": a number alone, with nothing to count from, is part of the name.
+        // "First aid box": a number with nothing to count from is part of the name.
         let named = if by.is_some() { head } else { words };
         return Some(Phrase { pick: pick(None), ..thing(named)? });
     };
@@ -247,7 +245,7 @@ mod tests {
         }
     }
 
-    /// On a thread with the stack of the service's threads, which one relation a level overflowed.
+    /// On a thread with the stack of the service's threads: one recursion per relation overflowed it.
     #[test]
     fn long_texts_are_no_phrases() {
         let read = |text: String| {
@@ -271,7 +269,7 @@ mod tests {
         }
     }
 
-    /// A phrase as JSON and back is the same, and JSON says what is wrong with it.
+    /// Phrases survive JSON and back; errors in JSON are named.
     #[test]
     fn phrases_are_checked() {
         let phrase = understand("third nearest mug to the lamp on the desk").expect("a phrase");

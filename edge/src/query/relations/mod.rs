@@ -1,6 +1,5 @@
-//! Relations between things: "mug on the table", "second pallet from the gate". Plain geometry over the objects on
-//! board, or over groups of Gaussians where no object answers, without a language model; the same scene and phrase give
-//! the same answer.
+//! Relations between things: "mug on the table", "second pallet from the gate". Plain geometry over objects, or over
+//! clusters where no object answers, without a language model; the same scene and phrase give the same answer.
 
 mod candidates;
 mod geometry;

@@ -1,4 +1,4 @@
-//! What a phrase about things and their places means, in words or as JSON.
+//! Phrases about things and their places, in words or as JSON.
 
 use std::fmt;
 
@@ -11,7 +11,7 @@ use crate::text::MAX_TEXT_BYTES;
 /// Most things that a phrase may name.
 pub const MAX_THINGS: usize = 8;
 pub const MAX_NTH: usize = 100;
-/// Names that stand for the asker, wherever it is.
+/// Names for the asker.
 pub const ASKER: [&str; 4] = ["me", "myself", "us", "here"];
 
 /// A thing, chosen by what it is, where it is, and how it compares with others of its kind.
@@ -86,12 +86,10 @@ impl Relation {
         Self::Behind,
     ];
 
-    /// Returns whether it depends on where the asker is.
     pub fn is_seen(self) -> bool {
         matches!(self, Self::LeftOf | Self::RightOf | Self::InFrontOf | Self::Behind)
     }
 
-    /// Returns whether it has a meaning only where up is known.
     pub(crate) fn needs_up(self) -> bool {
         !matches!(self, Self::In | Self::Near | Self::Between)
     }
@@ -152,7 +150,6 @@ impl Phrase {
         ASKER.contains(&self.thing.as_str())
     }
 
-    /// Returns the phrases directly inside.
     pub fn inner(&self) -> impl Iterator<Item = &Phrase> {
         let place = self.relation.iter().flat_map(|place| std::iter::once(&place.of).chain(&place.and));
         place.chain(self.pick.iter().flat_map(|pick| pick.from.as_deref()))
@@ -176,7 +173,7 @@ impl Phrase {
         1 + self.inner().map(Phrase::n_things).sum::<usize>()
     }
 
-    /// Returns whether a part needs the asker's position, and whether a part needs its heading.
+    /// Returns whether any part needs the asker's position, and its heading.
     pub fn needs(&self) -> [bool; 2] {
         let seen = self.relation.as_ref().is_some_and(|place| place.is.is_seen());
         let from_asker = self.relation.as_ref().is_some_and(|place| place.of.is_asker());
@@ -185,7 +182,7 @@ impl Phrase {
         self.inner().map(Phrase::needs).fold(own, |[a, b], [c, d]| [a || c, b || d])
     }
 
-    /// Checks every limit of a phrase, and that `between` has two things and only it has.
+    /// Checks every limit of a phrase, and that `between` alone has two things.
     pub fn check(&self) -> Result<(), RequestError> {
         let refuse = |found: &str, expected: &str| Err(RequestError::new("phrases", found, expected));
         if self.is_asker() {

@@ -1,4 +1,4 @@
-//! From candidates to the things that a phrase means, best first, or the part of the phrase that failed.
+//! From candidates to a phrase's matches, best first, or the part of the phrase that failed.
 
 use glam::DVec3;
 use schemars::JsonSchema;
@@ -11,7 +11,7 @@ use crate::query::answers::{Reason, ReasonKind};
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Related {
-    /// Its index among the candidates of the phrase's thing.
+    /// Index among the candidates of the phrase's thing.
     pub candidate: usize,
     /// Product of the confidences and degrees of every part, 0 to 1.
     pub score: f64,
@@ -36,17 +36,16 @@ pub struct Witness {
     pub score: Option<f32>,
 }
 
-/// Returns the part of a phrase that failed.
 fn miss(kind: ReasonKind, thing: &str, detail: String) -> Reason {
     Reason { thing: Some(thing.into()), ..Reason::new(kind, detail) }
 }
 
-/// A thing that others are compared with.
+/// A thing to compare others with.
 struct Anchor {
     solid: Solid,
     score: f64,
     witness: Witness,
-    /// Its public id; absent for the asker.
+    /// Public id; absent for the asker.
     id: Option<String>,
 }
 
@@ -56,7 +55,7 @@ struct Measure<'a, 'b> {
     metre: f64,
 }
 
-/// Returns the things that a phrase means, best first; only those in the region asked for.
+/// Returns a phrase's matches in the region, best first.
 pub fn relate(
     things: &Things<'_>,
     phrase: &Phrase,
@@ -75,7 +74,6 @@ pub fn relate(
 }
 
 impl<'b> Measure<'_, 'b> {
-    /// Returns the candidates that a phrase means, best first.
     fn matches(
         &self,
         phrase: &Phrase,
@@ -149,7 +147,7 @@ impl<'b> Measure<'_, 'b> {
         Ok(found)
     }
 
-    /// Returns the things that others are compared with.
+    /// Returns the anchors of a phrase.
     fn anchors(&self, phrase: &Phrase) -> Result<Vec<Anchor>, Reason> {
         if phrase.is_asker() {
             let at = self.viewer.map_or(DVec3::ZERO, |viewer| viewer.position_in_world);
@@ -181,7 +179,7 @@ impl<'b> Measure<'_, 'b> {
         };
         let best = found[0].score;
         found.retain(|related| related.score >= SURE * best);
-        // The surest of those that it is counted from.
+        // The surest one that distances are counted from.
         let origin = from.first();
         found.retain(|related| {
             origin.is_none_or(|origin| origin.id.as_ref() != Some(&all[related.candidate].id))

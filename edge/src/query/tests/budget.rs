@@ -3,7 +3,7 @@ use std::time::Duration;
 use super::*;
 use crate::score::{Budget, OverBudget, Pool, ScoreError};
 
-/// A request either gets its answer or an error that names the budget, and releases its memory in both cases.
+/// A request gets its answer or an error that names the budget, and releases its memory in both cases.
 #[test]
 fn a_budget_is_enough_or_is_named() {
     let yard = yard();

@@ -38,7 +38,6 @@ fn objects_answer_first_and_once() {
         (answers.kind, answers.searched.threshold_source),
         (AnswerKind::Objects, ThresholdSource::Scene)
     );
-    // Of the objects, not of the Gaussians.
     assert!((answers.searched.threshold - 0.4).abs() < 1e-6, "{}", answers.searched.threshold);
     let found = clusters(&answers);
     assert_eq!(found.len(), 1, "{found:?}");
@@ -116,7 +115,7 @@ fn objects_abstain_and_keep_to_the_region() {
     });
     let cut = &clusters(&answers)[0];
     assert_eq!(cut.n_gaussians, 20);
-    // Position and box are those of the part inside; the whole object's have a name of their own.
+    // Position and box of the part inside; the whole object's have names of their own.
     assert!((cut.position_in_world - DVec3::new(20.295, 0.0, 0.0)).length() < 1e-6, "{cut:?}");
     assert!(cut.box_min_in_world.x >= 20.195 && cut.box_max_in_world.x <= 20.9, "{cut:?}");
     let whole = cut.whole.expect("the box cuts the object");
@@ -124,7 +123,7 @@ fn objects_abstain_and_keep_to_the_region() {
         (whole.position_in_world, whole.box_max_in_world - whole.box_min_in_world),
         (DVec3::new(21.0, 0.0, 0.0), DVec3::splat(2.0))
     );
-    // Nothing within a radius is answered from beyond it.
+    // No answers beyond the radius.
     let near = DVec3::new(20.0, 0.0, 0.0);
     for radius in [0.15, 0.3, 1.0, 2.05, 30.0] {
         let answers = ask_objects(&|request| {
@@ -136,16 +135,15 @@ fn objects_abstain_and_keep_to_the_region() {
         assert!(object.distance.is_some_and(|distance| distance <= radius), "{radius}: {object:?}");
         assert_eq!(object.whole.is_none(), radius == 30.0);
     }
-    // The box holds all of cell 4 and none of the object's Gaussians in cell 3, though its border crosses
-    // that cell.
+    // The box holds all of cell 4 and none of the object's Gaussians in cell 3, though its border crosses that cell.
     let answers = ask_objects(&|request| {
         let bounds = Aabb { min: DVec3::new(21.9, -1.0, -1.0), max: DVec3::splat(1e3) };
         (request.threshold, request.region.bounds) = (Some(0.5), Some(bounds));
     });
     assert_eq!((clusters(&answers)[0].n_gaussians, answers.searched.n_searched), (12, 160));
-    // From 22.00 to 22.16: those of cell 3 are not in the box either.
+    // From 22.00 to 22.16: those of cell 3 are outside the box, too.
     assert!((clusters(&answers)[0].oriented_box.size.x - 0.16).abs() < 0.011);
-    // All matches are counted, and as many as asked for are returned.
+    // All matches are counted, however few are returned.
     let answers = ask_about(&scene, &[Question::new([0.6, 0.8])], |request, _| request.limit = Some(1));
     let found = clusters(&answers[0]);
     assert_eq!((found.len(), found[0].rank, found[0].n_gaussians), (1, 1, 42));
@@ -171,8 +169,8 @@ fn objects_abstain_and_keep_to_the_region() {
     assert_eq!(ask(&yard(), |_, _| ()).kind, AnswerKind::Clusters);
 }
 
-/// What is elsewhere is no miss, and an area that is on board need not be fetched. By hand: object 22 alone lies beyond
-/// x = 22.195, with a score of 0; from 20.5 to 20.9 lie Gaussians of no object, from 20.195 to 20.9 20 of object 21.
+/// Reasons are of the region, and suggest no fetch of an area on board. By hand: object 22 alone lies beyond x =
+/// 22.195, with a score of 0; from 20.5 to 20.9 lie Gaussians of no object, from 20.195 to 20.9 20 of object 21.
 #[test]
 fn reasons_are_of_the_region() {
     let scene = scene_of_objects();
@@ -202,7 +200,7 @@ fn reasons_are_of_the_region() {
         );
         let of_none = reason(20.5, 20.9, 1, kind);
         assert_eq!(of_none.kind, ReasonKind::BelowThreshold, "{}", of_none.detail);
-        // Without objects the nearest miss is of the Gaussians.
+        // Without objects the nearest miss is among the Gaussians.
         assert_eq!(of_none.best_score.is_some(), kind.is_none(), "{of_none:?}");
     }
     let small = reason(20.195, 20.9, 30, objects);

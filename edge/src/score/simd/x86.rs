@@ -130,8 +130,8 @@ fn fold(simd: V3, [a, b, c, d]: [__m256i; ROWS]) -> [i32; ROWS] {
     cast(simd.sse2._mm_add_epi32(low, high))
 }
 
-/// Adds a column's values. `sums[1]` holds those of the odd bytes; `sums[0]` those of the even bytes plus 256
-/// times those of the odd ones. Separating them at the end is cheaper than at every step.
+/// Adds a column's values. `sums[1]` holds those of the odd bytes; `sums[0]` those of the even bytes plus 256 times
+/// those of the odd ones. Separating them once at the end is cheaper.
 #[inline(always)]
 fn add_column(simd: V3, sums: &mut [__m256i; 2], codes: &Column, low: &Column, high: &Column) {
     let avx2 = simd.avx2;

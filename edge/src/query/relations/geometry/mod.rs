@@ -1,5 +1,4 @@
-//! Relations as plain geometry of upright boxes. Each relation gives a degree from 0 to 1;
-//! at [`HOLDS`] and above it holds. `docs/api.md` has the definitions for users.
+//! Relations as plain geometry of upright boxes: degrees from 0 to 1, holding from [`HOLDS`] on (`docs/api.md`).
 
 mod solid;
 
@@ -15,7 +14,7 @@ pub use solid::Solid;
 /// Least degree at which a relation holds.
 pub const HOLDS: f64 = 0.5;
 
-/// Returns the degree to which a thing is so placed to another; `between` is 0 here, see [`between`].
+/// Returns the degree of a relation; 0 for `between`, see [`between`].
 pub fn degree(is: Relation, thing: &Solid, of: &Solid, viewer: Option<&Viewer>, metre: f64) -> f64 {
     match is {
         Relation::On => on(thing, of, metre),
@@ -31,18 +30,18 @@ pub fn degree(is: Relation, thing: &Solid, of: &Solid, viewer: Option<&Viewer>, 
     }
 }
 
-/// Returns 1 below `full`, 0 above `none`, and a straight line between them.
+/// Returns 1 below `full`, 0 above `none`, linear between.
 fn falling(value: f64, full: f64, none: f64) -> f64 {
     ((none - value) / (none - full)).clamp(0.0, 1.0)
 }
 
-/// Distance, in metres, between a thing's bottom and the surface below it that still counts as touching: positions
-/// are those of Gaussians, and the box leaves out the outermost ones.
+/// Distance, metres, between a thing's bottom and the surface below that still counts as touching: positions are
+/// those of Gaussians, and the box excludes the outermost.
 const TOUCHES_M: f64 = 0.1;
-/// Distance at which it surely does not touch.
+/// Distance from which it surely does not touch.
 const APART_M: f64 = 0.25;
 /// Share of the support's height by which a thing's bottom may lie below its top: seats are lower than backs, and
-/// the masks of a support may take in what stands on it.
+/// masks of a support may include what stands on it.
 const SUNK: f64 = 0.6;
 /// Share of a thing's outline that must lie over its support.
 const OVER: [f64; 2] = [0.6, 0.2];
@@ -55,7 +54,7 @@ fn on(thing: &Solid, support: &Solid, metre: f64) -> f64 {
 }
 
 fn resting(thing: &Solid, support: &Solid, metre: f64) -> f64 {
-    // A thing that is much larger than its support rests on something else.
+    // A thing much larger than its support rests on something else.
     if thing.area() > 2.0 * support.area() || thing.centre.z <= support.centre.z {
         return 0.0;
     }
@@ -76,7 +75,6 @@ fn hanging(thing: &Solid, panel: &Solid, metre: f64) -> f64 {
     falling(thing.horizontal_gap(panel), TOUCHES_M * metre, APART_M * metre)
 }
 
-/// Returns the degree to which a thing is below another and within its outline.
 fn under(thing: &Solid, cover: &Solid, metre: f64) -> f64 {
     if thing.centre.z >= cover.centre.z || thing.top() > cover.top() {
         return 0.0;
@@ -89,19 +87,19 @@ fn under(thing: &Solid, cover: &Solid, metre: f64) -> f64 {
     falling(-share, -OVER[0], -OVER[1]) * low
 }
 
-/// Distance of the surfaces, in metres, that is near beyond doubt.
+/// Distance of the surfaces, metres, up to which things are near.
 const NEAR_M: f64 = 0.5;
-/// Distance that is not near any more; large things are near from farther away.
+/// Distance from which they are not; large things are near from farther away.
 const FAR_M: f64 = 1.5;
-/// Share of the smaller thing's size that is added to both.
+/// Share of the smaller thing's size added to both.
 const OF_SIZE: f64 = 0.5;
-/// The same for things beside each other.
+/// As [`NEAR_M`] and [`FAR_M`], for things beside each other.
 const BESIDE_M: [f64; 2] = [0.6, 1.4];
 /// Share of the lower thing's height that both must have in common.
 const LEVEL: [f64; 2] = [0.5, 0.1];
-/// Share of the smaller thing's outline that may lie over the other: boxes of things that stand close overlap.
+/// Share of the smaller thing's outline that may lie over the other: boxes of close things overlap.
 const APART: [f64; 2] = [0.5, 0.9];
-/// A thing between two others is off the line from one to the other by at most this share of its length.
+/// Largest distance from the line between two things, as a share of its length, for a thing between them.
 const OFF_LINE: [f64; 2] = [0.2, 0.5];
 
 fn near(thing: &Solid, other: &Solid, metre: f64) -> f64 {
@@ -109,9 +107,8 @@ fn near(thing: &Solid, other: &Solid, metre: f64) -> f64 {
     falling(thing.gap(other), NEAR_M * metre + more, FAR_M * metre + more)
 }
 
-/// Returns the degree to which two things stand side by side.
 fn beside(thing: &Solid, other: &Solid, metre: f64) -> f64 {
-    // A rug and a wardrobe stand on the same ground, though the boxes of their Gaussians may share no height.
+    // A rug and a wardrobe stand on the same ground, though their boxes may share no height.
     let touches = TOUCHES_M * metre;
     let lower = thing.height().min(other.height()).max(touches);
     let level = falling(-(thing.shared_height(other) + touches) / lower, -LEVEL[0], -LEVEL[1]);
@@ -134,9 +131,9 @@ pub fn between(thing: &Solid, one: &Solid, other: &Solid) -> f64 {
     inside * falling(to_segment(at, (from, to)) / length, OFF_LINE[0], OFF_LINE[1])
 }
 
-/// Metres by which a thing may stick out of the box that it is in.
+/// Metres by which a thing may stick out of its container's box.
 const SLACK_M: f64 = 0.1;
-/// Shares of a thing's box that lie inside: the relation holds fully from the first, not at all from the second.
+/// Shares of a thing's box inside: the relation holds fully from the first, not at all up to the second.
 const INSIDE: [f64; 2] = [0.8, 0.4];
 /// A thing is smaller than this share of what it is in.
 const SMALLER: f64 = 0.5;
@@ -151,30 +148,27 @@ fn inside(thing: &Solid, container: &Solid, metre: f64) -> f64 {
     falling(-(of_outline * of_height).min(1.0), -INSIDE[0], -INSIDE[1])
 }
 
-/// Angles from the direction that is meant, in degrees: the relation holds fully up to the first, not at all from
-/// the second.
+/// Degrees off the direction: the relation holds fully up to the first, not at all from the second.
 const OFF_DEG: [f64; 2] = [30.0, 60.0];
-/// Distances of the outlines, in metres: the relation holds fully up to the first, not at all from the second.
-/// Nobody calls a thing at the far end of a hall left of the door.
+/// Distances of the outlines, metres: as [`OFF_DEG`]. A thing at the far end of a hall is not left of the door.
 const REACH_M: [f64; 2] = [3.0, 7.0];
 
-/// Where the asker is, and where it looks.
+/// The asker's pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Viewer {
     pub position_in_world: DVec3,
-    /// Its heading, from the world's x axis towards y, radians.
+    /// From the world's x axis towards y, radians.
     pub heading_rad: Option<f64>,
 }
 
-/// Returns the degree to which a thing is left of another, right of it, in front of it or behind it.
-///
-/// Seen from the asker, who looks at the other thing; beside the asker itself, from its heading.
+/// Returns the degree to which a thing is left of, right of, in front of or behind another, seen by the asker looking
+/// at the latter; beside the asker itself, by its heading.
 fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, metre: f64) -> f64 {
     let anchor = of.centre.truncate();
     let sight = anchor - viewer.position_in_world.truncate();
     let heading = viewer.heading_rad.map(DVec2::from_angle);
     let is_asker = of.half == DVec3::ZERO && sight.length() <= f64::EPSILON;
-    // What is in front of a thing is on the asker's side of it; what is in front of the asker is where it looks.
+    // In front of a thing is the asker's side; in front of the asker is its heading.
     let Some(away) = (if is_asker { heading.map(|ahead| -ahead) } else { sight.try_normalize() }) else {
         return 0.0;
     };
@@ -197,7 +191,7 @@ fn towards(is: Relation, thing: &Solid, of: &Solid, viewer: &Viewer, metre: f64)
         _ => away,
     };
     let offset = thing.centre.truncate() - anchor;
-    // A thing that does not reach past the other's middle is in the same place.
+    // A thing that does not extend past the other's middle is in the same place.
     let past = offset.dot(meant) - 0.5 * of.reach(meant);
     if past <= 0.0 {
         return 0.0;

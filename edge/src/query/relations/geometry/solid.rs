@@ -4,20 +4,20 @@ use glam::{DVec2, DVec3};
 use slag_api::objects::{Alignment, OrientedBox};
 use slag_common::frames::Aabb;
 
-/// Share of the smaller of two boxes that lies in the larger one if they are of one thing.
+/// Share of the smaller of two boxes inside the larger from which they are one thing.
 const PIECE: f64 = 0.6;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Solid {
     pub centre: DVec3,
-    /// Half its edges; the first two are along `along` and to its left.
+    /// Half its edges; the first two along `along` and to its left.
     pub half: DVec3,
     /// Unit vector of its first edge.
     pub along: DVec2,
 }
 
 impl Solid {
-    /// Takes a thing's oriented box if that is upright, else its box along the world's axes.
+    /// Takes a thing's oriented box if upright, else its box along the world's axes.
     pub fn of(oriented: &OrientedBox, bounds: &Aabb) -> Self {
         match oriented.alignment {
             Alignment::Gravity => {
@@ -64,12 +64,11 @@ impl Solid {
         [middle - x - y, middle + x - y, middle + x + y, middle - x + y]
     }
 
-    /// Returns the box with `by` more on every side.
     pub fn grown(&self, by: f64) -> Self {
         Self { half: self.half + DVec3::splat(by), ..*self }
     }
 
-    /// Returns the smallest box along its edges around both.
+    /// Returns the smallest box around both along its own edges.
     pub(crate) fn joined(&self, other: &Self) -> Self {
         let across = self.along.perp();
         let range = |direction: DVec2| {
@@ -88,7 +87,7 @@ impl Solid {
         }
     }
 
-    /// Returns half its reach along a horizontal direction.
+    /// Returns half its extent along a horizontal direction.
     pub fn reach(&self, direction: DVec2) -> f64 {
         self.half.x * direction.dot(self.along).abs() + self.half.y * direction.dot(self.along.perp()).abs()
     }
@@ -102,7 +101,7 @@ impl Solid {
         of_outline * of_height >= PIECE
     }
 
-    /// Returns the length that two height ranges share, negative if there is a gap.
+    /// Returns the overlap of two height ranges, negative for a gap.
     pub(crate) fn shared_height(&self, other: &Self) -> f64 {
         self.top().min(other.top()) - self.bottom().max(other.bottom())
     }
@@ -121,7 +120,7 @@ impl Solid {
     }
 }
 
-/// Returns the area that two convex outlines share, both counter-clockwise (Sutherland and Hodgman, 1974).
+/// Returns the overlap area of two convex outlines, both counter-clockwise (Sutherland and Hodgman, 1974).
 fn shared_area(a: &[DVec2], b: &[DVec2]) -> f64 {
     let mut shared: Vec<DVec2> = a.to_vec();
     for (from, to) in edges(b) {

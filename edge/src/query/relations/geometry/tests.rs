@@ -25,7 +25,6 @@ fn any_solid() -> impl Strategy<Value = Solid> {
     })
 }
 
-/// A room by hand: which relations hold between which things.
 #[test]
 fn a_room_by_hand() {
     let table = solid([0.0, 0.0, 0.37], [1.6, 0.9, 0.74]);
@@ -38,7 +37,7 @@ fn a_room_by_hand() {
     let rug = solid([0.0, 0.0, 0.01], [3.0, 2.0, 0.02]);
     let cupboard = solid([-2.0, 2.5, 0.9], [1.0, 0.5, 1.8]);
     let plate = solid([-2.0, 2.5, 1.0], [0.3, 0.3, 0.05]);
-    // The box of what is seen of it begins above its feet.
+    // Its visible part begins above its feet.
     let wardrobe = solid([2.1, 0.0, 1.0], [1.0, 0.6, 1.88]);
     let lamp = solid([0.0, 0.0, 2.2], [0.4, 0.4, 0.3]);
     // From the south, looking north.
@@ -93,7 +92,6 @@ fn a_room_by_hand() {
 fn the_asker_has_a_left_and_a_front() {
     let position_in_world = DVec3::new(1.0, 1.0, 0.0);
     let me = Solid::point(position_in_world);
-    // Looks along y.
     let viewer = Viewer { position_in_world, heading_rad: Some(std::f64::consts::FRAC_PI_2) };
     let at = |x: f64, y: f64| solid([1.0 + x, 1.0 + y, 0.3], [0.3; 3]);
     for (is, x, y) in [
