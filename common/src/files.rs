@@ -1,13 +1,20 @@
 //! Files that users name, to read and to write.
 
+use std::fs::Metadata;
 use std::io::{self, Read};
 use std::path::Path;
 
 use fs_err::File;
 
+/// Returns what the system knows of a file or folder; the error names the path.
+pub fn metadata(path: &Path) -> io::Result<Metadata> {
+    std::fs::metadata(path)
+        .map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))
+}
+
 /// Opens a file to read. A pipe is refused: it keeps its reader waiting until somebody writes, perhaps for ever.
 pub fn open(path: &Path) -> io::Result<File> {
-    if std::os::unix::fs::FileTypeExt::is_fifo(&fs_err::metadata(path)?.file_type()) {
+    if std::os::unix::fs::FileTypeExt::is_fifo(&metadata(path)?.file_type()) {
         let text = format!("{} is a pipe; write what comes out of it into a file", path.display());
         return Err(io::Error::new(io::ErrorKind::InvalidInput, text));
     }
@@ -95,6 +102,9 @@ mod tests {
         let pipe = dir.path().join("pipe");
         assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("runs").success());
         assert!(open(&pipe).expect_err("is refused").to_string().contains("is a pipe"));
+        let missing = pipe.with_extension("ply");
+        let said = format!("{}: No such file", missing.display());
+        assert!(open(&missing).expect_err("is missing").to_string().starts_with(&said));
         assert!(read_short(&pipe, 9).expect_err("is refused").to_string().contains("is a pipe"));
         assert!(open(Path::new("/dev/null")).is_ok());
         let endless = read_short(Path::new("/dev/zero"), 9).expect_err("is refused").to_string();

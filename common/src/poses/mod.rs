@@ -18,6 +18,8 @@ pub use error::{Place, PoseError, PoseProblem};
 pub use splat_frame::{FRAME_FILE, Origin, SplatFrame, SplatFromPoses};
 pub use view_set::{AppliedTransform, PoseSource, ViewSet};
 
+use crate::files;
+
 /// Reads the posed views at `path`.
 ///
 /// `path` is the folder of a COLMAP model (or one of its files, or a folder with `sparse/0`, `0` or `sparse`; of
@@ -29,7 +31,7 @@ pub use view_set::{AppliedTransform, PoseSource, ViewSet};
 /// the model's folder), the paths in a `transforms.json`, and ScanNet's `color/`. Images need not exist, except
 /// that ScanNet states their size nowhere else.
 pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
-    if fs_err::metadata(path)?.is_file() {
+    if files::metadata(path)?.is_file() {
         return match path.extension().and_then(|e| e.to_str()) {
             Some("json") => transforms::read(path, images_dir),
             Some("bin") => colmap::read(paths::parent(path)?.as_path(), PoseSource::ColmapBinary, images_dir),

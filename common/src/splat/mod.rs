@@ -37,7 +37,7 @@ use input::Input;
 /// # Errors
 /// [`SplatError`], with the file, the place of the fault, and the remedy.
 pub fn read(path: &Path, options: &ReadOptions) -> Result<Gaussians, SplatError> {
-    if fs_err::metadata(path)?.is_dir() {
+    if files::metadata(path)?.is_dir() {
         return sog::read_folder(&path.join("meta.json"), *options);
     }
     let mut input = Input::open(path)?;

@@ -6,7 +6,7 @@ mod id_image;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use slag_common::{Hash32, View};
+use slag_common::{Hash32, View, files};
 
 use super::segmenter::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::masks::rle::Rle;
@@ -39,7 +39,7 @@ enum Source {
 impl GivenMasks {
     /// Opens a folder of masks or reads a COCO data set. `ignore_ids` are further background ids of id images.
     pub fn open(path: &Path, ignore_ids: Vec<u32>) -> Result<Self, SegmentError> {
-        let source = if fs_err::metadata(path)?.is_dir() {
+        let source = if files::metadata(path)?.is_dir() {
             Source::Folder(path.to_owned())
         } else {
             Source::DataSet { path: path.to_owned(), masks_of_image: coco::read_data_set(path)? }
