@@ -1,4 +1,4 @@
-//! Numbers of bytes, as flags take them and reports show them.
+//! Numbers of bytes in flags and reports.
 
 use std::fmt;
 use std::num::IntErrorKind;

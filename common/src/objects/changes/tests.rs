@@ -19,7 +19,6 @@ fn all(old: Vec<Thing>, new: Vec<Thing>) -> Changes {
 const CHAIR: [f64; 2] = [1.0, 0.0];
 const TABLE: [f64; 2] = [0.0, 1.0];
 
-/// By hand: one of each kind.
 #[test]
 fn each_change_is_named() {
     let old = vec![
@@ -43,7 +42,7 @@ fn each_change_is_named() {
     assert_eq!((moved.from.id, moved.to.id, moved.distance), (3, 6, 5.0));
 }
 
-/// Of two alike things, each goes to the nearer place; one of another size is none of them.
+/// Of two similar objects, each matches the nearer place; one of another size matches neither.
 #[test]
 fn a_thing_is_matched_once_and_to_the_nearest() {
     let at = |id, x: f64, size: f64| thing(id, [x, 0.0, 0.0], [size; 3], CHAIR);
@@ -78,7 +77,7 @@ fn what_one_list_cannot_know_is_not_compared() {
     assert_eq!(found.moved.iter().map(|m| (m.from.id, m.to.id)).collect::<Vec<_>>(), [(3, 6)]);
 }
 
-/// A hundred alike things that all moved by one: each is matched, though each has more candidates than are kept.
+/// A hundred similar objects moved by one: each is matched, though each has more candidates than are kept.
 #[test]
 fn many_alike_things_are_all_matched() {
     let row = |first: u64, shift: f64| -> Vec<Thing> {

@@ -52,7 +52,7 @@ pub fn write_rows(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Res
     Ok(())
 }
 
-/// Beyond these bounds exp and the sigmoid give 0 and 1 in f32 anyway; other readers reject infinities.
+/// Beyond these bounds exp and the sigmoid give 0 and 1 in f32; other readers reject infinities.
 const MIN_LOG: f64 = -110.0;
 const MAX_LOGIT: f64 = 40.0;
 
