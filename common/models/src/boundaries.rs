@@ -22,7 +22,7 @@ const MULTIPLE: u32 = 32;
 const N_CHANNELS: usize = 7;
 /// Slopes of the logarithm of depth span this many pixels on both sides.
 const SLOPE_REACH_PX: usize = 2;
-/// Slopes of this size, per [`SLOPE_REACH_PX`] both ways, are mapped to half of the range.
+/// Factor of a slope (over twice [`SLOPE_REACH_PX`]) before tanh.
 const SLOPE_SCALE: f32 = 20.0;
 /// Neighbours of a pixel with a predicted boundary: right, below left, below, below right.
 pub const N_NEIGHBOURS: usize = 4;
