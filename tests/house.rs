@@ -68,8 +68,7 @@ fn masks_take_a_share_of_windows() {
     assert!(!cosines.is_empty() && cosines.iter().all(|cosine| (least - 1e-3..0.9999).contains(cosine)));
 }
 
-/// Beside the coffee table, whose top is 0.36 m high with room above it, and elsewhere: places to stand are on the
-/// floor.
+/// Beside the coffee table (top at 0.36 m, room above it) and elsewhere: places to stand are on the floor.
 #[needs_shared]
 #[nightly("encodes the house with its free places")]
 #[test]

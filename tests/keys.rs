@@ -42,8 +42,7 @@ fn robots_believe_the_store_that_they_were_told_of() {
     assert_eq!(shown["expires_unix_secs"], refreshed["expires_unix_secs"]);
     assert_eq!(shown["root_sha256"], sha256);
 
-    // A leaked key: a new root replaces it, and robots follow. Root's keys are elsewhere, so a draft is carried
-    // there.
+    // A leaked key: a new root replaces it, and robots follow. Root's keys are elsewhere, so a draft goes there.
     let elsewhere = dir.path().join("elsewhere");
     std::fs::rename(store.join("keys/root"), &elsewhere).expect("moved");
     let status = run_json(&mut encoder(&["keys", "status", "--store", text(&store)]));

@@ -25,8 +25,7 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
     None
 }
 
-/// A closed reader of a program's messages (a logger that ended, `| head`) does not stop its work or change its
-/// results.
+/// A closed reader of a program's messages (`| head`) does not stop its work or change its results.
 #[test]
 fn programs_go_on_when_nobody_reads_what_they_say() {
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -62,8 +62,7 @@ fn scores_are_those_of_the_command_line() {
     assert!(expected[expected.len() - 1] - expected[0] > 0.5, "the question tells Gaussians apart");
 }
 
-/// A store is drawn in the colours of its balanced shards; compact ones, which robots fetch, have the same
-/// positions only.
+/// Balanced shards of a store show colours; compact ones, which robots fetch, have the same positions only.
 #[test]
 fn a_store_shows_colours_that_compact_shards_lack() {
     let site = Site::new();

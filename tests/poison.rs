@@ -1,5 +1,4 @@
-//! Puts every invalid value into every field of a scene: unusable Gaussians are rejected and counted, and the
-//! store has finite numbers only.
+//! Every invalid value in every field of a scene: unusable Gaussians are rejected and counted, the store stays finite.
 
 use std::collections::BTreeSet;
 use std::path::Path;

@@ -60,8 +60,8 @@ fn python_tuf_verifies(python: &Path, dir: &Path, store: &Path, service: &Servic
     assert_eq!(verified(&path, "forged"), "refused: UnsignedMetadataError");
 }
 
-/// A real robot before a repository signed by python-tuf: each attack is refused for its own reason, and later honest
-/// metadata is accepted.
+/// A real robot before a repository signed by python-tuf: each attack is refused for its own reason, honest metadata is
+/// accepted.
 fn a_robot_follows_python_tuf(python: &Path, dir: &Path, store: &Path, service: &Service) {
     let (published, cache) = (dir.join("published"), dir.join("cache"));
     fs_err::create_dir(&published).expect("made");

@@ -13,8 +13,7 @@ fn the_demo_answers_rightly() {
     }
 }
 
-/// Evaluates the embedded encoders on unseen shapes and pairs of noun and colour. Their card has all figures of this
-/// command.
+/// Evaluates the embedded encoders on unseen shapes and pairs of noun and colour, for the figures of their card.
 #[nightly("evaluates 30 scenes")]
 #[test]
 fn the_embedded_encoders_tell_things() {

@@ -1,5 +1,4 @@
-//! Encodes with masks from SAM: a tiny model with random weights, so its masks mean nothing; the code path is the
-//! real one.
+//! Encodes with SAM: a tiny model with random weights, so its masks mean nothing; the code path is the real one.
 
 use std::path::Path;
 

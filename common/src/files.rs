@@ -14,8 +14,8 @@ pub fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Reads a file of at most `max_bytes`. Pipes of a shell, `--token-file <(pass show robot)`, are accepted: they
-/// have no name, but a writer.
+/// Reads a file or a shell's pipe (`--token-file <(pass show robot)`), which has no name. More than `max_bytes` are an
+/// error.
 pub fn read_short(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let has_name = std::fs::canonicalize(path).is_ok();
     let file = if has_name { open(path)? } else { File::open(path)? };

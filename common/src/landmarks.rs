@@ -1,5 +1,4 @@
-//! Landmarks: scene points with feature codes, from which a robot finds the camera of a photo. The byte table is
-//! in `docs/formats.md`.
+//! Scene points with feature codes, from which a robot finds the camera of a photo. Byte table: `docs/formats.md`.
 
 use std::ops::Range;
 

@@ -1,5 +1,4 @@
-//! Poses (not pictures) of a scene's photos, so that a page can draw their cameras. The byte table is in
-//! `docs/formats.md`.
+//! Poses of a scene's photos, so that a page can draw their cameras. Byte table: `docs/formats.md`.
 
 use std::ops::Range;
 

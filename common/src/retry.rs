@@ -34,8 +34,7 @@ impl Retries {
         Self { backoff, max_attempts, n_failures: 0 }
     }
 
-    /// Counts a failed attempt; progress restarts the count. Returns the pause before the next attempt, if one is
-    /// left.
+    /// Counts a failed attempt; progress restarts the count. Returns the pause before the next attempt, if any.
     pub fn failed(&mut self, made_progress: bool) -> Option<Duration> {
         self.n_failures = if made_progress { 1 } else { self.n_failures.saturating_add(1) };
         (self.n_failures < self.max_attempts).then(|| self.backoff.after(self.n_failures))

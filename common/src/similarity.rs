@@ -63,8 +63,7 @@ impl Similarity {
         self.rotation.angle_between(DQuat::IDENTITY) < 1e-4
     }
 
-    /// Transforms means, rotations and standard deviations. Drops harmonics above degree 0, which belong to the
-    /// source frame's axes.
+    /// Transforms Gaussians; drops harmonics above degree 0, which belong to the source frame's axes.
     pub fn transform_gaussians(&self, gaussians: &mut Gaussians) {
         for mean in &mut gaussians.means_in_world {
             *mean = self.transform_point(*mean);

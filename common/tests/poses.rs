@@ -63,8 +63,7 @@ fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
     }
 }
 
-/// Oracle: the same 96 poses, world from camera in OpenGL axes and camera from world in OpenCV axes, both written by
-/// the scene's generator.
+/// Oracle: the generator's 96 poses, world from camera in OpenGL axes and camera from world in OpenCV axes.
 #[needs_shared]
 #[test]
 fn house_transforms_and_colmap_agree() {
@@ -272,8 +271,7 @@ fn frames_without_a_valid_pose_are_left_out() {
     assert_eq!((set.views.len(), set.damaged.len()), (2, 0));
 }
 
-/// Two cameras' photos in one folder are ambiguous. Names that are paths of another machine or in another Unicode
-/// form are found.
+/// Two cameras' photos in one folder are ambiguous. Names from another machine or in another Unicode form are found.
 #[test]
 fn a_photo_is_that_of_one_view() {
     let dir = tempfile::tempdir().unwrap();

@@ -36,8 +36,7 @@ fn pattern([u, v]: [f64; 2]) -> [f64; 3] {
     [128.0 + 100.0 * (u / 9.0).sin(), 128.0 + 100.0 * (v / 11.0).cos(), 128.0 + 0.5 * (u - v)]
 }
 
-/// Inverts a distortion by Newton's method with a numeric derivative. Oracle of the tests below: the code itself only
-/// distorts.
+/// Oracle of the tests below: inverts a distortion by Newton's method with a numeric derivative.
 fn invert(distortion: Distortion, [x, y]: [f64; 2]) -> [f64; 2] {
     let mut ideal = [x, y];
     for _ in 0..50 {
@@ -327,8 +326,7 @@ fn pixels_where_a_lens_folds_have_no_image() {
     }
 }
 
-/// An EXIF orientation is applied only where the turned photo alone fits its camera; transparent pixels are
-/// outside the photo.
+/// EXIF orientation is applied only if the turned photo alone fits its camera; transparent pixels are outside.
 #[test]
 fn turned_and_transparent_photos() {
     let dir = tempfile::tempdir().unwrap();

@@ -278,8 +278,7 @@ fn gaussians_are_in_the_order_of_the_format() {
     assert!(indices[n_with..].iter().all(|index| index % 10 == 0));
 }
 
-/// Components from 1 down to 1e-12 as f16: the error is half a step of 2^-11, below 2^-14 of 2^-24; the smallest
-/// become zero.
+/// Components from 1 down to 1e-12 as f16: errors of half a step of 2^-11, below 2^-14 of 2^-24; the smallest are 0.
 #[test]
 fn embeddings_stored_as_f16() {
     let random = &mut Random::new(4);
@@ -320,8 +319,7 @@ fn embeddings_stored_as_f16() {
     assert!(worst_step <= 1.0 && worst_vector <= 5e-4, "{worst_step} {worst_vector}");
 }
 
-/// Strays and scenes at any distance, Gaussians of any size: no stored position is farther from its mean than
-/// requested, nor than the manifest states.
+/// Strays, scenes at any distance, Gaussians of any size: no position errs more than requested, or than stated.
 #[test]
 fn positions_keep_their_error_with_strays() {
     let random = &mut Random::new(11);

@@ -87,8 +87,7 @@ fn a_folder_and_a_queue_conform() {
     conforms(&fleet.scene, coordinator, |_| fleet.worker_at(fleet.port, &flags), || fleet.n_views_done());
 }
 
-/// One worker is killed, one pauses for longer than the queue waits and continues; the server is killed in the
-/// middle and restarts empty.
+/// One worker is killed, one pauses longer than the queue waits; the server is killed half way and restarts empty.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {

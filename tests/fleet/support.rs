@@ -28,8 +28,7 @@ impl Scene {
     fn room() -> &'static (PathBuf, Vec<u8>) {
         static ROOM: OnceLock<(PathBuf, Vec<u8>)> = OnceLock::new();
         ROOM.get_or_init(|| {
-            // Beside the built programs, because nothing is dropped at a program's end. Several programs may run
-            // seeded faults.
+            // Beside the built programs, because statics are not dropped. Several programs may run seeded faults.
             let seed = std::env::var("SLAG_FAULT_SEED").unwrap_or_default();
             let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fleet{seed}"));
             if dir.exists() {

@@ -1,4 +1,4 @@
-//! Scenes and stores shared by tests: made once per run; tests read them, or write to a copy.
+//! Scenes and stores shared by tests: made once; tests read them, or write to a copy.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -8,14 +8,12 @@ use slag_common::Hash32;
 
 use crate::{copy_dir, encode_quickly, lab, program, run};
 
-/// A generated scene: `scene.ply`, `transforms.json`, photos and their labels; read-only. `flags`: of `slag-lab
-/// generate scene`.
+/// Generated scene: `scene.ply`, `transforms.json`, photos, labels; read-only. `flags`: `slag-lab generate scene`'s.
 pub fn generated(flags: &[&str]) -> PathBuf {
     made("scene", flags, |out| drop(run(lab(&["generate", "scene", "--out"]).arg(out).args(flags))))
 }
 
-/// A store of a generated scene; read-only, see [`encoded_into`]. `flags`: of `slag-encoder encode`, in addition
-/// to those of [`encode_quickly`].
+/// Store of a generated scene; read-only. `flags`: `slag-encoder encode`'s, besides those of [`encode_quickly`].
 pub fn encoded(scene: &[&str], flags: &[&str]) -> PathBuf {
     let key = [scene, &["encode"], flags].concat();
     made("store", &key, |out| drop(run(encode_quickly(&generated(scene), out).args(flags))))

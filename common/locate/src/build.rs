@@ -37,8 +37,7 @@ pub struct MappingView {
 /// Bytes that [`build`] takes per observation, besides itself: chosen and hidden flags, rank, bin.
 pub const WORKING_BYTES_PER_OBSERVATION: usize = 2 + size_of::<u32>() + size_of::<Binned>();
 
-/// Returns at most `limit` landmarks, in turn from each view, those that most of its neighbours show first. A
-/// point in several views is taken once.
+/// Returns at most `limit` landmarks, in turn from each view, those in most of its neighbours first, each point once.
 pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
     let finders: Vec<Finder<'_>> = views.iter().map(Finder::new).collect();
     let middles: Vec<DVec3> = views

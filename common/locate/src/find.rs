@@ -26,8 +26,7 @@ const MIN_RENDERED_INLIERS: usize = 12;
 const MIN_NEARER_INLIERS: usize = 8;
 /// Largest error of a patch that agrees with a pose, pixels.
 const PATCH_INLIER_PX: f64 = 2.0;
-/// Fewest patches that verify a pose, and their share of those tried; photos of other scenes reach 22 at most,
-/// fewer than 3 %.
+/// Fewest patches that verify a pose, and their share of those tried; other scenes reach at most 22, below 3 %.
 const MIN_PATCHES: usize = 20;
 const MIN_PATCH_SHARE: f64 = 0.04;
 /// Most renderings per proposed pose, and most proposed poses with renderings.

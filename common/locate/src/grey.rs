@@ -60,8 +60,7 @@ impl Grey {
         Self { width, height, values }
     }
 
-    /// Halves the image until it has at most `max_px` pixels; returns how many of its pixels a pixel of the result
-    /// spans.
+    /// Halves the image until it has at most `max_px` pixels; returns the width of a resulting pixel in original ones.
     pub(crate) fn limited(&self, max_px: usize) -> (Cow<'_, Self>, u32) {
         let (mut picture, mut factor) = (Cow::Borrowed(self), 1);
         while picture.values.len() > max_px {

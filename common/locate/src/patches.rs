@@ -1,5 +1,4 @@
-//! Searches patches of a photo in a rendering at its pose by normalised cross-correlation: it works where a splat
-//! is too blurred for features.
+//! Searches patches of a photo in a rendering by normalised cross-correlation, for splats too blurred for features.
 
 use std::collections::BTreeSet;
 

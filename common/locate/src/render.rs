@@ -12,8 +12,7 @@ use crate::grey::Grey;
 use crate::patches;
 use crate::pose::Match;
 
-/// Largest distance of descriptors as a share of the second best's (Lowe 2004, 7.1); high, because poses are near, so
-/// that most features have a match.
+/// Largest ratio to the second best distance (Lowe 2004, 7.1): high, because poses are near and most features match.
 const MAX_RATIO: f32 = 0.9;
 /// Largest relative depth step between neighbouring pixels of a surface.
 const MAX_DEPTH_STEP: f32 = 0.05;

@@ -5,8 +5,7 @@
 pub enum SmallPivots {
     /// The square of a pivot is raised to this value, above 0, so every pivot is positive.
     Raise(f64),
-    /// A pivot and its column are 0 unless its square exceeds this share of the diagonal element: the row depends on
-    /// earlier ones.
+    /// A pivot and its column are 0 (a dependent row) unless its square exceeds this share of the diagonal element.
     Drop(f64),
 }
 

@@ -57,8 +57,7 @@ impl Envelope {
     }
 }
 
-/// Returns the squared distance of each cell of a row-major grid to the nearest source, in cells; [`FAR`] without
-/// one.
+/// Returns squared distances to the nearest source, in cells of a row-major grid; [`FAR`] without one.
 pub fn squared_distances(is_source: &[bool], width: usize) -> Vec<u32> {
     let height = is_source.len().checked_div(width).unwrap_or(0);
     let mut rows = vec![0; is_source.len()];

@@ -71,8 +71,7 @@ impl Panels {
         out
     }
 
-    /// Returns for each row of `left` the column with the largest product minus offset, the first of equals.
-    /// `offsets`: `[n_columns]`.
+    /// Returns per row of `left` the first column with the largest product minus offset. `offsets`: `[n_columns]`.
     pub fn largest(&self, left: Rows<'_>, offsets: &[f32]) -> Vec<u32> {
         let mut padded = vec![[f32::INFINITY; PANEL]; self.n_columns.div_ceil(PANEL)];
         padded.as_flattened_mut()[..offsets.len()].copy_from_slice(offsets);

@@ -5,8 +5,7 @@ use std::fmt::Debug;
 use rand_core_09::{RngCore, SeedableRng};
 use rand_xoshiro::SplitMix64;
 
-/// Returns 64 well-mixed bits of an index: the `index + 1`-th output of SplitMix64 seeded with 0
-/// (Steele, Lea and Flood 2014).
+/// The `index + 1`-th output of SplitMix64 seeded with 0 (Steele, Lea and Flood 2014): 64 well-mixed bits.
 pub fn mix64(index: u64) -> u64 {
     let mut z = index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

@@ -44,8 +44,7 @@ impl<S, W: Work<S>> NullaryFnOnce for Bound<S, W> {
     }
 }
 
-/// An instruction set of this processor: values other than [`Self::Portable`] come from detection only, see
-/// [`Self::available`].
+/// An instruction set of this processor, from [`Self::available`]; only [`Self::Portable`] exists without detection.
 #[derive(Clone, Copy, Debug)]
 pub enum InstructionSet {
     /// Scalar code, for any processor.

@@ -19,8 +19,7 @@ pub(crate) enum Place {
     Device,
 }
 
-/// Concurrent runs of large models per GPU: the second fills the gaps around the first. More take as long in
-/// total, and each ends later.
+/// Concurrent runs per GPU: the second fills the gaps around the first; more only end later.
 const RUNS_AT_ONCE: usize = 2;
 
 /// Permits to run a large model on a GPU.

@@ -19,8 +19,7 @@ pub const NAME: &str = "colour-shape-v1";
 
 pub const ABOUT: &str = "built-in stand-in: knows 11 colours and 3 shapes, no objects";
 
-/// Least cosine of a match: an object with the colour on half of its pixels scores 0.5 or more and passes; one
-/// with the colour on a fifth does not.
+/// Least cosine of a match: an object with the colour on half of its pixels passes (0.5 or more), on a fifth does not.
 pub const THRESHOLD: f32 = 0.35;
 
 const COLOURS: [&str; 11] =
@@ -231,8 +230,7 @@ fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let lit = ramp(lightness, darkest, darkest + 0.08);
     add(Colour::Black, 1.0 - lit);
 
-    // A third of the way to the highlight: shaded white stays white down to a quarter of the light, and a grey
-    // part of a white object stays grey.
+    // A third of the way to the highlight: white stays white down to a quarter of the light; grey on white stays grey.
     let relit = lightness + 0.35 * (highlight - lightness).max(0.0);
     let white = ramp(relit, 0.76, 0.84);
     add(Colour::White, lit * (1.0 - chromatic) * white);
@@ -245,8 +243,7 @@ fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let towards_after = ramp((hue_deg - from) / (to - from), 0.25, 0.75);
     for (hue, share) in [(before, 1.0 - towards_after), (after, towards_after)] {
         let share = lit * chromatic * share;
-        // Names of one hue when dark, dull or light. They depend on the highlight, not the pixel, so that shaded
-        // colours keep their name.
+        // Names of one hue when dark, dull or light, by the highlight, so that shaded colours keep their name.
         let (other, part) = match hue {
             Colour::Red => {
                 let pink = ramp(highlight, 0.68, 0.78) * (1.0 - ramp(saturation, 0.2, 0.3));
@@ -280,8 +277,7 @@ fn shape(inside: &[usize], width_px: usize) -> [f32; 3] {
     }
     // Logarithm of height over width; 2.5 is fully tall.
     let elongation = 0.5 * (var_y / var_x).ln() / 2.5f64.ln();
-    // The mask's share of its enclosing circle: disc 1, square 0.64, ellipse 2:1 0.5. Ignores the farthest 2 % of the
-    // pixels, because masks have ragged edges.
+    // Share of the enclosing circle: disc 1, square 0.64, ellipse 2:1 0.5; without the ragged farthest 2 % of pixels.
     let (_, &mut radius2, _) = radii2.select_nth_unstable_by((inside.len() - 1) * 49 / 50, f64::total_cmp);
     let filled = n / (std::f64::consts::PI * (radius2.sqrt() + 0.5).powi(2) / 0.98);
     [elongation.clamp(0.0, 1.0) as f32, (-elongation).clamp(0.0, 1.0) as f32, ramp(filled as f32, 0.75, 0.9)]

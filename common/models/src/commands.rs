@@ -128,8 +128,7 @@ pub fn open(
     })
 }
 
-/// Folders that may hold ONNX Runtime for the program `exe`: its own, `lib/slag` and `lib/PROGRAM` of its prefix,
-/// and the build folder above it.
+/// Folders that may hold ONNX Runtime: `exe`'s own, `lib/slag` and `lib/PROGRAM` of its prefix, the build folder above.
 pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
     let packaged = Path::new("lib").join(exe.file_stem().unwrap_or_default());
     let built = Path::new("onnxruntime").join(std::env::consts::ARCH);

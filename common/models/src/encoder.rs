@@ -17,8 +17,7 @@ pub trait ImageEncoder: Send {
     /// Encodes `[n]` crops to `[n][dim]`, unit vectors, row-major. Memory is bounded by the preferred batch.
     fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError>;
 
-    /// Patches along each side of the square over which [`Self::encode_patches`] stretches photos; `None` without
-    /// vectors of patches.
+    /// Patches along each side of the square of [`Self::encode_patches`]; `None` without vectors of patches.
     fn patches_per_side(&self) -> Option<u32> {
         None
     }

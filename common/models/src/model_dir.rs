@@ -92,8 +92,7 @@ impl ModelDir {
         Self::with(Documented { document, description }, Files::Folder(files_root))
     }
 
-    /// Encoders embedded in the program: trained on generated scenes, poor on real photos (`embedded/CARD.md`).
-    /// They need ONNX Runtime too.
+    /// The embedded encoders: trained on generated scenes, poor on real photos (`embedded/CARD.md`); need ONNX Runtime.
     pub fn embedded() -> Result<Self, ModelError> {
         let description = Description::parse(Path::new("(embedded)/model.toml"), embedded::DESCRIPTION)?;
         Self::with(Documented { document: embedded::DESCRIPTION.to_owned(), description }, Files::Embedded)

@@ -18,11 +18,9 @@ struct Fit {
     none_at: f64,
 }
 
-/// Maximum likelihood for the objects of two generated houses, with true and automatic masks; the model's 85 words
-/// are what is generated.
+/// Maximum likelihood for two generated houses, with true and automatic masks; the model's 85 words are those generated.
 const EMBEDDED: Fit = Fit { sharpness: 1.5, none_at: 1.0 };
-/// Maximum likelihood for ConSE's names of the objects of house_a, with true and automatic masks. Other models
-/// were not available.
+/// Maximum likelihood for ConSE's names in house_a, with true and automatic masks; no other model was available.
 const OTHERS: Fit = Fit { sharpness: 1.0, none_at: 5.0 };
 
 /// Words for names: the model's own, or everyday nouns.

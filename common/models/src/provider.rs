@@ -68,8 +68,7 @@ impl Provider {
     }
 }
 
-/// Convolutions are chosen by rule, not by timing: always the same ones, and faster ones for CLIP's patches on an
-/// H100.
+/// Convolutions are chosen by rule, not by timing: always the same, and faster for CLIP's patches on an H100.
 fn cuda(gpu: i32) -> ep::CUDA {
     ep::CUDA::default().with_device_id(gpu).with_conv_algorithm_search(ConvAlgorithmSearch::Heuristic)
 }

@@ -15,8 +15,7 @@ pub fn restart_with(variables: &[(&str, &str)]) {
         return;
     }
     let (Ok(program), mut args) = (std::env::current_exe(), std::env::args_os()) else { return };
-    // Under emulation the kernel's path differs from ours, and it could not run the program; libc hands such
-    // programs to a shell.
+    // Under emulation these paths differ. The kernel cannot run our program then, and libc hands such files to a shell.
     if std::fs::read_link("/proc/thread-self/exe").is_ok_and(|runs| runs != program) {
         return tracing::debug!("not started anew: an emulator runs this program");
     }

@@ -99,8 +99,7 @@ impl Model {
         Self::open_sized(file, options, None)
     }
 
-    /// Opens the model for one size of a named dimension, so that dependent values are computed now, not in every
-    /// run.
+    /// Opens the model for one size of a named dimension, to compute dependent values only once.
     pub(crate) fn open_sized(
         file: &ModelFile,
         options: &SessionOptions,

@@ -11,8 +11,7 @@ pub const COVARIANCE_BLUR_PX2: f64 = 0.3;
 pub const MAX_ALPHA: f32 = 0.999;
 /// Smallest alpha that counts: the footprint of a Gaussian ends where its alpha falls below.
 pub const MIN_ALPHA: f32 = 1.0 / 255.0;
-/// Transmittance at which a pixel is opaque. The first Gaussian that would reach it is not blended and ends the
-/// pixel.
+/// Transmittance of an opaque pixel. The first Gaussian that would reach it is not blended and ends the pixel.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Margin around the image within which the Jacobian is exact, as a share of the tangent of half the field of view;
 /// beyond it, the Jacobian is evaluated at the limit.

@@ -84,8 +84,7 @@ pub fn check_view(view: &RasterView) -> Result<(), InputError> {
             centre_px: [centre_x_px, centre_y_px],
         });
     }
-    // Poses are often stored as f32 or rounded text: a deviation of 1e-3 is still a rotation, a mirror or scale is
-    // not.
+    // Poses are often f32 or rounded text: a deviation of 1e-3 is still a rotation, a mirror or scale is not.
     let rotation = view.camera_from_world.matrix3;
     let excess = rotation.transpose() * rotation - DMat3::IDENTITY;
     let off =

@@ -12,8 +12,7 @@ use super::columns::Objects;
 use crate::frames::Aabb;
 use crate::shard::ShardView;
 
-/// Least cosine of the vectors of an object that stayed: new photos change its vector, but less than another object
-/// at its place differs.
+/// Least cosine of an object that stayed: new photos change its vector, another object in its place differs more.
 const STAYED_COSINE: f64 = 0.8;
 /// Least intersection over union of the boxes of an object that stayed.
 const STAYED_OVERLAP: f64 = 0.25;
@@ -66,8 +65,8 @@ pub struct Changes {
 
 /// Returns the changes between two lists, each ascending by id.
 ///
-/// `new_tells`: whether an earlier object that is absent from the later list is gone; `old_tells`: the reverse. Other
-/// objects are only matched in place.
+/// `new_tells`: whether an earlier object absent from the later list is gone; `old_tells`: the reverse. Others are only
+/// matched in place.
 pub fn changes(
     old: Vec<Thing>,
     new: Vec<Thing>,

@@ -9,8 +9,7 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Li
 use crate::files;
 use jpeg::Damage;
 
-/// Most bytes of a file's header, inflated: colour profile, texts and a row of pixels. JPEG decoders copy the file
-/// besides.
+/// Most bytes of a file's inflated header: colour profile, texts, a row of pixels. JPEG decoders also copy the file.
 pub const HEAD_BYTES: u64 = 16 << 20;
 /// Bytes 4 to 12 of HEIF files, which phones write.
 const HEIF_BRANDS: [&[u8]; 9] = [

@@ -8,8 +8,7 @@ use crate::camera::{Distortion, Intrinsics};
 /// Largest image side accepted, pixels: that of the largest JPEG; pixel indices fit 32 bits.
 const MAX_SIDE_PX: u32 = 65_535;
 
-/// Largest deviation of a rotation from unit length or orthonormality that counts as rounding; a printout with 3
-/// decimals stays below it.
+/// Largest deviation from unit length or orthonormality that counts as rounding; printouts with 3 decimals are below.
 const ROTATION_TOLERANCE: f64 = 5e-3;
 
 /// Checks intrinsics: sizes within 1..=65,535, focal lengths positive, everything finite.

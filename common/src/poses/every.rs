@@ -8,8 +8,7 @@ impl ViewSet {
     /// Keeps every `n`th frame by number: the last run of digits in its file name (`frame_00040.jpg` is 40).
     ///
     /// Counting begins at the lowest number of its folder, frames without a pose included, so the choice does not
-    /// depend on which poses are known. If any name has no number, all frames are counted in the order of their
-    /// names.
+    /// depend on which poses are known. If any name has no number, all frames are counted by name.
     pub fn every(mut self, n: NonZeroU32) -> Self {
         let n = u64::from(n.get());
         let mut names: Vec<&str> = self

@@ -84,8 +84,7 @@ impl SplatFrame {
         serde_json::to_string_pretty(&json).unwrap_or_default() + "\n"
     }
 
-    /// Returns the transform from the poses' world to the splat's; `source` and `applied` are those of the
-    /// [`ViewSet`](super::ViewSet).
+    /// Transform from the poses' world to the splat's; for `source` and `applied` see [`ViewSet`](super::ViewSet).
     pub fn splat_from_poses(&self, source: PoseSource, applied: Option<AppliedTransform>) -> SplatFromPoses {
         let direct = |scale| Similarity::from_rigid_then_scale(self.transform, scale);
         let (similarity, begins_at) = match (self.from_poses, source, applied) {

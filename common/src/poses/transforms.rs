@@ -262,8 +262,7 @@ fn is_image_folder(name: &str) -> bool {
         .is_some_and(|rest| rest.is_empty() || rest.strip_prefix('_').is_some_and(is_number))
 }
 
-/// Returns the path and an empty text or, if it has no image extension, the first existing path with one, and the
-/// text added.
+/// Returns the path or, without an image extension, the first existing path with one; and the text added.
 pub(super) fn existing(path: &Path) -> (PathBuf, String) {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
     if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || path.is_file() {

@@ -128,8 +128,7 @@ impl ShardView<'_> {
         DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
     }
 
-    /// Returns a digest of the Gaussians' positions in any order: equal for shards of a cell while the splat is
-    /// unchanged.
+    /// Digest of the Gaussians' positions in any order: equal for shards of a cell while the splat is unchanged.
     pub fn splat_digest(&self) -> u64 {
         let chained = |digest: u64, bits: u64| mix64(digest ^ bits);
         let grid = self.header.origin_in_world.iter().chain(&self.header.position_step);

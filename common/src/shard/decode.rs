@@ -36,8 +36,7 @@ impl ShardView<'_> {
         self.combine(&of_centroid.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
     }
 
-    /// Returns the score of every Gaussian with evidence for a query (`[dim]`), from embeddings as decoded by this
-    /// profile.
+    /// Scores every Gaussian with evidence for a query (`[dim]`), from embeddings as decoded by this profile.
     pub fn scores(&self, query: &[f32]) -> Vec<f64> {
         let dim = self.header.dim as usize;
         let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {

@@ -37,8 +37,7 @@ fn record(id: u64, n_here: u32, photo: std::ops::Range<u32>) -> ObjectRecord {
     }
 }
 
-/// Six Gaussians of three dimensions with one centroid: 0 and 1 of object 1, 2 of none, 3 and 4 of object 0, 5 of
-/// object 1.
+/// Six Gaussians of three dimensions, one centroid; objects 1, 1, none, 0, 0, 1.
 fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
     let mut parts = Parts {
         header: ObjectsHeader {

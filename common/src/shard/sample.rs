@@ -159,8 +159,7 @@ impl SampleObjects {
     }
 }
 
-/// Returns a manifest of shards, which may be several of a cell in different profiles; generation 1, an encoder
-/// without a name.
+/// Returns a manifest, generation 1, of shards in any profiles, with an unnamed encoder.
 pub fn manifest(scene: &str, shards: &[(Profile, &[u8])]) -> Manifest {
     let mut cells: BTreeMap<u32, CellRecord> = BTreeMap::new();
     let mut encoder = encoder();

@@ -53,8 +53,7 @@ impl Input {
         Place::Byte(self.offset_bytes)
     }
 
-    /// Returns the next `n` bytes without consuming them, or fewer if the file is shorter. Only for small `n` and
-    /// a file just opened.
+    /// Returns up to `n` bytes without consuming them. Only for small `n` and a file just opened.
     pub fn peek(&mut self, n: usize) -> Result<&[u8], SplatError> {
         let buffered = self.reader.fill_buf()?;
         Ok(&buffered[..n.min(buffered.len())])

@@ -78,8 +78,7 @@ impl OneOrMany {
 }
 
 impl Quantised {
-    /// Returns the number of each byte of a channel; NaN beyond the end of a short codebook, so that Gaussians
-    /// that use it are unusable.
+    /// Returns the number of each byte of a channel; NaN, hence unusable Gaussians, beyond a short codebook's end.
     fn table(&self, channel: usize) -> Option<[f64; 256]> {
         if let Some(codebook) = &self.codebook {
             let mut table = [f64::NAN; 256];

@@ -85,8 +85,7 @@ impl Header {
         Ok(header)
     }
 
-    /// Stored bytes per Gaussian of each column: position, opacity, colour, scale, rotation and, from degree 1,
-    /// harmonics.
+    /// Bytes per Gaussian of each column: position, opacity, colour, scale, rotation and, from degree 1, harmonics.
     fn row_bytes(&self) -> VecDeque<usize> {
         let rotation = if self.version == 2 { 3 } else { 4 };
         let sh = 3 * Gaussians::sh_rest_per_channel(self.sh_degree);

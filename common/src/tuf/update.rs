@@ -6,8 +6,7 @@ use super::trusted::{Kept, Trusted, text};
 use super::{MAX_ROOT_BYTES, MAX_ROOTS, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES};
 
 pub trait Source {
-    /// Reads a metadata file, such as `2.root.json`: at most `max_bytes + 1` bytes, so that a longer one is
-    /// noticed; `None` if it does not exist.
+    /// Reads a file such as `2.root.json`, if it exists: up to `max_bytes + 1` bytes, so that a longer one is noticed.
     fn metadata(&mut self, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, String>;
 }
 

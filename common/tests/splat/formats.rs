@@ -1,5 +1,5 @@
-//! All formats against `expected.json`, recorded with splat-transform 2.7.1 and confirmed by a second reader; trained
-//! scenes against a separate parser.
+//! All formats against `expected.json` (splat-transform 2.7.1, confirmed by a second reader); trained scenes against a
+//! separate parser.
 
 use std::io::Read;
 

@@ -311,8 +311,7 @@ fn sog_labels_and_codebooks_out_of_range() {
     let error = read_all(path).expect_err("is refused").to_string();
     assert!(error.contains("shN: expected labels below 128, found 128"), "{error}");
 
-    // Version 2 with a codebook null, 1, ... 255, where PlayCanvas takes 1 + (1 - 255) / 255 for the
-    // null; and a short one, 1 to 99.
+    // Version 2 with a codebook null, 1, ... 255 (PlayCanvas takes 1 + (1 - 255) / 255 for null), and a short one.
     let numbers = |n: usize| (1..n).map(|i| i.to_string()).collect::<Vec<_>>().join(",");
     let meta = std::fs::read_to_string(path.join("meta.json")).expect("was written");
     let start = meta.find("\"scales\"").expect("is there");

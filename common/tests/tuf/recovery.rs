@@ -59,8 +59,7 @@ fn a_new_root_is_kept_after_an_error() {
     assert!(kept.timestamp.is_some(), "its keys have not changed");
 }
 
-/// A thief of the online keys signs the highest versions; honest metadata is then a rollback, until a root names new
-/// keys.
+/// A thief of the online keys signs the highest versions; honest metadata is a rollback until a root names new keys.
 #[test]
 fn fast_forward_is_made_good_by_a_new_root() {
     for taken in ["timestamp", "snapshot", "targets"] {

@@ -37,8 +37,7 @@ pub struct Row {
 }
 
 impl Row {
-    /// Compares every contribution with the oracle on every backend, and prints the row with the backend's
-    /// distance from the first one outside cuts.
+    /// Checks every contribution on every backend against the oracle; prints the row, with distances from the first.
     pub fn check(&self, cases: &[Case]) {
         let mut of_first: Vec<Weights> = Vec::new();
         for (b, backend) in backends().iter().enumerate() {

@@ -139,8 +139,7 @@ impl Hub {
         Ok(verified)
     }
 
-    /// Returns a model's folder: that of the pulled model `name`, unless `name` is a folder with a `model.toml`,
-    /// else `name`.
+    /// Returns `name` if it has a `model.toml` or is not in the table, else the pulled model's folder.
     pub fn resolve(&self, name: &Path) -> Result<PathBuf, HubError> {
         let entry = name.to_str().and_then(|name| self.table.find(name));
         match entry {

@@ -44,8 +44,7 @@ pub struct Entry {
     pub repository: String,
     /// A commit; default: that of the first pull.
     pub revision: Option<String>,
-    /// The script that makes the files from published weights where no export is published; such models cannot be
-    /// pulled.
+    /// Script that makes the files from published weights where no export is published; nothing can be pulled then.
     pub export: Option<String>,
     /// Files at the hub by role: `image`, `text` and `tokenizer`, or `image_encoder` and `mask_decoder`.
     #[serde(default)]

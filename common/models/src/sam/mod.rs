@@ -197,9 +197,8 @@ impl Sam {
         Ok(Embedding { tensors: inputs.zip(found).collect(), letterbox: self.letterbox_of(image) })
     }
 
-    /// Proposes masks for `n_prompts` prompts with the same number of points each. `points`: `[n_prompts][points]`
-    /// in pixels of the square, see [`Letterbox::point`]. `labels` of points: 1 inside the object, 0 outside, -1
-    /// no point.
+    /// Proposes masks for prompts with the same number of points. `points`: `[n_prompts][points]`, pixels of the square
+    /// ([`Letterbox::point`]). `labels` of points: 1 inside the object, 0 outside, -1 no point.
     pub fn decode(
         &self,
         embedding: &Embedding,

@@ -34,8 +34,7 @@ pub struct Point {
 }
 
 impl PointProperties {
-    /// Returns the header of a file of `n` points. `comments`: one line each; control and non-ASCII characters are
-    /// escaped.
+    /// Returns the header for `n` points. `comments`: one line each; control and non-ASCII characters are escaped.
     pub fn header(self, n: u64, comments: &[String]) -> String {
         let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
         for comment in comments {

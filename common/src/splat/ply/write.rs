@@ -7,8 +7,7 @@ use crate::Gaussians;
 use crate::durable;
 use crate::splat::error::SplatError;
 
-/// Writes Gaussians in the layout of 3DGS: binary little-endian, zero normals, logarithms of scales, logits of
-/// opacities.
+/// Writes the layout of 3DGS: binary little-endian, zero normals, logarithms of scales, logits of opacities.
 pub fn write(path: &Path, gaussians: &Gaussians) -> Result<(), SplatError> {
     Ok(durable::write_result(path, |file| write_to(file, gaussians))?)
 }
