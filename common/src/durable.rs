@@ -32,7 +32,7 @@ fn part_of(path: &Path) -> PathBuf {
 }
 
 /// Writes a file that a user named; its old content stays until the new one is complete. Pipes, devices and
-/// files in folders without write permission are written in place.
+/// files in folders that take no new ones are written in place.
 pub fn write_result<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,

@@ -59,7 +59,8 @@ pub fn median<T: Ordered>(values: &mut [T]) -> Option<T> {
     quantile(values, 500, Rank::After)
 }
 
-/// Returns least and largest value without the lowest and highest `trimmed` share (at most 0.5). Reorders the values.
+/// Returns least and largest value without the lowest and highest `trimmed` share (at most 0.5), if any are left. It
+/// reorders the values.
 pub fn trimmed_range<T: Ordered>(values: &mut [T], trimmed: f64) -> Option<(T, T)> {
     let cut = (trimmed * values.len().checked_sub(1)? as f64) as usize;
     let (_, low, above) = values.select_nth_unstable_by(cut, T::order);

@@ -1,7 +1,7 @@
 //! Disjoint sets with path halving (Tarjan and van Leeuwen, "Worst-case Analysis of Set Union Algorithms", JACM
 //! 31(2), 1984).
 
-/// Number of items that [`UnionFind::number`] was not given.
+/// Stands for the number of an item that [`UnionFind::number`] was not given.
 pub const NOT_NUMBERED: u32 = u32::MAX;
 
 /// A partition of the items `0..n` into disjoint sets, each represented by one of its items, the root.

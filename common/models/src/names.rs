@@ -18,7 +18,7 @@ struct Fit {
     none_at: f64,
 }
 
-/// Maximum likelihood for two generated houses, with true and automatic masks; the model's 85 words are those generated.
+/// Maximum likelihood for two generated houses, true and automatic masks; the model knows the 85 words generated.
 const EMBEDDED: Fit = Fit { sharpness: 1.5, none_at: 1.0 };
 /// Maximum likelihood for ConSE's names in house_a, with true and automatic masks; no other model was available.
 const OTHERS: Fit = Fit { sharpness: 1.0, none_at: 5.0 };

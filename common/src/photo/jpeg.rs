@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(damage(&appended[..]).expect("memory reads"), None);
     }
 
-    /// A noisy photo whose middle is zeros; flat ones, whose coded data may be nothing else.
+    /// A noisy photo with zeros in the middle; flat photos, whose coded data may be all zeros.
     #[test]
     fn zeros_in_the_middle_are_seen() {
         let mut random = slag_math::random::Random::new(1);

@@ -119,7 +119,7 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
     Ok(ViewSet { applied, notes, ..view_set(path, views, PoseSource::Transforms, damaged)? })
 }
 
-/// Lists what the file states in vain.
+/// Reports entries of the file that have no effect.
 fn not_read(transforms: &Transforms, views: &[View]) -> Vec<String> {
     let mut found = Vec::new();
     let n_masked = transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count();

@@ -61,9 +61,8 @@ fn overlaps_by_hand() {
     assert_eq!(overlap(&of(0.0, 1.0), &of(3.0, 1.0)), 0.0);
 }
 
-/// Both lists end at x = 10, the earlier one at x = 0 as well. By hand: a thing that only one can know is neither
-/// new nor gone, one across the border that changed a little stays, and one does not move to where it may have
-/// been all the time.
+/// Both lists end at x = 10, the earlier one at x = 0 as well. By hand: an object that only one can know is neither
+/// new nor gone, one across the border that changed a little stays, and none moves to a place unknown before.
 #[test]
 fn what_one_list_cannot_know_is_not_compared() {
     let at = |id, x: f64| thing(id, [x, 0.0, 0.0], [1.0; 3], CHAIR);
