@@ -1,4 +1,4 @@
-//! An encode uses threads of its own. A program of its own, because rayon's global pool belongs to the process.
+//! An encode uses its own threads. A separate program, because rayon's global pool belongs to the process.
 
 use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
 use slag_encoder::{progress::Silent, raster::CpuRasterizer, segment::SamSettings};

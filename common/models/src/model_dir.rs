@@ -275,7 +275,7 @@ mod tests {
         ModelDir::with(described, Files::Embedded).expect("every hash is recorded").encoder_id().hash()
     }
 
-    /// The id depends on everything that affects vectors, and not on descriptions, paths or batch sizes.
+    /// The id depends on everything that affects vectors, and not on texts for people, paths or batch sizes.
     #[test]
     fn the_encoder_id_covers_the_description() {
         let text = embedded::DESCRIPTION;
