@@ -1,5 +1,5 @@
-// First impression and chosen answers: the scene fills the screen, nothing covers the chosen answer, lit and unlit differ
-// for every eye.
+// First impression and chosen answers: the scene fills the screen, nothing covers the chosen answer, and lit and unlit
+// differ for every eye.
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
