@@ -90,6 +90,7 @@ pub fn code(descriptor: &Descriptor) -> Code {
     directions.chunks_exact(DIM).enumerate().map(|(at, direction)| bit(direction) << at).sum()
 }
 
+/// Number of bits in which two codes differ.
 pub fn distance(a: Code, b: Code) -> u32 {
     (a ^ b).count_ones()
 }

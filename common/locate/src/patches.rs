@@ -14,7 +14,7 @@ const N_PX: f32 = (SIDE * SIDE) as f32;
 /// Search radius, pixels.
 const SEARCH_PX: usize = 12;
 const N_STEPS: usize = 2 * SEARCH_PX + 1;
-/// Features within a square of this size share one patch.
+/// Features within a square of so many pixels share one patch.
 const SQUARE_PX: f64 = 4.0;
 /// Least standard deviation of a patch: below it, there is nothing to recognise.
 const MIN_DEVIATION: f32 = 0.01;

@@ -1,5 +1,6 @@
 use super::*;
 
+/// By hand.
 #[test]
 fn texts_have_binary_units() {
     let read = |text: &str| text.parse::<ByteSize>().map(|size| size.0).map_err(|e| e.to_string());
@@ -32,6 +33,7 @@ fn texts_have_binary_units() {
     }
 }
 
+/// By hand.
 #[test]
 fn reports_have_decimal_units() {
     let cases = [

@@ -42,6 +42,7 @@ fn quantiles_are_places_of_the_sorted_values() {
     }
 }
 
+/// By hand.
 #[test]
 fn a_trimmed_range_leaves_out_both_ends() {
     assert_eq!(trimmed_range(&mut tens(), 0.0), Some((0.0, 90.0)));

@@ -359,6 +359,7 @@ impl Letterbox {
         Self { size_px, image_px, resized_px: [size_px; 2], is_stretched: true }
     }
 
+    /// Converts a point from pixels of the image to pixels of the square.
     pub fn point(&self, point_px: [f64; 2]) -> [f32; 2] {
         std::array::from_fn(|axis| {
             (point_px[axis] * (f64::from(self.resized_px[axis]) / f64::from(self.image_px[axis]))) as f32

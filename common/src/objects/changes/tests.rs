@@ -19,6 +19,7 @@ fn all(old: Vec<Thing>, new: Vec<Thing>) -> Changes {
 const CHAIR: [f64; 2] = [1.0, 0.0];
 const TABLE: [f64; 2] = [0.0, 1.0];
 
+/// By hand: one of each kind.
 #[test]
 fn each_change_is_named() {
     let old = vec![
