@@ -168,6 +168,7 @@ impl OnnxImageEncoder {
         Ok(best)
     }
 
+    /// Vectors of at most a batch of crops, `[n][dim]`.
     fn vectors(&mut self, crops: &[Crop]) -> Result<Vec<f32>, SessionError> {
         let Some(OnGpu { memory, levels, turns }) = &mut self.on_gpu else {
             let mut pixels = Vec::new();

@@ -80,6 +80,7 @@ impl PhraseEncoder {
             .enumerate()
             .filter_map(|(index, phrase)| {
                 let other: Vec<char> = phrase.to_lowercase().chars().collect();
+                // Among phrases that share a word, shorter ones rank first.
                 let shares_a_word = key
                     .split(' ')
                     .any(|w| phrase.split_whitespace().any(|p| p == w || is_start(w, p) || is_start(p, w)));

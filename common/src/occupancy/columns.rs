@@ -137,6 +137,7 @@ impl<'a> Occupancy<'a> {
     }
 }
 
+/// `voxel`: 0..4 each.
 pub(super) fn state_of(masks: [u64; 2], [x, y, z]: [i32; 3]) -> VoxelState {
     let bit = 1u64 << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x));
     match (masks[0] & bit != 0, masks[1] & bit != 0) {

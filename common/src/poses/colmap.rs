@@ -346,6 +346,7 @@ fn record_of_line(line: &str, place: Place) -> Result<Record<'_>, PoseProblem> {
     Ok(Record { name: rest.trim(), camera_id, wxyz, translation, place })
 }
 
+/// Counts in the file are checked against its length.
 struct Binary {
     path: PathBuf,
     reader: BufReader<File>,

@@ -108,6 +108,7 @@ impl ShardView<'_> {
         components
     }
 
+    /// Writes the vector of some components (`[m]`) to `out` (`[dim]`).
     fn combine(&self, components: &[f64], out: &mut [f64]) {
         let Some(basis) = &self.basis else {
             out.copy_from_slice(components);

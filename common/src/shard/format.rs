@@ -148,6 +148,7 @@ pub enum Profile {
 }
 
 impl Profile {
+    /// Smallest first.
     pub const ALL: [Self; 3] = [Self::Compact, Self::Balanced, Self::Exact];
 
     pub fn name(self) -> &'static str {

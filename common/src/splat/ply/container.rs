@@ -114,6 +114,7 @@ impl Element {
     }
 }
 
+/// A PLY file, positioned at the rows of the next element.
 pub(super) struct Ply {
     pub input: Input,
     encoding: Encoding,
