@@ -8,6 +8,7 @@ use crate::text;
 
 pub struct Authority {
     issuer: Issuer<'static, KeyPair>,
+    /// PEM.
     pub file: PathBuf,
 }
 

@@ -86,6 +86,7 @@ impl Grey {
             padded[radius + width..].fill(row[width - 1]);
             for (i, weight) in kernel.iter().enumerate() {
                 let (left, right) = (&padded[radius - i..][..width], &padded[radius + i..][..width]);
+                // The middle counts once.
                 let weight = if i == 0 { weight * 0.5 } else { *weight };
                 out.iter_mut().zip(left).zip(right).for_each(|((o, l), r)| *o += weight * (l + r));
             }

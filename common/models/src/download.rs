@@ -290,6 +290,7 @@ impl<'a> Client<'a> {
         Self { agent, limits, watch, resumed_bytes, retries }
     }
 
+    /// `None` if the server does not have it.
     pub fn small(&self, url: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, DownloadError> {
         self.retrying(url, || {
             let response = self.request(Method::GET, url, max_bytes, &[], &mut |_, _| {})?;

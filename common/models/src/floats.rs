@@ -89,6 +89,7 @@ impl Deref for Floats {
     fn deref(&self) -> &[f32] {
         match &self.0 {
             Memory::Own(values) => values,
+            // Cannot fail: it was read when it was made.
             Memory::Runtime(tensor) => read(tensor).unwrap_or_default(),
         }
     }

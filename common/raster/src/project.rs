@@ -199,6 +199,7 @@ pub fn reach2(opacity: f32) -> f32 {
     ((2.0 * (255.0 * f64::from(opacity)).ln()).max(0.0) + REACH2_MARGIN) as f32
 }
 
+/// The projected covariance exceeds the range of the pixels' arithmetic.
 struct Unrepresentable;
 
 /// Projects a usable Gaussian with its mean in the camera frame; `None` if it is culled.

@@ -81,6 +81,7 @@ impl SplatFrame {
             vec![row.x, row.y, row.z, translation[axis]]
         };
         let json = Json { transform: (0..3).map(row).collect(), scale, from: Some(FROM_POSES.to_owned()) };
+        // Numbers and texts always serialise.
         serde_json::to_string_pretty(&json).unwrap_or_default() + "\n"
     }
 

@@ -84,6 +84,7 @@ impl Input {
         ))
     }
 
+    /// Checks that nothing but blanks remains.
     pub fn require_end(&mut self) -> Result<(), SplatError> {
         loop {
             let bytes = self.fill_buf()?;
