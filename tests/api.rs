@@ -1,4 +1,4 @@
-//! The APIs as programs use them: the Python client, and both services against their own descriptions.
+//! The APIs as programs use them: the Python client, and both services against their descriptions.
 
 use std::path::Path;
 use std::process::Command;
@@ -15,16 +15,16 @@ fn the_python_client_asks_a_robot() {
     assert!(printed.contains(" things, "), "{printed}");
 }
 
-/// Schemathesis makes requests from `/openapi.json`, valid and invalid ones, and holds status, type and schema of
-/// every answer against it. `names`: values for the configuration; `excluded`: operations that never end.
+/// Schemathesis sends valid and invalid requests from `/openapi.json` and checks status, type and schema of every
+/// answer. `names`: values for the configuration; `excluded`: operations that never end.
 fn conforms(service: &Service, names: &[(&str, &str)], excluded: &[&str]) {
     let python = python_with("tests/schemathesis");
     let mut command = Command::new(python.with_file_name("schemathesis"));
-    // It writes reports beside itself.
+    // It writes reports to the working folder.
     let dir = tempfile::tempdir().expect("a temporary folder");
     command.current_dir(dir.path());
     command.arg("--config-file").arg(root().join("tests/schemathesis/schemathesis.toml"));
-    // One thread: some Pythons fail where two threads parse Python at once (its issue 106905).
+    // One thread: some Pythons fail when two threads parse Python (issue 106905).
     command.args(["--no-color", "run", "--checks", "all", "--workers", "1", "--continue-on-failure"]);
     command.args(excluded.iter().flat_map(|path| ["--exclude-path", path]));
     command.envs(names.iter().copied());
@@ -42,6 +42,6 @@ fn both_services_are_as_they_describe_themselves() {
     let sha256 = targets["signed"]["targets"]["manifest"]["hashes"]["sha256"].as_str().expect("a target");
     let names = [("SLAG_HASH", hash), ("SLAG_TARGET", &format!("{sha256}.manifest"))];
     conforms(&site.store, &names, &[]);
-    // Events are sent for as long as the client listens.
+    // Events are sent as long as the client listens.
     conforms(&site.robot(&[]), &names, &["/v1/events"]);
 }

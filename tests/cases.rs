@@ -1,8 +1,7 @@
-//! Inputs as people have them: what `check` and `encode` make of files of kinds that people report trouble with.
+//! User inputs that often cause trouble, in `check` and `encode`.
 //!
-//! `../shared/cases` makes the inputs, small changes of the labelled house. A row says what a command does with
-//! one: its exit code and words of what it prints. The ordinary run does the rows marked `fast`;
-//! `.ci/nightly` does all.
+//! `../shared/cases` makes them by small changes of the labelled house. A row states a command's exit code and
+//! words of its output. The ordinary run does the rows marked `fast`; `.ci/nightly` does all.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -14,11 +13,10 @@ use slag_common::splat::{self, ReadOptions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
-/// Scripts of `../shared/cases`, in the order in which they build on each other.
+/// Scripts of `../shared/cases`, in order of dependence.
 const SCRIPTS: [&str; 6] =
     ["make_clean", "make_cases", "make_masks", "make_ply", "make_more", "make_floaters"];
 
-/// Whether a row is part of the ordinary run.
 #[derive(Clone, Copy, PartialEq)]
 enum Speed {
     Fast,
@@ -26,7 +24,7 @@ enum Speed {
 }
 use Speed::{Fast, Slow};
 
-/// Poses of a folder of `cases`, with the clean splat: speed, poses, further flags, exit code, words.
+/// Poses from a folder of `cases`, with the clean splat: speed, poses, further flags, exit code, words.
 const POSES: &[(Speed, &str, &[&str], i32, &str)] = &[
     (Slow, "a1_spaces/sparse/0", &[], 0, "match the photos"),
     (Fast, "a2_three_words_no_features/sparse/0", &[], 0, "match the photos"),
@@ -99,9 +97,9 @@ const POSES: &[(Speed, &str, &[&str], i32, &str)] = &[
     (Slow, "d15_huge", &[], 0, "match the photos"),
 ];
 
-/// Splats of `ply`, with the clean poses.
+/// Splats from `ply`, with the clean poses.
 const SPLATS: &[(Speed, &str, i32, &str)] = &[
-    // Without six of ten Gaussians, or without their third axis, they do not match the photos either.
+    // Without six of ten Gaussians, or without the third axis, they do not match the photos either.
     (Slow, "p1_zero_rows_60", 4, "Gaussians cannot be drawn"),
     (Fast, "p1b_zero_rows_all_but_one", 4, "Gaussians cannot be drawn"),
     (Slow, "p2_linear_scales", 4, "--activated scales"),
@@ -133,7 +131,7 @@ const SPLATS: &[(Speed, &str, i32, &str)] = &[
     (Slow, "q9_transparent", 4, "transparent"),
 ];
 
-/// Masks of `masks`, of an encode of the clean scene.
+/// Masks from `masks`, in an encode of the clean scene.
 const MASKS: &[(Speed, &str, &[&str], i32, &str)] = &[
     (Slow, "m1_amg_folders", &[], 0, ""),
     (Slow, "m2_rle_string", &[], 0, ""),
@@ -153,7 +151,7 @@ const MASKS: &[(Speed, &str, &[&str], i32, &str)] = &[
     (Slow, "m14_bytes_repr", &[], 3, ""),
 ];
 
-/// Splats of `ply`, of an encode with the clean poses and masks.
+/// Splats from `ply`, in an encode with the clean poses and masks.
 const ENCODED: &[(Speed, &str, i32, &str)] = &[
     (Slow, "p1_zero_rows_60", 3, "unusable"),
     (Fast, "p1b_zero_rows_all_but_one", 1, "hardly any of 104878 Gaussians can be seen"),
@@ -169,7 +167,7 @@ fn made(dir: &Path) {
     }
 }
 
-/// Runs a command, and returns what is wrong with its outcome.
+/// Runs a command; returns what is wrong with its outcome.
 fn judged(name: &str, command: &mut Command, exit: i32, words: &str) -> Option<String> {
     let output = command.output().expect("the program starts");
     let said =
@@ -178,7 +176,7 @@ fn judged(name: &str, command: &mut Command, exit: i32, words: &str) -> Option<S
     (!is_right).then(|| format!("{name}: {}, expected {exit} and {words:?}:\n{said}", output.status))
 }
 
-/// Runs the rows that `chosen` takes, and fails with all outcomes that are wrong.
+/// Runs the rows that `chosen` accepts; fails with all wrong outcomes.
 pub fn run_cases(chosen: impl Fn(bool) -> bool) {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let dir = dir.path();
@@ -221,8 +219,7 @@ fn encode(scene: &Path, views: &Path, masks: &Path, store: &Path) -> Command {
     command
 }
 
-/// The largest distance of a stored position from its Gaussian, of those near the house, and the largest error
-/// stated.
+/// Largest distance of a stored position from its Gaussian near the house, and largest stated error.
 fn position_errors(store: &Path, splat: &Path) -> (f64, f64) {
     let scene = splat::read(splat, &ReadOptions::default()).expect("reads");
     let reader = StoreReader::open(store).expect("a published store");
@@ -244,7 +241,7 @@ fn position_errors(store: &Path, splat: &Path) -> (f64, f64) {
     (largest, stated)
 }
 
-/// Strays far away cost no other Gaussian its precision, whatever the units are.
+/// Strays far away do not reduce the precision of other Gaussians, in any unit.
 fn strays_cost_no_precision(files: &[&str]) {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let dir = dir.path();

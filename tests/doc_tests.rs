@@ -1,4 +1,4 @@
-//! The documents are short, and what they name exists: files, headings, flags and tests.
+//! The documents are short, and the files, headings, flags and tests that they name exist.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -8,15 +8,15 @@ use slag_tests::{files_below, root, sources, words};
 use syn::visit::{self, Visit};
 
 const MAX_WORDS: usize = 22_000;
-/// Most characters of a line, of a row of a table, and most columns.
+/// Most characters of a line and of a table row, and most columns.
 const MAX_LINE: usize = 120;
 const MAX_ROW: usize = 200;
 const MAX_COLUMNS: usize = 8;
-/// Flags of other projects' programs and of scripts, which documents name beside ours.
+/// Flags of other programs and of scripts that documents name besides ours.
 const OTHER_FLAGS: [&str; 6] =
     ["--alignment_type", "--container", "--help", "--help-all", "--no-normalize-world-space", "--ref_is_gps"];
 
-/// Returns the documents, relative to the project's root, with their texts.
+/// The documents with their texts, relative to the project's root.
 fn documents() -> Vec<(PathBuf, String)> {
     let mut paths: Vec<PathBuf> = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "jetson/README.md"]
         .into_iter()
@@ -81,7 +81,7 @@ fn lines_and_tables_fit_a_screen() {
     });
 }
 
-/// Returns the anchor of a heading, as GitHub makes it.
+/// GitHub's anchor of a heading.
 fn anchor(heading: &str) -> String {
     let heading = heading.trim_start_matches('#').trim().to_lowercase();
     let kept = heading.chars().filter(|c| c.is_alphanumeric() || [' ', '-', '_'].contains(c));
@@ -110,7 +110,7 @@ fn links_lead_somewhere() {
     });
 }
 
-/// Collects the flags that clap reads into the fields of structs and variants.
+/// Collects clap's flags from fields of structs and variants.
 #[derive(Default)]
 struct Flags(BTreeSet<String>);
 
@@ -129,7 +129,7 @@ impl<'ast> Visit<'ast> for Flags {
     }
 }
 
-/// Returns the commands of our programs in the code blocks of a document, each as its words.
+/// Commands of our programs in the code blocks of a document, as words.
 fn commands(text: &str) -> Vec<Vec<String>> {
     let mut lines = vec![String::new()];
     let mut is_fenced = false;
@@ -153,7 +153,7 @@ fn commands(text: &str) -> Vec<Vec<String>> {
         .collect()
 }
 
-/// Returns the code in a document's sentences that begins as commands and flags of our programs do.
+/// Code in sentences that begins like commands and flags of our programs.
 fn code_in_sentences(text: &str) -> Vec<&str> {
     const OURS: [&str; 12] = [
         "encode", "check", "query", "serve", "fetch", "worker", "goal", "store", "keys", "trust", "push",
@@ -203,8 +203,7 @@ fn flags_that_the_documents_name_exist() {
     });
 }
 
-/// The command lines of the documents are those that the programs parse, with values in place of their
-/// placeholders.
+/// Documented command lines parse, with values for their placeholders.
 #[test]
 fn documented_commands_are_understood() {
     let programs =
@@ -236,7 +235,7 @@ fn documented_commands_are_understood() {
     });
 }
 
-/// Returns whether the words before the first flag are commands, as far as the program has some.
+/// Whether the words before the first flag are commands, if the program has any.
 fn has_command(program: &clap::Command, words: &[&str]) -> bool {
     match words {
         [word, rest @ ..] if program.has_subcommands() && !word.starts_with('-') => {
@@ -246,7 +245,7 @@ fn has_command(program: &clap::Command, words: &[&str]) -> bool {
     }
 }
 
-/// Collects the functions of all Rust files: `function` and `file::function`.
+/// Functions of all Rust files: `function` and `file::function`.
 fn functions() -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for path in sources("rs") {
@@ -263,8 +262,8 @@ fn functions() -> BTreeSet<String> {
     found
 }
 
-/// Returns the names of tests in a text: words in backquotes with a `::`, or of at least four parts (`a_b_c_d`).
-/// Names of columns and fields are shorter.
+/// Names of tests in a text: words in backquotes with a `::`, or of at least four parts (`a_b_c_d`); names of
+/// columns and fields are shorter.
 fn tests_named(text: &str) -> Vec<&str> {
     let is_name = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == ':';
     let words = text.split('`').skip(1).step_by(2);

@@ -1,4 +1,4 @@
-//! The doors to other systems in front of a real robot, each driven by the other project's own software.
+//! The doors to other systems before a real robot, each driven by the other project's own software.
 
 use std::process::Command;
 
@@ -27,7 +27,7 @@ fn the_library_of_the_mcap_project_reads_what_a_robot_said() {
     let printed = judge(&python, "doors/mcap/tests/against_the_file.py", &[text(&file), &robot.url]);
     assert!(printed.contains("things, points, ground"), "{printed}");
 
-    // A robot that refuses leaves no file, and its reason is told.
+    // A robot that refuses leaves no file, and its reason is reported.
     let nothing = dir.path().join("nothing.mcap");
     let mut refused = Command::new(program("slag-mcap"));
     let output = refused.args(["--robot", &robot.url, "--text", ""]).arg(&nothing).output().expect("starts");
@@ -53,9 +53,9 @@ fn cyclone_dds_asks_a_robot() {
     let python = python_with("doors/ros/tests");
     let site = Site::new();
     let robot = site.robot(&["--follow", &site.store.url]);
-    // Runs of the tests at the same time do not hear each other.
+    // Separates concurrent runs of the tests.
     let domain = (50 + std::process::id() % 40).to_string();
-    // The nightly checks build the node for Jazzy, and say so.
+    // The nightly checks build the node for Jazzy and set this.
     let distribution = std::env::var("SLAG_ROS_DISTRIBUTION").unwrap_or("humble".into());
     let node = program("slag-ros");
     let args = [text(&node), &robot.url, "red", &domain, &distribution];
@@ -63,7 +63,7 @@ fn cyclone_dds_asks_a_robot() {
     assert!(printed.contains(" points, service, tf, odometry, fix, "), "{printed}");
 }
 
-/// The odometry of the robot is turned and moved against the scene; six photos that no landmark was made from tell how.
+/// Odometry turned and moved against the scene; six photos without landmarks of their own determine the transform.
 #[nightly("encodes a room with landmarks")]
 #[test]
 fn cyclone_dds_tells_a_robot_where_it_is() {

@@ -18,7 +18,7 @@ fn check_confirms_the_poses() {
     assert!(report["diagnosis"].is_null());
 }
 
-/// Encodes photos with automatic masks and fetches the shards around a place, given in metres and in degrees.
+/// Encodes photos with automatic masks and fetches the shards around a place in metres and in degrees.
 #[needs_shared]
 #[test]
 fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
@@ -26,7 +26,7 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let store = dir.path().join("brighton");
     let models = root().join("tests/models/conse");
-    // Six photos show the road end to end; all eighteen only take longer.
+    // Six photos show the road end to end; all eighteen take longer.
     let mut encode = encoder(&["encode", "--scene", text(&scene.join("point_cloud.ply"))]);
     encode.args(["--views", text(&scene.join("sparse/0")), "--masks", "auto", "--models", text(&models)]);
     let summary = run_json(encode.args(["--views-limit", "6", "--store", text(&store)]));
@@ -34,8 +34,7 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let n_cells = summary["n_cells"].as_u64().expect("a count");
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
 
-    // A point on the ground near the middle, and the same point in degrees. Oracle: an ENU library's figures for
-    // the origin of geo.json.
+    // A point on the ground near the middle, also in degrees. Oracle: an ENU library, for the origin of geo.json.
     let origin = server.get("/v1/cells?x=0&y=0&z=2&radius=30");
     let nearby = origin["cells"].as_array().expect("cells").len() as u64;
     assert!(0 < nearby && nearby < n_cells, "{nearby} of {n_cells} cells");

@@ -39,7 +39,7 @@ fn robots_fetch_from_static_files() {
     assert_eq!(first, fetch("served", &service.url));
     assert!(first.0["n_shards"].as_u64() > Some(0) && first.1 == 1, "{first:?}");
 
-    // The next generation, and the one after it, when the first one's shards go.
+    // The next generation, and then the one that drops the first one's shards.
     encode("0.4");
     assert_eq!(export()["n_removed"], 0);
     assert_eq!(fetch("static", &files.url), fetch("served", &service.url));

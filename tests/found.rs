@@ -7,7 +7,7 @@ use slag_common::Gaussians;
 use slag_common::splat::{self, ReadOptions, ply};
 use slag_tests::*;
 
-/// World units: far less than the distance between most neighbours.
+/// World units; far below the distance between most neighbours.
 const POSITION_ERROR: &str = "0.0004";
 
 /// Encodes the room with input indices in fine positions; returns its Gaussians.
@@ -17,8 +17,8 @@ fn encoded(store: &Path, profiles: &str) -> Gaussians {
     splat::read(&generated(&ROOM).join("scene.ply"), &ReadOptions { with_sh_rest: true }).expect("reads")
 }
 
-/// Asserts that each point's input index is that of the splat's Gaussian nearest to it, found by comparing with
-/// all. Where two Gaussians are as near as the error of positions, either may be meant. Returns the indices.
+/// Asserts that each point's input index is that of the splat's nearest Gaussian, by brute force, or of one as
+/// near within the position error. Returns the indices.
 fn assert_nearest(points: &[[f64; 4]], scene: &Gaussians) -> Vec<u32> {
     let error = 1.01 * POSITION_ERROR.parse::<f64>().expect("a number");
     let mut n_ambiguous = 0;
@@ -93,7 +93,7 @@ fn an_answer_on_the_encoder_is_a_splat() {
     assert_eq!(indices, expected);
     assert_eq!(without_scene["n_matching"], expected.len());
 
-    // The splat: the same Gaussians with all their parameters, best first.
+    // The splat has the same Gaussians with all their parameters, best first.
     let found = splat::read(found, &ReadOptions { with_sh_rest: true }).expect("a splat");
     let mut best_first = expected;
     best_first.sort_by(|a, b| scores[*b as usize].total_cmp(&scores[*a as usize]).then(a.cmp(b)));
@@ -105,7 +105,7 @@ fn an_answer_on_the_encoder_is_a_splat() {
         assert!((0..3).all(|c| (found.scales[at][c] / scene.scales[index][c] - 1.0).abs() < 1e-5));
     }
 
-    // Another splat is refused, and advice is given where nothing says which Gaussian is which.
+    // Another splat is refused; without indices, advice is given.
     let mut moved = scene.clone();
     moved.means_in_world.iter_mut().for_each(|mean| mean.x += 0.01);
     let other = dir.path().join("moved.ply");

@@ -1,7 +1,5 @@
-//! Runs every fuzz target on seeds, on what fuzzing guided by coverage found (`fuzz/corpus`), and on thousands of
-//! seeded mutations of both.
-//!
-//! `SLAG_FUZZ_SECS` sets the seconds per target, instead of a fixed number of mutations.
+//! Runs every fuzz target on seeds, on the corpus of coverage-guided fuzzing (`fuzz/corpus`), and on thousands of
+//! seeded mutations of both. `SLAG_FUZZ_SECS` sets seconds per target instead of a number of mutations.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
@@ -13,16 +11,16 @@ mod targets;
 use slag_math::random::Random;
 use slag_test_support::{memory_of, shared_folder};
 
-/// Memory a decoder may take in addition to [`MAX_EXPANSION`] times its input: buffers and small images.
+/// Memory that a decoder may take in addition to [`MAX_EXPANSION`] times its input: buffers and small images.
 const FREE_BYTES: usize = 64 << 20;
 const MAX_EXPANSION: usize = 256;
-/// Mutations of each target; targets that write files and decode images take the longest.
+/// Mutations per target; those that write files and decode images take longest.
 const N_MUTATIONS: u64 = 3000;
 const INTERESTING: [u64; 12] =
     [0, 1, 2, 0x7f, 0x80, 0xff, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, u64::MAX >> 1, u64::MAX];
 
-/// Mutates a seed as fuzzers do: bits, numbers, digits, truncation, copies, pieces of another seed. Half of the time
-/// one of the first `n_valid`: few mutations of refused inputs are accepted.
+/// Mutates a seed: bits, numbers, digits, truncation, copies, pieces of another seed. Half of the time it is one
+/// of the first `n_valid`, because few mutations of refused inputs are accepted.
 fn mutated(seeds: &[Vec<u8>], n_valid: usize, random: &mut Random) -> Vec<u8> {
     let n = if random.below(2) == 0 { n_valid } else { seeds.len() };
     let mut bytes = seeds[random.below(n)].clone();
@@ -40,7 +38,7 @@ fn mutated(seeds: &[Vec<u8>], n_valid: usize, random: &mut Random) -> Vec<u8> {
                 bytes[at..end].copy_from_slice(&value[..end - at]);
             }
             5 => {
-                // Text: replaced by a digit, a sign or a long number.
+                // Text: a digit, a sign or a long number.
                 let piece: &[u8] =
                     [b"-".as_slice(), b"9", b"1e999", b"NaN", b"99999999999999999999", b"\"", b"{"]
                         [random.below(7)];
@@ -66,7 +64,7 @@ fn mutated(seeds: &[Vec<u8>], n_valid: usize, random: &mut Random) -> Vec<u8> {
     bytes
 }
 
-/// Returns the inputs that fuzzing guided by coverage kept for a target, in order of their names.
+/// Inputs that coverage-guided fuzzing kept for a target, sorted by name.
 fn corpus(name: &str) -> Vec<Vec<u8>> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(name);
     let Ok(entries) = fs_err::read_dir(folder) else { return Vec::new() };

@@ -1,4 +1,4 @@
-//! The labelled house: agreement with a field that an independent pipeline computed.
+//! The labelled house: agreement with the field of an independent pipeline.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,7 +11,6 @@ use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
-/// Returns the command that encodes the house with its given masks into a store.
 fn encode_house(views: &str, store: &Path, flags: &str) -> std::process::Command {
     let house = shared("scenes/house_a");
     let mut command = encoder(&["encode", "--scene", text(&house.join("point_cloud.ply"))]);
@@ -20,9 +19,8 @@ fn encode_house(views: &str, store: &Path, flags: &str) -> std::process::Command
     command
 }
 
-/// Encodes the house with its given masks and the ConSE encoder, and compares total weights, embeddings, and each
-/// word's AUC and IoU. The tolerances are the reference's own, because crops, resizing and runtime versions differ
-/// slightly.
+/// Encodes the house with its given masks and ConSE, and compares total weights, embeddings, and each word's AUC
+/// and IoU. The tolerances are the reference's own, because crops, resizing and runtime versions differ slightly.
 #[needs_shared]
 #[test]
 fn the_field_agrees_with_the_independent_reference() {
@@ -30,7 +28,7 @@ fn the_field_agrees_with_the_independent_reference() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let store = dir.path().join("house");
     let models = root().join("tests/models/conse");
-    // The reference's width.
+    // As the reference.
     let flags = "--preset plain --min-mask-px 200 --raster-width 640 --strict";
     let summary = run_json(encode_house("sparse/0", &store, flags).args(["--models", text(&models)]));
     println!("{summary:#}");
@@ -40,9 +38,9 @@ fn the_field_agrees_with_the_independent_reference() {
     check_words(&house, &store, &models);
 }
 
-/// A model that wants windows over the photo gets them: vectors turn, as far as a share of 0.35 can turn them, and
-/// their number is that of the masks. Oracle: unit vectors a and b give |0.65 a + 0.35 b| >= 0.3, and an angle to
-/// a of at most asin(0.35 / 0.65).
+/// A model with windows over the photo gets them: vectors turn by as much as a share of 0.35 can, and there is one
+/// per mask. Oracle: unit vectors a and b give |0.65 a + 0.35 b| >= 0.3, and an angle to a of at most asin(0.35 /
+/// 0.65).
 #[needs_shared]
 #[test]
 fn masks_take_a_share_of_windows() {
@@ -70,8 +68,7 @@ fn masks_take_a_share_of_windows() {
     assert!(!cosines.is_empty() && cosines.iter().all(|cosine| (least - 1e-3..0.9999).contains(cosine)));
 }
 
-/// Beside the coffee table, whose top is 0.36 m high and has room above it, and from elsewhere: places to stand are
-/// on the floor.
+/// Beside the coffee table (top at 0.36 m, room above it) and elsewhere: places to stand are on the floor.
 #[needs_shared]
 #[nightly("encodes the house with its free places")]
 #[test]
@@ -97,7 +94,7 @@ fn places_by_the_sofa_are_on_the_floor() {
 }
 
 /// The GPU's field equals the CPU's within the bound of docs/numerics.md: contributions differ only at pixels
-/// across a cut, together by less than a 50,000th. A machine without a GPU uses a software adapter.
+/// across a cut, in total by less than a 50,000th. A machine without a GPU uses a software adapter.
 #[nightly("encodes the house on a software GPU")]
 #[needs_shared]
 #[test]
@@ -193,7 +190,7 @@ fn check_embeddings(house: &Path, store: &Path) {
     assert!(weight_errors[n * 95 / 100] <= 0.01);
 }
 
-/// Compares the program's evaluation with the reference's figures, and that of each profile with the field's.
+/// Compares the evaluation with the reference's figures, and each profile's with the field's.
 fn check_words(house: &Path, store: &Path, models: &Path) {
     let reference = read_json(&house.join("gt/reference.json"));
     let reference = &reference["results"]["white"];
@@ -219,7 +216,7 @@ fn check_words(house: &Path, store: &Path, models: &Path) {
     assert!((iou - figure(&reference["miou"])).abs() <= 0.02);
 
     let manifest = StoreReader::open(store).expect("a published store").manifest().clone();
-    // Of the last two 10 bytes tell how a Gaussian looks.
+    // Ten bytes of the last two are the appearance.
     for (profile, most_bytes) in
         [(Profile::Compact, 10.0), (Profile::Balanced, 34.5), (Profile::Exact, 1200.0)]
     {

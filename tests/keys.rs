@@ -35,15 +35,14 @@ fn robots_believe_the_store_that_they_were_told_of() {
         refused(&mut add(cache, &[&[impostor.url.as_str()][..], &first].concat()), "--replace");
     }
 
-    // A refresh needs no encode, and a robot sees it.
+    // A refresh needs no encode, and reaches robots.
     let refreshed = run_json(&mut encoder(&["store", "refresh", "--store", text(&store), "--days", "3"]));
     run(&mut fetch(&by_file, &service));
     let shown = run_json(&mut edge(&["trust", "show", "--cache", text(&by_file)]));
     assert_eq!(shown["expires_unix_secs"], refreshed["expires_unix_secs"]);
     assert_eq!(shown["root_sha256"], sha256);
 
-    // A key leaked: a new root replaces it, and robots follow. Root's keys lie elsewhere, so a draft is carried
-    // there.
+    // A leaked key: a new root replaces it, and robots follow. Root's keys are elsewhere, so a draft goes there.
     let elsewhere = dir.path().join("elsewhere");
     std::fs::rename(store.join("keys/root"), &elsewhere).expect("moved");
     let status = run_json(&mut encoder(&["keys", "status", "--store", text(&store)]));
@@ -60,7 +59,7 @@ fn robots_believe_the_store_that_they_were_told_of() {
     for cache in [&by_file, &by_hash] {
         assert_eq!(run_json(&mut fetch(cache, &service))["root_version"], 2);
     }
-    // Adding the first root again is harmless; a new robot may begin with either.
+    // Adding the first root again is harmless; new robots may begin with either.
     assert_eq!(run_json(&mut add(&by_file, &[&service.url, "--sha256", sha256]))["is_new"], false);
     assert_eq!(run_json(&mut fetch(&by_file, &service))["root_version"], 2);
     let late = dir.path().join("late");

@@ -1,4 +1,4 @@
-//! Power cuts: kills encode and fetch at random moments and starts them again.
+//! Power cuts: encode and fetch are killed at random moments and restarted.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -10,7 +10,7 @@ use slag_tests::*;
 
 /// Runs a command and returns its output, or kills it after a while.
 fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
-    // The output fits in the pipe's buffer, so nobody has to read it meanwhile.
+    // The output fits in the pipe's buffer, so it need not be read meanwhile.
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
     let start = Instant::now();
     while start.elapsed() < after {
@@ -25,7 +25,7 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
     None
 }
 
-/// Whoever reads what a program says may leave (a logger that ends, `| head`). The work goes on and its results stay.
+/// A closed reader of a program's messages (`| head`) does not stop its work or change its results.
 #[test]
 fn programs_go_on_when_nobody_reads_what_they_say() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -51,7 +51,7 @@ fn programs_go_on_when_nobody_reads_what_they_say() {
     }
 }
 
-/// Under `nohup` an encode outlives its terminal; without, it stops as at ctrl-c.
+/// Under `nohup` an encode outlives its terminal; otherwise it stops as at ctrl-c.
 #[test]
 fn a_hangup_that_is_ignored_stops_nothing() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -84,8 +84,7 @@ fn killed_encodes_resume_and_show_nothing_half() {
     let encode_time = start.elapsed();
     let expected = content(&whole);
 
-    // Kills come within the first half of the time, so that several hit each store. A finished store is replaced
-    // by a new one.
+    // Kills in the first half of the time, so that several hit each store. A finished store is replaced by a new one.
     let mut random = Random::new(7);
     let (mut n_kills, mut n_stores, mut n_resumed) = (0, 0, 0);
     while n_kills < n_wanted {
@@ -110,7 +109,7 @@ fn killed_encodes_resume_and_show_nothing_half() {
     println!("encode: {n_kills} kills, {n_stores} stores, {n_resumed} views not done twice");
 }
 
-/// Kills a robot with generation 1 on board while it fetches generation 2, in which all shards differ.
+/// Kills a robot with generation 1 on board while it fetches generation 2, whose shards all differ.
 #[test]
 fn killed_fetches_leave_the_old_or_the_new_generation() {
     let n_wanted = trials(12, 2000);

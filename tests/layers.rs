@@ -1,7 +1,7 @@
 //! Dependencies point one way: the layers of ARCHITECTURE.md, and no circle between files of a crate.
 //!
-//! Every path in the source is resolved to the file that defines the item, through re-exports; so a `mod.rs` that
-//! only declares and re-exports its children depends on none of them. Tests (`#[cfg(test)]`) do not count.
+//! Every path in the source is resolved through re-exports to the file that defines the item, so a `mod.rs` that only
+//! declares and re-exports its children depends on none. Tests (`#[cfg(test)]`) do not count.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -35,14 +35,13 @@ type ModulePath = Vec<String>;
 struct Module {
     file: PathBuf,
     children: BTreeSet<String>,
-    /// Names that `use` imports: the path as written, and whether other modules see it.
+    /// Names imported by `use`: the path as written, and whether other modules see it.
     imports: BTreeMap<String, ModulePath>,
     globs: Vec<ModulePath>,
-    /// Paths in use, without re-exports.
+    /// Paths used, without re-exports.
     paths: BTreeSet<ModulePath>,
 }
 
-/// The modules of all crates.
 struct Workspace(BTreeMap<ModulePath, Module>);
 
 fn is_test(attributes: &[Attribute]) -> bool {
@@ -51,7 +50,7 @@ fn is_test(attributes: &[Attribute]) -> bool {
     attributes.iter().any(is_cfg_test)
 }
 
-/// Returns the file of a child module: `#[path]`, `child.rs` or `child/mod.rs`.
+/// `#[path]`, `child.rs` or `child/mod.rs`.
 fn file_of_child(parent: &Path, name: &str, attributes: &[Attribute]) -> PathBuf {
     let is_root = parent.file_name().is_some_and(|f| f == "mod.rs" || f == "lib.rs" || f == "main.rs");
     let folder = if is_root { parent.with_file_name("") } else { parent.with_extension("") };
@@ -114,7 +113,7 @@ impl Workspace {
         }
     }
 
-    /// Returns the module that defines the item of a path, as seen from a module; `None` for foreign crates.
+    /// Module that defines a path's item, as seen from a module; `None` for foreign crates.
     fn resolve(&self, from: &ModulePath, path: &[String], depth: usize) -> Option<ModulePath> {
         if depth > 16 {
             return None;
@@ -155,7 +154,7 @@ impl Workspace {
                 at.push(name.clone());
                 rest = &rest[1..];
             } else if let Some(import) = module.imports.get(name) {
-                // An import under its own name, such as a crate's, leads no further.
+                // An import under its own name, such as a crate's, ends the search.
                 if import.first() == Some(name) && import.len() == 1 {
                     return None;
                 }
@@ -169,7 +168,7 @@ impl Workspace {
         self.0.contains_key(&at).then_some(at)
     }
 
-    /// Returns pairs of (user, used) modules of different files, with the path that connects them.
+    /// Pairs of (user, used) modules of different files, with the connecting path.
     fn edges(&self) -> Vec<(&ModulePath, ModulePath, String)> {
         let mut edges = Vec::new();
         for (from, module) in &self.0 {
@@ -271,7 +270,7 @@ impl<'ast> Visit<'ast> for Module {
     }
 }
 
-/// Returns the layers that ARCHITECTURE.md states: the modules of each crate from the bottom up.
+/// The layers in ARCHITECTURE.md: modules of each crate, from the bottom up.
 fn stated_layers() -> BTreeMap<String, Vec<Vec<String>>> {
     let text = fs_err::read_to_string(root().join("ARCHITECTURE.md")).expect("ARCHITECTURE.md");
     let block =
@@ -286,7 +285,6 @@ fn stated_layers() -> BTreeMap<String, Vec<Vec<String>>> {
     layers
 }
 
-/// A layer may use the layers below it, nothing else.
 #[test]
 fn modules_use_only_the_layers_below() {
     let workspace = Workspace::read();
@@ -317,7 +315,6 @@ fn modules_use_only_the_layers_below() {
     assert!(wrong.is_empty(), "against ARCHITECTURE.md:\n{}", wrong.join("\n"));
 }
 
-/// No file depends on itself through others.
 #[test]
 fn files_form_no_circle() {
     let workspace = Workspace::read();
@@ -327,7 +324,7 @@ fn files_form_no_circle() {
         let (user, used) = (&workspace.0[*from].file, &workspace.0[to].file);
         uses.entry(user).or_default().entry(used).or_insert_with(|| path.clone());
     }
-    // The files reachable from each file; two files that reach each other form a circle.
+    // Files reachable from each file; two that reach each other form a circle.
     let reach = |start: &Path| -> BTreeSet<&Path> {
         let mut seen = BTreeSet::new();
         let mut open: Vec<&Path> = uses.get(start).into_iter().flat_map(|m| m.keys().copied()).collect();

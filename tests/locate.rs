@@ -1,10 +1,10 @@
-//! From a photo to a place to stand: where the camera is, what the robot finds from there, where it may go.
+//! From a photo to a place to stand: the camera's pose, what the robot finds from there, where it may go.
 
 use glam::{DMat4, DVec3};
 use serde_json::Value;
 use slag_tests::*;
 
-/// Photos that no landmark was made from, of a camera whose pose is known.
+/// Photos without landmarks of their own, with known poses.
 #[test]
 fn a_photo_leads_to_a_place_to_stand() {
     let room = ["--n-views", "24", "--seed", "7"];
@@ -32,7 +32,7 @@ fn a_photo_leads_to_a_place_to_stand() {
         n_stood += usize::from(goal["goals"].as_array().is_some_and(|goals| !goals.is_empty()));
     }
     let n = frames.len();
-    // The splat lacks some of what photos show.
+    // The splat lacks details of the photos.
     assert!(n_drawn >= 3, "{n_drawn} of {n} verified by a drawing");
     assert!(n_found >= 5 && n_stood >= 5, "{n_found} of {n} found, {n_stood} with a place to stand");
 }

@@ -1,4 +1,4 @@
-//! The programs together, as one test program: it is linked once, and its tests share what they encode.
+//! All end-to-end tests in one program: it is linked once, and its tests share what they encode.
 
 mod api;
 mod cases;

@@ -1,4 +1,4 @@
-//! Manual pages and completions, against what the programs themselves print and how `man` and bash read the files.
+//! Manual pages and completions, against the programs' own output and as `man` and bash read them.
 
 use std::path::Path;
 use std::process::Command;
@@ -6,7 +6,7 @@ use std::process::Command;
 use clap::CommandFactory;
 use slag_tests::*;
 
-/// The programs, and the least number of pages that each has.
+/// The programs, and their least number of pages.
 const PROGRAMS: [(&str, usize); 5] =
     [("slag-encoder", 21), ("slag-edge", 16), ("slag-mcap", 1), ("slag-mcp", 1), ("slag-ros", 1)];
 
@@ -20,7 +20,7 @@ fn with_single_spaces(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Returns what a program prints as its help, in long lines.
+/// Help of a program, in long lines.
 fn help(path: &[&str]) -> String {
     let mut command = Command::new(program(path[0]));
     let flag = if ["slag-encoder", "slag-edge"].contains(&path[0]) { "--help-all" } else { "--help" };
@@ -28,7 +28,7 @@ fn help(path: &[&str]) -> String {
     String::from_utf8(run(&mut command).stdout).expect("text")
 }
 
-/// Returns the flags of a help text, each with the first paragraph of its help.
+/// Flags of a help text, each with the first paragraph of its help.
 fn flags(help: &str) -> Vec<(String, String)> {
     let mut flags: Vec<(String, String)> = Vec::new();
     let mut is_open = false;
@@ -49,7 +49,7 @@ fn flags(help: &str) -> Vec<(String, String)> {
         }
     }
     for (_, help) in &mut flags {
-        // Defaults and the like stand elsewhere in a page.
+        // Pages show defaults and the like elsewhere.
         let end =
             [" [default:", " [env:", " [possible", " [alias"].iter().filter_map(|mark| help.find(mark)).min();
         *help = with_single_spaces(&help[..end.unwrap_or(help.len())]);
@@ -57,7 +57,7 @@ fn flags(help: &str) -> Vec<(String, String)> {
     flags
 }
 
-/// Returns the commands below a command, by its help text.
+/// Subcommands in a help text.
 fn commands(help: &str) -> Vec<&str> {
     let below = help.split("\nCommands:\n").nth(1).unwrap_or_default();
     let lines = below.lines().take_while(|line| !line.is_empty());
@@ -69,7 +69,7 @@ fn commands(help: &str) -> Vec<&str> {
         .collect()
 }
 
-/// Returns a page as `man` shows it; it must not warn.
+/// A page as `man` shows it, without warnings.
 fn page(path: &Path) -> String {
     let shown = Command::new("man")
         .args(["--warnings=w", "--nh", "--nj", "--encoding=UTF-8", "-l", text(path)])
@@ -82,7 +82,7 @@ fn page(path: &Path) -> String {
     with_single_spaces(&String::from_utf8(shown.stdout).expect("text"))
 }
 
-/// Compares the pages of a command and those below it; returns how many there are, and how many flags they have.
+/// Compares the pages of a command and its subcommands; returns their number and that of their flags.
 fn compare(path: &[&str], manual: &Path) -> (usize, usize) {
     let help = help(path);
     let name = format!("{}.1", path.join("-"));
@@ -133,7 +133,7 @@ fn bash_completes_commands_flags_and_values() {
     }
 }
 
-/// Every example of `--help` is a command line that the program takes.
+/// Every example of `--help` parses.
 #[test]
 fn examples_of_help_parse() {
     let mut n_examples = 0;
@@ -160,7 +160,7 @@ fn examples_of_help_parse() {
     assert_eq!(n_examples, 45);
 }
 
-/// Else they are unknown flags, for which clap has the advice `-- -5`: not true of a flag's value.
+/// Otherwise clap takes them for unknown flags and suggests `-- -5`, which is wrong for a flag's value.
 #[test]
 fn negative_numbers_are_values_of_flags() {
     for (name, line) in [

@@ -1,9 +1,9 @@
-//! What the page is sent, by both programs, against the scores that the command line prints.
+//! The data of the page, from both programs, against the scores of the command line.
 
 use serde_json::json;
 use slag_tests::*;
 
-/// A message of scores: for each cell its id and the scores of its Gaussians; `None` where no view shows one.
+/// A message of scores: per cell its id and the scores of its Gaussians; `None` for those in no view.
 fn scores_of(service: &Service, query: &str) -> Vec<(u32, Vec<Option<f64>>)> {
     let url = format!("{}/v1/view/scores?{query}", service.url);
     let bytes = ureq::get(url).call().expect("answers").body_mut().read_to_vec().expect("bytes");
@@ -62,8 +62,7 @@ fn scores_are_those_of_the_command_line() {
     assert!(expected[expected.len() - 1] - expected[0] > 0.5, "the question tells Gaussians apart");
 }
 
-/// A store is drawn in the colours of its balanced shards; compact ones, which robots fetch, have the same places
-/// alone.
+/// Balanced shards of a store show colours; compact ones, which robots fetch, have the same positions only.
 #[test]
 fn a_store_shows_colours_that_compact_shards_lack() {
     let site = Site::new();
@@ -76,15 +75,14 @@ fn a_store_shows_colours_that_compact_shards_lack() {
     let (of_store, of_robot) = (cell_of(&site.store), cell_of(&robot));
     let flags = |bytes: &[u8]| u32::from_le_bytes(bytes[24..28].try_into().expect("4 bytes"));
     assert_eq!((flags(&of_store) & 1, flags(&of_robot) & 1), (1, 0));
-    // What names the cell, and its centres of 6 bytes.
+    // The cell's head, and its centres of 6 bytes.
     let n = u32::from_le_bytes(of_store[8..12].try_into().expect("4 bytes")) as usize;
     let places = 32..32 + 6 * n;
     assert!(n > 100 && of_store[..24] == of_robot[..24] && of_store[places.clone()] == of_robot[places]);
 }
 
-/// Things of balanced shards carry a picture: the part of their best photo around their box.
-///
-/// Oracle: the mean colour of that part of the generated photo.
+/// Objects of balanced shards carry a picture: the box in their best photo. Oracle: the mean colour of that part
+/// of the generated photo.
 #[test]
 fn things_carry_pictures_of_themselves() {
     let site = Site::new();
@@ -129,7 +127,7 @@ fn mean_colour(picture: &image::RgbImage) -> [f64; 3] {
     [0, 1, 2].map(|channel| picture.pixels().map(|pixel| f64::from(pixel[channel])).sum::<f64>() / n)
 }
 
-/// Answers of the store's service are the robot's: same things, scores and places.
+/// The store's service answers like the robot: same objects, scores and places.
 #[test]
 fn the_store_finds_what_the_robot_finds() {
     let site = Site::new();
@@ -159,7 +157,7 @@ fn the_store_finds_what_the_robot_finds() {
     );
 }
 
-/// Both programs suggest the likely names of things: those of the robot's list, and its other words without a thing.
+/// Both programs suggest likely names of objects: the robot's list, then its other words.
 #[test]
 fn suggestions_are_the_names_of_things() {
     let site = Site::new();

@@ -1,5 +1,4 @@
-//! Poisons every field of a scene in every way: unusable Gaussians are rejected and counted, and the store holds
-//! finite numbers only.
+//! Every invalid value in every field of a scene: unusable Gaussians are rejected and counted, the store stays finite.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -50,7 +49,7 @@ impl Ply {
     }
 }
 
-/// Values for some properties, and whether the Gaussian can still be used.
+/// Values of some properties, and whether the Gaussian stays usable.
 fn poisons() -> Vec<(Vec<(&'static str, f64)>, bool)> {
     let (nan, infinity) = (f64::NAN, f64::INFINITY);
     let rotation = ["rot_0", "rot_1", "rot_2", "rot_3"];
@@ -107,7 +106,6 @@ fn a_poisoned_scene_leaves_no_nan_in_the_store() {
     assert_eq!((manifest.n_rejected, manifest.n_gaussians), (n_rejected, ply.len() as u64 - n_rejected));
 
     let table = read_regions(&reader).expect("regions");
-    // Every component of every region's vector, one at a time.
     for component in 0..table.dim() {
         let mut query = vec![0.0; table.dim()];
         query[component] = 1.0;

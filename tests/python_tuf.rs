@@ -1,4 +1,4 @@
-//! Stores and robots against python-tuf, the reference implementation of The Update Framework, both ways.
+//! Stores and robots against python-tuf, TUF's reference implementation, both ways.
 
 use std::path::Path;
 use std::process::Command;
@@ -17,7 +17,7 @@ fn python_tuf_verifies_stores_and_robots_follow_python_tuf() {
     a_robot_follows_python_tuf(&python, dir.path(), &store, &service);
 }
 
-/// One client of python-tuf that remembers what it saw, and new ones that begin with the first root.
+/// One client of python-tuf with a memory, and new ones that begin with the first root.
 fn python_tuf_verifies(python: &Path, dir: &Path, store: &Path, service: &Service) {
     let root = store.join("metadata/1.root.json");
     let length = fs_err::metadata(store.join("manifest")).expect("published").len().to_string();
@@ -43,7 +43,7 @@ fn python_tuf_verifies(python: &Path, dir: &Path, store: &Path, service: &Servic
     }
     // Also begun with the newest root.
     assert_eq!(verified(&store.join("metadata/2.root.json"), "late"), length);
-    // What python-tuf would refuse, it refuses: an old timestamp, and a root with another signature.
+    // It refuses an old timestamp, and a root with another signature.
     let new = fs_err::read(&timestamp).expect("published");
     fs_err::write(&timestamp, old).expect("written");
     assert_eq!(
@@ -60,8 +60,8 @@ fn python_tuf_verifies(python: &Path, dir: &Path, store: &Path, service: &Servic
     assert_eq!(verified(&path, "forged"), "refused: UnsignedMetadataError");
 }
 
-/// A robot of the real program in front of a repository that python-tuf signs: attacks are refused for their own
-/// reasons, and what comes after each is followed.
+/// A real robot before a repository signed by python-tuf: each attack is refused for its own reason, honest metadata is
+/// accepted.
 fn a_robot_follows_python_tuf(python: &Path, dir: &Path, store: &Path, service: &Service) {
     let (published, cache) = (dir.join("published"), dir.join("cache"));
     fs_err::create_dir(&published).expect("made");
@@ -109,7 +109,7 @@ fn a_robot_follows_python_tuf(python: &Path, dir: &Path, store: &Path, service: 
             Ok(version) => assert_eq!(run_json(&mut fetch(state))["root_version"], version, "{state}"),
             Err(reason) => drop(refused(&mut fetch(state), reason)),
         }
-        // Whatever was refused, what is on board answers.
+        // After any refusal, the scene on board answers.
         run(&mut edge(&["query", "blue", "--models", "colours", "--cache", text(&cache)]));
     }
 }

@@ -1,5 +1,4 @@
-//! A store that rots: another encode writes its files anew, from the views that are kept, and its catalogue from
-//! the files.
+//! A rotten store: another encode rewrites its files from the kept views, and its catalogue from the files.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -27,7 +26,7 @@ fn an_encode_heals_a_store_from_kept_views() {
         (output.status.success(), serde_json::from_slice(&output.stdout).expect("JSON"))
     };
     encode();
-    // Commands that read write nothing, not even away what another writer has in work.
+    // Reading commands write nothing, and leave another writer's temporary files.
     fs_err::write(store.join("tmp/7.part"), "of a writer").expect("written");
     let untouched = files(&store);
     run(&mut encoder(&["keys", "status", "--store", text(&store)]));
@@ -36,7 +35,7 @@ fn an_encode_heals_a_store_from_kept_views() {
     assert!(json("verify").0);
     assert!(files(&store) == untouched, "a command that reads wrote");
 
-    // A byte that rots, files that are gone, and an object that only queries here need.
+    // A flipped byte, missing files, and an object that only queries here need.
     let before = content(&store);
     let path = |hash: &str| store.join("objects").join(&hash[..2]).join(hash);
     // Profiles of few vectors may share a file.
@@ -52,8 +51,7 @@ fn an_encode_heals_a_store_from_kept_views() {
     fs_err::write(path(&a_field(&store)), b"").expect("written");
     let bad = json("verify").1["bad"].as_array().cloned().expect("a list");
     assert_eq!(bad.len(), 4, "{bad:?}");
-    // The database, the metadata and the list of fields rot as well, and a folder holds what is none of the
-    // store's.
+    // The database, the metadata and the list of fields rot as well, and a foreign file lies in a folder.
     for entry in fs_err::read_dir(store.join("db")).expect("there") {
         let path = entry.expect("readable").path();
         if path.is_file() {
@@ -65,7 +63,7 @@ fn an_encode_heals_a_store_from_kept_views() {
 
     let (summary, errors) = encode();
     assert_eq!((&summary["n_views_resumed"], &summary["generation"]), (&4.into(), &2.into()), "{errors}");
-    // Only the removal of what no generation needs failed, after the publication.
+    // Only the removal of unneeded files failed, after the publication.
     assert!(errors.contains("generation 2 is published") && errors.contains("stray"), "{errors}");
     fs_err::remove_file(store.join("objects/stray")).expect("there");
     let (is_whole, verified) = json("verify");
@@ -73,7 +71,7 @@ fn an_encode_heals_a_store_from_kept_views() {
     assert_eq!(content(&store), before);
     run(&mut encoder(&["query", "blue", "--store", text(&store), "--models", "colours"]));
 
-    // Kept views rot: one is cut, one is gone, and a byte of a third's contributions shows when they are read.
+    // Kept views rot: one is cut, one is missing, one has a wrong byte among its contributions, found on reading.
     let mut kept = files_below(&store.join("job/views"));
     kept.retain(|path| path.extension().is_some_and(|extension| extension == "contributions"));
     let bytes = fs_err::read(&kept[0]).expect("there");
@@ -93,7 +91,7 @@ fn an_encode_heals_a_store_from_kept_views() {
     assert!(json("verify").0);
     assert_eq!(content(&store), before);
 
-    // What robots would refuse is told, and no robot gets it.
+    // What robots would refuse is reported, and no robot gets it.
     let targets = store.join("metadata/1.targets.json");
     let newest = (1..).map(|n| targets.with_file_name(format!("{n}.targets.json")));
     let newest = newest.take_while(|path| path.exists()).last().expect("signed");
@@ -106,12 +104,10 @@ fn an_encode_heals_a_store_from_kept_views() {
     run(&mut encoder(&["store", "refresh", "--store", text(&store)]));
     assert!(json("verify").0);
     run(&mut export());
-    // Nothing is listened for where there is nothing to show.
     let nothing = ["view", "--store", text(&out), "--no-open", "--listen", "127.0.0.1:0"];
     refused(&mut encoder(&nothing), "nothing has been published here yet");
 }
 
-/// Returns the hash of a published field.
 fn a_field(store: &Path) -> String {
     let mut entries = fs_err::read_dir(store.join("extras")).expect("there");
     let extras = entries.next().expect("one").expect("readable").path();

@@ -1,4 +1,4 @@
-//! The generated room: the demo as a user runs it, reproducible stores, the robot's service.
+//! The generated room: the demo, reproducible stores, the robot's service.
 
 use serde_json::{Value, json};
 use slag_tests::*;
@@ -13,8 +13,7 @@ fn the_demo_answers_rightly() {
     }
 }
 
-/// Evaluates the embedded encoders on shapes, and pairs of noun and colour, that they never saw. Their card has
-/// all figures, by the same command.
+/// Evaluates the embedded encoders on unseen shapes and pairs of noun and colour, for the figures of their card.
 #[nightly("evaluates 30 scenes")]
 #[test]
 fn the_embedded_encoders_tell_things() {
@@ -24,7 +23,7 @@ fn the_embedded_encoders_tell_things() {
         let tally = &report["tallies"][i][1];
         tally[what].as_f64().expect("a number") / tally["n_crops"].as_f64().expect("a number")
     };
-    // Whole things, and held-out pairs.
+    // Complete objects, and held-out pairs.
     assert!(tally(0, "noun") > 0.85 && tally(0, "colour") > 0.85 && tally(0, "material") > 0.7);
     assert!(tally(1, "noun") > 0.65 && tally(1, "colour") > 0.65);
     assert!(report["found"].as_f64() > Some(0.7) && report["found_absent"].as_f64() < Some(0.01));
@@ -49,7 +48,7 @@ fn stores_are_equal_to_the_byte() {
     assert_eq!(content(&store), one);
 }
 
-/// Each mistake of a user gets a message that says what to do.
+/// Each user mistake gets a message with a remedy.
 #[test]
 fn mistakes_are_named() {
     let room = generated(&ROOM);
@@ -79,7 +78,7 @@ fn the_robots_service_answers() {
     let reply = robot.get("/query?text=sofa&near=3.5,2.7,0");
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");
     assert_eq!(reply["asked_as"], Value::Null);
-    // A word that the model does not know, in every form of question.
+    // An unknown word, in every form of question.
     let couch = robot.get("/query?text=couch&near=3.5,2.7,0");
     assert_eq!((&couch["asked_as"], &couch["answers"]), (&json!({ "couch": "sofa" }), &reply["answers"]));
     for text in ["where%20is%20the%20couch", "lamp%20near%20the%20couch"] {
@@ -102,8 +101,8 @@ fn the_robots_service_answers() {
     panic!("the service did not take up the new generation");
 }
 
-/// Views without masks, a mask of one pixel, a view that sees nothing, and missing or damaged photos are normal
-/// input: they are counted and named, and left out where necessary.
+/// Views without masks, a mask of one pixel, a view of nothing, and missing or damaged photos are normal input:
+/// counted, named, and omitted where necessary.
 #[test]
 fn odd_views_are_counted_not_fatal() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -111,18 +110,18 @@ fn odd_views_are_counted_not_fatal() {
     copy_dir(&generated(&["--n-views", "8"]), &room);
     let (views, images) = (room.join("transforms.json"), room.join("images"));
     let mut poses = read_json(&views);
-    // A camera 1,000 m up that looks up: nothing is in view.
+    // A camera 1,000 m up that looks up sees nothing.
     poses["frames"][4]["transform_matrix"] =
         json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1000], [0, 0, 0, 1]]);
     fs_err::write(&views, poses.to_string()).expect("writes");
-    // 0000: two masks, one of them a single pixel; 0001: none; 0004: one, of a view that sees nothing.
+    // 0000: two masks, one of a single pixel; 0001: none; 0004: one, in a view of nothing.
     fs_err::create_dir(&masks).expect("makes");
     let mut ids = image::GrayImage::new(640, 480);
     image::imageops::replace(&mut ids, &image::GrayImage::from_pixel(200, 200, image::Luma([7])), 200, 150);
     ids.save(masks.join("0004.png")).expect("writes");
     ids.put_pixel(5, 5, image::Luma([9]));
     ids.save(masks.join("0000.png")).expect("writes");
-    // 0002 and 0005 to 0007: cut photos; 0003: no photo.
+    // 0002 and 0005 to 0007: truncated photos; 0003: none.
     let photo = fs_err::read(images.join("0002.png")).expect("reads");
     for cut in ["0002.png", "0005.png", "0006.png", "0007.png"] {
         fs_err::write(images.join(cut), &photo[..photo.len() / 2]).expect("writes");
@@ -149,7 +148,7 @@ fn odd_views_are_counted_not_fatal() {
     assert_eq!(summary["encoder_before"], Value::Null);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("1 more views are left out") && !said.contains("view 0007.png"), "{said}");
-    // Other models: robots need the new text model, and the summary names the encoder before.
+    // Other models: robots need the new text model, and the summary names the previous encoder.
     let output = encode("--restart").args(["--models", "colours"]).output().expect("starts");
     let (again, said) = (
         serde_json::from_slice::<Value>(&output.stdout).expect("JSON"),

@@ -1,5 +1,4 @@
-//! Encodes with masks from SAM. The model is tiny and its weights are random, so its masks mean nothing; the code
-//! path is the real one.
+//! Encodes with SAM: a tiny model with random weights, so its masks mean nothing; the code path is the real one.
 
 use std::path::Path;
 
@@ -7,8 +6,8 @@ use serde_json::Value;
 use slag_common::poses;
 use slag_tests::*;
 
-/// Photos with damaged data are left out and named; the store does not depend on threads; a model directory of
-/// another kind is refused in one message.
+/// Damaged photos are omitted and named; the store does not depend on threads; a model directory of another kind is
+/// refused in one message.
 #[needs_shared]
 #[test]
 fn sam_finds_masks_the_same_for_any_number_of_threads() {
@@ -29,7 +28,7 @@ fn sam_finds_masks_the_same_for_any_number_of_threads() {
         command.args(["--images", text(&images), "--segmenter", text(segmenter), "--store", text(&store)]);
         command.args(["--models", text(&root().join("tests/models/conse"))]);
         command.args("--views-limit 3 --view-order nth --metric --raster-width 320".split(' '));
-        // Random weights find weak masks.
+        // Random weights give weak masks.
         command.args("--sam-predicted-iou 0 --sam-stability 0.2 --sam-stability-offset 0.05".split(' '));
         command.args("--points-per-side 4 --sam-points-per-batch 24 --sam-crop-layers 1".split(' '));
         command

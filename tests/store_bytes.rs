@@ -1,8 +1,7 @@
-//! The bytes of a store: shards of every profile, region tables and fields equal those that were recorded.
+//! Shards of every profile, region tables and fields of a store equal the recorded ones to the byte.
 //!
-//! `golden/store_bytes.txt` was recorded when an object came to need one of eleven photos that shows it whole. To
-//! record a change that is meant: `SLAG_RECORD=1 cargo test --workspace --test system store_bytes::`, and say in the
-//! commit why.
+//! To record an intended change of `golden/store_bytes.txt`: `SLAG_RECORD=1 cargo test --workspace --test system
+//! store_bytes::`; say why in the commit.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,7 +12,7 @@ use slag_tests::*;
 
 /// Section of a shard that holds its header.
 const HEADER_SECTION: u32 = 1;
-/// The encoder id within the header. It names the model, not the contents, and is left out of a digest.
+/// The encoder id within the header; it names the model, not the contents, and is excluded from digests.
 const ENCODER_ID: std::ops::Range<usize> = 144..176;
 
 #[test]
@@ -41,7 +40,6 @@ fn the_house_has_the_recorded_bytes() {
     check("house", &mut encode, dir.path());
 }
 
-/// Encodes a scene and compares its store with the recorded lines.
 fn check(scene: &str, encode: &mut std::process::Command, dir: &Path) {
     let store = match std::env::var_os("SLAG_RECORD_FROM") {
         Some(stores) => PathBuf::from(stores).join(scene),
@@ -64,7 +62,7 @@ fn check(scene: &str, encode: &mut std::process::Command, dir: &Path) {
     assert!(differing.is_empty(), "{scene}: these differ from {}: {differing:?}", path.display());
 }
 
-/// Returns a digest for each shard, region table and field of a store.
+/// Digests of each shard, region table and field of a store.
 fn digests(store: &Path) -> BTreeMap<String, String> {
     let reader = StoreReader::open(store).expect("a published store");
     let digest = |hash: Hash32, masked| {
@@ -85,7 +83,7 @@ fn digests(store: &Path) -> BTreeMap<String, String> {
     digests
 }
 
-/// Returns a digest of the ids and contents of a container's sections. Magic, version and checksums may change.
+/// Digest of the ids and contents of a container's sections; magic, version and checksums may change.
 fn digest_of_sections(bytes: &[u8], masked_in_header: Option<std::ops::Range<usize>>) -> String {
     let u32_at = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"));
     let u64_at = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes")) as usize;

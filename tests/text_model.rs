@@ -1,5 +1,4 @@
-//! A store that carries the text side of its encoder: robots fetch it with the scene and need no models of their
-//! own.
+//! A store with the text side of its encoder: robots fetch it with the scene and need no models of their own.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -7,10 +6,10 @@ use std::time::Duration;
 use serde_json::Value;
 use slag_tests::*;
 
-/// What a robot asks: the nearest Gaussians whatever their scores, so that equal vectors give equal answers.
+/// The nearest Gaussians whatever their scores, so that equal vectors give equal answers.
 const QUESTION: [&str; 5] = ["query", "chair", "--kind", "gaussians", "--threshold=-1"];
 
-/// A folder of models that no program has built in: the embedded ones, whose texts get another prompt.
+/// Models that no program has built in: the embedded ones with another prompt.
 fn models(folder: &Path, licence: &str) -> PathBuf {
     let embedded = root().join("common/models/embedded");
     fs_err::create_dir_all(folder).expect("made");
@@ -37,7 +36,6 @@ fn ask(cache: &Path) -> Value {
     answers
 }
 
-/// Flips a bit in the middle of a file.
 fn flip(path: &Path) {
     let mut bytes = fs_err::read(path).expect("there");
     let middle = bytes.len() / 2;
@@ -57,7 +55,7 @@ fn robots_fetch_the_text_model_with_the_scene() {
         command.args(["--models", text(models)]).args(flags);
         command
     };
-    // A licence that forbids it is named before the work.
+    // A licence that forbids it is reported before the work.
     let restricted = models(&at("restricted"), "apple-amlr");
     refused(&mut encode(&restricted, &at("refused"), &["--text-model"]), "apple-amlr");
     assert!(!at("refused").exists(), "no empty store is left behind");
@@ -105,7 +103,7 @@ fn robots_fetch_the_text_model_with_the_scene() {
     assert!((0..300).any(is_ready), "the robot does not take the scene with its text model");
     let answers = robot.get("/query?text=chair&kind=gaussians&threshold=-1");
     assert_eq!(answers["answers"], ask(&served), "{answers}");
-    // A robot that has the generation before it brings shards only.
+    // A robot with the previous generation fetches shards only.
     let report = run_json(&mut fetch(&service.url, &with_models));
     assert_eq!(
         (&report["generation"], &report["text_model"]["downloaded_bytes"]),
@@ -114,7 +112,7 @@ fn robots_fetch_the_text_model_with_the_scene() {
     );
     assert_eq!(ask(&with_models), ask(&served));
 
-    // What the store needs no more goes; the text model stays.
+    // Unneeded objects are removed; the text model stays.
     run_json(&mut encoder(&["store", "gc", "--store", text(&store)]));
     assert_eq!(
         run_json(&mut encoder(&["store", "verify", "--store", text(&store)]))["bad"],
@@ -128,13 +126,13 @@ fn robots_fetch_the_text_model_with_the_scene() {
     run_json(&mut fetch(&static_files.url, &from_files));
     assert_eq!(ask(&from_files), ask(&served));
 
-    // A flipped bit on the way is refused, and nothing of the scene becomes current.
+    // A flipped bit on the way is refused, and the scene does not become current.
     let model = files[0]["hash"].as_str().expect("a hash");
     flip(&site.join("v1/objects").join(model));
     let damaged = at("damaged");
     refused(&mut fetch(&static_files.url, &damaged), model);
     assert!(!damaged.join("current").exists());
-    // On board it is not used, and replaced.
+    // A damaged file on board is not used, and replaced.
     flip(&served.join("shards").join(model));
     refused(edge(&QUESTION).args(["--cache", text(&served)]), "SHA-256");
     let report = run_json(&mut fetch(&service.url, &served));

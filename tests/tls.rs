@@ -1,4 +1,4 @@
-//! TLS between the real programs, with certificates of an authority of our own.
+//! TLS between the real programs, with certificates of a test authority.
 
 use slag_tests::*;
 
@@ -27,7 +27,7 @@ fn robots_and_stores_speak_tls() {
         command.args(args);
         command
     };
-    // Neither the public authorities nor another one vouch for it, and what is no authority is named.
+    // The public authorities and another one do not vouch for it; a file that is no authority is named.
     refused(&mut add(&[]), "UnknownIssuer; give the authority that vouches for the server with --ca FILE");
     refused(&mut add(&ca(&other)), "UnknownIssuer");
     refused(&mut add(&["--ca".into(), text(&key).into()]), "key.pem: no certificate is there");
@@ -50,7 +50,7 @@ fn robots_and_stores_speak_tls() {
     refused(&mut fetch(&ca(&authority)), "UnknownIssuer");
     run(&mut fetch(&ca(&other)));
 
-    // A certificate that only an authority may have, and an address without the s.
+    // A certificate that only an authority may have, and an address with http.
     let authoritys = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
     other.issue_as(authoritys, &cert, &key);
     refused(&mut fetch(&ca(&other)), "basicConstraints=critical,CA:FALSE");

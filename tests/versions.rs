@@ -1,4 +1,4 @@
-//! One version: that of the workspace. Programs, packages, descriptions and clients state the same.
+//! The workspace's version: programs, packages, descriptions and clients state the same.
 
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Stdio};
@@ -6,7 +6,6 @@ use std::process::{Command, Stdio};
 use serde_json::{Value, json};
 use slag_tests::*;
 
-/// The workspace's version, by which all crates go.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 #[test]
@@ -37,7 +36,6 @@ fn descriptions_and_clients_state_the_version_of_the_workspace() {
     }
 }
 
-/// What the door for language models says of itself at the start of a session.
 #[test]
 fn the_door_for_language_models_states_the_version_of_the_workspace() {
     let mut door = Command::new(program("slag-mcp"));

@@ -1,4 +1,4 @@
-//! Views by coverage: a limit or a time budget stops an encode early, and the next one goes on.
+//! Views by coverage: a limit or a time budget stops an encode early; the next one continues.
 
 use std::path::Path;
 
@@ -7,14 +7,14 @@ use slag_tests::*;
 
 const VIEWS: [&str; 4] = ["--n-views", "10", "--seed", "31"];
 
-/// Encodes the room's scene with its true masks, and returns the summary.
+/// Encodes the room's scene with its true masks; returns the summary.
 fn encode_scene(room: &Path, views: &Path, store: &Path, more: &[&str]) -> Value {
     let mut command = encoder(&["encode", "--scene", text(&room.join("scene.ply")), "--views", text(views)]);
     command.args(["--masks", text(&room.join("gt/masks")), "--store", text(store), "--name", "room"]);
     run_json(command.args(["--metric", "--raster-width", "320"]).args(more))
 }
 
-/// Views that were used, and those of them that were not done again.
+/// Views used, and those of them that were kept from before.
 fn counts(summary: &Value) -> [u64; 2] {
     ["n_views", "n_views_resumed"].map(|name| summary[name].as_u64().expect("a count"))
 }
@@ -44,7 +44,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
     let three = encode(&["--views-limit", "3"]);
     assert_eq!(counts(&three), [3, 3]);
     assert_eq!(content(&store), of_three, "the views that are left over do not show");
-    // A budget of no time: the kept views, and no more.
+    // A budget of no time: the kept views only.
     let stopped = encode(&["--time-budget", "0.000001"]);
     assert_eq!(counts(&stopped), [6, 6]);
     // All views: the bytes of an encode without an order.
@@ -53,7 +53,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert_eq!(content(&store), expected);
     // All views were used, so nothing is kept.
     assert_eq!(counts(&encode(&["--view-order", "nth", "--views-limit", "2"])), [2, 0]);
-    // Another raster width is another job; the published views are no unfinished work.
+    // Other mask settings are another job; the published views are no unfinished work.
     assert_eq!(counts(&encode(&["--views-limit", "2", "--min-mask-px", "300"])), [2, 0]);
 
     // An empty store and no time: a generation of one view.
@@ -66,7 +66,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert_eq!(content(&dir.path().join("kept")), expected);
 }
 
-/// The summary states the cost of views and cells. Threads and resuming change nothing.
+/// The summary states the cost of views and cells; threads and resuming do not change it.
 #[nightly("encodes a room three times")]
 #[test]
 fn what_was_spent_is_reported() {
@@ -106,8 +106,8 @@ fn what_was_spent_is_reported() {
     assert_eq!(column(&by_photo, "raster_width_px"), [640.0; 10]);
 }
 
-/// Photos of a second flight come in and one goes: only new views are done, and the bytes are those of an encode
-/// of all photos from the beginning. Masks of the new photos lie beside the old ones.
+/// Photos of a second flight are added and one is withdrawn: only new views are done, and the bytes are those of
+/// an encode of all photos from scratch. Masks of the new photos lie beside the old ones.
 #[test]
 fn photos_are_added_and_withdrawn() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -152,10 +152,10 @@ fn photos_are_added_and_withdrawn() {
     let dropped = encode("grown", &views, &["--drop", "0003.png"]);
     assert_eq!(dropped.0, [9, 9], "nothing is done again");
     assert_eq!(dropped.1, encode("fewer", &without, &[]).1, "without the photo from the beginning");
-    // A withdrawn photo leaves nothing behind, and comes back as a new one.
+    // A withdrawn photo leaves nothing behind, and returns as a new one.
     assert_eq!(encode("grown", &views, &["--keep-views"]).0, [10, 9]);
 
-    // A photo that was replaced under its name is done again, and its neighbours are not.
+    // A photo replaced under its name is done again, its neighbours are not.
     fs_err::copy(room.join(name(0)), room.join(name(5))).expect("copies");
     let replaced = encode("grown", &views, &["--keep-views"]);
     assert_eq!(replaced.0, [10, 9]);
@@ -169,7 +169,7 @@ fn photos_are_added_and_withdrawn() {
     fails("--add", text(&second), "has a pose already");
     fails("--drop", "absent.png", "absent.png");
 
-    // The splat was trained again: of its Gaussians, backwards, a hundred are gone and fifty have moved by a bit.
+    // The splat was retrained: its Gaussians in reverse, a hundred removed and fifty moved by a bit.
     let scene = room.join("scene.ply");
     let ply = fs_err::read(&scene).expect("reads");
     let end = b"end_header\n";

@@ -13,16 +13,16 @@ pub const BYTES: usize = 10;
 const LN_SIZE_MIN: f32 = -12.0;
 /// Natural logarithm of the largest size.
 const LN_SIZE_MAX: f32 = 9.0;
-/// Codes of sizes beside 0, which is no extent at all: neighbouring ones differ by 8.6 %.
+/// Codes of sizes besides 0, which means no extent; neighbouring codes differ by 8.6 %.
 const LAST_SIZE_STEP: f32 = 254.0;
 const LARGEST: f32 = 255.0;
-/// Rotations by less have no axis.
+/// Smaller rotations have no axis.
 const LEAST_AXIS: f32 = 1e-6;
 
-/// The appearance of a cell's Gaussians, a column a field.
+/// The appearance of a cell's Gaussians, one column per field.
 #[derive(Clone, Copy, Debug)]
 pub struct Appearance<'a> {
-    /// `[N]`: red, green, blue (`0.5 + SH_C0 * sh_dc`, clamped) and opacity, 0..=255 for 0..=1.
+    /// `[N]`: red, green, blue (`0.5 + SH_C0 * sh_dc`, clamped) and opacity; 0..=255 stands for 0..=1.
     pub colours: &'a [[u8; 4]],
     /// `[N]`: codes of the standard deviations along the Gaussian's own axes, see [`size_code`].
     pub sizes: &'a [[u8; 3]],
@@ -36,7 +36,7 @@ impl Appearance<'_> {
         size_of_code(self.sizes[index].into_iter().fold(0, u8::max))
     }
 
-    /// Adds the Gaussian at an index, as it looks from everywhere, to a scene without harmonics above degree 0.
+    /// Adds a Gaussian to a scene without harmonics above degree 0.
     pub fn add_to(&self, scene: &mut Gaussians, index: usize, mean_in_world: DVec3) {
         let [r, g, b, opacity] = self.colours[index].map(|code| f32::from(code) / LARGEST);
         scene.means_in_world.push(mean_in_world);
@@ -55,7 +55,7 @@ pub struct AppearanceColumns {
 }
 
 impl AppearanceColumns {
-    /// Rounds the appearance of some of a scene's Gaussians, in the order of `indices`.
+    /// Quantises the appearance of some Gaussians of a scene, in the order of `indices`.
     pub fn of(scene: &Gaussians, indices: &[u32]) -> Self {
         let at = |index: &u32| *index as usize;
         let colour = |index: &u32| {
@@ -74,14 +74,13 @@ impl AppearanceColumns {
     }
 }
 
-/// Returns the byte of a value of 0..=1; others are clamped, NaN is 0.
+/// Maps 0..=1 to a byte; other values are clamped, NaN is 0.
 fn unit_code(value: f32) -> u8 {
     (value * LARGEST).round() as u8
 }
 
-/// Returns the byte of a standard deviation, world units: 0 for 0, else `1 + 254 * (ln size + 12) / 21`, rounded
-/// and clamped to
-/// 1..=255. Sizes from 6e-6 to 8,000 are off by at most 4.3 %.
+/// Returns the byte of a standard deviation (world units): 0 for 0, else `1 + 254 * (ln size + 12) / 21`, rounded
+/// and clamped to 1..=255. Sizes from 6e-6 to 8,000 are off by at most 4.3 %.
 pub fn size_code(size: f32) -> u8 {
     if size <= 0.0 || size.is_nan() {
         return 0;
@@ -90,7 +89,7 @@ pub fn size_code(size: f32) -> u8 {
     (1.0 + step.round()).clamp(1.0, LARGEST) as u8
 }
 
-/// Returns the standard deviation of a byte, world units.
+/// Inverse of [`size_code`].
 fn size_of_code(code: u8) -> f32 {
     if code == 0 {
         return 0.0;
@@ -98,7 +97,7 @@ fn size_of_code(code: u8) -> f32 {
     ((f32::from(code) - 1.0) / LAST_SIZE_STEP * (LN_SIZE_MAX - LN_SIZE_MIN) + LN_SIZE_MIN).exp()
 }
 
-/// Returns the byte of a standard deviation that is `times` as large as that of another byte, `times` at least 1.
+/// Returns the byte of a standard deviation `times` (at least 1) that of another byte.
 pub fn larger_size_code(code: u8, times: f32) -> u8 {
     if code == 0 {
         return 0;
@@ -123,7 +122,7 @@ pub fn rotation_code([w, x, y, z]: [f32; 4]) -> [u8; 3] {
     [unit_code(u * 0.5 + 0.5), unit_code(v * 0.5 + 0.5), unit_code(angle / PI)]
 }
 
-/// Returns the rotation of bytes: see [`rotation_code`].
+/// Inverse of [`rotation_code`].
 fn rotation_of_code([u, v, angle]: [u8; 3]) -> [f32; 4] {
     let [u, v] = [u, v].map(|code| f32::from(code) / LARGEST * 2.0 - 1.0);
     let z = 1.0 - u.abs() - v.abs();

@@ -1,4 +1,4 @@
-//! Numbers of bytes, as flags take them and reports show them.
+//! Numbers of bytes in flags and reports.
 
 use std::fmt;
 use std::num::IntErrorKind;
@@ -48,7 +48,7 @@ impl fmt::Display for ByteSize {
         let mut value = self.0 as f64;
         let mut unit = "B";
         for larger in ["kB", "MB", "GB", "TB", "PB", "EB"] {
-            // What would be rounded to 1000.0 is 1.0 of the next unit.
+            // Numbers that round to 1000.0 are 1.0 of the next unit.
             let least = if unit == "B" { 1000.0 } else { 999.95 };
             if value < least {
                 break;

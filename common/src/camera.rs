@@ -37,7 +37,7 @@ pub struct Intrinsics {
     pub distortion: Distortion,
 }
 
-/// Returns the intrinsics of an ideal lens with square pixels, whose axis meets the middle of the image.
+/// Returns the intrinsics of an undistorted lens with square pixels, centred on the image.
 pub const fn pinhole([width_px, height_px]: [u32; 2], focal_px: f64) -> Intrinsics {
     Intrinsics {
         width_px,
@@ -56,9 +56,8 @@ const MAX_NORMALISED_RADIUS: f64 = 100.0;
 impl Distortion {
     /// Returns the distorted position of an ideal normalised point (x/z, y/z).
     ///
-    /// Brown: `x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)`, and y accordingly.
-    /// Fisheye: `x theta_d / r` with `theta = atan r`. Both formulas are those of OpenCV's
-    /// `calib3d` and of COLMAP's models of the same names.
+    /// Brown: `x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)`, and y accordingly. Fisheye:
+    /// `x theta_d / r` with `theta = atan r`. Both as in OpenCV's `calib3d` and COLMAP's models of these names.
     pub fn distort(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         match *self {
             Self::None => [x, y],
@@ -84,9 +83,9 @@ impl Distortion {
         }
     }
 
-    /// Returns whether the tangential terms fold the image over at an ideal normalised point: the derivative of
-    /// [`Self::distort`], which is symmetric, is not positive, so that another direction has the same pixel. Where the
-    /// image is folded twice, along both axes, the determinant alone would be positive again.
+    /// Returns whether the tangential terms fold the image at an ideal normalised point: the derivative of
+    /// [`Self::distort`], which is symmetric, is not positive definite, so another direction has the same pixel.
+    /// The determinant alone would be positive again where the image folds along both axes.
     pub fn folds_at(&self, [x, y]: [f64; 2]) -> bool {
         let Self::Brown { k: [k1, k2, k3], p: [p1, p2] } = *self else { return false };
         let r2 = x * x + y * y;
@@ -101,8 +100,8 @@ impl Distortion {
 
     /// Returns the normalised radius up to which the radial part grows with the radius.
     ///
-    /// Beyond it the polynomial folds back and maps a second direction to the same pixel; such directions have no
-    /// image. [`Self::folds_at`] is the criterion for tangential terms.
+    /// Beyond it the polynomial maps a second direction to the same pixel; such directions are not imaged.
+    /// [`Self::folds_at`] is the criterion for tangential terms.
     pub fn monotonic_radius(&self) -> f64 {
         match *self {
             Self::None => MAX_NORMALISED_RADIUS,
@@ -123,7 +122,7 @@ impl Distortion {
 }
 
 impl Intrinsics {
-    /// Returns the distorted position of an ideal normalised point (x/z, y/z); see [`Distortion::distort`].
+    /// See [`Distortion::distort`].
     pub fn distort(&self, normalised: [f64; 2]) -> [f64; 2] {
         self.distortion.distort(normalised)
     }
@@ -136,7 +135,7 @@ impl Intrinsics {
         [(u - self.centre_x_px) / self.focal_x_px, (v - self.centre_y_px) / self.focal_y_px]
     }
 
-    /// Returns the camera scaled to another image size, with focal lengths and centre.
+    /// Returns the camera for another image size; focal lengths and centre scale with it.
     pub fn scaled_to(&self, width_px: u32, height_px: u32) -> Self {
         let sx = f64::from(width_px) / f64::from(self.width_px);
         let sy = f64::from(height_px) / f64::from(self.height_px);
@@ -151,7 +150,7 @@ impl Intrinsics {
         }
     }
 
-    /// Returns the camera scaled to another image width; the height keeps the aspect ratio, rounded, at least 1.
+    /// Returns the camera for another image width; the height keeps the aspect ratio, rounded, at least 1.
     pub fn scaled_to_width(&self, width_px: u32) -> Self {
         let height_px = ((f64::from(self.height_px) * f64::from(width_px) / f64::from(self.width_px)).round()
             as u32)
@@ -166,7 +165,7 @@ impl Intrinsics {
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// Its name, unique in the set: the image's path relative to the image folder, with `/` as separator.
+    /// Unique in the set: the image's path relative to the image folder, with `/` as separator.
     pub name: String,
     pub image_path: PathBuf,
     pub intrinsics: Intrinsics,
@@ -181,7 +180,7 @@ impl View {
 }
 
 /// Returns the ascending points of `low..high` at which a polynomial (coefficients from the constant term up)
-/// changes sign; there is at most one between two roots of its derivative.
+/// changes sign: at most one between two roots of its derivative.
 pub fn roots_between(coefficients: &[f64], low: f64, high: f64) -> Vec<f64> {
     if coefficients.len() < 2 {
         return Vec::new();

@@ -43,7 +43,7 @@ pub enum ContainerError {
     Missing { id: u32, name: &'static str },
 }
 
-/// Returns the first eight bytes of the BLAKE3 hash, little-endian.
+/// The first eight bytes of the BLAKE3 hash, little-endian.
 fn checksum(bytes: &[u8]) -> u64 {
     let hash = blake3::hash(bytes);
     u64::from_le_bytes(hash.as_bytes()[..8].try_into().expect("a hash has 32 bytes"))
@@ -83,7 +83,7 @@ pub fn write(mut out: impl Write, magic: [u8; 8], version: u32, sections: &[(u32
     Ok(())
 }
 
-/// Checks preamble and table as far as their checksum covers them; returns the number of sections.
+/// Checks preamble and table against their checksum; returns the number of sections.
 fn check_head(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<usize, ContainerError> {
     let length =
         |expected_bytes: u64| Err(ContainerError::Length { expected_bytes, found_bytes: bytes.len() as u64 });
@@ -116,7 +116,6 @@ fn check_head(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<usize, Conta
     Ok(n_sections as usize)
 }
 
-/// Says what is wrong with a file at a byte.
 pub(crate) fn damaged(offset: usize, what: impl Into<String>) -> ContainerError {
     ContainerError::Damaged { offset_bytes: offset as u64, what: what.into() }
 }
@@ -142,7 +141,7 @@ impl Layout {
         Ok(layout)
     }
 
-    /// Checks the preamble and the table without reading the sections.
+    /// Checks preamble and table only.
     ///
     /// # Errors
     /// As [`Layout::check`], without the checksums of the sections.
@@ -179,7 +178,7 @@ impl Layout {
         self.sections.iter().find(|(other, _)| *other == id).map(|(_, range)| range.clone())
     }
 
-    /// Returns the place of a section of `expected_len` values of `T`.
+    /// Returns the place of a section, which must hold `expected_len` values of `T`.
     pub fn column<T>(
         &self,
         id: u32,
@@ -199,7 +198,6 @@ impl Layout {
         Ok(range)
     }
 
-    /// Returns a copy of a section that holds one value.
     pub fn value<T: AnyBitPattern>(
         &self,
         bytes: &[u8],
@@ -209,7 +207,6 @@ impl Layout {
         Ok(bytemuck::pod_read_unaligned(&bytes[self.column::<T>(id, name, 1)?]))
     }
 
-    /// Returns a copy of the values of a section.
     pub fn values<T: AnyBitPattern + NoUninit>(
         &self,
         bytes: &[u8],
@@ -277,7 +274,6 @@ impl std::ops::Deref for AlignedBytes {
     }
 }
 
-/// Returns the bytes of a column, as input to [`write()`].
 pub fn bytes_of<T: NoUninit>(column: &[T]) -> &[u8] {
     bytemuck::cast_slice(column)
 }

@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 
 use fs_err::File;
 
-/// The readers of a new file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {
     /// Those that the process's umask allows.
@@ -17,8 +16,7 @@ pub enum Access {
     Private,
 }
 
-/// Replaces a file through `PATH.part`: after a crash it has either its complete old content or its complete new
-/// one.
+/// Replaces a file through `PATH.part`; after a crash it has its complete old or its complete new content.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let part = part_of(path);
     if part.exists() {
@@ -33,13 +31,13 @@ fn part_of(path: &Path) -> PathBuf {
     part.into()
 }
 
-/// Writes a file that a user named: what stood there stays until the whole is written. Pipes, devices and files in
-/// folders that take no new ones are written in place.
+/// Writes a file that a user named; its old content stays until the new one is complete. Pipes, devices and
+/// files in folders that take no new ones are written in place.
 pub fn write_result<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), E> {
-    // The name stays a link.
+    // Write to the target of a link, so that the link stays.
     let path = &std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     let is_device = path.starts_with("/dev") || std::fs::metadata(path).is_ok_and(|about| !about.is_file());
     let part = part_of(path);
@@ -57,7 +55,7 @@ pub fn write_result<E: From<io::Error>>(
     };
     let finished = finish();
     if finished.is_err() && is_beside {
-        // The first error is the one to tell.
+        // The caller gets the first error.
         let _ = std::fs::remove_file(&part);
     }
     finished
@@ -70,8 +68,7 @@ fn in_place(error: io::Error) -> io::Result<Option<File>> {
     }
 }
 
-/// Replaces the content of `path` by `bytes` through `part`, which must not exist and must be on the same file
-/// system.
+/// Replaces the content of `path` through `part`, which must not exist and must be on the same file system.
 pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Result<()> {
     let mut options = fs_err::OpenOptions::new();
     options.write(true).create_new(true);
@@ -83,7 +80,7 @@ pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Re
     let written =
         file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| move_into_place(part, path));
     if written.is_err() {
-        // A full disk would stay full; the first error is the one to tell.
+        // The caller gets the first error.
         let _ = fs_err::remove_file(part);
     }
     written
@@ -106,7 +103,7 @@ pub fn sync_folder(path: &Path) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    /// A process has one current folder, so this file lies in that of all tests for a moment.
+    /// The file is in the working folder of the whole process, so all tests see it for a moment.
     #[test]
     fn a_name_alone_is_a_file_of_the_current_folder() {
         let name = format!("durable-test-{}", std::process::id());
@@ -120,7 +117,7 @@ mod tests {
         assert!(!std::fs::exists(format!("{name}.part")).expect("a path"));
     }
 
-    /// A result that fails half way leaves what was there, and nothing beside it.
+    /// A result that fails half way leaves the old file, and no other.
     #[test]
     fn a_result_is_whole_or_not_there() {
         let dir = tempfile::tempdir().expect("a temporary folder");
@@ -141,7 +138,7 @@ mod tests {
         assert_eq!((std::fs::read(&path).expect("read"), files()), (b"new".to_vec(), 1));
     }
 
-    /// The link, and who may read, stay.
+    /// The link and the file's permissions stay.
     #[test]
     fn links_and_devices_are_written_through() {
         let dir = tempfile::tempdir().expect("a temporary folder");

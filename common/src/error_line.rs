@@ -1,6 +1,6 @@
 //! Errors in one line.
 
-/// Returns an error and its causes in one line, without causes that the line already contains.
+/// Joins an error and its causes; causes that the line already contains are left out.
 pub fn error_line(error: &dyn std::error::Error) -> String {
     let mut line = error.to_string();
     let mut cause = error.source();
@@ -28,7 +28,7 @@ mod tests {
     #[error("scene")]
     struct Scene(#[source] Open);
 
-    /// A message that includes its cause's text is not followed by it again; one that does not is.
+    /// A cause is appended only if the message does not include its text.
     #[test]
     fn an_error_names_its_file_and_cause_once() {
         let error = Scene(Open(io::Error::other("cannot open `a.json`: absent")));

@@ -12,7 +12,7 @@ pub fn metadata(path: &Path) -> io::Result<Metadata> {
         .map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", path.display())))
 }
 
-/// Opens a file to read. A pipe is refused: it keeps its reader waiting until somebody writes, perhaps for ever.
+/// Opens a file to read. A pipe is refused, because it may never get a writer.
 pub fn open(path: &Path) -> io::Result<File> {
     if std::os::unix::fs::FileTypeExt::is_fifo(&metadata(path)?.file_type()) {
         let text = format!("{} is a pipe; write what comes out of it into a file", path.display());
@@ -21,8 +21,8 @@ pub fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Reads a file of at most `max_bytes`; a longer one is refused. What a shell puts in a file's place,
-/// `--token-file <(pass show robot)`, is read, too: it has no name, but a writer.
+/// Reads a file or a shell's pipe (`--token-file <(pass show robot)`), which has no name. More than `max_bytes` are an
+/// error.
 pub fn read_short(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let has_name = std::fs::canonicalize(path).is_ok();
     let file = if has_name { open(path)? } else { File::open(path)? };
@@ -40,7 +40,7 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
     read_short(path, u64::MAX)
 }
 
-/// What the bytes of a text are instead of UTF-8.
+/// The encoding of a text that is not UTF-8.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NotUtf8 {
     #[error(
@@ -51,9 +51,9 @@ pub enum NotUtf8 {
     Other,
 }
 
-/// Returns the text of a file, without the byte order mark that editors and shells of Windows begin it with.
+/// Returns the text of a file without its byte order mark, which editors and shells of Windows write.
 pub fn text_of(bytes: &[u8]) -> Result<&str, NotUtf8> {
-    // Without a mark, every second byte of its first two letters, brackets or spaces is 0.
+    // Without a mark, every second byte of ASCII text in UTF-16 is 0.
     let is_utf16 = match bytes {
         [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => true,
         [a, 0, b, 0, ..] | [0, a, 0, b, ..] => *a > 0 && *b > 0,
@@ -66,7 +66,7 @@ pub fn text_of(bytes: &[u8]) -> Result<&str, NotUtf8> {
     Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
 }
 
-/// Checks that a result can be written to a file, before the work that makes it.
+/// Checks that a file can be written, before the work for its content.
 pub fn check_writable(path: &Path) -> io::Result<()> {
     match fs_err::metadata(path) {
         // A pipe would wait for its reader.
@@ -79,7 +79,7 @@ pub fn check_writable(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Returns what often stands in a file's place, by its first bytes, and what to do then.
+/// Returns what a file is if it is a well-known stand-in, by its first bytes, and what to do then.
 pub fn stand_in(start: &[u8]) -> Option<(&'static str, &'static str)> {
     match start.trim_ascii_start() {
         [b'v', b'e', b'r', b's', b'i', b'o', b'n', b' ', b'h', b't', b't', b'p', ..] => {

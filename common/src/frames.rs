@@ -93,14 +93,13 @@ impl GeoReference {
         ]
     }
 
-    /// Returns a geographic position in the world frame (ENU), metres.
+    /// Returns the position in the world frame (ENU), metres.
     pub fn world_from_geographic(&self, position: Geographic) -> DVec3 {
         let offset = position.to_ecef_m() - self.origin.to_ecef_m();
         let [east, north, up] = self.axes_in_ecef();
         DVec3::new(east.dot(offset), north.dot(offset), up.dot(offset))
     }
 
-    /// Returns a position in the world frame (ENU, metres) as latitude, longitude and height.
     pub fn geographic_from_world(&self, position_in_world: DVec3) -> Geographic {
         let [east, north, up] = self.axes_in_ecef();
         Geographic::from_ecef_m(
@@ -124,7 +123,7 @@ pub struct Aabb {
 }
 
 impl Aabb {
-    /// The empty box: extended by a point, it becomes that point.
+    /// The empty box: extending it by a point gives that point.
     pub const EMPTY: Self = Self { min: DVec3::INFINITY, max: DVec3::NEG_INFINITY };
 
     pub fn extend_ball(&mut self, centre: DVec3, radius: f64) {
@@ -141,7 +140,7 @@ impl Aabb {
         point.cmpge(self.min).all() && point.cmple(self.max).all()
     }
 
-    /// Returns whether both have a point in common, borders included.
+    /// Returns whether the boxes have a common point, borders included.
     pub fn touches(&self, other: &Self) -> bool {
         self.min.cmple(other.max).all() && other.min.cmple(self.max).all()
     }

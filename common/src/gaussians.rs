@@ -8,10 +8,10 @@ pub const SH_C0: f32 = 0.282_094_79;
 /// Largest coordinate of a mean; keeps box sizes and squared distances finite in f64.
 const MAX_COORDINATE: f64 = f32::MAX as f64;
 
-/// 3D Gaussians with a column per field; every column has [`Gaussians::len`] rows.
+/// 3D Gaussians, one column per field, [`Gaussians::len`] rows each.
 ///
-/// Values are decoded: opacities are linear (not logits), scales are standard deviations (not
-/// logs), rotations are unit quaternions.
+/// Values are decoded: opacities are linear (not logits), scales are standard deviations (not logs), rotations are
+/// unit quaternions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
     pub means_in_world: Vec<DVec3>,
@@ -30,7 +30,7 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// Returns grey, half opaque balls at these means.
+    /// Returns grey, half opaque balls.
     pub fn balls(means_in_world: Vec<DVec3>, scale: f32) -> Self {
         let n = means_in_world.len();
         Self {
@@ -68,7 +68,7 @@ impl Gaussians {
         self.sh_dc[index].map(|c| 0.5 + SH_C0 * c)
     }
 
-    /// Returns some of the Gaussians, in the order of `indices`.
+    /// Returns the Gaussians at `indices`, in that order.
     pub fn select(&self, indices: &[u32]) -> Self {
         fn pick<T: Copy>(column: &[T], indices: &[u32]) -> Vec<T> {
             indices.iter().map(|index| column[*index as usize]).collect()
@@ -89,10 +89,9 @@ impl Gaussians {
         }
     }
 
-    /// Returns whether a Gaussian can be drawn: finite fields, a mean within the range of f32, a rotation of unit
-    /// length.
+    /// Returns whether a Gaussian can be drawn: finite fields, a mean within f32, a rotation of unit length.
     ///
-    /// Readers keep unusable rows, so that indices stay those of the file; stages skip and count them.
+    /// Readers keep unusable rows so that indices stay those of the file; later stages skip and count them.
     pub fn is_usable(&self, index: usize) -> bool {
         let norm2: f32 = self.rotations_wxyz[index].iter().map(|q| q * q).sum();
         self.means_in_world[index].to_array().iter().all(|x| x.abs() <= MAX_COORDINATE)
@@ -102,8 +101,7 @@ impl Gaussians {
             && self.sh_dc[index].iter().all(|c| c.is_finite())
     }
 
-    /// Undoes the decoding of values that a file had decoded already: scales instead of logarithms, opacities
-    /// instead of logits.
+    /// Undoes the decoding for files whose scales (not logarithms) or opacities (not logits) were linear already.
     pub fn deactivate(&mut self, scales: bool, opacities: bool) {
         if scales {
             self.scales.iter_mut().flatten().for_each(|scale| *scale = scale.ln().max(0.0));

@@ -42,7 +42,7 @@ impl fmt::Debug for Hash32 {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{found:?} is not a hash, expected 64 lower-case hex digits")]
 pub struct NotAHash {
-    /// The text (cut to 80 characters).
+    /// Cut to 80 characters.
     pub found: String,
 }
 

@@ -1,5 +1,4 @@
-//! Landmarks: points of a scene that photos show as features, with which a robot finds the camera of a photo. The
-//! byte table is in `docs/formats.md`.
+//! Scene points with feature codes, from which a robot finds the camera of a photo. Byte table: `docs/formats.md`.
 
 use std::ops::Range;
 
@@ -18,16 +17,15 @@ pub mod section {
 /// Steps of a position along each axis.
 const STEPS: f64 = u16::MAX as f64;
 
-/// A point of the scene that photos show as a feature.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Landmark {
     pub position_in_world: DVec3,
     pub code: u128,
-    /// Number of a mapping photo that shows it, in the order of names; those beyond 65,535 share numbers.
+    /// Number of a mapping photo that shows it, by sorted name; those beyond 65,535 share numbers.
     pub view: u16,
 }
 
-/// What the landmarks of a shard have in common.
+/// The common header of a shard's landmarks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct LandmarksHeader {
@@ -35,7 +33,7 @@ pub struct LandmarksHeader {
     pub origin_in_world: [f64; 3],
     /// World units per step of a position, per axis.
     pub step: [f64; 3],
-    /// Version of the codes. Those of other versions cannot be matched.
+    /// Version of the codes; other versions cannot be matched.
     pub code_version: u32,
     pub reserved: u32,
 }
@@ -83,13 +81,13 @@ pub struct BuiltLandmarks {
 }
 
 impl BuiltLandmarks {
-    /// Packs the landmarks of a cell; those whose positions are not finite are left out.
+    /// Packs the landmarks of a cell; those without a finite position are dropped.
     pub fn pack(code_version: u32, landmarks: &[Landmark]) -> Self {
         let finite = || landmarks.iter().filter(|landmark| landmark.position_in_world.is_finite());
         let positions = || finite().map(|landmark| landmark.position_in_world);
         let Some(min) = positions().reduce(DVec3::min) else { return Self::default() };
         let max = positions().fold(min, DVec3::max);
-        // Halves, because the size of the largest scene overflows.
+        // Divided before subtracting, because the difference overflows for the largest scene.
         let step = (max / STEPS - min / STEPS).max(DVec3::splat(f64::MIN_POSITIVE));
         let record = |landmark: &Landmark| Record {
             position: ((landmark.position_in_world - min) / step)
@@ -107,7 +105,7 @@ impl BuiltLandmarks {
         Self { header, records: finite().map(record).collect() }
     }
 
-    /// Returns the columns; `None` without landmarks, whose shard has no sections of them.
+    /// Returns the columns; `None` without landmarks, because the shard then has no sections for them.
     pub fn view(&self) -> Option<Landmarks<'_>> {
         (!self.records.is_empty()).then_some(Landmarks { header: &self.header, records: &self.records })
     }

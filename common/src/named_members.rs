@@ -1,9 +1,8 @@
-//! Objects of JSON whose members have names: an array in their place is refused.
+//! JSON objects with named members; arrays in their place are refused.
 
-/// Implements `Deserialize` for structs that derive it with `#[serde(remote = "Self")]`, so that they are read
-/// from members with names alone. What serde derives also takes an array of the members in their order, and so
-/// `[lon, lat]` for a latitude and a longitude. With `; Serialize` it implements that as derived, for structs that
-/// derive both.
+/// Implements `Deserialize` from named members only, for structs that derive it with `#[serde(remote = "Self")]`.
+/// Derived code alone would also accept an array in declaration order, and so `[lon, lat]` for latitude and
+/// longitude. With `; Serialize` it also implements that as derived, for structs that derive both.
 #[macro_export]
 macro_rules! named_members {
     ($($type:ty),+; Serialize) => {

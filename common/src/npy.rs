@@ -34,13 +34,13 @@ pub fn write_file<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> io:
 /// Writes an array, row-major and little-endian.
 pub fn write<T: Element>(mut out: impl Write, shape: &[usize], values: &[T]) -> io::Result<()> {
     assert_eq!(values.len(), shape.iter().product::<usize>(), "values of an array of {shape:?}");
-    // Python writes a tuple of one element with a comma behind it.
+    // Python writes a trailing comma in a tuple of one element.
     let shape = match shape {
         [n] => format!("({n},)"),
         shape => format!("({})", shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")),
     };
     let mut header = format!("{{'descr': '{}', 'fortran_order': False, 'shape': {shape}, }}", T::DESCRIPTION);
-    // Magic, version and length take 10 bytes; the whole is a multiple of 64 and ends in a newline.
+    // Magic, version and length take 10 bytes; the total is a multiple of 64 and ends in a newline.
     let padding = 63 - (10 + header.len()) % 64;
     header.extend(std::iter::repeat_n(' ', padding));
     header.push('\n');
@@ -57,7 +57,7 @@ impl Npz {
         Ok(Self(ZipArchive::new(BufReader::new(File::open(path)?))?))
     }
 
-    /// Returns the bytes of an array, header included, decompressed as they are read; `None` if it is absent.
+    /// Returns the bytes of an array, header included, decompressed while reading; `None` if it is absent.
     pub fn array(&mut self, name: &str) -> io::Result<Option<impl Read + '_>> {
         match self.0.by_name(&format!("{name}.npy")) {
             Ok(member) => Ok(Some(member)),
@@ -77,7 +77,7 @@ mod tests {
         bytes
     }
 
-    /// Oracle: the bytes that NumPy's format specification asks for, by hand.
+    /// Oracle: NumPy's format specification, by hand.
     #[test]
     fn arrays_have_the_specified_bytes() {
         let cases = [

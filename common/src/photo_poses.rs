@@ -1,5 +1,4 @@
-//! Where a scene's photos were taken, so that a page can draw their cameras: poses, not pictures. The byte table
-//! is in `docs/formats.md`.
+//! Poses of a scene's photos, so that a page can draw their cameras. Byte table: `docs/formats.md`.
 
 use std::ops::Range;
 
@@ -17,7 +16,7 @@ pub mod section {
     pub const NAMES: u32 = 61;
 }
 
-/// Largest difference of a rotation's length from 1: rounding to f32, with room.
+/// Largest deviation of a rotation's length from 1: f32 rounding with a margin.
 const MAX_LENGTH_ERROR: f32 = 1e-3;
 
 const LARGEST: f64 = f32::MAX as f64;
@@ -25,7 +24,7 @@ const LARGEST: f64 = f32::MAX as f64;
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct PhotoPose {
-    /// The camera, world frame, less the shard's origin.
+    /// Position of the camera in the world frame, minus the shard's origin.
     pub offset: [f32; 3],
     /// World from camera (x right, y down, z forward), a unit quaternion.
     pub rotation_xyzw: [f32; 4],
@@ -33,7 +32,7 @@ pub struct PhotoPose {
     pub focal_px: f32,
     pub width_px: u32,
     pub height_px: u32,
-    /// End of its name in the names; they follow one another.
+    /// End of its name in the concatenated names.
     pub name_end: u32,
 }
 
@@ -62,14 +61,13 @@ pub struct BuiltPhotoPoses {
 }
 
 impl BuiltPhotoPoses {
-    /// Adds a photo to those of a shard with this origin. A name that readers would refuse is replaced by none: it
-    /// is for people alone.
+    /// Adds a photo to a shard with this origin. A name that readers would refuse is dropped: names are only shown.
     pub fn push(&mut self, origin: DVec3, view: &View) {
         let world_from_camera = view.camera_from_world.inverse();
         let rotation = glam::DQuat::from_mat3(&world_from_camera.matrix3).normalize().as_quat();
         let is_name = view.name.len() <= MAX_PHOTO_BYTES && !view.name.chars().any(char::is_control);
         self.names.push_str(if is_name { &view.name } else { "" });
-        // What an f32 cannot hold saturates: readers would refuse the whole shard.
+        // Saturates: readers would refuse the whole shard for an infinite offset.
         let offset =
             (world_from_camera.translation - origin).clamp(DVec3::splat(-LARGEST), DVec3::splat(LARGEST));
         let focal_px = view.intrinsics.focal_x_px / 2.0 + view.intrinsics.focal_y_px / 2.0;
@@ -83,7 +81,7 @@ impl BuiltPhotoPoses {
         });
     }
 
-    /// Returns the columns; `None` without photos, whose shard has no sections of them.
+    /// Returns the columns; `None` without photos, because the shard then has no sections for them.
     pub fn view(&self) -> Option<PhotoPoses<'_>> {
         (!self.poses.is_empty()).then_some(PhotoPoses { poses: &self.poses, names: &self.names })
     }
@@ -130,13 +128,12 @@ impl PhotoPosesLayout {
     }
 }
 
-/// Returns the fault of a photo whose name begins at `start`, if it has one.
 fn fault(pose: &PhotoPose, start: usize, names: &str) -> Option<&'static str> {
     let length = pose.rotation_xyzw.iter().map(|c| c * c).sum::<f32>().sqrt();
     let name = names.get(start..pose.name_end as usize);
     match () {
         () if !pose.offset.iter().all(|c| c.is_finite()) => Some("its position is not finite"),
-        // A NaN is in no range.
+        // Also true for NaN.
         () if !(1.0 - MAX_LENGTH_ERROR..=1.0 + MAX_LENGTH_ERROR).contains(&length) => {
             Some("its rotation has not length 1")
         }

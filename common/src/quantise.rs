@@ -1,6 +1,6 @@
 //! Rounding of vectors to 8-bit components.
 
-/// Rounds values to 8 bits with a common step, which is returned with them.
+/// Rounds values to 8 bits; returns them with their common step.
 pub fn quantise(values: &[f32]) -> (Vec<i8>, f32) {
     let largest = values.iter().fold(0.0f32, |most, v| most.max(v.abs()));
     let step = largest / 127.0;

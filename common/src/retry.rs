@@ -1,11 +1,11 @@
 //! Repeated attempts: how many, and the pauses between them.
 //!
-//! Not the crate `backon`: its count cannot begin anew after progress, which resumed downloads need, and the
-//! pauses here belong to the caller, who ends them when cancelled or waits as long as the server asks.
+//! Not the crate `backon`: its count cannot restart after progress, which resumed downloads need, and here the caller
+//! owns the pauses, ending them when cancelled or waiting as long as the server asks.
 
 use std::time::Duration;
 
-/// Pauses that double from failure to failure.
+/// Pauses that double with each failure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Backoff {
     /// Pause after the first failure.
@@ -21,7 +21,7 @@ impl Backoff {
     }
 }
 
-/// Counts the failures of one request in a row.
+/// Counts consecutive failures of one request.
 #[derive(Clone, Debug)]
 pub struct Retries {
     backoff: Backoff,
@@ -34,8 +34,7 @@ impl Retries {
         Self { backoff, max_attempts, n_failures: 0 }
     }
 
-    /// Counts a failed attempt; one that made progress is the first of a new count. Returns the pause before the
-    /// next attempt, or `None` if none is left.
+    /// Counts a failed attempt; progress restarts the count. Returns the pause before the next attempt, if any.
     pub fn failed(&mut self, made_progress: bool) -> Option<Duration> {
         self.n_failures = if made_progress { 1 } else { self.n_failures.saturating_add(1) };
         (self.n_failures < self.max_attempts).then(|| self.backoff.after(self.n_failures))
@@ -60,7 +59,6 @@ mod tests {
         assert_eq!((retries.failed(true), retries.n_failures()), (Some(ms(10)), 1));
         assert_eq!(retries.failed(false), Some(ms(20)));
         assert_eq!(Retries::new(1, backoff).failed(true), None);
-        // No overflow, however many failures and however long the pauses.
         assert_eq!([0, 1, 33, u32::MAX].map(|n| backoff.after(n)), [10, 10, 60, 60].map(ms));
         let unbounded = Backoff { first: Duration::MAX, longest: Duration::MAX };
         assert_eq!(unbounded.after(9), Duration::MAX);

@@ -36,7 +36,6 @@ impl Similarity {
         self.rotation * point * self.scale + self.translation
     }
 
-    /// Returns the transform that applies `first` and then this one.
     pub fn after(&self, first: &Self) -> Self {
         Self {
             scale: self.scale * first.scale,
@@ -50,10 +49,8 @@ impl Similarity {
         Self { scale, rotation, translation: -(rotation * self.translation * scale) }
     }
 
-    /// Returns the camera of this transform's target frame that sees what `camera_from_source` sees of the source
-    /// frame.
-    ///
-    /// Depths are in units of the target frame; pictures are the same.
+    /// Returns the camera of the target frame that sees what `camera_from_source` sees of the source frame. The
+    /// picture is the same; depths are in units of the target frame.
     pub fn camera_from_target(&self, camera_from_source: DAffine3) -> DAffine3 {
         let inverse = self.inverse();
         DAffine3 {
@@ -62,14 +59,11 @@ impl Similarity {
         }
     }
 
-    /// Returns whether the rotation is the identity, within rounding.
     pub fn is_unrotated(&self) -> bool {
         self.rotation.angle_between(DQuat::IDENTITY) < 1e-4
     }
 
-    /// Transforms Gaussians: means, rotations and standard deviations.
-    ///
-    /// Spherical harmonics above degree 0 belong to the axes of the source frame; they are dropped.
+    /// Transforms Gaussians; drops harmonics above degree 0, which belong to the source frame's axes.
     pub fn transform_gaussians(&self, gaussians: &mut Gaussians) {
         for mean in &mut gaussians.means_in_world {
             *mean = self.transform_point(*mean);

@@ -1,9 +1,9 @@
-//! What programs tell people beside their results.
+//! Messages of programs besides their results.
 
 use std::fmt::Display;
 use std::io::{self, Write};
 
-/// Writes a line to stderr. That its reader is gone (a logger that ended, `| head`) ends no program.
+/// Writes a line to stderr; a closed reader (`| head`, a logger that ended) does not end the program.
 pub fn note(text: impl Display) {
     let _ = writeln!(io::stderr(), "{text}");
 }

@@ -1,4 +1,4 @@
-//! Shards with an appearance: it comes back, and columns of another length are refused.
+//! Shards with an appearance: round trip, and refusal of columns of another length.
 
 use glam::DVec3;
 use slag_common::appearance::Appearance;

@@ -1,4 +1,4 @@
-//! Fine residuals of exact shards: written, read, decoded as in docs/formats.md, and refused if invalid.
+//! Fine residuals of exact shards: round trip, decoding as in docs/formats.md, refusal of invalid ones.
 
 use glam::DVec3;
 use half::f16;
@@ -7,7 +7,6 @@ use slag_common::frames::Aabb;
 use slag_common::shard::sample::{self, SampleShard};
 use slag_common::shard::{Basis, ExactColumns, Fine, ScoreErrors, ShardHeader, ShardLayout, ShardView};
 
-/// The parts of a shard that a test edits before it is written.
 struct Parts {
     errors: ScoreErrors,
     steps: Vec<f32>,

@@ -7,7 +7,7 @@ use slag_common::occupancy::{self, OccupancyHeader};
 use slag_common::shard::{self, ShardHeader, section};
 use slag_common::{container, manifest};
 
-/// Returns the cells of all table rows of the document.
+/// Cells of all table rows of the document.
 fn rows() -> Vec<Vec<String>> {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/formats.md");
     let text = fs_err::read_to_string(path).expect("docs/formats.md exists");

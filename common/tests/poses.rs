@@ -31,7 +31,7 @@ fn problem(result: Result<ViewSet, PoseError>) -> (Place, PoseProblem) {
     }
 }
 
-/// Oracle: the camera centres in geo.json (`cam_enu`), computed by a separate program and rounded to a millimetre.
+/// Oracle: camera centres in geo.json (`cam_enu`), computed by another program and rounded to a millimetre.
 #[needs_shared]
 #[test]
 fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
@@ -63,8 +63,7 @@ fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
     }
 }
 
-/// Oracle: the same 96 poses as world from camera in OpenGL axes and as camera from world in OpenCV axes, both
-/// written by the scene's generator.
+/// Oracle: the generator's 96 poses, world from camera in OpenGL axes and camera from world in OpenCV axes.
 #[needs_shared]
 #[test]
 fn house_transforms_and_colmap_agree() {
@@ -98,7 +97,7 @@ fn a_given_image_folder_replaces_the_default() {
     }
 }
 
-/// Every lens model, as text and as binary; the test builds the binary files itself.
+/// Every lens model, as text and binary; the test builds the binary files itself.
 #[test]
 fn lens_models() {
     let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
@@ -205,8 +204,7 @@ fn colmap_errors_have_place_and_fault() {
     assert!(matches!(read_files(&[("cameras.txt", b"")]), Err(PoseError::NotFound { .. })));
 }
 
-/// Lines of features may be missing, and names may have any number of words; images without a pose are left out
-/// and named.
+/// Lines of features may be missing, names may have several words; images without a pose are omitted and named.
 #[test]
 fn every_image_of_a_model_is_read_or_named() {
     const CAMERA: &str = "\u{feff}1 PINHOLE 64 48 50 50 32 24\r\n";
@@ -224,7 +222,7 @@ fn every_image_of_a_model_is_read_or_named() {
     assert!(set.left_out().is_some_and(|text| text.contains("2 of 3") && text.contains("b.jpg")));
 }
 
-/// One frame whose pose is none is left out and named in every format; where all are such, the first is the error.
+/// A frame with an invalid pose is omitted and named in every format; if all are invalid, the first is the error.
 #[test]
 fn frames_without_a_valid_pose_are_left_out() {
     const CAMERA: &str = "1 PINHOLE 64 48 50 50 32 24\n";
@@ -265,7 +263,7 @@ fn frames_without_a_valid_pose_are_left_out() {
         assert!(set.left_out().unwrap().contains("1 of 2 frames have no pose"), "{bad}");
         assert_eq!(problem(read(&[bad.clone(), bad])).0, Place::Frame(0));
     }
-    // Frames that --every passes over are not missed.
+    // Frames that --every skips are not reported.
     let mut lost = frame("2.jpg");
     lost["transform_matrix"] = serde_json::Value::Null;
     let set = read(&[frame("1.jpg"), lost, frame("3.jpg")]).unwrap();
@@ -273,8 +271,7 @@ fn frames_without_a_valid_pose_are_left_out() {
     assert_eq!((set.views.len(), set.damaged.len()), (2, 0));
 }
 
-/// Two cameras' photos in one folder without theirs: which is whose, nothing says. Names that are paths of another
-/// machine, and names whose letters are taken apart, are found.
+/// Two cameras' photos in one folder are ambiguous. Names from another machine or in another Unicode form are found.
 #[test]
 fn a_photo_is_that_of_one_view() {
     let dir = tempfile::tempdir().unwrap();
@@ -311,7 +308,7 @@ fn a_photo_is_that_of_one_view() {
     assert!(set.notes[0].starts_with("2 photos are ambiguous"), "{:?}", set.notes);
 }
 
-/// Windows' editors and shells write a mark, or UTF-16.
+/// Editors and shells of Windows write a byte order mark, or UTF-16.
 #[test]
 fn texts_of_other_encodings_are_read_or_named() {
     let cameras = "1 PINHOLE 64 48 50 50 32 24\n";
@@ -327,7 +324,7 @@ fn texts_of_other_encodings_are_read_or_named() {
     assert!(error.to_string().contains("cameras.txt: line 1: the text is UTF-16"), "{error}");
 }
 
-/// Photos under other paths, endings or letters; several models; a second form of the model.
+/// Photos under other paths, extensions or case; several models; a second form of the model.
 #[test]
 fn photos_and_models_are_found_and_choices_are_said() {
     let dir = tempfile::tempdir().unwrap();
@@ -340,7 +337,7 @@ fn photos_and_models_are_found_and_choices_are_said() {
     for name in ["3.jpg", "4.png", "5.JPG"] {
         write(&format!("images/{name}"), "");
     }
-    // A folder, and a link to itself, are no photos with other names.
+    // A folder and a link to itself are no photos.
     fs_err::create_dir(dir.path().join("images/6.JPG")).unwrap();
     fs_err::os::unix::fs::symlink("7.JPG", dir.path().join("images/7.JPG")).unwrap();
     for path in ["", "sparse", "sparse/1"] {
@@ -353,7 +350,7 @@ fn photos_and_models_are_found_and_choices_are_said() {
             "{:?}",
             set.notes
         );
-        // The larger one is a choice, too.
+        // The choice of the larger one is reported too.
         assert!(set.notes.iter().any(|note| note.contains("0 beside it has 2: COLMAP made several models")));
     }
     let small = poses::read(&dir.path().join("sparse/0"), None).unwrap();
@@ -367,7 +364,7 @@ fn photos_and_models_are_found_and_choices_are_said() {
     );
 }
 
-/// NaN is no JSON, a byte order mark neither; paths of another machine are found by their endings.
+/// NaN and a byte order mark are not JSON; paths of another machine are found by their suffix.
 #[test]
 fn transforms_of_other_programs_are_read() {
     let dir = tempfile::tempdir().unwrap();
@@ -401,7 +398,7 @@ fn transforms_of_other_programs_are_read() {
     assert!(cameras.contains("cameras.json"), "{cameras}");
 }
 
-/// Counts of 2D features that exceed the file, by one record and by overflow.
+/// Counts of 2D features beyond the file's end, by one record and by overflow.
 #[test]
 fn counts_are_not_trusted() {
     let camera = [&1_u64.to_le_bytes()[..], &1_u32.to_le_bytes(), &0_i32.to_le_bytes()].concat();
@@ -456,7 +453,7 @@ fn a_point_in_camera(view: &View, point_in_world: DVec3) -> DVec3 {
     view.camera_from_world.transform_point3(point_in_world)
 }
 
-/// A mask that is not read, and an angle that says another focal length, are told.
+/// A mask that is not read, and an angle that contradicts the focal length, are reported.
 #[test]
 fn what_transforms_say_in_vain_is_told() {
     let with = |angle: f64| {
@@ -529,7 +526,7 @@ fn transforms_errors_have_place_and_fault() {
     assert!(matches!(read_files(&[("transforms.json", b"{\"frames\": 3}")]), Err(PoseError::Json { .. })));
 }
 
-/// Two images of one file name are two views wherever their folders tell them apart.
+/// Two images of one file name are two views if their folders differ.
 #[test]
 fn transforms_names_keep_the_folders_that_tell_images_apart() {
     let cases = [

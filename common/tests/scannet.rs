@@ -81,7 +81,7 @@ fn a_scene_folder_gives_its_posed_frames() {
 fn damaged_scene_folders_are_named() {
     let dir = scene();
     let path = dir.path();
-    // The frame alone is left out, with what is wrong with its pose.
+    // Only the frame is omitted, with the fault of its pose.
     let posed = pose(world_from_camera(7));
     let texts: [(Vec<u8>, &str); 10] = [
         (posed.replace("0.997551", "nan").into(), "its rotation is off by NaN"),
@@ -128,8 +128,7 @@ fn damaged_scene_folders_are_named() {
     assert!(message.contains("intrinsic_color.txt"), "{message}");
 }
 
-/// Restates nerfstudio's dataparsers as 4 x 4 matrices on camera-to-world poses: the trained position of a camera
-/// is where its translation column goes.
+/// Repeats nerfstudio's dataparsers with 4 x 4 matrices: a camera's trained position is the transformed translation.
 #[test]
 fn dataparser_transforms_begin_where_their_dataparser_does() {
     let swap = DAffine3::from_mat3(DMat3::from_cols(DVec3::Y, DVec3::X, -DVec3::Z));
@@ -171,8 +170,7 @@ fn dataparser_transforms_begin_where_their_dataparser_does() {
     let found = read(orient, 0.5).splat_from_poses(views.source, views.applied);
     assert_eq!(found.begins_at, Origin::Poses);
     same(found.similarity.transform_point(point), orient.transform_point3(point) * 0.5);
-    // The dataparser orients the saved poses by `orient` and scales them by 0.5; its file states `orient *
-    // applied` and 0.5 * 4.
+    // The dataparser applies `orient` and 0.5 to the saved poses; its file states `orient * applied` and 0.5 * 4.
     let views =
         json(r#""applied_transform": [[0,1,0,0],[1,0,0,0],[0,0,-1,0]], "applied_scale": 4.0,"#).unwrap();
     let found = read(orient * swap, 0.5 * 4.0).splat_from_poses(views.source, views.applied);

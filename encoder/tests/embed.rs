@@ -72,7 +72,7 @@ fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
     assert_eq!(none.expect("nothing to do"), Vec::<f32>::new());
 }
 
-/// Records the number of crops per call; a vector is the crop's width and height.
+/// Records the crops per call; a vector is a crop's width and height.
 struct Recorder {
     batches: Vec<usize>,
 }
@@ -102,14 +102,14 @@ fn batches_are_bounded_by_count_and_by_pixels() {
     masks.push(rectangle(2999, 2999, 3000, 3000));
     let mut recorder = Recorder { batches: Vec::new() };
     let vectors = embed_masks(&photo, &masks, None, &mut recorder, None).expect("it embeds");
-    // 4 by count; a small one and one of 9 million pixels; such ones alone; the rest.
+    // 4 by count; a small one and one of 9 million pixels; large ones alone; the rest.
     assert_eq!(recorder.batches, [4, 2, 1, 1, 1]);
     let expected: Vec<f32> =
         masks.iter().flat_map(|m| [m.box_px.width_px() as f32, m.box_px.height_px() as f32]).collect();
     assert_eq!(vectors, expected);
 }
 
-/// Squares of 64 masks: a batch of four is held at a time, beside the crop that is being cut.
+/// Squares of 64 masks: only a batch of four is held at a time, besides the crop that is being cut.
 #[test]
 fn squares_are_held_a_batch_at_a_time() {
     let photo = RgbImage::new(400, 300);
@@ -120,7 +120,7 @@ fn squares_are_held_a_batch_at_a_time() {
     let square_px = preprocess.size_px() as usize;
     assert_eq!(vectors.expect("it embeds"), [square_px as f32; 128]);
     assert_eq!(recorder.batches, [4; 16]);
-    // Three colours and the mask, by both sides; twice the crop while it is cut and resized.
+    // Three colours and the mask, times both sides; twice the crop while it is cut and resized.
     let most_bytes = 4 * 5 * square_px.pow(2) + 4 * 4 * 200 * 200 + 4096 * 4;
     assert!(taken.peak_bytes < most_bytes, "{taken:?}, {most_bytes}");
 }

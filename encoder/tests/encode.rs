@@ -1,4 +1,4 @@
-//! Encodes whose inputs change under them, or whose store cannot be published into.
+//! Encodes whose inputs change meanwhile, or whose store cannot be published into.
 
 use std::path::PathBuf;
 use std::sync::Mutex;
@@ -10,7 +10,7 @@ use slag_encoder::raster::CpuRasterizer;
 use slag_lab::generate::{Scene, grammar};
 use slag_models::{ModelDir, SessionOptions};
 
-/// Does something when a view has its masks, and when a stage begins.
+/// Acts when a view has its masks, and when a stage begins.
 struct When<F>(F);
 
 impl<F: Fn(&str) + Sync> Progress for When<F> {
@@ -33,7 +33,6 @@ struct Room {
 }
 
 impl Room {
-    /// Writes a room of four photos.
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let files = Scene::new(&[grammar::SceneKind::Room], 1, 4).write(folder.path(), &Silent).unwrap();
@@ -57,8 +56,8 @@ impl Room {
     }
 }
 
-/// Rewritten, cut off or deleted while its view is worked on, a photo is left out, and said; with `strict` it ends the
-/// encode. No view is kept under the name of bytes that were not used.
+/// A photo that is rewritten, truncated or deleted while its view is processed is omitted and named, or ends the
+/// encode with `strict`. No view is kept under the hash of bytes that were not used.
 #[test]
 fn photos_that_change_are_left_out() {
     let mut room = Room::new();
@@ -81,7 +80,7 @@ fn photos_that_change_are_left_out() {
     restore();
     assert_eq!(room.encode(|_| {}).unwrap().n_views_resumed, 1);
 
-    // Landmarks are found in the photos once more, when all views are done.
+    // Landmarks read the photos again, after all views.
     room.settings.cells.landmarks = true;
     let at_landmarks = |stage: &str| {
         if stage == "landmarks" {
@@ -98,7 +97,7 @@ fn photos_that_change_are_left_out() {
     assert!(message.contains("changed after the encode began"), "{message}");
 }
 
-/// A key that is missing is told before the first photo is looked at, not when all is done.
+/// A missing key is reported before the first photo is read.
 #[test]
 fn a_missing_key_is_told_before_the_work() {
     let room = Room::new();

@@ -1,4 +1,4 @@
-//! The built-in segmenter: synthetic images with known answers, and photos with known instances.
+//! The built-in segmenter on synthetic images with known answers, and on photos with known instances.
 
 use std::path::Path;
 
@@ -66,18 +66,18 @@ fn shapes_on_a_noisy_ramp() {
     });
     let masks = segment(&image, None, None);
     let size = (240, 160);
-    // The outline's ramp of colours is a good pixel wide: 5 % of the disc's radius.
+    // The outline's colour ramp is over a pixel wide: 5 % of the disc's radius.
     assert!(best_iou(&masks, disc, size) > 0.9);
     assert!(best_iou(&masks, bar, size) > 0.93);
     assert!(best_iou(&masks, |x, y| !disc(x, y) && !bar(x, y), size) > 0.93);
-    // The coarsest level is the answer; finer ones do not repeat it.
+    // Only the coarsest level has it; finer ones do not repeat it.
     assert_eq!(masks.iter().filter(|mask| mask.level == 0).count(), 3);
     for (index, mask) in masks.iter().enumerate() {
         assert!(masks[..index].iter().all(|coarser| iou_of_masks(mask, coarser) <= 0.9));
     }
 }
 
-/// A box of the floor's colour on a slanting floor: only depth separates them.
+/// A box of the floor's colour on a sloping floor: only depth separates them.
 #[test]
 fn depth_separates_what_colour_does_not() {
     let size = (200, 150);
@@ -107,7 +107,7 @@ fn invalid_pixels_are_in_no_mask() {
     assert!(best_iou(&masks, |x, _| (20..45).contains(&x), (90, 60)) > 0.95);
 }
 
-/// Work is bounded by the inner resolution, and masks come back at the photo's.
+/// Work is bounded by the inner resolution; masks have the photo's.
 #[test]
 fn large_and_tiny_images() {
     let left = |x: u32, _: u32| x < 1500;
@@ -118,7 +118,7 @@ fn large_and_tiny_images() {
     assert!((f64::from(masks[0].area_px) / (1500.0 * 3000.0) - 1.0).abs() < 0.01);
     for (width, height) in [(0, 0), (1, 1), (2, 1), (1, 9), (3000, 1)] {
         let masks = segment(&RgbImage::new(width, height), None, None);
-        // Smaller than the smallest mask, there is none.
+        // An image smaller than the smallest mask has none.
         assert_eq!(masks.len(), usize::from(width == 3000), "{width} x {height}");
         assert!(masks.iter().all(|mask| mask.area_px == width * height));
     }
@@ -165,8 +165,8 @@ fn iou_of_masks(a: &Mask, b: &Mask) -> f64 {
     both as f64 / ((a.area_px + b.area_px) as f64 - both as f64)
 }
 
-/// The mean over true instance masks of at least 200 pixels of the best overlap, and the number of masks found, over
-/// eight photos that were not used to choose the default settings.
+/// Mean best overlap over true instance masks of at least 200 pixels, and number of masks, over eight photos that
+/// were not used to choose the default settings.
 #[needs_shared]
 #[test]
 fn instances_of_real_photos() {

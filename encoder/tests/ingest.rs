@@ -31,13 +31,12 @@ fn view(image_path: &Path, intrinsics: Intrinsics) -> View {
     }
 }
 
-/// A smooth pattern of the ideal image, at a position in pixels.
+/// A smooth pattern of the undistorted image; argument in pixels.
 fn pattern([u, v]: [f64; 2]) -> [f64; 3] {
     [128.0 + 100.0 * (u / 9.0).sin(), 128.0 + 100.0 * (v / 11.0).cos(), 128.0 + 0.5 * (u - v)]
 }
 
-/// Finds the ideal point of a distorted one by Newton's method with a numeric derivative. Oracle of the tests
-/// below: the code itself only distorts.
+/// Oracle of the tests below: inverts a distortion by Newton's method with a numeric derivative.
 fn invert(distortion: Distortion, [x, y]: [f64; 2]) -> [f64; 2] {
     let mut ideal = [x, y];
     for _ in 0..50 {
@@ -55,7 +54,6 @@ fn invert(distortion: Distortion, [x, y]: [f64; 2]) -> [f64; 2] {
     ideal
 }
 
-/// Photographs the pattern through a lens.
 fn photograph(camera: &Intrinsics) -> RgbImage {
     RgbImage::from_fn(camera.width_px, camera.height_px, |x, y| {
         let distorted = camera.distorted_from_pixel([f64::from(x) + 0.5, f64::from(y) + 0.5]);
@@ -98,8 +96,8 @@ fn a_photo_through_a_lens_becomes_the_ideal_one() {
                 (0..3).for_each(|c| largest = largest.max((expected[c] - f64::from(pixel.0[c])).abs()));
             }
         }
-        // Twice rounded to 8 bits, and a chord of the pattern's curvature 100 / 81 over a pixel that
-        // the lens may stretch (1.4 times at most here).
+        // Two roundings to 8 bits, and a chord of the pattern's curvature 100 / 81 over a pixel that the lens may
+        // stretch (1.4 times at most here).
         assert!(largest < 1.3, "{distortion:?}: off by {largest}");
         assert!(
             displaced > 3.0 && n_valid > 14_000,
@@ -121,7 +119,7 @@ fn labels_are_those_of_the_nearest_pixel() {
                 camera.pixel_from_distorted(invert(distortion, camera.distorted_from_pixel(found)));
             let expected_px = [at % 160, at / 160].map(|v| f64::from(v) + 0.5);
             let off_px = [0, 1].map(|axis| ideal_px[axis] - expected_px[axis]);
-            // Half a pixel each way, which the fisheye's corners stretch to nearly twice.
+            // Half a pixel each way, nearly doubled in the fisheye's corners.
             assert!(off_px.iter().all(|off| off.abs() < 1.0), "{distortion:?} {at}: {off_px:?}");
             n += 1.0;
             sum_px = [sum_px[0] + off_px[0], sum_px[1] + off_px[1]];
@@ -133,7 +131,7 @@ fn labels_are_those_of_the_nearest_pixel() {
     }
 }
 
-/// Pixels beyond the fold of a strong barrel lens are invalid, although the formula maps them back into the image.
+/// Pixels beyond the fold of a strong barrel lens are invalid, although the formula maps them into the image.
 #[test]
 fn folded_pixels_are_not_valid() {
     let camera = Intrinsics {
@@ -206,7 +204,7 @@ fn exif_orientation_is_ignored() {
     fs_err::write(&path, [&jpeg[..2], EXIF, &jpeg[2..]].concat()).unwrap();
     let rotated = load_image(&view(&path, camera(Distortion::None))).unwrap();
     assert!(rotated.image == plain && rotated.is_rotated);
-    // Two thousand of them make one line.
+    // Two thousand of them give one line.
     let photos = RotatedPhotos::default();
     assert_eq!(photos.line(), None);
     (0..2000).for_each(|_| photos.add(&rotated));
@@ -228,7 +226,7 @@ fn absent_and_damaged_images_are_named() {
     let views = [damaged, absent.clone()];
     assert_eq!(missing_images(&views), [&absent]);
 
-    // A JPEG that was copied in part, and more pixels than there is memory for.
+    // A truncated JPEG, and more pixels than memory.
     let mut random = slag_math::random::Random::new(3);
     let path = dir.path().join("c.jpg");
     RgbImage::from_fn(160, 120, |_, _| Rgb([random.bits() as u8; 3])).save(&path).unwrap();
@@ -246,7 +244,7 @@ fn absent_and_damaged_images_are_named() {
     check_memory(&photo, 1 << 20).expect("enough");
 }
 
-/// Drawings are told from photos whatever mark the text begins with.
+/// Drawings are recognised whatever byte order mark the text has.
 #[test]
 fn drawings_are_told_by_a_text_of_windows() {
     let dir = tempfile::tempdir().unwrap();
@@ -281,7 +279,7 @@ fn geo_reference() {
         "[]",
         r#"{"origin": {"lat": 0, "lon": 0}}"#,
         r#"{"origin": {"lat": NaN, "lon": 0, "alt": 0}}"#,
-        // Arrays have no names: GeoJSON's order is not ours.
+        // Arrays are refused: GeoJSON's order differs from ours.
         r#"{"origin": [8.54, 47.37, 400]}"#,
         r#"[{"lat": 1, "lon": 2, "alt": 3}]"#,
     ] {
@@ -293,7 +291,7 @@ fn geo_reference() {
     assert!(read("\u{feff}{\"origin\": {\"lat\": 1, \"lon\": 2, \"alt\": 3}}").is_ok(), "a byte order mark");
     let twice = read(r#"{"origin": {"lat": 8, "lat": 47, "lon": 8, "alt": 0}}"#).unwrap_err().to_string();
     assert!(twice.contains("duplicate field `lat`"), "{twice}");
-    // Endless: no more than a limit is read.
+    // Endless, but no more than a limit is read.
     assert!(matches!(read_geo_reference("/dev/zero".as_ref()), Err(GeoError::Json { .. })));
     let brighton = shared("scenes/brighton/geo.json");
     let origin = read_geo_reference(&brighton).unwrap().origin;
@@ -303,8 +301,8 @@ fn geo_reference() {
     );
 }
 
-/// Oracle: the derivative by differences. Strong tangential terms fold the image over; such pixels have no image,
-/// and the lenses of real cameras do not fold.
+/// Oracle: numeric derivatives. Strong tangential terms fold the image, and folded pixels have no image; lenses of
+/// real cameras do not fold.
 #[test]
 fn pixels_where_a_lens_folds_have_no_image() {
     for (p, folds) in [([0.4, -0.3], true), ([0.003, -0.002], false)] {
@@ -328,8 +326,7 @@ fn pixels_where_a_lens_folds_have_no_image() {
     }
 }
 
-/// An EXIF orientation is applied where only the turned photo fits its camera; transparent pixels are outside of
-/// the photo.
+/// EXIF orientation is applied only if the turned photo alone fits its camera; transparent pixels are outside.
 #[test]
 fn turned_and_transparent_photos() {
     let dir = tempfile::tempdir().unwrap();
@@ -343,7 +340,7 @@ fn turned_and_transparent_photos() {
     assert_eq!(valid.iter().position(|valid| !valid), Some(3 * 160 + 7));
     assert_eq!((valid.iter().filter(|valid| !**valid).count(), loaded.image.get_pixel(7, 3).0), (1, [0; 3]));
 
-    // Stored upright, with the orientation 6: a quarter turn clockwise brings its right column to the bottom.
+    // Stored upright with orientation 6: a clockwise quarter turn moves its right column to the bottom.
     let upright = RgbImage::from_fn(120, 160, |x, _| Rgb([if x == 119 { 250 } else { 5 }; 3]));
     let mut jpeg = Vec::new();
     image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95).encode_image(&upright).unwrap();

@@ -1,5 +1,5 @@
-//! Embeddings at the extremes: rows of the table in docs/numerics.md, each against the paper's equation in
-//! float64 or a closed form.
+//! Embeddings at the extremes: rows of the table in docs/numerics.md, against the paper's equation in float64 or a
+//! closed form.
 
 use glam::DVec3;
 use half::f16;
@@ -77,7 +77,7 @@ impl Seen {
         (field, table)
     }
 
-    /// Returns the mean vector and the total weight, in float64.
+    /// The mean vector and the total weight, in float64.
     fn truth(&self) -> (Vec<f64>, f64) {
         let total: f64 = self.weights.iter().map(|w| f64::from(*w)).sum();
         let component = |c: usize| {
@@ -87,8 +87,8 @@ impl Seen {
         ((0..DIM).map(component).collect(), total)
     }
 
-    /// Returns the errors of the total weight (relative), of the mean length, of the unit embedding and of its
-    /// cosine with a query, the last two times the mean length; `None` if there is no evidence.
+    /// Errors of the total weight (relative), the mean length, the unit embedding and its cosine with a query, the
+    /// last two times the mean length; `None` without evidence.
     fn errors(&self, query: &[f64]) -> Option<[f64; 4]> {
         let (field, table) = self.field();
         let (mean, total) = self.truth();
@@ -167,7 +167,7 @@ fn parallel_and_antiparallel_vectors() {
 fn masks_that_disagree() {
     let random = &mut Random::new(2);
     let mut worst = [0.0; 4];
-    // Shares that do not cancel, around the limit below which there is no evidence.
+    // Shares that do not cancel, around the limit of evidence.
     for (share, has_evidence) in [(0.0, false), (1e-6, false), (9e-4, false), (1.1e-3, true), (1e-2, true)] {
         for n_pairs in [1, 30, 1000] {
             let mut terms: Vec<(Vec<f32>, f32)> = Vec::new();
@@ -189,7 +189,7 @@ fn masks_that_disagree() {
     print("cancellation", "2 to 2,001 masks, weights to 1e5, 0 to 1e-2 remain", worst, 1e-6);
 }
 
-/// A Gaussian seen in 16,384 views at 65,536 pixels each: 2^30 pixels in all.
+/// A Gaussian in 16,384 views of 65,536 pixels each: 2^30 pixels.
 #[test]
 fn a_billion_pixels_over_many_views() {
     let random = &mut Random::new(3);
@@ -203,7 +203,7 @@ fn a_billion_pixels_over_many_views() {
     print("contributions of views", "16,384 views, 1.07e9 pixels", errors, 1e-5);
 }
 
-/// Non-finite mask vectors, which slag-models refuses, give no evidence and never a NaN in the field.
+/// Non-finite mask vectors, which slag-models refuses, give no evidence, and never a NaN in the field.
 #[test]
 fn vectors_that_are_no_numbers_are_no_evidence() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX] {
@@ -214,7 +214,7 @@ fn vectors_that_are_no_numbers_are_no_evidence() {
     }
 }
 
-/// Returns the exact shard of a cell, and the error that is stated for its positions.
+/// The exact shard of a cell, and its stated position error.
 fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (AlignedBytes, f64) {
     let bank = TextBank::directions(embeddings.dim);
     let metric = ScoreMetric::new(embeddings.dim, &bank);
@@ -231,7 +231,7 @@ fn exact_shard(scene: &Gaussians, cell: &Cell, embeddings: &CellEmbeddings) -> (
     (AlignedBytes::copy_of(&built.shards[0].bytes), built.position_error)
 }
 
-/// Returns the exact shard of a scene of one cell, in which each Gaussian shows one mask.
+/// The exact shard of a one-cell scene in which each Gaussian shows one mask.
 fn one_shard(vectors: &[Vec<f32>], means: Vec<DVec3>) -> AlignedBytes {
     let n = vectors.len();
     let scene = Gaussians::balls(means, 0.1);
@@ -246,8 +246,7 @@ fn one_shard(vectors: &[Vec<f32>], means: Vec<DVec3>) -> AlignedBytes {
     exact_shard(&scene, cell, &CellEmbeddings { dim: DIM, vectors: embeddings, has_evidence }).0
 }
 
-/// Gaussians lie by centroid, then along the Morton curve; those without evidence come last. Oracle: bits
-/// interleaved one by one.
+/// Order by centroid, then along the Morton curve; without evidence last. Oracle: bits interleaved one by one.
 #[test]
 fn gaussians_are_in_the_order_of_the_format() {
     let random = &mut Random::new(6);
@@ -279,8 +278,7 @@ fn gaussians_are_in_the_order_of_the_format() {
     assert!(indices[n_with..].iter().all(|index| index % 10 == 0));
 }
 
-/// Components from 1 down to 1e-12 are stored as f16: the error is half a step of 2^-11, below 2^-14 of 2^-24, and
-/// the smallest become zero.
+/// Components from 1 down to 1e-12 as f16: errors of half a step of 2^-11, below 2^-14 of 2^-24; the smallest are 0.
 #[test]
 fn embeddings_stored_as_f16() {
     let random = &mut Random::new(4);
@@ -307,7 +305,7 @@ fn embeddings_stored_as_f16() {
         assert!(stored.iter().all(|c| c.is_finite()));
         for (difference, expected) in difference.iter().zip(&expected) {
             let half_step = (expected.abs() * 2.0_f64.powi(-11)).max(2.0_f64.powi(-25));
-            // Beyond the half step is the f32 rounding of the mean and of its length.
+            // The rest is the f32 rounding of the mean and of its length.
             worst_step = worst_step.max((difference.abs() - 4e-7 * expected.abs()) / half_step);
         }
         worst_vector = worst_vector.max(length(&difference));
@@ -321,8 +319,7 @@ fn embeddings_stored_as_f16() {
     assert!(worst_step <= 1.0 && worst_vector <= 5e-4, "{worst_step} {worst_vector}");
 }
 
-/// Strays at any distance, scenes at any distance, Gaussians of any size: no stored position is farther from its
-/// mean than was asked for, nor than the manifest states.
+/// Strays, scenes at any distance, Gaussians of any size: no position errs more than requested, or than stated.
 #[test]
 fn positions_keep_their_error_with_strays() {
     let random = &mut Random::new(11);
@@ -361,7 +358,7 @@ fn positions_keep_their_error_with_strays() {
                 let mean = scene.means_in_world[*input as usize];
                 let off = (shard.position_in_world(k) - mean).abs().max_element();
                 assert!(off <= stated, "{distance}: {off} {stated}");
-                // Of the size of Gaussians, but no finer than an f32.
+                // As large as Gaussians, but no finer than f32.
                 let allowed = match error {
                     PositionError::Within(error) => error,
                     PositionError::OfSize if (*input as usize) < n_strays => distance * 6e-8,
@@ -377,17 +374,17 @@ fn positions_keep_their_error_with_strays() {
     }
 }
 
-/// What the radii of a shard's centroids are worth, in float64.
+/// How tight the radii of a shard's centroids are, in float64.
 struct Bounds {
-    /// A radius over the distance of its centroid's farthest member: the least and the largest.
+    /// Ratio of a radius to the distance of its farthest member: least and largest.
     nearest: f64,
     farthest: f64,
-    /// The largest error of a score, in radii.
+    /// Largest error of a score, in radii.
     score: f64,
 }
 
 impl Bounds {
-    /// `vectors`: by input index. Where all members are the centroid, its radius must not be negative.
+    /// `vectors`: by input index. Where all members equal the centroid, its radius must not be negative.
     fn of(shard: &ShardView<'_>, vectors: &[Vec<f32>], queries: &[Vec<f64>]) -> Self {
         let (mut nearest, mut farthest, mut score) = (f64::INFINITY, 0.0_f64, 0.0_f64);
         for centroid in 0..shard.radii.len() {
@@ -412,9 +409,8 @@ impl Bounds {
     }
 }
 
-/// The bound of scores at the extremes: all vectors alike, two that cancel, every axis, components that a byte
-/// cannot hold beside large ones, and one that is unlike thousands. The worst question is the error's own
-/// direction.
+/// The bound of scores at the extremes: equal vectors, two that cancel, every axis, components below a byte's step
+/// beside large ones, one vector unlike thousands. The worst query is the direction of the error.
 #[test]
 fn scores_keep_their_bound_at_the_extremes() {
     let random = &mut Random::new(12);

@@ -1,4 +1,4 @@
-//! The encoder's tests, but for one that needs a process of its own.
+//! The encoder's tests, except for one that needs its own process.
 
 mod embed;
 mod encode;

@@ -1,5 +1,4 @@
-//! An encode works on threads of its own. This is the only test of its program: rayon's global pool belongs to the
-//! process.
+//! An encode uses its own threads. A separate program, because rayon's global pool belongs to the process.
 
 use slag_encoder::encode::{self, EncodeSettings, Engines, Masks};
 use slag_encoder::{progress::Silent, raster::CpuRasterizer, segment::SamSettings};
@@ -17,7 +16,7 @@ fn an_encode_leaves_rayons_global_pool_alone() {
     let files = pool.install(|| room.write(folder.path(), &Silent).expect("a room"));
     let mut settings = EncodeSettings::new(files.scene, files.views, folder.path().join("store"), true);
     settings.run.threads = 2;
-    // Random weights find weak masks.
+    // Random weights give weak masks.
     let sam = SamSettings {
         points_per_side: 4,
         predicted_iou: 0.0,
@@ -36,7 +35,7 @@ fn an_encode_leaves_rayons_global_pool_alone() {
         summary.n_views,
         summary.n_masks
     );
-    // The global pool is made once: by whoever uses it first, else here.
+    // The global pool is built once: by its first user, else here.
     let made = rayon::ThreadPoolBuilder::new().num_threads(1).build_global();
     made.expect("the encode made rayon's global pool");
 }

@@ -15,7 +15,7 @@ use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput, Segmenter};
 use slag_math::random::Random;
 use slag_test_support::{memory_of, needs_shared, shared};
 
-/// Makes a mask of a membership function; `None` if no pixel is inside.
+/// `None` if no pixel is inside.
 fn mask(width: u32, height: u32, inside: impl Fn(u32, u32) -> bool) -> Option<Mask> {
     let pixels: Vec<(u32, u32)> =
         (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).filter(|(x, y)| inside(*x, *y)).collect();
@@ -73,7 +73,7 @@ fn input<'a>(view: &'a View, image: &'a RgbImage) -> SegmentInput<'a> {
     SegmentInput { view, image, valid: None, undistorter: None, depth: None, pool: None }
 }
 
-/// Loads the masks of image `left/a.jpg`, 8 x 6 pixels, from a folder.
+/// Masks of image `left/a.jpg`, 8 x 6 pixels, from a folder.
 fn load(
     dir: &Path,
     ignore_ids: &[u32],
@@ -90,7 +90,7 @@ fn load(
     loaded
 }
 
-/// Masks are identified by the contents of their files, not by paths, lengths or place.
+/// Given masks are identified by file contents, not by path, length or place.
 #[test]
 fn the_identity_of_given_masks_is_that_of_their_contents() {
     let of_view = |name: &str, path: &Path, ignored: &[u32]| {
@@ -146,7 +146,7 @@ fn write_png(path: &Path, color: png::ColorType, depth: png::BitDepth, rows: &[u
     encoder.write_header().unwrap().write_image_data(rows).unwrap();
 }
 
-/// The ids 0, 3 and 255 on an 8 x 6 image, in every kind of PNG that can hold them or their like.
+/// The ids 0, 3 and 255 on an 8 x 6 image, in every kind of PNG that can hold them or similar ones.
 #[test]
 fn id_images_of_every_depth() {
     let dir = folder();
@@ -189,14 +189,14 @@ fn id_images_of_the_wrong_kind_or_size_are_refused() {
     GrayImage::new(6, 8).save(&path).unwrap();
     let size = load(dir.path(), &[], None).unwrap_err();
     assert!(matches!(size, SegmentError::Size { found_px: [6, 8], expected_px: [8, 6], .. }), "{size}");
-    // A small file that unpacks to far more than the photo has pixels is refused by its header.
+    // A small file that inflates far beyond the photo is refused by its header.
     GrayImage::new(6_000, 6_000).save(&path).unwrap();
     let (loaded, taken) = memory_of(|| load(dir.path(), &[], None));
     assert!(matches!(loaded, Err(SegmentError::Size { found_px: [6_000, 6_000], .. })));
     assert!(taken.largest_bytes < 100_000, "{taken:?}");
 }
 
-/// As an image program draws a mask with antialiasing: each value between black and white would be a mask of its own.
+/// A mask drawn with antialiasing: each grey level would become a mask.
 #[test]
 fn soft_edges_are_no_ids() {
     let dir = folder();
@@ -206,7 +206,7 @@ fn soft_edges_are_no_ids() {
     write_png(&dir.path().join("left/a.png"), gray, eight, &ramp);
     let refused = load(dir.path(), &[], None).unwrap_err().to_string();
     assert!(refused.contains("soft edges: 18 values"), "{refused}");
-    // A black and white image of one mask is cut at half.
+    // A black and white image of one mask is thresholded at half.
     fs_err::create_dir(dir.path().join("left/a")).unwrap();
     fs_err::rename(dir.path().join("left/a.png"), dir.path().join("left/a/0.png")).unwrap();
     let half = mask(8, 6, |x, y| ramp[(y * 8 + x) as usize] >= 128).unwrap();
@@ -239,7 +239,7 @@ fn run_length_files_of_every_form() {
     let given = GivenMasks::open(&whole, Vec::new()).unwrap();
     assert!(given.covers(&view("b.jpg", 8, 6)) && !given.covers(&view("c.jpg", 8, 6)));
 
-    // Masks that would be lost, or end at another photo.
+    // Masks that would be lost, or assigned to another photo.
     for (images, id, expected) in [
         (r#"{"id": 8, "file_name": "left/a.jpg"}"#, "9", "mask 0 has image_id 9, which no image has"),
         (r#"{"id": 8, "file_name": "left/a.jpg"}"#, "null", "mask 0 has image_id none"),
@@ -269,7 +269,7 @@ fn run_length_files_of_every_form() {
     }
 }
 
-/// Returns the runs of a mask of 8 x 6 pixels.
+/// Run lengths of a mask of 8 x 6 pixels.
 fn counts(mask: &Mask) -> Vec<u32> {
     let mut counts = vec![0];
     for at in 0..48 {
@@ -281,7 +281,7 @@ fn counts(mask: &Mask) -> Vec<u32> {
     counts
 }
 
-/// Both kinds of mask file go through the lens exactly as a label image does, pixel by pixel.
+/// Both kinds of mask files are undistorted exactly like a label image.
 #[test]
 fn masks_are_undistorted_like_the_photo() {
     let dir = folder();
@@ -309,7 +309,7 @@ fn masks_are_undistorted_like_the_photo() {
     assert_eq!(load(dir.path(), &[], Some(&undistorter)).unwrap().unwrap(), expected[..1]);
 }
 
-/// Oracle: the number of pixels of each instance over all views, counted by the scene's generator.
+/// Oracle: pixels of each instance over all views, counted by the scene's generator.
 #[needs_shared]
 #[test]
 fn house_masks_have_the_pixels_that_the_scene_states() {
@@ -330,7 +330,7 @@ fn house_masks_have_the_pixels_that_the_scene_states() {
         let png =
             image::open(scene.join("gt/masks").join(&view.name).with_extension("png")).unwrap().into_luma8();
         for mask in given.load(&input(view, &image)).unwrap().unwrap() {
-            // The id, which a mask does not carry, is that of any of its pixels.
+            // A mask carries no id, so take that of any of its pixels.
             let first = mask.inside.iter().position(|inside| inside).unwrap() as u32;
             let (x, y) = (first % mask.box_px.width_px(), first / mask.box_px.width_px());
             let id = u32::from(png.get_pixel(mask.box_px.x0 + x, mask.box_px.y0 + y).0[0]);
@@ -342,7 +342,7 @@ fn house_masks_have_the_pixels_that_the_scene_states() {
     assert_eq!(found_px.values().sum::<u64>(), 96 * 640 * 480);
 }
 
-/// The set of masks of every raster pixel, one by one.
+/// The set of masks of every raster pixel.
 fn sets_of_pixels(
     masks: &[Mask],
     size: (u32, u32),
@@ -378,7 +378,7 @@ fn check_partition(masks: &[Mask], size: (u32, u32), target: (u32, u32), valid: 
         next = next.max(region + 1);
     }
     assert_eq!(next, map.n_regions);
-    // No two regions with one set: together with the above, regions are exactly the distinct sets.
+    // No two regions have the same set, so regions are exactly the distinct sets.
     let distinct: std::collections::BTreeSet<_> = masks_of_region.iter().collect();
     assert_eq!(distinct.len(), masks_of_region.len());
 }
@@ -402,7 +402,7 @@ proptest! {
     ) {
         let mut random = Random::new(seed);
         let mut masks: Vec<Mask> = (0..n).map(|_| random_mask(&mut random, size.0, size.1)).collect();
-        // Identical masks, and one of a single pixel.
+        // Equal masks, and one of a single pixel.
         masks.extend(masks.first().cloned());
         masks.extend(mask(size.0, size.1, |x, y| (x, y) == (size.0 / 2, size.1 / 2)).filter(|_| n > 0));
         let valid: Vec<bool> = (0..size.0 * size.1).map(|_| random.below(5) > 0).collect();
@@ -420,12 +420,12 @@ fn three_hundred_overlapping_masks() {
     assert_eq!(partition(&masks, 64, 48, 64, 48, Some(&[false; 64 * 48])).0.n_regions, 0);
 }
 
-/// Slivers join the neighbour with the longest border; a mask's only region, and one without a neighbour, stay.
+/// Slivers join the neighbour with the longest border, except a mask's only region and those without a neighbour.
 #[test]
 fn slivers_go_to_their_neighbours() {
     let inside =
         |x: u32, y: u32, (x0, y0, x1, y1): (u32, u32, u32, u32)| x >= x0 && x < x1 && y >= y0 && y < y1;
-    // 11 pixels are the largest sliver of this raster. Left and right overlap in a column of 11 that ends at the
+    // Slivers have at most 11 pixels in this raster. Left and right overlap in a column of 11 that ends at the
     // lower edge of both, and in an island of 4; the nail is on the left one.
     let (island, nail, size) = ((380, 280, 382, 282), (20, 20, 24, 22), (400, 300));
     let left = |x, y| inside(x, y, (10, 10, 101, 50)) && (x < 100 || y >= 39) || inside(x, y, island);
@@ -457,7 +457,7 @@ fn slivers_go_to_their_neighbours() {
     assert_eq!(set(&map, &masks_of_region, 22, 21), [0, 2], "8 pixels, but all that the nail has");
     assert_eq!(at(&map, 300, 200), NO_REGION);
 
-    // Two masks whose only common pixels lie apart from the rest of both.
+    // Two masks whose only common pixels are apart from the rest of both.
     let far = |box_px| move |x, y| inside(x, y, box_px) || inside(x, y, island);
     let masks = [(0, 0, 60, 60), (200, 0, 260, 60)].map(|b| mask(size.0, size.1, far(b)).unwrap());
     let (mut map, mut masks_of_region) = partition(&masks, size.0, size.1, size.0, size.1, None);
@@ -466,12 +466,12 @@ fn slivers_go_to_their_neighbours() {
     assert_eq!(map, before, "without a neighbour it stays");
 }
 
-/// A thing behind a grid of others, cut into nine slivers of 10 pixels: the largest stays, the others go.
+/// An object behind a grid of others, cut into nine slivers of 10 pixels: the largest stays, the others go.
 #[test]
 fn a_mask_cut_into_slivers_keeps_one() {
     let (width, height) = (400, 300);
     let strips: Vec<Mask> = (0..9).map(|i| mask(width, height, |x, _| x / 10 == i).unwrap()).collect();
-    // A line of ten pixels a strip; the fourth piece has one more, below.
+    // A line of ten pixels per strip; the fourth piece has one more, below.
     let thing = mask(width, height, |x, y| (x < 90 && y == 150) || (x, y) == (33, 151)).unwrap();
     let masks: Vec<Mask> = strips.into_iter().chain([thing]).collect();
     let (mut map, mut masks_of_region) = partition(&masks, width, height, width, height, None);
@@ -485,7 +485,7 @@ fn a_mask_cut_into_slivers_keeps_one() {
     assert_eq!(masks_of_region.iter().filter(|set| set.contains(&9)).count(), 1);
 }
 
-/// Masks that match no photo are refused by name; folders of `amg.py` and entries with other folders are found.
+/// Masks without a photo are refused by name; folders of `amg.py` and entries with other folders are matched.
 #[test]
 fn masks_are_matched_with_their_photos() {
     let dir = tempfile::tempdir().unwrap();
@@ -533,7 +533,7 @@ fn masks_are_matched_with_their_photos() {
         fs_err::write(&path, format!(r#"{{"images": [{}], "annotations": []}}"#, images.join(","))).unwrap();
         assert_eq!(check(&path, true).is_ok(), covered, "{names:?}");
     }
-    // Two cameras' photos of one name: an entry without its folder may be either's.
+    // Photos of two cameras with one name: an entry without a folder is ambiguous.
     let rig = [view("left/0.jpg", 4, 3), view("right/0.jpg", 4, 3)];
     let of = |file_name: &str| {
         let text = format!(r#"{{"images": [{{"id": 1, "file_name": "{file_name}"}}], "annotations": []}}"#);

@@ -1,4 +1,4 @@
-//! Planned views of splats without photos.
+//! Planned views for splats without photos.
 
 use std::sync::atomic::AtomicBool;
 
@@ -17,7 +17,7 @@ use slag_math::random::Random;
 use slag_models::{ModelDir, SessionOptions};
 use slag_test_support::{needs_shared, nightly, shared};
 
-/// Distance between the Gaussians of a surface.
+/// Distance between Gaussians of a surface.
 const SPACING: f64 = 0.1;
 
 /// Adds a flat Gaussian every 0.1 units of a rectangle.
@@ -50,7 +50,7 @@ fn room() -> Gaussians {
     scene
 }
 
-/// Moves a scene: turned, then scaled, then shifted.
+/// Rotates, then scales, then shifts a scene.
 fn moved(scene: &Gaussians, turn: DQuat, scale: f64, shift: DVec3) -> Gaussians {
     let turned = |[w, x, y, z]: [f32; 4]| {
         let q = turn * DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());
@@ -69,7 +69,7 @@ fn plan_of(scene: &Gaussians, up: Option<DVec3>) -> Result<ViewpointPlan, Viewpo
     plan(scene, &CpuRasterizer, &settings, 1 << 30, &AtomicBool::new(false))
 }
 
-/// Oracle: the room's walls, and what is up in it.
+/// Oracle: the room's walls and upward direction.
 #[test]
 fn views_of_a_room_are_in_the_room_upright_for_any_number_of_threads() {
     let scene = room();
@@ -91,7 +91,7 @@ fn views_of_a_room_are_in_the_room_upright_for_any_number_of_threads() {
     }
 }
 
-/// However a scene is turned, up is up; however it is scaled, the views are the same.
+/// Rotated scenes keep their upward direction; scaled ones give the same views.
 #[test]
 fn plans_follow_the_scene() {
     let mut random = Random::new(48);
@@ -111,7 +111,7 @@ fn plans_follow_the_scene() {
     }
 }
 
-/// Turned 20 times, none of the labelled scenes is upside down; scaled 20 times, each has the same views.
+/// Rotated 20 times, no labelled scene is upside down; scaled 20 times, each has the same views.
 #[needs_shared]
 #[nightly("plans 120 times")]
 #[test]
@@ -142,7 +142,7 @@ fn labelled_scenes_are_never_upside_down() {
     }
 }
 
-/// A ball with nothing around it tells no direction: it is seen from all sides, with the upward direction of files.
+/// A ball alone has no upward direction: it is seen from all sides, with the file's.
 #[test]
 fn a_thing_by_itself_is_seen_from_around() {
     let mut random = Random::new(9);
@@ -164,7 +164,7 @@ fn a_thing_by_itself_is_seen_from_around() {
     assert_eq!(sides, [true; 8]);
 }
 
-/// What cannot be planned is refused, and the message says what to give.
+/// Splats that cannot be planned are refused, and the message says what to add.
 #[test]
 fn splats_that_tell_too_little_are_refused() {
     let refused = |scene: &Gaussians, up| plan_of(scene, up).expect_err("refused").to_string();
@@ -176,7 +176,7 @@ fn splats_that_tell_too_little_are_refused() {
     let mut cave = Gaussians::balls((0..6000).map(|_| direction()).collect(), 0.03);
     cave.opacities.fill(0.97);
     assert!(refused(&cave, None).contains("which way is up"));
-    // Floaters in all free places of the room.
+    // Floaters in all free space of the room.
     let mut floaters = room();
     for _ in 0..3000 {
         let at = [6.0, 4.0, 2.6].map(|side| random.between(0.0, side));
@@ -190,7 +190,7 @@ fn splats_that_tell_too_little_are_refused() {
     assert!(message.contains("haze") && message.contains("--views"), "{message}");
 }
 
-/// A generated room without its photos becomes a store, whose summary and poses say that its images are drawings.
+/// A generated room without photos becomes a store whose summary and poses say that its images are drawings.
 #[test]
 fn a_splat_alone_is_encoded() {
     let folder = tempfile::tempdir().unwrap();

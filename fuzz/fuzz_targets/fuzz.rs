@@ -1,5 +1,5 @@
-//! libFuzzer's program. `SLAG_FUZZ_TARGET` names the target; with `SLAG_FUZZ_SEEDS` it writes the seeds of all
-//! targets to that folder instead, and `SLAG_SHARED` is the folder of shared test data.
+//! libFuzzer's program. `SLAG_FUZZ_TARGET` names the target; `SLAG_FUZZ_SEEDS` instead writes the seeds of all
+//! targets to that folder; `SLAG_SHARED` is the folder of shared test data.
 
 #![no_main]
 

@@ -21,10 +21,10 @@ use slag_models::description::Description;
 
 use super::seeds::{self, MASKED_PX};
 
-/// Separates the files of an input that consists of several.
+/// Separator of inputs with several files.
 const SEPARATOR: &[u8] = b"\n====\n";
 
-/// Runs `work` in a folder of the current thread, in memory where the system has a place for it.
+/// Runs `work` in the thread's own folder, in memory if possible.
 fn in_folder(work: impl FnOnce(&Path) -> bool) -> bool {
     thread_local! {
         static FOLDER: RefCell<Option<tempfile::TempDir>> = const { RefCell::new(None) };
@@ -39,7 +39,7 @@ fn in_folder(work: impl FnOnce(&Path) -> bool) -> bool {
     })
 }
 
-/// Returns whether a file was read; an error must name it, or the folder that it lies in.
+/// Whether a file was read; an error must name it or its folder.
 fn is_read<T>(result: Result<T, impl std::fmt::Display>, path: &Path) -> bool {
     let error = result.map_or_else(|error| error.to_string(), |_| String::new());
     assert!(error.is_empty() || error.contains(&path.display().to_string()), "{error}");
@@ -54,8 +54,7 @@ fn in_file(name: &str, data: &[u8], work: impl FnOnce(&Path) -> bool) -> bool {
     })
 }
 
-/// Returns the bytes with correct checksums of the container's sections and head, as a hostile writer can compute
-/// them.
+/// Corrects the checksums of a container's sections and head, as a hostile writer can.
 fn with_checksums(data: &[u8]) -> Vec<u8> {
     let mut bytes = data.to_vec();
     let Some(n) = bytes.get(12..16).map(|n| u32::from_le_bytes([n[0], n[1], n[2], n[3]]) as usize) else {
@@ -166,7 +165,7 @@ fn read_splat(name: &str, data: &[u8]) -> bool {
     in_file(name, data, |path| read_splat_at(path, path))
 }
 
-/// `named`: what an error must name.
+/// `named`: path that an error must contain.
 fn read_splat_at(path: &Path, named: &Path) -> bool {
     let read = splat::read(path, &ReadOptions { with_sh_rest: true });
     if let Ok(gaussians) = &read {
@@ -179,7 +178,6 @@ fn read_splat_at(path: &Path, named: &Path) -> bool {
     is_read(read, named)
 }
 
-/// Plain and compressed PLY files.
 pub fn ply(data: &[u8]) -> bool {
     read_splat("x.ply", data)
 }
@@ -188,7 +186,7 @@ pub fn splat(data: &[u8]) -> bool {
     read_splat("x.splat", data)
 }
 
-/// The bytes unchanged, and compressed by gzip like versions 1 to 3.
+/// Raw, and gzip-compressed like versions 1 to 3.
 pub fn spz(data: &[u8]) -> bool {
     use std::io::Write;
     let is_accepted = read_splat("x.spz", data);
@@ -201,7 +199,7 @@ pub fn sog(data: &[u8]) -> bool {
     read_splat("x.sog", data)
 }
 
-/// The meta file of a folder, and an image that stands for each of its images.
+/// A folder's meta file, and an image for each of its images.
 pub fn sog_folder(data: &[u8]) -> bool {
     let (meta, image) = two_parts(data);
     in_folder(|folder| {
@@ -247,7 +245,7 @@ pub fn transforms(data: &[u8]) -> bool {
     in_file("transforms.json", data, |path| read_poses(path, None))
 }
 
-/// The camera matrix and a pose of a ScanNet scene whose one photo is whole.
+/// Camera matrix and pose of a ScanNet scene with one intact photo.
 pub fn scannet(data: &[u8]) -> bool {
     let (camera, pose) = two_parts(data);
     in_folder(|folder| {
@@ -274,7 +272,7 @@ pub fn splat_frame(data: &[u8]) -> bool {
     })
 }
 
-/// Two bytes of width, two of height, and the run lengths.
+/// Width and height in two bytes each, then run lengths.
 pub fn rle(data: &[u8]) -> bool {
     let Some((size, text)) = data.split_at_checked(4) else { return false };
     let side = |at: usize| u32::from(u16::from_le_bytes([size[at], size[at + 1]]));
@@ -287,7 +285,6 @@ pub fn coco(data: &[u8]) -> bool {
     in_file("masks.json", data, read_masks)
 }
 
-/// The ids of the masks of a photo.
 pub fn id_image(data: &[u8]) -> bool {
     in_folder(|folder| {
         let ids = folder.join("ids");
@@ -385,7 +382,7 @@ pub fn query(data: &[u8]) -> bool {
     slag_edge::http::parse_query(text).is_ok()
 }
 
-/// A text that may name relations, and a phrase as JSON, on a thread with the stack of the service's threads.
+/// A text that may name relations, and a phrase as JSON, on a thread with the service's stack size.
 pub fn grammar(data: &[u8]) -> bool {
     let text = String::from_utf8_lossy(data).into_owned();
     let read = std::thread::Builder::new().stack_size(2 << 20).spawn(move || {
@@ -396,7 +393,6 @@ pub fn grammar(data: &[u8]) -> bool {
     read.expect("a thread").join().expect("no panic")
 }
 
-/// Lines with positions of the robot.
 pub fn position(data: &[u8]) -> bool {
     let mut n_accepted = 0;
     let read = slag_edge::fetch::follow::read_positions(data, |_, position| {

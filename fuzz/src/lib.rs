@@ -1,7 +1,7 @@
-//! One function for each decoder of foreign bytes; it must return whatever the bytes are.
+//! One function for each decoder of foreign bytes, which must return for any bytes.
 //!
-//! `scripts/fuzz.sh` runs them guided by coverage (`fuzz_targets/`), the tests of the workspace with seeded
-//! mutations (`tests/fuzz.rs`). Checksums and signatures are corrected first, or no mutation would pass them.
+//! `scripts/fuzz.sh` runs them guided by coverage (`fuzz_targets/`), the workspace's tests with seeded mutations
+//! (`tests/fuzz.rs`). Checksums and signatures are corrected first, because no mutation would pass them.
 
 #[path = "formats.rs"]
 mod formats;
@@ -14,8 +14,7 @@ mod services;
 
 pub struct Target {
     pub name: &'static str,
-    /// Decodes the bytes and returns whether they were accepted. It must neither panic nor take memory out of
-    /// proportion.
+    /// Decodes the bytes and returns whether they were accepted, without panics or memory out of proportion.
     pub run: fn(&[u8]) -> bool,
 }
 

@@ -1,4 +1,4 @@
-//! An honest repository of The Update Framework, of which one role's file is replaced.
+//! A valid TUF repository in which one role's file is replaced.
 
 use std::collections::BTreeMap;
 use std::sync::OnceLock;
@@ -10,7 +10,7 @@ pub fn key() -> SigningKey {
     SigningKey::from_bytes(&[7; 32])
 }
 
-/// The files of a repository whose roles state versions alone, so that each may be replaced.
+/// Roles state versions only, so that each file may be replaced.
 pub fn repository() -> &'static BTreeMap<&'static str, Vec<u8>> {
     static FILES: OnceLock<BTreeMap<&'static str, Vec<u8>>> = OnceLock::new();
     FILES.get_or_init(|| {
@@ -37,10 +37,10 @@ pub fn repository() -> &'static BTreeMap<&'static str, Vec<u8>> {
     })
 }
 
-/// The file that the first byte of an input names.
+/// Files by the first byte of an input.
 pub const REPLACED: [&str; 4] = ["2.root.json", "timestamp.json", "1.snapshot.json", "1.targets.json"];
 
-/// Returns a seed for each role: its byte, and what it signs.
+/// A seed for each role: its byte, and its signed content.
 pub fn seeds() -> Vec<Vec<u8>> {
     let seed = |(number, name): (usize, &&str)| {
         let text = String::from_utf8(repository()[name].clone()).expect("JSON is text");

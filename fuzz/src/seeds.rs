@@ -18,7 +18,7 @@ use slag_common::shard::{
 use slag_common::{Hash32, View, container, pinhole};
 use slag_edge::store::EdgeCache;
 
-/// Longest shared file used: in longer ones mutations rarely hit anything that matters.
+/// Longest shared file used: mutations of longer ones rarely matter.
 const MAX_SHARED_BYTES: usize = 100_000;
 
 /// Columns and rows of the photo with masks.
@@ -26,7 +26,7 @@ pub const MASKED_PX: [u32; 2] = [4, 3];
 
 pub const ENCODER: Hash32 = Hash32([9; 32]);
 
-/// Requests of all kinds, and one whose body is no JSON.
+/// Requests of all kinds, one with a body that is not JSON.
 const HTTP_REQUESTS: &[&str] = &[
     "GET /query?text=red%20chair&near=1,2,3&limit=2 HTTP/1.1\r\nHost: localhost:7734\r\nAccept: application/json\r\nX-Request-Id: a-1\r\n\r\n",
     "POST /v1/query HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 41\r\n\r\n{\"texts\":[\"red\",\"blue mug\"],\"threshold\":0}",
@@ -36,7 +36,6 @@ const HTTP_REQUESTS: &[&str] = &[
     "GET /metrics HTTP/1.1\r\nHost: [::1]:7734\r\nExpect: 100-continue\r\n\r\n",
 ];
 
-/// Bodies of `POST /v1/query` with every member.
 const V1_BODIES: &[&str] = &[
     r#"{"texts":["a on the b","nearest a","c"],"near":[0,0,0],"heading_rad":1.5,"limit":5,"offset":1}"#,
     r#"{"vectors":[[1,0,0.5]],"kind":"gaussians","min_score":-1,"precision":"centroids","time_budget_ms":500}"#,
@@ -44,7 +43,6 @@ const V1_BODIES: &[&str] = &[
     r#"{"texts":["a"],"kind":"clusters","voxel":0.5,"negatives":["b","c"],"region":{"ball":{"centre":[1,2,3],"radius":9},"box":{"from":[0,0,0],"to":[9,9,9]},"polygon":[[0,0],[9,0],[9,9]]}}"#,
 ];
 
-/// Texts that name relations, and a phrase as JSON.
 const PHRASES: &[&str] = &[
     "where is the second largest red mug on a table near the window?",
     "chair between the sofa and the lamp in front of me",
@@ -52,8 +50,7 @@ const PHRASES: &[&str] = &[
     r#"{"thing":"mug","pick":{"by":"nearest","n":2,"from":{"thing":"gate"}},"relation":{"is":"on","of":{"thing":"me"}}}"#,
 ];
 
-/// Writes the cache of a robot with a scene of one cell with objects, in the space of [`ENCODER`] and of three
-/// components.
+/// Writes a robot's cache with a one-cell scene with objects, in the space of [`ENCODER`] with three components.
 pub fn write_scene(folder: &Path) {
     let bytes = shard(true);
     let bytes_of_manifest = manifest(&bytes);
@@ -73,7 +70,7 @@ pub fn write_scene(folder: &Path) {
     }
 }
 
-/// Returns the seeds of a target; `shared` is the folder of shared test data, if it exists.
+/// `shared`: folder of shared test data, if it exists.
 pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
     let text = |text: &str| vec![text.as_bytes().to_vec()];
     let mut seeds = match target {
@@ -198,7 +195,7 @@ fn shard(is_exact: bool) -> Vec<u8> {
     out
 }
 
-/// Returns a shard of six Gaussians with all that it may carry besides.
+/// A shard of six Gaussians with all additions.
 fn with_additions(view: &ShardView<'_>) -> Vec<u8> {
     let object = |id: u64, runs: &[Range<u32>]| SampleObject {
         id,
@@ -240,7 +237,7 @@ fn manifest(shard: &[u8]) -> Vec<u8> {
     sample::manifest("yard", &[(Profile::Compact, shard)]).to_bytes()
 }
 
-/// An uncompressed file of version 2 with one Gaussian of zeros; the target compresses it.
+/// An uncompressed SPZ 2 file with one Gaussian of zeros; the target compresses it.
 fn spz() -> Vec<u8> {
     let mut bytes = b"NGSP".to_vec();
     bytes.extend([2, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 0]);
@@ -248,9 +245,9 @@ fn spz() -> Vec<u8> {
     bytes
 }
 
-/// Folders of versions 1 and 2 that use one image for all columns.
+/// Versions 1 and 2, with one image for all columns.
 fn sog_folders() -> Vec<Vec<u8>> {
-    // Small, so that any of its pixels is a label, and any of its rows a quaternion.
+    // Small, so that any pixel is a label and any row a quaternion.
     let pixels =
         image::RgbaImage::from_fn(192, 2, |x, y| image::Rgba([x as u8 % 100, 0, y as u8, 252 + x as u8 % 4]));
     let mut webp = Vec::new();

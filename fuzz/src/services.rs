@@ -1,4 +1,4 @@
-//! Targets that need more than a function: the robot's service, and a repository of The Update Framework.
+//! Targets that need more than a function: the robot's service, and a TUF repository.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -18,11 +18,11 @@ use slag_service::listen::{Listen, bind};
 use super::repository::{REPLACED, key, repository};
 use super::seeds;
 
-/// Asks for little, and ends the connection; what comes before may be whole or not.
+/// Requests little and closes the connection; earlier bytes may be incomplete.
 const LAST: &[u8] = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
 const MAX_ANSWER_BYTES: u64 = 1 << 20;
 
-/// Knows any text that begins with a letter.
+/// An encoder that knows any text beginning with a letter.
 struct Letters;
 
 impl TextEncoder for Letters {
@@ -36,7 +36,7 @@ impl TextEncoder for Letters {
     }
 }
 
-/// Starts the robot's service with a small scene, once; returns its socket.
+/// Starts the robot's service with a small scene once; returns its socket.
 fn service() -> &'static PathBuf {
     static SOCKET: OnceLock<PathBuf> = OnceLock::new();
     SOCKET.get_or_init(|| {
@@ -65,7 +65,6 @@ fn service() -> &'static PathBuf {
     })
 }
 
-/// A body of `POST /v1/query` to a service with a scene.
 pub fn v1(data: &[u8]) -> bool {
     let head = format!(
         "POST /v1/query HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {}\r\n\r\n",
@@ -74,11 +73,10 @@ pub fn v1(data: &[u8]) -> bool {
     http_request(&[head.as_bytes(), data].concat())
 }
 
-/// The bytes of a connection to the robot's service: whatever they are, no handler panics, and the service answers
-/// on.
+/// Bytes of a connection to the robot's service: no handler may panic, and the service must keep answering.
 pub fn http_request(data: &[u8]) -> bool {
     let mut stream = UnixStream::connect(service()).expect("the service listens");
-    // A request that is not whole gets no answer for seconds.
+    // An incomplete request gets no answer for seconds.
     stream.set_read_timeout(Some(Duration::from_millis(20))).expect("set");
     // The service may have closed the connection already.
     let _ = stream.write_all(data).and_then(|()| stream.write_all(LAST));
@@ -97,7 +95,7 @@ impl Source for Files {
     }
 }
 
-/// One role's metadata, signed by its key as far as it can be, in an honest repository.
+/// One role's metadata in a valid repository, signed with its key as far as possible.
 pub fn tuf(data: &[u8]) -> bool {
     let Some((role, signed)) = data.split_first() else { return false };
     let envelope = [b"{\"signatures\":[],\"signed\":", signed, b"}"].concat();

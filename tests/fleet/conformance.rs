@@ -1,4 +1,4 @@
-//! What every fleet does, whatever its bucket is and however work is handed out.
+//! Behaviour of every fleet, for any bucket and any distribution of work.
 
 use std::process::Command;
 
@@ -6,8 +6,7 @@ use serde_json::json;
 
 use super::support::*;
 
-/// The first of two workers is killed at its second view; the other does what is left, and no view is done twice.
-///
+/// The first of two workers is killed at its second view; the other does the rest, and no view is done twice.
 /// `coordinator`: by its store; `worker`: by its number; `n_views`: those in the bucket.
 pub fn conforms(
     scene: &Scene,
@@ -26,7 +25,7 @@ pub fn conforms(
     assert_eq!((&summary["n_views"], &summary["skipped_views"]), (&N_VIEWS.into(), &json!([])));
     assert_eq!(report["n_views"], N_VIEWS - n_of_killed, "{report}");
     scene.assert_same("store");
-    // What the bucket has is not done again, whoever asks for it: there is no worker.
+    // What the bucket has is not done again: there is no worker.
     Running::start(&mut coordinator("again")).json();
     scene.assert_same("again");
 }

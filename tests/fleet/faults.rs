@@ -1,5 +1,4 @@
-//! Seeded faults: any part of a fleet is killed, stands still, is cut off, or comes back with nothing, and the
-//! bytes stay the same.
+//! Seeded faults: any part of a fleet is killed, paused, cut off or restarted empty, and the bytes stay the same.
 
 use std::fmt;
 use std::time::Duration;
@@ -11,7 +10,7 @@ use super::nats::Fleet;
 use super::network::{Network, Weather};
 use super::support::*;
 
-/// Seeds, unless `SLAG_FAULT_RUNS` gives another number; `SLAG_FAULT_SEED` is the first one.
+/// Number of seeds, unless `SLAG_FAULT_RUNS` is set; `SLAG_FAULT_SEED` is the first.
 const N_RUNS: u64 = 20;
 
 #[nightly("half a minute a run; SLAG_FAULT_RUNS=N chooses how many")]
@@ -30,7 +29,7 @@ fn seeded_faults_do_not_show() {
     println!("{n_runs} runs: {all}");
 }
 
-/// What befell a fleet.
+/// Faults of a fleet.
 #[derive(Clone, Copy, Default)]
 struct Faults {
     n_workers_killed: u64,
@@ -89,7 +88,7 @@ fn run_with_faults(seed: u64) -> Faults {
         let which = random.below(workers.len());
         match random.below(12u32) {
             0..3 => {
-                // One that has ended by itself, as no run was open, is replaced as well.
+                // One that ended because no run was open is also replaced.
                 drop(std::mem::replace(&mut workers[which], start(which)));
                 faults.n_workers_killed += 1;
             }
@@ -125,8 +124,7 @@ fn run_with_faults(seed: u64) -> Faults {
             _ => {}
         }
     }
-    // Workers that ended because a run was published, or failed because the server was away, are replaced: they
-    // are a scheduler's business.
+    // A scheduler would replace workers that ended after a publication or because the server was away.
     while coordinator.is_running() {
         for (which, worker) in workers.iter_mut().enumerate() {
             if !worker.is_running() {

@@ -19,8 +19,8 @@ fn a_folder_and_shares_conform() {
     conforms(&scene, coordinator, |number| with_share(worker(&bucket), number), n_views);
 }
 
-/// Folders for photos in work go with their workers, or when the next one begins; workers of other models and
-/// versions are refused.
+/// Temporary folders of photos are removed with their workers, or when the next one begins; workers of other
+/// models and versions are refused.
 #[test]
 fn workers_leave_nothing_and_do_not_mix() {
     let scene = Scene::new();
@@ -38,7 +38,7 @@ fn workers_leave_nothing_and_do_not_mix() {
     assert_eq!(n_objects(&scratch), 1, "a worker that is killed leaves its folder");
     assert!(n_of_killed < N_VIEWS / 2, "it was killed too late");
 
-    // Another image model makes other vectors.
+    // Another image model gives other vectors.
     let mut other =
         encoder(&["worker", "--blobs", text(&bucket), "--index", "1", "--of", "2", "--device", "cpu"]);
     let refused = worker_output(&mut other);

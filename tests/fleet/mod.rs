@@ -1,4 +1,4 @@
-//! Fleets of real workers against the bytes that one process makes.
+//! Fleets of real workers give the bytes of a single process.
 
 mod conformance;
 mod faults;

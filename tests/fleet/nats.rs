@@ -1,4 +1,4 @@
-//! Workers that a queue hands work to: a real nats-server with JetStream.
+//! Workers fed by a queue: a real nats-server with JetStream.
 
 use std::process::Command;
 
@@ -44,7 +44,7 @@ impl Fleet {
         command
     }
 
-    /// Starts the coordinator; `flags` are for it and the workers alike.
+    /// `flags` are for it and the workers alike.
     pub fn coordinator(&self, flags: &[&str]) -> Running {
         Running::start(&mut self.coordinator_of("store", flags))
     }
@@ -64,7 +64,7 @@ impl Fleet {
         command
     }
 
-    /// Kills the server and starts it again: with its files, or with nothing.
+    /// Kills the server and restarts it, with its files or empty.
     pub fn restart(&self, server: Server, is_lost: bool) -> Server {
         let Server { running, port, .. } = server;
         running.kill();
@@ -87,8 +87,7 @@ fn a_folder_and_a_queue_conform() {
     conforms(&fleet.scene, coordinator, |_| fleet.worker_at(fleet.port, &flags), || fleet.n_views_done());
 }
 
-/// One worker is killed, one stands still for longer than the queue waits for it and goes on; the server is killed
-/// in the middle and comes back with nothing.
+/// One worker is killed, one pauses longer than the queue waits; the server is killed half way and restarts empty.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
@@ -115,8 +114,8 @@ fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
     fleet.scene.assert_same("store");
 }
 
-/// Views that a worker took down with it are given up once they were handed out too often: they are named, and the
-/// encode is one of the others. Without the queue's limit they are done by the next encode.
+/// Views that kill their worker are given up after too many deliveries and named; the encode uses the others.
+/// Without the queue's limit the next encode does them.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn views_that_end_workers_are_given_up_and_named() {
@@ -126,7 +125,7 @@ fn views_that_end_workers_are_given_up_and_named() {
     let killed = fleet.worker(&flags);
     wait_until("a first view", || fleet.n_views_done() > 0);
     killed.kill();
-    // Work that the worker held in the queue's eyes, and did not finish.
+    // Unfinished work that the queue still assigns to the worker.
     let survivor = fleet.worker(&flags);
     let output = coordinator.output();
     assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
@@ -140,7 +139,7 @@ fn views_that_end_workers_are_given_up_and_named() {
     assert_eq!(helper.json()["n_views"], skipped.len());
 }
 
-/// Work that takes longer than the queue waits is not handed out again, as its worker says that it is at it.
+/// Work that takes longer than the queue waits is not delivered again, because its worker reports progress.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn work_in_progress_is_not_handed_out_again() {
@@ -152,7 +151,7 @@ fn work_in_progress_is_not_handed_out_again() {
     let worker = fleet.worker(&wait);
     assert_eq!(coordinator.json()["n_views"], N_VIEWS);
     assert_eq!(worker.json()["n_views"], N_VIEWS);
-    // Also where a view that was given up is finished after all.
+    // Also if a view that was given up is finished after all.
     assert_eq!(n_objects(&fleet.scene.path("bucket/jobs/00000001/failed")), 0);
     run(fleet.scene.encode("alone").args(width));
     let alone = fs_err::read(fleet.scene.path("alone/manifest")).expect("published");

@@ -1,7 +1,5 @@
-//! The network between a worker and the queue, as a proxy on loopback: delay, loss and partitions.
-//!
-//! TCP hides a lost packet as a wait for its retransmission, and a partition as silence until it ends; so does the
-//! proxy.
+//! The network between a worker and the queue, as a proxy on loopback: delay, loss and partitions. As with TCP, a
+//! lost packet becomes a wait for its retransmission, and a partition silence until it ends.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -10,27 +8,27 @@ use std::time::Duration;
 
 use slag_math::random::Random;
 
-/// Least time after which TCP sends a packet again (RFC 6298 in Linux's form).
+/// Least retransmission timeout of TCP (RFC 6298 as in Linux).
 const RETRANSMISSION: Duration = Duration::from_millis(200);
 
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Weather {
-    /// Time that each piece of data takes.
+    /// Delay of each piece of data.
     pub delay: Duration,
-    /// Share of the pieces that are lost and sent again.
+    /// Share of pieces that are lost and sent again.
     pub loss: f64,
-    /// Whether nothing comes through.
+    /// Whether nothing passes.
     pub is_cut: bool,
 }
 
-/// A network of its own between a port of this machine and another.
+/// A separate network between a port of this machine and another.
 pub struct Network {
     pub port: u16,
     weather: Arc<Mutex<Weather>>,
 }
 
 impl Network {
-    /// Makes a network to a port, with seeded loss.
+    /// `upstream`: a port; `seed`: of the losses.
     pub fn to(upstream: u16, seed: u64) -> Self {
         let listener = TcpListener::bind(("127.0.0.1", 0)).expect("binds");
         let port = listener.local_addr().expect("an address").port();
@@ -58,7 +56,7 @@ impl Network {
     }
 }
 
-/// Returns the weather once it is no partition.
+/// Waits for the end of a partition.
 fn wait_for_calm(weather: &Mutex<Weather>) -> Weather {
     loop {
         let now = *weather.lock().unwrap_or_else(PoisonError::into_inner);
@@ -69,7 +67,7 @@ fn wait_for_calm(weather: &Mutex<Weather>) -> Weather {
     }
 }
 
-/// Carries data one way until an end is closed.
+/// Copies data one way until an end is closed.
 fn carry(mut from: TcpStream, mut to: TcpStream, weather: &Mutex<Weather>, mut random: Random) {
     let mut piece = vec![0; 1400];
     while let Ok(n @ 1..) = from.read(&mut piece) {
@@ -80,7 +78,7 @@ fn carry(mut from: TcpStream, mut to: TcpStream, weather: &Mutex<Weather>, mut r
             break;
         }
     }
-    // The other direction ends as well; it may have ended before.
+    // Ends the other direction, which may have ended before.
     let _ = to.shutdown(std::net::Shutdown::Both);
     let _ = from.shutdown(std::net::Shutdown::Both);
 }

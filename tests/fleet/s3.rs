@@ -1,4 +1,4 @@
-//! A fleet over S3: a server of another project, with conditional puts.
+//! A fleet over S3: another project's server, with conditional puts.
 
 use std::process::Command;
 
@@ -13,8 +13,7 @@ use super::support::*;
 const KEY: &str = "robot";
 const SECRET: &str = "secret";
 
-/// s3s-fs with a bucket named `scenes`, in threads of this process. It checks signatures, and keeps an object as a
-/// file.
+/// s3s-fs with a bucket named `scenes`, in threads of this process. It checks signatures and stores objects as files.
 struct S3s {
     runtime: Option<tokio::runtime::Runtime>,
     dir: tempfile::TempDir,
@@ -50,7 +49,7 @@ impl S3s {
         if path.is_file() { 1 } else { n_objects(&path) }
     }
 
-    /// Gives a command the address and credentials.
+    /// Sets the address and credentials.
     fn known_to(&self, mut command: Command) -> Command {
         command.env("AWS_ENDPOINT", format!("http://127.0.0.1:{}", self.port)).env("AWS_ALLOW_HTTP", "true");
         command.env("AWS_ACCESS_KEY_ID", KEY).env("AWS_SECRET_ACCESS_KEY", SECRET);
@@ -61,12 +60,11 @@ impl S3s {
 
 impl Drop for S3s {
     fn drop(&mut self) {
-        // Without waiting for open connections.
         self.runtime.take().into_iter().for_each(tokio::runtime::Runtime::shutdown_background);
     }
 }
 
-/// A coordinator is fenced by a second one; puts of the bucket decide. Another fleet in the same bucket conforms.
+/// A second coordinator fences the first by conditional puts. Another fleet in the same bucket conforms.
 #[test]
 fn a_bucket_of_s3_fences_and_conforms() {
     let (scene, s3) = (Scene::new(), S3s::start());

@@ -1,4 +1,4 @@
-//! A fleet over the server that `encoder/deploy/nats.conf` describes: TLS, and a key for each role.
+//! A fleet over the server of `encoder/deploy/nats.conf`: TLS, and a key for each role.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -8,7 +8,7 @@ use slag_tests::*;
 
 use super::support::*;
 
-/// nats-server with the configuration as it is shipped, but for its port, folders and keys.
+/// nats-server with the shipped configuration, except for port, folders and keys.
 struct Secured {
     _server: Running,
     authority: Authority,
@@ -66,8 +66,7 @@ impl Secured {
     }
 }
 
-/// Each role does its work with its key; a worker's key fills no queue, an unknown key and an unknown authority do
-/// nothing.
+/// Each role works with its key; a worker's key cannot fill a queue; unknown keys and authorities can do nothing.
 #[nightly("starts servers, and fails parts of a fleet")]
 #[test]
 fn each_role_has_its_key_and_no_more() {
@@ -88,8 +87,7 @@ fn each_role_has_its_key_and_no_more() {
     stranger.args(["--fleet", &format!("tls://127.0.0.1:{}", fleet.port)]);
     refused(stranger, "certificate");
 
-    // The server does not answer what the key may not ask; the coordinator says so and tries again until somebody
-    // stops it.
+    // The server does not answer forbidden requests; the coordinator reports that and retries until it is stopped.
     let mut weak = Running::start(&mut fleet.coordinator("worker.nk"));
     std::thread::sleep(std::time::Duration::from_secs(7));
     weak.signal("INT");

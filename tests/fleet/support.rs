@@ -10,10 +10,9 @@ use slag_tests::*;
 
 const MODELS: [&str; 4] = ["--models", "colours", "--device", "cpu"];
 
-/// Flags of the encode: one profile, so that codebooks take less time than views.
+/// One profile, so that codebooks take less time than views.
 const ENCODE: [&str; 5] = ["--name", "room", "--profiles", "compact", "--photo-poses"];
 
-/// Photos of the room.
 pub const N_VIEWS: usize = 6;
 
 /// A generated room, which all tests encode, and the folder of one test.
@@ -29,8 +28,7 @@ impl Scene {
     fn room() -> &'static (PathBuf, Vec<u8>) {
         static ROOM: OnceLock<(PathBuf, Vec<u8>)> = OnceLock::new();
         ROOM.get_or_init(|| {
-            // Beside the built programs: nothing is dropped at a program's end. Seeded faults may run as several
-            // programs.
+            // Beside the built programs, because statics are not dropped. Several programs may run seeded faults.
             let seed = std::env::var("SLAG_FAULT_SEED").unwrap_or_default();
             let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fleet{seed}"));
             if dir.exists() {
@@ -54,12 +52,12 @@ impl Scene {
         command
     }
 
-    /// Fails unless a store has the manifest of the one that a single process made, and its objects.
+    /// Fails unless a store has the manifest and objects of the one made by a single process.
     pub fn assert_same(&self, store: &str) {
         self.assert_has(store, &Self::room().1);
     }
 
-    /// Fails unless a store has a manifest that one process made, and its objects.
+    /// Fails unless a store has this manifest and its objects.
     pub fn assert_has(&self, store: &str, expected: &[u8]) {
         let manifest = fs_err::read(self.path(store).join("manifest")).expect("published");
         assert!(manifest == expected, "{store}: another manifest than one process makes");
@@ -67,14 +65,14 @@ impl Scene {
     }
 }
 
-/// Returns the command of a worker; `bucket`: an address.
+/// `bucket`: an address.
 pub fn worker(bucket: &str) -> Command {
     let mut command = encoder(&["worker", "--json", "--blobs", bucket, "--wait", "30"]);
     command.args(MODELS);
     command
 }
 
-/// Gives a worker one of two shares.
+/// Assigns one of two shares.
 pub fn with_share(mut worker: Command, number: usize) -> Command {
     worker.args(["--index", &number.to_string(), "--of", "2", "--help-after", "0.3", "--threads", "1"]);
     worker
@@ -101,7 +99,6 @@ impl Running {
         self.child().try_wait().expect("waits").is_none()
     }
 
-    /// Kills it (-9), while it runs.
     pub fn kill(mut self) {
         assert!(self.is_running(), "{} has ended", self.what);
         self.child().kill().expect("killed");
@@ -122,7 +119,7 @@ impl Running {
         self.child.take().expect("it runs").wait_with_output().expect("waits")
     }
 
-    /// Waits for its end, which must be a good one, and returns the JSON that it prints.
+    /// Waits for its successful end; returns the JSON that it prints.
     pub fn json(self) -> Value {
         let what = self.what.clone();
         let output = self.output();
@@ -144,14 +141,14 @@ impl Drop for Running {
 }
 
 pub fn n_objects(folder: &Path) -> usize {
-    // An object on its way has a `#` in its name; a killed worker leaves it so.
+    // An unfinished object has a `#` in its name, and a killed worker leaves it.
     let is_whole = |entry: &std::io::Result<std::fs::DirEntry>| {
         entry.as_ref().is_ok_and(|entry| !entry.file_name().to_string_lossy().contains('#'))
     };
     std::fs::read_dir(folder).map_or(0, |entries| entries.filter(is_whole).count())
 }
 
-/// Waits until something is so.
+/// Waits until a condition holds.
 ///
 /// # Panics
 /// After a minute.
@@ -165,8 +162,7 @@ pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     panic!("{what}: not after a minute");
 }
 
-/// Starts a server that Python's packages bring; returns it once it listens on its port. Nobody reads what it
-/// prints.
+/// Starts a server from a Python package; returns it once it listens on its port. Its output is not read.
 pub fn start_server(name: &str, port: u16, args: &[&str]) -> Running {
     let mut command = Command::new(python_with("tests/fleet").with_file_name(name));
     let child = command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
@@ -175,7 +171,6 @@ pub fn start_server(name: &str, port: u16, args: &[&str]) -> Running {
     server
 }
 
-/// Returns a port of this machine that nobody listens on.
 pub fn free_port() -> u16 {
     let listener = std::net::TcpListener::bind(("127.0.0.1", 0)).expect("binds");
     listener.local_addr().expect("an address").port()

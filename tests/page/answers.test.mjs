@@ -1,4 +1,4 @@
-// What the page says of answers and of none, and what people copy of them, over the small known scene.
+// The page's texts on answers and on none, and what people copy of them, over the small known scene.
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";

@@ -54,7 +54,7 @@ test("keys choose a suggestion, and screen readers are told which", () => opened
   const box = page.getByRole("combobox", { name: "Ask the scene" });
   await box.focus();
   const options = page.locator("#question-suggestions [role=option]");
-  // Nothing is typed: things on board, no others.
+  // Without input: objects on board only.
   assert.deepEqual(await options.allInnerTexts(), ["chair1", "ball1"]);
   await box.pressSequentially("wa");
   assert.deepEqual(await options.allInnerTexts(), ["wall", "red wall"]);
@@ -69,7 +69,7 @@ test("keys choose a suggestion, and screen readers are told which", () => opened
   await page.keyboard.press("Enter");
   await answered(page, "wall");
   assert.deepEqual([await box.inputValue(), await box.getAttribute("aria-expanded"), await options.count()], ["wall", "false", 0]);
-  // The negative that is begun is completed, and the words before it stay.
+  // The unfinished negative is completed, and the words before it stay.
   await box.fill("chair -ba");
   assert.deepEqual(await options.allInnerTexts(), ["chair -ball1"]);
   await page.keyboard.press("Escape");
@@ -88,7 +88,7 @@ test("a click chooses a suggestion, and a second question has its own", () => op
   assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=ball"));
 }));
 
-// A model that takes any text counts everyday words, some at a time.
+// For a model that takes any text, everyday words are counted, some at a time.
 test("things on board are suggested of a model without a list of words, as they are counted", () => opened(async (page, service) => {
   await drawn(page);
   await page.locator("#question").focus();

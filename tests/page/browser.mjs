@@ -1,4 +1,4 @@
-// Chromium with a software GPU, and what tests look at in it.
+// Chromium with a software GPU, and helpers of the tests.
 
 import assert from "node:assert/strict";
 import { mkdirSync, readFileSync } from "node:fs";

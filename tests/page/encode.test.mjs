@@ -52,8 +52,7 @@ test("slag-encoder encode: --report has the encode in one file; the bytes are th
     const column = (heading, at) => rowsUnder(heading).evaluateAll((rows, k) => rows.map((row) => row.children[k].innerText), at);
     const sum = (numbers) => numbers.reduce((a, b) => a + Number(b), 0);
     assert.equal(await rowsUnder("Cells").count(), summary.n_cells);
-    // The map has each camera where its pose is, x to the right and y up, and the one that was left out is the
-    // broken photo's.
+    // The map has each camera at its pose, x to the right and y up; the omitted one is the broken photo's.
     const circles = await page.locator("h2:text-is('Map') ~ figure circle").evaluateAll((all) => all.map((c) => ({
       isLeftOut: c.textContent.includes("left out"), x: Number(c.getAttribute("cx")), y: -Number(c.getAttribute("cy")),
     })));
@@ -69,7 +68,7 @@ test("slag-encoder encode: --report has the encode in one file; the bytes are th
     assert.equal(sum(await column("Views", 1)), summary.n_masks);
     const pictures = await page.locator("figure img").evaluateAll((all) => all.map((image) => image.naturalWidth));
     assert.ok(pictures.length >= N_VIEWS - 1 && pictures.every((width) => width > 100), String(pictures));
-    // Things: as many as the summary counts, their Gaussians as well, and with the ids that answers have.
+    // As many objects and Gaussians as in the summary, with the ids of answers.
     const ids = await column("Objects", 0);
     assert.equal(new Set(ids).size, summary.objects.n_objects);
     assert.equal(sum(await column("Objects", 3)), summary.objects.n_gaussians);

@@ -1,5 +1,5 @@
-// The built page in Chromium over a small known scene, whose service can refuse, vanish and publish at will:
-// what is lit is compared with the boxes that are true. `real.test.mjs` asks the real programs.
+// The built page in Chromium over a small known scene, whose service can refuse, vanish and publish at will: lit points
+// are compared with the true boxes. `real.test.mjs` asks the real programs.
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";

@@ -1,5 +1,4 @@
-// The page of the real programs in Chromium: what a question lights is compared with the mask of a photo that
-// the encoder never saw.
+// The page of the real programs in Chromium: lit points are compared with the mask of a photo that was not encoded.
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -175,7 +174,7 @@ test("another generation is told while the page is open, and a robot that goes a
   room.fetch(store.url);
   await page.getByText("generation 2 now").waitFor({ timeout: 30000 });
   await answered(page, THING);
-  // The store's page counts what its program's own command does, the robot's what its own route does.
+  // The store's page counts like its program's command, the robot's like its route.
   const { appeared, went, moved, n_same, n_stayed } = JSON.parse(run("slag-encoder", ["diff", room.store, "--json"]));
   assert.ok(appeared.length + went.length + moved.length > 0);
   await opened(store.url, async (of) => {

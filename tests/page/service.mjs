@@ -1,5 +1,4 @@
-// A service that speaks the page's protocol over a small known scene, so that tests can refuse, vanish and
-// publish at will.
+// A service with the page's protocol over a small known scene, which can refuse, vanish and publish at will.
 
 import { createReadStream, readFileSync, statSync } from "node:fs";
 import { createServer } from "node:http";

@@ -66,8 +66,7 @@ test("without a generation before, the service's words say so", () => opened(asy
   await page.locator("#changes").getByText("one generation alone").waitFor();
 }, { behaviour: { program: "slag-encoder", generation: 2 }, expected: /409/ }));
 
-// Where the test's camera is, it would be under the panel: this one looks at the scene's middle from the other
-// side.
+// The test's camera would have it under the panel: this one looks at the scene's middle from the other side.
 const PHOTO = { name: "roof/12.jpg", position_m: [1.5, 1.5, 1.2], rotation_xyzw: [0.7071068, 0, 0, 0.7071068], width_px: 640, height_px: 480, focal_px: 500, has_picture: false };
 
 test("a camera without its picture can be clicked and stood in", () => opened(async (page) => {
@@ -127,7 +126,7 @@ test("a geo-referenced scene has east, north and up, latitude and longitude, and
   await drawn(page);
   await answered(page, "chair");
   const red = await pixels(page, PANEL_PX, isColour([0xe0, 0x5a, 0x4e]));
-  // The arrow leaves the middle of the ground along y; beyond the floor it is seen.
+  // The arrow leaves the middle of the ground along y, visible beyond the floor.
   const [u, v] = project([0, 5.5, -0.1]);
   assert.ok(red.some(([x, y]) => Math.hypot(x + 0.5 - u, y + 0.5 - v) < 3));
   await page.locator("#answers .card").click();
@@ -161,7 +160,7 @@ test("of a large scene a part is drawn at first, then all, and fewer again where
   assert.deepEqual([first, second].map((asked) => [...new Set(asked.map(([, step]) => step))]), [[4], [1]]);
   const amount = page.locator("#amount");
   assert.match(await amount.textContent(), /^493,264 of 493,264 Gaussians/);
-  // A software GPU draws so many less than 25 times a second.
+  // A software GPU draws this many at less than 25 frames a second.
   await page.locator("#canvas").focus();
   await page.keyboard.down("ArrowLeft");
   await page.waitForFunction(() => document.getElementById("amount").textContent.startsWith("246,632 of 493,264"), null, { timeout: 120000 });

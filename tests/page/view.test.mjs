@@ -1,5 +1,5 @@
-// What a person sees at first, and of a chosen answer: the scene fills the screen, nothing covers what was chosen, lit
-// and unlit differ for every eye.
+// First impression and chosen answers: the scene fills the screen, nothing covers the chosen answer, and lit and unlit
+// differ for every eye.
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
@@ -70,7 +70,7 @@ test("cards have the photo's crop, whereabouts, size and how sure; the chosen on
   assert.equal(await page.locator("#answers li #details > :first-child").evaluate((first) => first.tagName), "FIGURE");
   const box = await page.locator("#details rect").evaluate((rect) => ["x", "y", "width", "height"].map((name) => Number(rect.getAttribute(name))));
   assert.deepEqual(box, [400, 200, 100, 100]);
-  // It looks from where the photo was taken, not farther away than that.
+  // It looks from the photo's position, not from farther away.
   const [from, to] = await cameraOf(page);
   const along = [0, 1, 2].map((k) => (from[k] - to[k]) / Math.hypot(...from.map((v, i) => v - to[i])));
   const toPhoto = PHOTO.position_m.map((v, k) => v - to[k]);
@@ -181,7 +181,7 @@ test("an arrow leads to what is out of view, a chip lists all that is on board",
   assert.equal(await chips.first().innerText(), "all30");
   await chips.first().click();
   assert.deepEqual([await chips.count(), await chips.last().innerText()], [30, "thing 291"]);
-  // It looks at the chair, then away from it, by half a turn to the left.
+  // It looks at the chair, then turns half round to the left.
   await page.fill("#question", "chair");
   await answered(page, "chair");
   const label = page.locator("#labels .answer");

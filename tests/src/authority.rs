@@ -1,4 +1,4 @@
-//! Certificates of an authority of our own.
+//! Certificates of a test authority.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use crate::text;
 
 pub struct Authority {
     issuer: Issuer<'static, KeyPair>,
-    /// Its certificate, PEM.
+    /// PEM.
     pub file: PathBuf,
 }
 
@@ -26,7 +26,7 @@ impl Authority {
         self.issue_as(IsCa::NoCa, cert, key);
     }
 
-    /// Issues a certificate, which may be an authority's.
+    /// Issues a certificate, perhaps an authority's.
     pub fn issue_as(&self, kind: IsCa, cert: &Path, key: &Path) {
         let own = KeyPair::generate().expect("a key");
         let mut params = CertificateParams::new(["127.0.0.1".to_owned()]).expect("an address");
@@ -35,7 +35,7 @@ impl Authority {
         fs_err::write(cert, params.signed_by(&own, &self.issuer).expect("signed").pem()).expect("written");
     }
 
-    /// Asks a service, as a client that knows this authority alone.
+    /// Requests a URL as a client that trusts this authority only.
     pub fn get(&self, url: &str) -> Result<String, ureq::Error> {
         let pem = fs_err::read(&self.file).expect("there");
         let root = ureq::tls::Certificate::from_pem(&pem).expect("a certificate");

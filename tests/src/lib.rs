@@ -1,4 +1,4 @@
-//! What the end-to-end tests share: the programs, the data beside the project, and accuracy measures.
+//! Shared by the end-to-end tests: programs, shared data, accuracy measures.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -25,10 +25,10 @@ pub fn root() -> PathBuf {
     slag_test_support::workspace_root()
 }
 
-/// Returns a program of the project, built as the tests are.
+/// Returns a program of the project, built like the tests.
 ///
-/// `./test.sh` builds all programs before the tests, and says so by `SLAG_PROGRAMS_ARE_BUILT`. Without that
-/// variable they are built first: a part of the tests may run alone.
+/// `./test.sh` builds all programs first and sets `SLAG_PROGRAMS_ARE_BUILT`; without it they are built here,
+/// because a part of the tests may run alone.
 pub fn program(name: &str) -> PathBuf {
     static BUILT: OnceLock<PathBuf> = OnceLock::new();
     let folder = BUILT.get_or_init(|| {
@@ -38,7 +38,7 @@ pub fn program(name: &str) -> PathBuf {
         if std::env::var_os("SLAG_PROGRAMS_ARE_BUILT").is_none() {
             let mut build = Command::new(env!("CARGO"));
             build.current_dir(root()).args(["build", "--workspace", "--bins", "--locked"]);
-            // scripts/timed-test.sh sets it, and cargo would build again what depends on it.
+            // Set by scripts/timed-test.sh; with it, cargo would rebuild what depends on it.
             build.env_remove("RUSTC_BOOTSTRAP");
             if folder.ends_with("release") {
                 build.arg("--release");
@@ -60,7 +60,7 @@ pub fn lab(args: &[&str]) -> Command {
 
 pub fn edge(args: &[&str]) -> Command {
     let mut command = command("slag-edge", args);
-    // Not this machine's own configuration.
+    // Ignores this machine's own configuration.
     command.env("SLAG_EDGE_CONFIG", "");
     command
 }
@@ -71,7 +71,7 @@ fn command(name: &str, args: &[&str]) -> Command {
     command
 }
 
-/// Runs a command that must succeed and returns its output.
+/// Runs a command that must succeed.
 pub fn run(command: &mut Command) -> Output {
     let output = command.output().expect("the program starts");
     assert!(
@@ -84,7 +84,7 @@ pub fn run(command: &mut Command) -> Output {
     output
 }
 
-/// Runs a command that must fail and say what is wrong; returns what it prints.
+/// Runs a command that must fail with `expected` in its output, which is returned.
 pub fn refused(command: &mut Command, expected: &str) -> String {
     let output = command.output().expect("the program starts");
     let printed = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
@@ -93,13 +93,13 @@ pub fn refused(command: &mut Command, expected: &str) -> String {
     printed
 }
 
-/// Runs a command that must succeed and returns the JSON object that it prints.
+/// Runs a command that must succeed; returns the JSON object that it prints.
 pub fn run_json(command: &mut Command) -> Value {
     let output = run(command.arg("--json"));
     serde_json::from_slice(&output.stdout).expect("one JSON object on stdout")
 }
 
-/// Returns the command that encodes a generated room into a store, in cells small enough that there are several.
+/// Encodes a generated room into a store, with cells small enough for several.
 pub fn encode_room(room: &Path, store: &Path) -> Command {
     let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
     let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
@@ -108,7 +108,7 @@ pub fn encode_room(room: &Path, store: &Path) -> Command {
     command
 }
 
-/// Returns the command by which a robot without trust fetches what lies around the middle of a generated room.
+/// Fetches the middle of a generated room to a robot without prior trust.
 pub fn fetch(from: &str, cache: &Path) -> Command {
     let mut command =
         edge(&["fetch", "--trust-first", "--from", from, "--at", "3.5,2.7,0", "--radius", "50"]);
@@ -120,7 +120,7 @@ pub fn read_json(path: &Path) -> Value {
     serde_json::from_slice(&fs_err::read(path).expect("the file is there")).expect("JSON")
 }
 
-/// As [`encode_room`], with the room's true masks and small rasters, which take a fifth of the time.
+/// Like [`encode_room`], with true masks and small rasters, in a fifth of the time.
 pub fn encode_quickly(room: &Path, store: &Path) -> Command {
     let mut command = encode_room(room, store);
     command.args(["--masks", text(&room.join("gt/masks")), "--raster-width", "320"]);
@@ -139,7 +139,7 @@ pub fn copy_dir(from: &Path, to: &Path) {
     }
 }
 
-/// Returns all files below a folder, in order of their paths.
+/// Sorted by path.
 pub fn files_below(folder: &Path) -> Vec<PathBuf> {
     let mut paths: Vec<PathBuf> =
         fs_err::read_dir(folder).expect("a folder").map(|entry| entry.expect("readable").path()).collect();
@@ -147,7 +147,7 @@ pub fn files_below(folder: &Path) -> Vec<PathBuf> {
     paths.into_iter().flat_map(|path| if path.is_dir() { files_below(&path) } else { vec![path] }).collect()
 }
 
-/// Returns the files of the project's own folders with an extension, without those that are built or installed.
+/// Files of the project's own folders with an extension, without built or installed ones.
 pub fn sources(extension: &str) -> Vec<PathBuf> {
     let is_made =
         |path: &Path| ["target", "node_modules", "dist"].map(Path::new).iter().any(|of| path.ends_with(of));
@@ -178,7 +178,7 @@ impl Service {
         Self::start_as(command.args(["--listen", "127.0.0.1:0"]))
     }
 
-    /// Starts any service that prints its address, and waits until it does.
+    /// Starts a service that prints its address, and waits until it does.
     pub fn start_as(command: &mut Command) -> Self {
         let mut child = command.stdout(Stdio::piped()).spawn().expect("starts");
         let mut lines = BufReader::new(child.stdout.take().expect("piped")).lines();
@@ -197,7 +197,7 @@ impl Service {
         Self { child, url }
     }
 
-    /// Serves a folder of static files by Python.
+    /// Serves a folder of static files with Python.
     pub fn of_files(folder: &Path) -> Self {
         let mut python = Command::new("python3");
         python.args("-u -m http.server 0 --bind 127.0.0.1 --directory".split(' ')).arg(folder);
@@ -219,7 +219,7 @@ impl Drop for Service {
     }
 }
 
-/// Returns the words of a command line; what is between quotes is one word.
+/// Words of a command line; text in quotes is one word.
 pub fn words(line: &str) -> Vec<String> {
     let parts = line.split('"').enumerate();
     let words = parts.flat_map(|(at, part)| match at % 2 {
@@ -238,7 +238,7 @@ pub fn read_npy<T: npyz::Deserialize>(path: &Path) -> Vec<T> {
     npyz::NpyFile::new(&bytes[..]).expect("a NumPy array").into_vec().expect("of the type asked for")
 }
 
-/// Returns the hashes of all shards and fields of a store, by role: what must not depend on the run.
+/// Hashes of all shards and fields of a store, by role: they must not depend on the run.
 pub fn content(store: &Path) -> Vec<(String, String)> {
     let manifest = read_json(&store.join("manifest"));
     let mut content = Vec::new();

@@ -1,4 +1,4 @@
-//! Scenes and stores that tests share: the programs make each once, and tests read it or write to a copy.
+//! Scenes and stores shared by tests: made once; tests read them, or write to a copy.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -8,16 +8,12 @@ use slag_common::Hash32;
 
 use crate::{copy_dir, encode_quickly, lab, program, run};
 
-/// Returns a generated scene: `scene.ply`, `transforms.json`, photos and their labels. Tests do not write to it.
-///
-/// `flags`: of `slag-lab generate scene`.
+/// Generated scene: `scene.ply`, `transforms.json`, photos, labels; read-only. `flags`: `slag-lab generate scene`'s.
 pub fn generated(flags: &[&str]) -> PathBuf {
     made("scene", flags, |out| drop(run(lab(&["generate", "scene", "--out"]).arg(out).args(flags))))
 }
 
-/// Returns a store of a generated scene; tests do not write to it. [`encoded_into`] makes a copy.
-///
-/// `flags`: of `slag-encoder encode`, in addition to those of [`encode_quickly`].
+/// Store of a generated scene; read-only. `flags`: `slag-encoder encode`'s, besides those of [`encode_quickly`].
 pub fn encoded(scene: &[&str], flags: &[&str]) -> PathBuf {
     let key = [scene, &["encode"], flags].concat();
     made("store", &key, |out| drop(run(encode_quickly(&generated(scene), out).args(flags))))
@@ -28,8 +24,8 @@ pub fn encoded_into(store: &Path, scene: &[&str], flags: &[&str]) {
     copy_dir(&encoded(scene, flags), store);
 }
 
-/// Returns the folder that `make` fills, unless this or another test program has filled it for the same kind, key
-/// and programs. It lies beside the programs; what other programs made is removed.
+/// Returns the folder that `make` fills, once per kind, key and build of the programs, for all test programs. It lies
+/// beside the programs; folders of other builds are removed.
 pub fn made(kind: &str, key: &[&str], make: impl FnOnce(&Path)) -> PathBuf {
     static MADE: OnceLock<PathBuf> = OnceLock::new();
     let folder = MADE.get_or_init(|| {
@@ -45,7 +41,7 @@ pub fn made(kind: &str, key: &[&str], make: impl FnOnce(&Path)) -> PathBuf {
         for entry in fs_err::read_dir(&all).expect("there") {
             let other = entry.expect("readable").path();
             if other != folder {
-                // Another test program may be at it as well.
+                // Another test program may remove it too.
                 let _ = std::fs::remove_dir_all(other);
             }
         }

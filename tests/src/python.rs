@@ -1,4 +1,4 @@
-//! Clients of other projects, which are Python packages: an environment for each list of requirements.
+//! Clients of other projects as Python packages: an environment for each list of requirements.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -6,10 +6,9 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::{program, root, run};
 
-/// Returns the Python of an environment that holds the packages of `FOLDER/requirements.txt`, a folder of the
-/// project.
+/// Returns the Python of an environment with the packages of `FOLDER/requirements.txt`.
 ///
-/// The environment lies beside the built programs and is made anew when the requirements change.
+/// The environment lies beside the built programs and is rebuilt when the requirements change.
 ///
 /// # Panics
 /// If it cannot be made; `scripts/setup.sh` installs Python and its `venv`.
@@ -32,7 +31,7 @@ pub fn python_with(folder: &str) -> PathBuf {
     python
 }
 
-/// Runs a Python script of the project, which fails where a program is wrong, and returns what it prints.
+/// Runs a Python script, which fails if a program is wrong; returns its output.
 pub fn judge(python: &Path, script: &str, args: &[&str]) -> String {
     let judged =
         run(Command::new(python).arg(root().join(script)).args(args).env("PYTHONDONTWRITEBYTECODE", "1"));

@@ -1,4 +1,4 @@
-//! A generated room that is encoded, served, and fetched to a robot's storage.
+//! A generated room: encoded, served, and fetched to a robot's storage.
 
 use std::path::PathBuf;
 
@@ -10,7 +10,7 @@ pub const ROOM: [&str; 2] = ["--n-views", "8"];
 /// Flags of the encode of a [`Site`].
 pub const SITE: [&str; 6] = ["--models", "colours", "--occupancy", "0.1", "--name", "room"];
 
-/// A service with a generated room whose things are known by their colours, and a robot's storage that holds it.
+/// A service with a generated room whose objects are known by colour, and a robot's storage with it.
 pub struct Site {
     /// The service that robots fetch from.
     pub store: Service,
@@ -34,7 +34,7 @@ impl Site {
         site
     }
 
-    /// Replaces the room by one with other things, and fetches this second generation.
+    /// Publishes a room with other objects, and fetches this second generation.
     pub fn publish_another(&self) {
         let other = generated(&["--n-views", "12", "--seed", "2"]);
         run(encode_room(&other, &self.dir.path().join("store")).args(SITE));

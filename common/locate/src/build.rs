@@ -1,4 +1,4 @@
-//! Makes a map from the features of the photos of a scene.
+//! Makes a map from features of a scene's photos.
 
 use std::cmp::Reverse;
 
@@ -9,11 +9,11 @@ use slag_common::landmarks::Landmark;
 use crate::map::{Code, distance, middle};
 use crate::pose::Pinhole;
 
-/// Views that a view's points are looked for in: those that look at places nearest to its own.
+/// Neighbours in which a view's points are searched: the views of the nearest places.
 const N_NEIGHBOURS: usize = 24;
-/// Distance between a point and a feature of another view that shows it, pixels.
+/// Largest distance between a projected point and a feature of another view that shows it, pixels.
 const SAME_FEATURE_PX: f64 = 3.0;
-/// Bits in which the codes of one point may differ in two views.
+/// Largest difference of the codes of one point in two views, bits.
 const SAME_FEATURE_BITS: u32 = 36;
 
 /// A feature of a mapping photo whose depth is known.
@@ -34,11 +34,10 @@ pub struct MappingView {
     pub observations: Vec<Observation>,
 }
 
-/// Bytes that [`build`] takes for each observation and beside it: whether it is chosen or hidden, its rank, its bin.
+/// Bytes that [`build`] takes per observation, besides itself: chosen and hidden flags, rank, bin.
 pub const WORKING_BYTES_PER_OBSERVATION: usize = 2 + size_of::<u32>() + size_of::<Binned>();
 
-/// Returns at most `limit` landmarks: of each view, its share of the points that most of its neighbours show, too.
-/// A point that several views show is taken once.
+/// Returns at most `limit` landmarks, in turn from each view, those in most of its neighbours first, each point once.
 pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
     let finders: Vec<Finder<'_>> = views.iter().map(Finder::new).collect();
     let middles: Vec<DVec3> = views
@@ -55,13 +54,13 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
         others
     };
     let neighbours: Vec<Vec<usize>> = (0..views.len()).map(neighbours).collect();
-    // The observations of other views that show the same point: view, observation. They are found again where a point
-    // is chosen: kept for all, they would take ten times the memory of the observations.
+    // (view, observation) of the same point in other views. Recomputed for chosen points, because storing all
+    // would take ten times the memory of the observations.
     let seen = |at: usize, index: usize| {
         let (of, finders) = (&views[at].observations[index], &finders);
         neighbours[at].iter().filter_map(move |other| Some((*other, finders[*other].find(of)?)))
     };
-    // By view: observations, those that most others show first.
+    // Per view: observations, those that most others show first.
     let ranked: Vec<Vec<u32>> = (0..views.len())
         .map(|at| {
             let mut ranked: Vec<u32> = (0..views[at].observations.len() as u32).collect();
@@ -71,7 +70,7 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
         .collect();
     let mut next = vec![0; views.len()];
     let mut landmarks = Vec::new();
-    // In turn, one of each view, until there are enough or no more.
+    // One of each view in turn, until there are enough or none is left.
     loop {
         let before = landmarks.len();
         for (at, view) in views.iter().enumerate() {
@@ -96,7 +95,6 @@ pub fn build(views: &[MappingView], limit: usize) -> Vec<Landmark> {
     }
 }
 
-/// Finds the feature of a view at a place.
 struct Finder<'a> {
     view: &'a MappingView,
     camera: Pinhole,
@@ -104,10 +102,9 @@ struct Finder<'a> {
     bins: Vec<Binned>,
 }
 
-/// A bin, and an observation in it.
 type Binned = ([i32; 2], u32);
 
-/// Returns the bin of a pixel. What lies near the camera's plane is seen millions of pixels away, where no feature is.
+/// Returns the bin of a pixel. Points near the camera's plane project millions of pixels away, where no feature is.
 fn bin(at: DVec2) -> [i32; 2] {
     at.to_array().map(|at| (at / SAME_FEATURE_PX).floor().clamp(-1e9, 1e9) as i32)
 }
@@ -120,7 +117,7 @@ impl<'a> Finder<'a> {
         Self { view, camera: Pinhole::new(&view.intrinsics), bins }
     }
 
-    /// Returns the view's feature that shows the point of another view's.
+    /// Returns the view's feature of the same point as an observation of another view.
     fn find(&self, of: &Observation) -> Option<usize> {
         let at = self.camera.pixel(self.view.camera_from_world.transform_point3(of.point_in_world))?;
         let [x, y] = bin(at);

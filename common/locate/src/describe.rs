@@ -4,36 +4,36 @@ use std::f32::consts::TAU;
 
 use crate::grey::Grey;
 
-/// Numbers of a descriptor: 4 x 4 places, 8 directions.
+/// Length of a descriptor: 4 x 4 cells, 8 directions.
 pub const DIM: usize = PLACES * PLACES * DIRECTIONS;
-/// The root of a SIFT descriptor's share in each direction (RootSIFT; Arandjelovic and Zisserman 2012): of length 1.
+/// RootSIFT (Arandjelovic and Zisserman 2012): the square root of each share of a SIFT descriptor; of length 1.
 pub type Descriptor = [f32; DIM];
 
 const PLACES: usize = 4;
 const DIRECTIONS: usize = 8;
 const ORIENTATION_BINS: usize = 36;
-/// Other peaks of the histogram from which a keypoint has another orientation.
+/// Share of the highest peak from which another peak gives the keypoint another orientation.
 const OTHER_PEAK: f32 = 0.8;
-/// Standard deviation of the window for orientations, in the keypoint's.
+/// Standard deviation of the orientation window, in the keypoint's.
 const ORIENTATION_WINDOW: f32 = 1.5;
-/// Width of a place, in the keypoint's standard deviations (Lowe's code; Vedaldi and Fulkerson 2008).
+/// Width of a cell, in the keypoint's standard deviations (Lowe's code; Vedaldi and Fulkerson 2008).
 const PLACE_WIDTH: f32 = 3.0;
-/// Largest share of one number, which bounds the effect of highlights.
+/// Largest share of one number, which limits the effect of highlights.
 const MAX_SHARE: f32 = 0.2;
 
-/// An extremum, in an octave's pixels.
+/// An extremum, in pixels of its octave.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Keypoint {
     pub(crate) x: f32,
     pub(crate) y: f32,
-    /// The blurred picture that is nearest in scale.
+    /// The blurred image nearest in scale.
     pub(crate) layer: usize,
-    /// Blur, the octave's pixels.
+    /// Blur, pixels of the octave.
     pub(crate) sigma: f32,
     pub(crate) contrast: f32,
 }
 
-/// Returns the gradient at a pixel: its length and its direction, 0..TAU.
+/// Length and direction (0..TAU) of the gradient at a pixel.
 fn gradient(layer: &Grey, x: usize, y: usize) -> (f32, f32) {
     let at = y * layer.width + x;
     let dx = layer.values[at + 1] - layer.values[at - 1];
@@ -41,7 +41,7 @@ fn gradient(layer: &Grey, x: usize, y: usize) -> (f32, f32) {
     ((dx * dx + dy * dy).sqrt(), dy.atan2(dx).rem_euclid(TAU))
 }
 
-/// Returns the pixels at most `radius` from a place that have a gradient, as offsets and indices.
+/// Returns the pixels within `radius` of a keypoint that have a gradient: offsets and indices.
 fn around(layer: &Grey, keypoint: &Keypoint, radius: f32) -> impl Iterator<Item = (f32, f32, usize, usize)> {
     let range = |at: f32, n: usize| {
         let first = (at - radius).ceil().max(1.0) as usize;
@@ -53,7 +53,7 @@ fn around(layer: &Grey, keypoint: &Keypoint, radius: f32) -> impl Iterator<Item 
         .flat_map(move |y| columns.clone().map(move |x| (x as f32 - cx, y as f32 - cy, x, y)))
 }
 
-/// Returns the orientations of a keypoint: the peaks of the histogram of the gradients around it.
+/// Returns the peaks of the gradient histogram around a keypoint.
 pub(crate) fn orientations(layer: &Grey, keypoint: &Keypoint) -> Vec<f32> {
     let window = ORIENTATION_WINDOW * keypoint.sigma;
     let mut bins = [0.0f32; ORIENTATION_BINS];
@@ -64,7 +64,7 @@ pub(crate) fn orientations(layer: &Grey, keypoint: &Keypoint) -> Vec<f32> {
         bins[bin] += weight * length;
     }
     let n = ORIENTATION_BINS;
-    // Smoothed by (1, 4, 6, 4, 1) / 16, as Lowe's code.
+    // Smoothed by (1, 4, 6, 4, 1) / 16, like Lowe's code.
     let smooth: [f32; ORIENTATION_BINS] = std::array::from_fn(|i| {
         let at = |step: usize| bins[(i + step) % n];
         (at(0) * 6.0 + (at(1) + at(n - 1)) * 4.0 + at(2) + at(n - 2)) / 16.0
@@ -74,7 +74,7 @@ pub(crate) fn orientations(layer: &Grey, keypoint: &Keypoint) -> Vec<f32> {
     for i in 0..n {
         let (before, at, after) = (smooth[(i + n - 1) % n], smooth[i], smooth[(i + 1) % n]);
         if at > before && at > after && at >= OTHER_PEAK * highest {
-            // The peak of the parabola through the three.
+            // Peak of the parabola through the three.
             let peak = i as f32 + 0.5 * (before - after) / (before - 2.0 * at + after);
             found.push((peak / n as f32 * TAU).rem_euclid(TAU));
         }
@@ -86,7 +86,7 @@ pub(crate) fn describe(layer: &Grey, keypoint: &Keypoint, angle: f32) -> Descrip
     let (sin, cos) = angle.sin_cos();
     let place = PLACE_WIDTH * keypoint.sigma;
     let half = PLACES as f32 / 2.0;
-    // A corner of the rotated square, with the half place beyond that interpolation reaches.
+    // A corner of the rotated square, plus the half cell that interpolation reaches.
     let radius = place * (half + 0.5) * std::f32::consts::SQRT_2;
     // One bin of padding at each border, and directions that wrap.
     const PADDED: usize = PLACES + 2;
@@ -119,7 +119,7 @@ pub(crate) fn describe(layer: &Grey, keypoint: &Keypoint, angle: f32) -> Descrip
     out
 }
 
-/// Limits the largest numbers of a descriptor and takes its root.
+/// Clips the largest numbers of a descriptor, and takes the root of their shares.
 fn normalise(out: &mut Descriptor) {
     let length = out.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
     out.iter_mut().for_each(|v| *v = v.min(MAX_SHARE * length));

@@ -1,45 +1,45 @@
-//! Features of a photo: SIFT (Lowe 2004). Keypoints are extrema of differences of Gaussians, in position to a
-//! fraction of a pixel and in scale; each has an orientation, and a descriptor of the gradients around it.
+//! SIFT features (Lowe 2004): extrema of differences of Gaussians, subpixel in position and scale, each with an
+//! orientation and a descriptor of the gradients around it.
 
 use crate::describe::{Descriptor, Keypoint, describe, orientations};
 use crate::grey::Grey;
 
 pub const MAX_FEATURES: usize = 1200;
-/// Scales an octave (Lowe 2004, 3.1).
+/// Scales per octave (Lowe 2004, 3.1).
 const SCALES: usize = 3;
-/// Blur of the first scale of an octave, its pixels (Lowe 2004, 3.3).
+/// Blur of an octave's first scale, its pixels (Lowe 2004, 3.3).
 const SIGMA: f32 = 1.6;
-/// Blur that a photo is taken to have, pixels.
+/// Assumed blur of a photo, pixels.
 const CAMERA_SIGMA: f32 = 0.5;
-/// Least contrast of a keypoint, of 0..=1. Lowe has 0.03; on plain walls of rooms most keypoints that two photos share
-/// are weaker, and elsewhere the strongest are taken.
+/// Least contrast of a keypoint, of 0..=1. Lowe has 0.03; on plain walls most keypoints that two photos share are
+/// weaker, and elsewhere the strongest are kept.
 const MIN_CONTRAST: f32 = 0.0067;
-/// Largest ratio of the principal curvatures: above it lies an edge (Lowe 2004, 4.1).
+/// Largest ratio of principal curvatures; above it is an edge (Lowe 2004, 4.1).
 const MAX_CURVATURE_RATIO: f32 = 10.0;
-/// Pixels at the border of each octave without keypoints.
+/// Width of the border of each octave without keypoints, pixels.
 const BORDER: usize = 5;
 const MAX_STEPS: usize = 5;
-/// Pixels up to which a photo keeps its size: see [`working_bytes`].
+/// Larger photos are halved: see [`working_bytes`].
 pub(crate) const MAX_PX: usize = 1_500_000;
 /// Shortest side of an octave, pixels.
 const MIN_SIDE: usize = 16;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Feature {
-    /// Where, pixels; the centre of the first pixel is 0.5.
+    /// Pixels; the centre of the first pixel is 0.5.
     pub at: [f64; 2],
     /// Blur at which it was found, pixels of the photo.
     pub sigma: f32,
     /// Direction of the gradients around it, radians.
     pub angle: f32,
-    /// Contrast, 0..=1.
+    /// Of 0..=1.
     pub contrast: f32,
     pub descriptor: Descriptor,
 }
 
 struct Octave {
     layers: Vec<Grey>,
-    /// Width of its pixels, in the photo's.
+    /// Width of its pixels, in pixels of the photo.
     pixel: f32,
 }
 
@@ -49,7 +49,7 @@ pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
     if photo.width < MIN_SIDE || photo.height < MIN_SIDE {
         return Vec::new();
     }
-    // Doubled, so that the finest details become keypoints; its blur doubles, too.
+    // Doubled, so that the finest details become keypoints; this doubles the blur.
     let first = (SIGMA * SIGMA - 4.0 * CAMERA_SIGMA * CAMERA_SIGMA).sqrt();
     let mut base = photo.doubled().blurred(first);
     let mut pixel = 0.5 * factor as f32;
@@ -58,7 +58,7 @@ pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
     while base.width >= MIN_SIDE && base.height >= MIN_SIDE {
         let layers = blurred_layers(base);
         let mut keypoints = extrema(&layers);
-        // No more of one octave than of all: bounds the memory on noise.
+        // No octave keeps more than the total limit: bounds the memory on noise.
         keypoints.sort_by(stronger);
         keypoints.truncate(limit);
         found.extend(keypoints.into_iter().map(|keypoint| (octaves.len(), keypoint)));
@@ -71,7 +71,7 @@ pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
         let Octave { layers, pixel } = &octaves[octave];
         let layer = &layers[keypoint.layer];
         orientations(layer, &keypoint).into_iter().map(move |angle| Feature {
-            // Pixel 0 of the doubled picture is the middle of the photo's first pixel.
+            // Pixel 0 of the doubled image is the centre of the photo's first pixel.
             at: [keypoint.x, keypoint.y].map(|c| f64::from(c * pixel) + 0.5 * f64::from(factor)),
             sigma: keypoint.sigma * pixel,
             angle,
@@ -82,14 +82,13 @@ pub fn features(photo: &Grey, limit: usize) -> Vec<Feature> {
     found.into_iter().flat_map(of_keypoint).take(limit).collect()
 }
 
-/// Returns the bytes that finding the features of a photo takes at most, the photo itself not counted.
+/// Most bytes for finding the features of a photo, besides the photo.
 pub fn working_bytes(width: usize, height: usize) -> usize {
     let mut n_px = width * height;
     while n_px > MAX_PX {
         n_px /= 4;
     }
-    // The halved photo, and of the photo doubled in width and height each layer, the sum of all octaves, and a
-    // picture between two passes.
+    // The halved photo; and, of the doubled photo, each layer over all octaves, and an image between two passes.
     let n_layers = SCALES + 3;
     n_px.max(width * height / 4) * size_of::<f32>() + 4 * n_px * size_of::<f32>() * (n_layers * 4 / 3 + 2)
 }
@@ -98,7 +97,7 @@ fn stronger(a: &Keypoint, b: &Keypoint) -> std::cmp::Ordering {
     b.contrast.total_cmp(&a.contrast).then(a.y.total_cmp(&b.y)).then(a.x.total_cmp(&b.x))
 }
 
-/// Returns the pictures of an octave: blur [`SIGMA`] times `2^(i / SCALES)`.
+/// Images of an octave: blur [`SIGMA`] times `2^(i / SCALES)`.
 fn blurred_layers(base: Grey) -> Vec<Grey> {
     let step = 2f32.powf(1.0 / SCALES as f32);
     let mut layers = vec![base];
@@ -121,7 +120,7 @@ impl Differences<'_> {
         self.layers[layer + 1].values[pixel] - self.layers[layer].values[pixel]
     }
 
-    /// Returns whether no neighbour in space and scale is further from 0.
+    /// Whether no neighbour in space and scale is farther from 0.
     fn is_extremum(&self, layer: usize, pixel: usize, value: f32) -> bool {
         let sign = value.signum();
         let rows = [pixel - self.width, pixel, pixel + self.width];
@@ -131,7 +130,7 @@ impl Differences<'_> {
         })
     }
 
-    /// Returns the gradient and the Hessian along x, y and scale.
+    /// Gradient and Hessian along x, y and scale.
     fn derivatives(&self, layer: usize, pixel: usize) -> ([f32; 3], [[f32; 3]; 3]) {
         let w = self.width;
         let d = |layer: usize, pixel: usize| self.at(layer, pixel);
@@ -158,7 +157,7 @@ impl Differences<'_> {
 fn extrema(layers: &[Grey]) -> Vec<Keypoint> {
     let (width, height) = (layers[0].width, layers[0].height);
     let differences = Differences { layers, width };
-    // Contrast before interpolation may be lower (as OpenCV's).
+    // Contrast before interpolation may be lower (as in OpenCV).
     let least = 0.5 * MIN_CONTRAST;
     let mut found = Vec::new();
     for layer in 1..=SCALES {
@@ -175,7 +174,7 @@ fn extrema(layers: &[Grey]) -> Vec<Keypoint> {
     found
 }
 
-/// Returns the extremum near a pixel (Lowe 2004, 4), if it is one, has contrast and is no edge.
+/// Returns the extremum near a pixel (Lowe 2004, 4) unless it lacks contrast or is an edge.
 fn interpolate(
     differences: &Differences<'_>,
     mut layer: usize,

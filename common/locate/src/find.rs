@@ -1,4 +1,4 @@
-//! From a photo to the pose of its camera, or to the reason why there is none.
+//! From a photo to the pose of its camera, or the reason why there is none.
 
 use glam::{DAffine3, DVec2, DVec3};
 use slag_common::Intrinsics;
@@ -12,39 +12,38 @@ use crate::ransac::{Agreed, INLIER_PX, locally_refined, ransac};
 use crate::render::{Compared, Renderer};
 
 const MIN_FEATURES: usize = 20;
-/// Fewest inliers of a pose that no rendering verifies; of photos of other scenes 15 agree at most.
+/// Fewest inliers of an unverified pose; photos of other scenes reach 15 at most.
 const MIN_INLIERS: usize = 20;
-/// The same where a rendering shows something else: 33 agree on a car that stands in two scenes.
+/// The same if a rendering contradicts it: a car in two scenes reaches 33.
 const MIN_INLIERS_AGAINST_RENDERING: usize = 40;
-/// Fewest inliers of a pose that is told as a candidate.
+/// Fewest inliers of a candidate.
 const MIN_UNSURE_INLIERS: usize = 12;
-/// Share of the best pose's inliers from which a pose elsewhere is its rival.
+/// A pose elsewhere with this share of the best pose's inliers is a rival.
 const RIVAL_SHARE: f64 = 0.7;
-/// Fewest inliers among matches with a rendering at the pose; of photos of other scenes 7 agree at most.
+/// Fewest inliers among matches with a rendering at the pose; photos of other scenes reach 7 at most.
 const MIN_RENDERED_INLIERS: usize = 12;
-/// Fewest inliers among them for which another rendering, at the pose that they give, is tried.
+/// Fewest of these inliers for another rendering, at the pose that they give.
 const MIN_NEARER_INLIERS: usize = 8;
-/// Error of a patch that agrees with a pose, pixels.
+/// Largest error of a patch that agrees with a pose, pixels.
 const PATCH_INLIER_PX: f64 = 2.0;
-/// Fewest patches that verify a pose, and their share of those that were tried: of photos of other scenes 22 agree
-/// at most, those less than 3 %.
+/// Fewest patches that verify a pose, and their share of those tried; other scenes reach at most 22, below 3 %.
 const MIN_PATCHES: usize = 20;
 const MIN_PATCH_SHARE: f64 = 0.04;
-/// Renderings for one proposed pose, and proposed poses for which there are renderings.
+/// Most renderings per proposed pose, and most proposed poses with renderings.
 const MAX_RENDERINGS: usize = 2;
 const MAX_PROPOSALS: usize = 4;
 const MIN_PROPOSED_INLIERS: usize = 5;
-/// Least spread of the inliers on the photo: standard deviation along their shorter axis, as a share of its width.
+/// Least spread of inliers on the photo: standard deviation along their shorter axis, as a share of its width.
 const MIN_SPREAD: f64 = 0.04;
-/// Largest angle between the stated direction of gravity and the one that the pose gives: 10 degrees.
+/// Largest angle between stated direction of gravity and that of the pose: 10 degrees.
 const MAX_GRAVITY_ANGLE: f64 = 0.175;
 
-/// What is known about a photo besides its pixels.
+/// A photo, and what is known about it.
 #[derive(Clone, Copy, Debug)]
 pub struct Photo<'a> {
     pub grey: &'a Grey,
     pub intrinsics: &'a Intrinsics,
-    /// Direction of gravity in the camera's frame; the world's is down z.
+    /// Direction of gravity in the camera frame; in the world it is -z.
     pub gravity_in_camera: Option<DVec3>,
     pub prior: Option<Prior>,
 }
@@ -57,7 +56,6 @@ pub struct Prior {
 }
 
 impl Photo<'_> {
-    /// Returns why a pose does not fit the photo's gravity or prior, if it does not.
     fn contradiction(&self, camera_from_world: &DAffine3) -> Option<Reason> {
         let down = camera_from_world.transform_vector3(DVec3::NEG_Z);
         if self.gravity_in_camera.is_some_and(|gravity| down.angle_between(gravity) > MAX_GRAVITY_ANGLE) {
@@ -69,16 +67,15 @@ impl Photo<'_> {
     }
 }
 
-/// Standard deviations of a [`Prior`] within which poses lie.
 const PRIOR_SIGMAS: f64 = 3.0;
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
     pub camera_from_world: DAffine3,
-    /// Of position and rotation in the world, `[6][6]`; the rotation is a small one about the world's axes.
+    /// Covariance `[6][6]` of position and rotation in the world; the rotation is a small one about the world's axes.
     pub covariance: [f64; 36],
     pub n_inliers: usize,
-    /// Whether a rendering at the pose shows what the photo shows.
+    /// Whether a rendering at the pose matches the photo.
     pub is_verified: bool,
 }
 
@@ -135,9 +132,7 @@ impl std::fmt::Display for Reason {
     }
 }
 
-/// Finds the camera of a photo. Same input, same answer.
-///
-/// A pose that no rendering verifies needs more inliers.
+/// Finds the camera of a photo, deterministically. A pose that no rendering verifies needs more inliers.
 pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> Outcome {
     if map.is_empty() {
         return Outcome::Lost(Reason::EmptyMap);
@@ -167,7 +162,7 @@ pub fn locate(map: &Map, photo: &Photo<'_>, renderer: Option<&dyn Renderer>) -> 
 
 const SEED: u64 = 47;
 
-/// What renderings at proposed poses say.
+/// Result of renderings at proposed poses.
 enum Verified {
     Yes(Box<Located>),
     No,
@@ -183,9 +178,8 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Returns poses on which matches with the map agree, those with most inliers first: of matches with all
-    /// landmarks and with those of a few views; unless the first suffice, also of matches with single places, of
-    /// which two may look alike.
+    /// Returns poses by number of inliers: from matches with all landmarks and with those of a few views and,
+    /// unless these suffice, with single places, of which two may look alike.
     fn proposals(&self) -> Vec<Agreed> {
         let agreed = |matches: &[Match]| ransac(&self.camera, matches, SEED);
         let all = self.query.match_all(self.map);
@@ -214,7 +208,7 @@ impl Search<'_> {
         a.distance_squared(b) <= SAME_POSE * self.map.same_place
     }
 
-    /// Returns a pose refined on the landmarks that it shows where the photo does.
+    /// Refines a pose on the landmarks that the photo shows where the pose predicts.
     fn guided(&self, one: &Agreed) -> Agreed {
         let pose = one.camera_from_world;
         let matches = self.query.match_guided(self.map, &self.camera, &pose, self.size_px);
@@ -235,7 +229,7 @@ impl Search<'_> {
         verified
     }
 
-    /// Returns the pose by matches with renderings, each at the pose that the one before gives.
+    /// Returns the pose from matches with renderings, each at the pose that the previous one gives.
     fn rendered(&self, one: &Agreed, renderer: &dyn Renderer, compared: &Compared<'_>) -> Verified {
         let landmarks = self.guided(one);
         let mut pose = landmarks.camera_from_world;
@@ -261,7 +255,7 @@ impl Search<'_> {
         verified
     }
 
-    /// Returns the pose on which patches agree, if they are enough to verify it.
+    /// Returns the pose on which patches agree, if they suffice to verify it.
     fn agreed_patches(&self, (matches, n_tried): &(Vec<Match>, usize)) -> Option<Agreed> {
         let mut agreed = ransac(&self.camera, matches, SEED)?;
         agreed.inliers.retain(|one| self.camera.error(&agreed.camera_from_world, one) < PATCH_INLIER_PX);
@@ -269,8 +263,8 @@ impl Search<'_> {
         (n >= MIN_PATCHES && n as f64 >= MIN_PATCH_SHARE * *n_tried as f64).then_some(agreed)
     }
 
-    /// Returns a pose that a rendering verified, refined on landmarks, too: those of the proposed pose, or those
-    /// that it shows itself. Where the splat lacks the texture of photos, landmarks are more, and better.
+    /// Refines a verified pose on landmarks too: those of the proposed pose, or its own. Where the splat lacks the
+    /// texture of photos, landmarks are more and better.
     fn with_landmarks(&self, proposed: &Agreed, verified: Agreed) -> Agreed {
         let own = self.guided(&verified);
         let landmarks = if own.inliers.len() > proposed.inliers.len() { &own } else { proposed };
@@ -303,7 +297,6 @@ impl Search<'_> {
         }
     }
 
-    /// Returns the pose if its inliers spread over the photo and it fits gravity and prior.
     fn located(&self, agreed: &Agreed, is_verified: bool) -> Result<Located, Reason> {
         let Agreed { camera_from_world, inliers, .. } = agreed;
         if spread(inliers) < MIN_SPREAD * self.size_px.x {
@@ -322,10 +315,10 @@ impl Search<'_> {
     }
 }
 
-/// Squared distance of two cameras that stand in one place, in the map's.
+/// Squared distance up to which two camera positions are the same, in units of the map's `same_place`.
 const SAME_POSE: f64 = 25.0;
 
-/// Returns the standard deviation of the matches' places along their shorter axis, pixels.
+/// Standard deviation of the matches' places along their shorter axis, pixels.
 fn spread(matches: &[Match]) -> f64 {
     let n = matches.len().max(1) as f64;
     let mean = matches.iter().map(|one| one.at).sum::<DVec2>() / n;
@@ -339,11 +332,11 @@ fn spread(matches: &[Match]) -> f64 {
     least.max(0.0).sqrt()
 }
 
-/// Returns where an ideal pinhole shows a feature, pixels.
+/// Returns the position of a feature in an ideal pinhole's image, pixels.
 fn ideal(intrinsics: &Intrinsics, feature: &Feature) -> DVec2 {
     let distorted = intrinsics.distorted_from_pixel(feature.at);
     let mut ideal = distorted;
-    // A fixed point: lenses of photos that can be undistorted contract.
+    // Fixed point: lenses of photos that can be undistorted contract.
     for _ in 0..UNDISTORT_ROUNDS {
         let again = intrinsics.distort(ideal);
         ideal = [ideal[0] + distorted[0] - again[0], ideal[1] + distorted[1] - again[1]];

@@ -1,8 +1,8 @@
-//! Grey pictures, and the few filters that features need.
+//! Grey images, and the few filters that features need.
 
 use std::borrow::Cow;
 
-/// A grey picture, row-major, 0..=1.
+/// A grey image, row-major, 0..=1.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Grey {
     pub width: usize,
@@ -10,11 +10,11 @@ pub struct Grey {
     pub values: Vec<f32>,
 }
 
-/// Standard deviations that a Gaussian kernel reaches: what it leaves out is below 1e-4.
+/// Radius of a Gaussian kernel in standard deviations: the rest is below 1e-4.
 const KERNEL_SIGMAS: f32 = 4.0;
 
 impl Grey {
-    /// Takes the luma (ITU-R BT.601) of 8-bit RGB.
+    /// Luma (ITU-R BT.601) of 8-bit RGB.
     pub fn from_rgb8(width: usize, height: usize, rgb: &[u8]) -> Self {
         assert_eq!(rgb.len(), width * height * 3, "three bytes a pixel");
         let luma = |[r, g, b]: &[u8; 3]| {
@@ -23,7 +23,7 @@ impl Grey {
         Self { width, height, values: rgb.as_chunks().0.iter().map(luma).collect() }
     }
 
-    /// Returns the picture in twice the size (bilinear). Pixel (x, y) lies at (2x, 2y).
+    /// Doubles the size (bilinear); pixel (x, y) moves to (2x, 2y).
     pub(crate) fn doubled(&self) -> Self {
         let (width, height) = (self.width * 2, self.height * 2);
         let mut values = vec![0.0; width * height];
@@ -39,7 +39,6 @@ impl Grey {
         Self { width, height, values }
     }
 
-    /// Returns every second pixel.
     pub(crate) fn halved(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
         let mut values = Vec::with_capacity(width * height);
@@ -49,7 +48,7 @@ impl Grey {
         Self { width, height, values }
     }
 
-    /// Returns the means of 2 x 2 pixels; an odd last row or column is left out.
+    /// Means of 2 x 2 pixels; an odd last row or column is dropped.
     fn halved_by_mean(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
         let mut values = Vec::with_capacity(width * height);
@@ -61,8 +60,7 @@ impl Grey {
         Self { width, height, values }
     }
 
-    /// Halves the picture until it has at most `max_px` pixels; returns how many of its pixels one of the result
-    /// is wide.
+    /// Halves the image until it has at most `max_px` pixels; returns the width of a resulting pixel in original ones.
     pub(crate) fn limited(&self, max_px: usize) -> (Cow<'_, Self>, u32) {
         let (mut picture, mut factor) = (Cow::Borrowed(self), 1);
         while picture.values.len() > max_px {
@@ -72,7 +70,7 @@ impl Grey {
         (picture, factor)
     }
 
-    /// Returns the picture blurred by a Gaussian; borders are repeated.
+    /// Gaussian blur; borders are repeated.
     pub(crate) fn blurred(&self, sigma: f32) -> Self {
         let radius = (KERNEL_SIGMAS * sigma).ceil() as usize;
         let weight = |i: usize| (-0.5 * (i as f32 / sigma).powi(2)).exp();

@@ -1,9 +1,9 @@
 //! Finds the camera of a photo in a map of landmarks, without a GPU, a network or a model.
 //!
-//! [`features`] (SIFT) become codes of 128 bits ([`code`]). Those of mapping photos, whose depth the splat gives,
-//! make the map ([`build()`]); those of a photo are matched with it, and the pose on which most matches agree is
-//! the answer ([`locate`]). A rendering of the scene at that pose verifies and improves it ([`Renderer`]): by its
-//! features, or by patches of the photo that are found in it.
+//! [`features`] (SIFT) become codes of 128 bits ([`code`]). Those of mapping photos, with depths from the splat,
+//! make the map ([`build()`]); those of a photo are matched with it, and the answer is the pose with most inliers
+//! ([`locate`]). A rendering of the scene at that pose ([`Renderer`]) verifies and improves it by features or,
+//! where the splat is too blurred, by patches.
 #![forbid(unsafe_code)]
 
 mod build;

@@ -7,16 +7,16 @@ use slag_common::landmarks::Landmark;
 
 use crate::describe::{DIM, Descriptor};
 
-/// Share of the map's size within which two landmarks are one place: such a second-best match is no rival.
+/// Landmarks within this share of the map's size are one place: such a second-best match is no rival.
 const SAME_PLACE: f64 = 0.01;
 
-/// The landmarks of a scene, or of the part that is on board.
+/// The landmarks of a scene, or of its part on board.
 #[derive(Clone, Debug)]
 pub struct Map {
     pub(crate) landmarks: Vec<Landmark>,
-    /// By view: indices of landmarks.
+    /// Per view: indices of landmarks.
     pub(crate) of_views: BTreeMap<u16, Vec<u32>>,
-    /// By view: the median of its landmarks' positions.
+    /// Per view: the median of its landmarks' positions.
     middles: BTreeMap<u16, DVec3>,
     /// Squared distance up to which two landmarks are one place.
     pub(crate) same_place: f64,
@@ -30,13 +30,13 @@ impl Map {
         }
         let positions = |of: &[u32]| of.iter().map(|at| landmarks[*at as usize].position_in_world).collect();
         let middles = of_views.iter().map(|(view, of)| (*view, middle(positions(of)))).collect();
-        // Medians: a few landmarks far away do not make the scene large.
+        // Medians, so that a few landmarks far away do not enlarge the scene.
         let of_all = middle(landmarks.iter().map(|l| l.position_in_world).collect());
         let size = median(landmarks.iter().map(|l| l.position_in_world.distance(of_all)).collect());
         Self { of_views, middles, same_place: (SAME_PLACE * size).powi(2), landmarks }
     }
 
-    /// Returns the landmarks of the `n` views that show places nearest to those of a view, itself included.
+    /// Returns the landmarks of the `n` views nearest to a view by place, itself included.
     pub(crate) fn around(&self, view: u16, n: usize) -> Vec<u32> {
         let middle = self.middles[&view];
         let mut views: Vec<(u16, f64)> =
@@ -54,7 +54,7 @@ impl Map {
     }
 }
 
-/// Returns the bytes of a map of `n` landmarks: in it, and in its views' lists and one more, for a median.
+/// Bytes of a map of `n` landmarks: themselves, the views' lists, and one more list for a median.
 pub fn map_bytes(n: usize) -> usize {
     n * (size_of::<Landmark>() + 2 * size_of::<u32>() + 2 * size_of::<DVec3>())
 }
@@ -70,7 +70,7 @@ pub(crate) fn middle(points: Vec<DVec3>) -> DVec3 {
 
 pub type Code = u128;
 
-/// Version of the codes: maps of other versions cannot be matched.
+/// Version of the codes: other versions cannot be matched.
 pub const CODE_VERSION: u32 = 1;
 
 /// `[DIM]` the mean of descriptors, u8 in 1/1000, then `[128][DIM]` the directions, i8, of any length. Learned from
@@ -90,7 +90,7 @@ pub fn code(descriptor: &Descriptor) -> Code {
     directions.chunks_exact(DIM).enumerate().map(|(at, direction)| bit(direction) << at).sum()
 }
 
-/// Returns the number of bits in which two codes differ.
+/// Number of bits in which two codes differ.
 pub fn distance(a: Code, b: Code) -> u32 {
     (a ^ b).count_ones()
 }

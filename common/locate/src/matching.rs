@@ -1,4 +1,4 @@
-//! Features of a photo matched with landmarks.
+//! Matches features of a photo with landmarks.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -7,21 +7,21 @@ use glam::{DAffine3, DVec2};
 use crate::map::{Code, Map, distance};
 use crate::pose::{Match, Pinhole};
 
-/// Bits in which a feature and its landmark may differ.
+/// Largest difference of a feature and its landmark, bits.
 const MAX_DISTANCE: u32 = 40;
-/// Largest distance, as a share of the second best place's.
+/// Largest distance as a share of that to the second best place.
 const MAX_RATIO: f32 = 0.8;
-/// The same among the landmarks of a few views, where fewer look alike by chance.
+/// The same among the landmarks of a few views, where fewer are similar by chance.
 const MAX_RATIO_OF_VIEWS: f32 = 0.9;
-/// Bits in which they may differ where the pose says which landmark it is.
+/// Largest difference in bits where the pose says which landmark it is.
 const MAX_GUIDED_DISTANCE: u32 = 44;
-/// Pixels around a feature in which its landmark lies, given the pose.
+/// Radius around a feature within which its landmark lies, given the pose, pixels.
 const GUIDED_PX: f64 = 12.0;
 const N_VIEWS: usize = 8;
-/// Views around which landmarks are matched by themselves.
+/// Views around which landmarks are matched separately.
 const N_PLACES: usize = 8;
 
-/// The features to match: places on an ideal pinhole's image, pixels, and codes.
+/// The features to match: positions in an ideal pinhole's image, pixels, and codes.
 pub(crate) struct Query {
     pub(crate) at: Vec<DVec2>,
     pub(crate) codes: Vec<Code>,
@@ -39,7 +39,7 @@ impl Query {
         self.match_among(map, &all, MAX_RATIO)
     }
 
-    /// Matches each feature with the landmarks of the views for which matches vote.
+    /// Matches features with the landmarks of the views with most `votes`.
     pub(crate) fn match_views(&self, map: &Map, votes: &[Match]) -> Vec<Match> {
         let mut of_views: BTreeMap<u16, usize> = BTreeMap::new();
         for vote in votes {
@@ -50,8 +50,8 @@ impl Query {
         self.match_among(map, &landmarks, MAX_RATIO_OF_VIEWS)
     }
 
-    /// Matches each feature with the landmarks around each of the views for which most features vote: a feature
-    /// votes for all views with a landmark nearly as like it as the best.
+    /// Matches features with the landmarks around each of the views with most votes: a feature votes for all views
+    /// with a landmark nearly as similar as the best.
     pub(crate) fn match_places<'a>(&'a self, map: &'a Map) -> impl Iterator<Item = Vec<Match>> + use<'a> {
         let mut votes: BTreeMap<u16, usize> = BTreeMap::new();
         for code in &self.codes {
@@ -74,7 +74,7 @@ impl Query {
             let distances: Vec<u32> = codes.iter().map(|other| distance(*code, *other)).collect();
             let (best, least) = distances.iter().copied().enumerate().min_by_key(|(at, d)| (*d, *at))?;
             let limit = least as f32 / max_ratio;
-            // A rival is as near, and elsewhere.
+            // A rival is as near, and at another place.
             let is_rival = |(at, d): (usize, &u32)| {
                 (*d as f32) < limit && place(at).distance_squared(place(best)) > map.same_place
             };
@@ -84,7 +84,7 @@ impl Query {
         self.codes.iter().enumerate().filter_map(one).collect()
     }
 
-    /// Matches each feature with the most similar landmark that a pose shows near it; a landmark has one feature.
+    /// Matches features with the most similar landmark that a pose predicts nearby; a landmark has one feature.
     pub(crate) fn match_guided(
         &self,
         map: &Map,

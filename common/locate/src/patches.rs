@@ -1,5 +1,4 @@
-//! Patches of a photo looked for in a rendering at its pose, by normalised cross-correlation: where a splat is too
-//! blurred for features to match, patches still do.
+//! Searches patches of a photo in a rendering by normalised cross-correlation, for splats too blurred for features.
 
 use std::collections::BTreeSet;
 
@@ -8,32 +7,31 @@ use glam::DVec2;
 use crate::features::Feature;
 use crate::grey::Grey;
 
-/// Pixels on each side of a patch's centre.
+/// A patch's pixels on each side of its centre.
 const RADIUS: usize = 7;
 const SIDE: usize = 2 * RADIUS + 1;
 const N_PX: f32 = (SIDE * SIDE) as f32;
-/// Pixels on each side of a place in which its patch is looked for.
+/// Search radius, pixels.
 const SEARCH_PX: usize = 12;
 const N_STEPS: usize = 2 * SEARCH_PX + 1;
-/// Features within a square of so many pixels have one patch.
+/// Features within a square of so many pixels share one patch.
 const SQUARE_PX: f64 = 4.0;
 /// Least standard deviation of a patch: below it, there is nothing to recognise.
 const MIN_DEVIATION: f32 = 0.01;
-/// The same of a part of the rendering, which is smoother.
+/// The same for the rendering, which is smoother.
 const MIN_RENDERED_DEVIATION: f32 = 0.005;
 const MIN_CORRELATION: f32 = 0.7;
-/// Blur of both pictures, against noise.
+/// Blur of both images, against noise.
 const SIGMA: f32 = 0.8;
 
-/// What was found of the patches around a photo's features.
 pub(crate) struct Found {
     pub(crate) n_tried: usize,
-    /// Features, and where the rendering shows their patches, its pixels.
+    /// Features, and the positions of their patches in the rendering, its pixels.
     pub(crate) matches: Vec<(usize, DVec2)>,
 }
 
-/// Looks for the patch around each feature of a photo in a rendering of the same scale, near `at`, where the
-/// rendering would show it. `px` is the width of a pixel of `photo`, of those that the features are in.
+/// Searches the patch around each feature in a rendering of the same scale, near `at`, its predicted position.
+/// `px`: width of a pixel of `photo`, in the features' pixels.
 pub(crate) fn find(photo: &Grey, px: f64, features: &[Feature], at: &[DVec2], rendering: &Grey) -> Found {
     let (photo, rendering) = (photo.blurred(SIGMA), rendering.blurred(SIGMA));
     let mut squares = BTreeSet::new();
@@ -53,10 +51,10 @@ pub(crate) fn find(photo: &Grey, px: f64, features: &[Feature], at: &[DVec2], re
     found
 }
 
-/// A part of a picture: its mean is 0, its length 1.
+/// Part of an image with mean 0 and length 1.
 struct Patch([[f32; SIDE]; SIDE]);
 
-/// Returns the first pixel of the part around a pixel, if the part lies within the picture.
+/// Returns the first pixel of the part around a pixel, if it lies within the image.
 fn corner(of: &Grey, centre: DVec2) -> Option<[usize; 2]> {
     let first = centre.floor() - RADIUS as f64;
     let end = first + SIDE as f64;
@@ -65,7 +63,7 @@ fn corner(of: &Grey, centre: DVec2) -> Option<[usize; 2]> {
 }
 
 impl Patch {
-    /// Returns the patch around a place; `None` at the picture's border, and where it shows nothing.
+    /// Returns the patch around a position; `None` at the border and for a plain patch.
     fn around(photo: &Grey, centre: DVec2) -> Option<Self> {
         let [x, y] = corner(photo, centre)?;
         let mut rows: [[f32; SIDE]; SIDE] =
@@ -81,7 +79,7 @@ impl Patch {
         Some(Self(rows))
     }
 
-    /// Returns how far from a place the rendering shows the patch, to a fraction of a pixel.
+    /// Returns the subpixel offset at which the rendering shows the patch.
     fn find(&self, rendering: &Grey, near: DVec2) -> Option<DVec2> {
         let step = |k: usize| k as f64 - SEARCH_PX as f64;
         let score = |x: usize, y: usize| {
@@ -101,7 +99,7 @@ impl Patch {
         Some(DVec2::new(step(x), step(y)) + top(around))
     }
 
-    /// Returns the correlation, -1 to 1, with the part of a rendering that starts at a pixel.
+    /// Correlation, -1 to 1, with the part of a rendering that starts at a pixel.
     fn score(&self, rendering: &Grey, [x, y]: [usize; 2]) -> f32 {
         let (mut sum, mut squares, mut product) = (0.0, 0.0, 0.0);
         for (row, patch) in self.0.iter().enumerate() {
@@ -117,7 +115,7 @@ impl Patch {
     }
 }
 
-/// Returns where the paraboloid through nine scores has its top, from the middle one; at most one pixel.
+/// Returns the top of the paraboloid through nine scores, relative to the middle one; at most one pixel.
 fn top([[nw, n, ne], [w, middle, e], [sw, s, se]]: [[f64; 3]; 3]) -> DVec2 {
     let slope = 0.5 * DVec2::new(e - w, s - n);
     let (xx, xy, yy) = (w - 2.0 * middle + e, 0.25 * (se - sw - ne + nw), n - 2.0 * middle + s);
@@ -168,7 +166,7 @@ mod tests {
         let right =
             other.matches.iter().filter(|(feature, found)| found.distance(at[*feature] + moved) < 2.0);
         assert!(right.count() < 5);
-        // In half the size, and at a border, where patches would reach out.
+        // At half the size, and at a border, where patches would reach out.
         let halved = find(
             &photo.halved(),
             2.0,

@@ -1,4 +1,4 @@
-//! Refinement of a pose by the errors of its points on the image, and its covariance.
+//! Refines a pose by reprojection errors, and estimates its covariance.
 
 use glam::{DAffine3, DQuat, DVec2, DVec3};
 use slag_common::Intrinsics;
@@ -6,9 +6,9 @@ use slag_common::Intrinsics;
 /// A point of the map and where the photo shows it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Match {
-    /// Its feature, in the order of the features.
+    /// Index of its feature.
     pub feature: usize,
-    /// Its landmark, in the order of the map.
+    /// Index of its landmark in the map.
     pub landmark: usize,
     /// Pixels of an ideal pinhole.
     pub at: DVec2,
@@ -17,12 +17,11 @@ pub struct Match {
 
 /// Rounds of refinement; it converges in four or five.
 const MAX_ROUNDS: usize = 12;
-/// Least standard deviation of a feature's place, pixels: SIFT's own, and the map's.
+/// Least standard deviation of a feature's position, pixels: that of SIFT and of the map.
 const MIN_SIGMA_PX: f64 = 0.5;
-/// Median of the length of a normal vector of two components, in standard deviations: sqrt(2 ln 2).
+/// Median length of a normal vector of two components, in standard deviations: sqrt(2 ln 2).
 const MEDIAN_RADIUS: f64 = 1.1774;
 
-/// The focal lengths and the principal point of a pinhole camera.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Pinhole {
     focal: DVec2,
@@ -36,7 +35,7 @@ impl Pinhole {
         Self { focal, centre }
     }
 
-    /// Returns where a point of the camera's frame appears; `None` behind the camera.
+    /// Projects a point of the camera frame; `None` behind the camera.
     pub(crate) fn pixel(&self, in_camera: DVec3) -> Option<DVec2> {
         (in_camera.z > 1e-9).then(|| in_camera.truncate() / in_camera.z * self.focal + self.centre)
     }
@@ -45,14 +44,14 @@ impl Pinhole {
         ((pixel - self.centre) / self.focal).extend(1.0).normalize()
     }
 
-    /// Returns the error of a match on the image, pixels; infinite behind the camera.
+    /// Reprojection error of a match, pixels; infinite behind the camera.
     pub(crate) fn error(&self, camera_from_world: &DAffine3, one: &Match) -> f64 {
         let in_camera = camera_from_world.transform_point3(one.point_in_world);
         self.pixel(in_camera).map_or(f64::INFINITY, |pixel| pixel.distance(one.at))
     }
 }
 
-/// The normal equations of a pose's six parameters: a small rotation and a small translation of the camera's frame.
+/// Normal equations of a pose's six parameters: a small rotation and translation of the camera frame.
 struct Normal {
     matrix: [[f64; 6]; 6],
     vector: [f64; 6],
@@ -87,7 +86,7 @@ fn normal_equations(
     of
 }
 
-/// Returns the inverse of a positive definite matrix (Gauss and Jordan, largest pivot); `None` where it is singular.
+/// Inverts a positive definite matrix (Gauss-Jordan, largest pivot); `None` if it is singular.
 fn inverse(mut m: [[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
     let mut out: [[f64; 6]; 6] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
     for column in 0..6 {
@@ -111,7 +110,7 @@ fn inverse(mut m: [[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
     Some(out)
 }
 
-/// Refines a pose so that the errors of its matches become least; errors above `soft_px` count less (Cauchy).
+/// Refines a pose by least squares; errors above `soft_px` count less (Cauchy).
 pub(crate) fn refine(camera: &Pinhole, pose: &DAffine3, matches: &[Match], soft_px: f64) -> Option<DAffine3> {
     let mut pose = *pose;
     for _ in 0..MAX_ROUNDS {
@@ -133,8 +132,8 @@ pub(crate) fn refine(camera: &Pinhole, pose: &DAffine3, matches: &[Match], soft_
     Some(DAffine3::from_rotation_translation(rotation, pose.translation))
 }
 
-/// Returns the covariance of the camera's position and rotation in the world: x, y, z, then a small rotation about
-/// the world's axes. The errors' standard deviation comes from their median; 36 numbers, row by row.
+/// Covariance of the camera's position and of a small rotation about the world's axes, row by row. The errors'
+/// standard deviation comes from their median.
 pub(crate) fn covariance(camera: &Pinhole, pose: &DAffine3, matches: &[Match]) -> Option<[f64; 36]> {
     let mut errors: Vec<f64> = matches.iter().map(|one| camera.error(pose, one)).collect();
     errors.sort_by(f64::total_cmp);

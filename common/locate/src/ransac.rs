@@ -8,21 +8,20 @@ use slag_math::random::Random;
 use crate::pose::{Match, Pinhole, refine};
 
 pub(crate) const INLIER_PX: f64 = 5.0;
-/// Samples tried at most: 12 % inliers are found with probability 0.9997.
+/// Most samples tried: 12 % inliers are found with probability 0.9997.
 const MAX_SAMPLES: usize = 5000;
-/// Probability that a sample of inliers alone was among those tried.
+/// Probability that one of the samples had inliers only.
 const CONFIDENCE: f64 = 0.9999;
-/// Rounds of refinement on the inliers of the best pose.
+/// Rounds of refinement on the best pose's inliers.
 const LOCAL_ROUNDS: usize = 3;
-/// Where errors count half, pixels.
+/// Error that counts half, pixels.
 pub(crate) const SOFT_PX: f64 = 2.0;
 
-/// A pose, and the matches that agree with it.
 #[derive(Clone, Debug)]
 pub(crate) struct Agreed {
     pub(crate) camera_from_world: DAffine3,
     pub(crate) inliers: Vec<Match>,
-    /// Sum of squared errors of all matches, each at most that of an inlier's bound.
+    /// Sum of squared errors of all matches, each capped at an inlier's bound.
     pub(crate) cost: f64,
 }
 
@@ -37,7 +36,7 @@ impl Agreed {
     }
 }
 
-/// Returns the sum of squared errors, each at most that of an inlier's bound; infinite from `limit` on.
+/// Sum of squared errors, each capped at an inlier's bound; infinite from `limit` on.
 fn cost(camera: &Pinhole, pose: &DAffine3, matches: &[Match], limit: f64) -> f64 {
     let mut sum = 0.0;
     for one in matches {
@@ -49,7 +48,7 @@ fn cost(camera: &Pinhole, pose: &DAffine3, matches: &[Match], limit: f64) -> f64
     sum
 }
 
-/// Returns the pose on which most matches agree; `None` where no sample has a pose. Same input, same result.
+/// Returns the pose with most inliers; `None` if no sample has a pose. Deterministic.
 pub(crate) fn ransac(camera: &Pinhole, matches: &[Match], seed: u64) -> Option<Agreed> {
     let n = matches.len();
     if n < 4 {
@@ -71,7 +70,7 @@ pub(crate) fn ransac(camera: &Pinhole, matches: &[Match], seed: u64) -> Option<A
             let agreed = locally_refined(camera, pose, matches);
             if agreed.cost < limit {
                 let share = agreed.inliers.len() as f64 / n as f64;
-                // log(1 - p) / log(1 - share^3); the logarithm of 1 less almost nothing is minus that.
+                // log(1 - p) / log(1 - share^3), with `ln_1p` for small shares.
                 let tries = (1.0 - CONFIDENCE).ln() / (-share.powi(3)).ln_1p();
                 needed = if tries < MAX_SAMPLES as f64 { tries.ceil() as usize } else { MAX_SAMPLES };
                 best = Some(agreed);
@@ -81,7 +80,7 @@ pub(crate) fn ransac(camera: &Pinhole, matches: &[Match], seed: u64) -> Option<A
     best
 }
 
-/// Refines a pose on its inliers for as long as that lowers its cost.
+/// Refines a pose on its inliers while that lowers its cost.
 pub(crate) fn locally_refined(camera: &Pinhole, pose: DAffine3, matches: &[Match]) -> Agreed {
     let mut best = Agreed::of(camera, pose, matches);
     for _ in 0..LOCAL_ROUNDS {
@@ -97,14 +96,13 @@ pub(crate) fn locally_refined(camera: &Pinhole, pose: DAffine3, matches: &[Match
     best
 }
 
-/// Largest ratio of two distances from the camera that is looked for.
+/// Largest ratio of two distances from the camera that is searched.
 const MAX_RATIO: f64 = 1e4;
-/// Steps of Newton's method on the distances: bisection's digits become those of f64.
+/// Newton steps on the distances, from bisection's precision to that of f64.
 const POLISHING_STEPS: usize = 3;
 
-/// Returns the poses (`camera_from_world`) that see three points in three directions: at most four.
-///
-/// `rays`: unit vectors, camera frame. Points on a line, or two of them in one place, have none.
+/// Returns the poses (`camera_from_world`) that see three points in three directions: at most four. `rays`: unit
+/// vectors, camera frame. Collinear or coinciding points have none.
 pub fn p3p(rays: [DVec3; 3], points_in_world: [DVec3; 3]) -> Vec<DAffine3> {
     let [p1, p2, p3] = points_in_world;
     let (a2, b2, c2) = (p2.distance_squared(p3), p1.distance_squared(p3), p1.distance_squared(p2));
@@ -115,7 +113,7 @@ pub fn p3p(rays: [DVec3; 3], points_in_world: [DVec3; 3]) -> Vec<DAffine3> {
     let d = (a2 - c2) / b2;
     let (ab, cb) = (a2 / b2, c2 / b2);
     let sum = (a2 + c2) / b2;
-    // Of v, the ratio of the third distance and the first; from the constant term up.
+    // In v, the ratio of the third distance to the first; from the constant term up.
     let quartic = [
         (1.0 + d).powi(2) - 4.0 * ab * gamma * gamma,
         4.0 * (-d * (1.0 + d) * beta + 2.0 * ab * gamma * gamma * beta - (1.0 - sum) * alpha * gamma),
@@ -137,7 +135,7 @@ pub fn p3p(rays: [DVec3; 3], points_in_world: [DVec3; 3]) -> Vec<DAffine3> {
     roots.filter_map(pose).collect()
 }
 
-/// Improves the distances of the three points so that those between the points are as given (law of cosines).
+/// Improves the distances of the three points, so that those between them are as given (law of cosines).
 fn polish([mut s1, mut s2, mut s3]: [f64; 3], [alpha, beta, gamma]: [f64; 3], between: [f64; 3]) -> [f64; 3] {
     for _ in 0..POLISHING_STEPS {
         let error = DVec3::new(
@@ -159,7 +157,7 @@ fn polish([mut s1, mut s2, mut s3]: [f64; 3], [alpha, beta, gamma]: [f64; 3], be
     [s1, s2, s3]
 }
 
-/// Returns the rigid transform that takes one triangle to another of the same shape.
+/// Returns the rigid transform between congruent triangles.
 fn align(in_camera: [DVec3; 3], in_world: [DVec3; 3]) -> Option<DAffine3> {
     let frame = |[a, b, c]: [DVec3; 3]| {
         let x = (b - a).try_normalize()?;

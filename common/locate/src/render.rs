@@ -1,4 +1,4 @@
-//! A photo matched with a rendering of the scene.
+//! Matches a photo with a rendering of the scene.
 
 use std::borrow::Cow;
 
@@ -12,22 +12,21 @@ use crate::grey::Grey;
 use crate::patches;
 use crate::pose::Match;
 
-/// Largest distance of descriptors, as a share of the second best's (Lowe 2004, 7.1): poses are near, so most
-/// features have their match.
+/// Largest ratio to the second best distance (Lowe 2004, 7.1): high, because poses are near and most features match.
 const MAX_RATIO: f32 = 0.9;
-/// Largest step of the depth between neighbouring pixels of a surface, as a share of the depth.
+/// Largest relative depth step between neighbouring pixels of a surface.
 const MAX_DEPTH_STEP: f32 = 0.05;
 
-/// Opacity of a pixel from which its depth is a surface's.
+/// Least opacity of a pixel whose depth is that of a surface.
 const MIN_COVERAGE: f32 = 0.5;
-/// A picture of the scene, with the camera z of each pixel; 0 where there is no surface.
+/// An image of the scene, with the camera z of each pixel; 0 where there is no surface.
 pub struct Rendering {
     pub grey: Grey,
     pub depth: Vec<f32>,
 }
 
 pub trait Renderer {
-    /// Draws what an ideal pinhole sees; `None` where that cannot be drawn.
+    /// Draws the view of an ideal pinhole; `None` if that is impossible.
     fn render(&self, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Option<Rendering>;
 }
 
@@ -41,7 +40,7 @@ impl Rendering {
         Self { grey, depth }
     }
 
-    /// Returns the camera z at a place; `None` beside the picture, without a surface and at the edge of one.
+    /// Camera z at a position; `None` outside the image, without a surface and at its edge.
     pub fn depth_at(&self, at: DVec2) -> Option<f64> {
         let Grey { width, height, .. } = self.grey;
         let (x, y) = (at.x.floor() as usize, at.y.floor() as usize);
@@ -55,22 +54,22 @@ impl Rendering {
     }
 }
 
-/// Returns the point that a pixel of an ideal pinhole shows at a depth.
+/// Returns the point at a pixel and depth of an ideal pinhole.
 pub fn point_in_world(camera_from_world: &DAffine3, intrinsics: &Intrinsics, at: DVec2, depth: f64) -> DVec3 {
     let [x, y] = intrinsics.distorted_from_pixel(at.to_array());
     camera_from_world.inverse().transform_point3(DVec3::new(x, y, 1.0) * depth)
 }
 
-/// A photo, in the size in which it is compared with renderings.
+/// A photo at the size for comparison with renderings.
 pub(crate) struct Compared<'a> {
     photo: Cow<'a, Grey>,
-    /// Width of its pixels, in the photo's.
+    /// Width of its pixels, in pixels of the photo.
     px: f64,
-    /// Pixels of a rendering for one of the photo.
+    /// Pixels of a rendering per pixel of the photo.
     scale: f64,
-    /// Of renderings at its pose.
+    /// Camera of renderings at its pose.
     pinhole: Intrinsics,
-    /// Of the photo: its features, and where an ideal pinhole shows them, the photo's pixels.
+    /// The photo's features, and their positions in an ideal pinhole's image, pixels of the photo.
     features: &'a [Feature],
     at: &'a [DVec2],
 }
@@ -98,7 +97,7 @@ impl<'a> Compared<'a> {
         Some(Match { feature, landmark, at: self.at[feature], point_in_world })
     }
 
-    /// Matches features of the photo with those of a rendering, each the other's best.
+    /// Matches features of photo and rendering that are each other's best.
     pub(crate) fn match_features(&self, rendered: &Rendered) -> Vec<Match> {
         let photo = self.features;
         let in_rendering = features(&rendered.rendering.grey, MAX_FEATURES);
@@ -128,7 +127,7 @@ impl<'a> Compared<'a> {
         (0..photo.len()).filter_map(one).collect()
     }
 
-    /// Matches patches of the photo with a rendering; returns how many were tried, too.
+    /// Matches patches of the photo with a rendering; also returns how many were tried.
     pub(crate) fn match_patches(&self, rendered: &Rendered) -> (Vec<Match>, usize) {
         let at: Vec<DVec2> = self.at.iter().map(|at| *at * self.scale).collect();
         let found = patches::find(&self.photo, self.px, self.features, &at, &rendered.rendering.grey);

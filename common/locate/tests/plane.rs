@@ -1,5 +1,5 @@
-//! A photo of a painted floor is located in a map of other photos of it. Truth: the cameras that the photos were
-//! drawn with, by intersection of rays and floor.
+//! Locates a photo of a painted floor in a map of other photos of it. Truth: the cameras that drew the photos, by
+//! intersection of rays and floor.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use slag_common::{Intrinsics, pinhole};
@@ -11,7 +11,7 @@ use slag_math::random::mix64;
 
 const INTRINSICS: Intrinsics = pinhole([320, 240], 280.0);
 
-/// Returns the paint at a place of a floor: patches of random grey in four sizes.
+/// Grey of a floor at a place: random squares in four sizes.
 fn paint(floor: u64, at: DVec2) -> f32 {
     let of_size = |size: f64| {
         let (x, y) = ((at.x / size).floor() as i64 as u64, (at.y / size).floor() as i64 as u64);
@@ -28,7 +28,7 @@ fn looking(from: DVec3, at: DVec3) -> DAffine3 {
     world_from_camera.inverse()
 }
 
-/// Draws the floor z = 0, 3 x 3 rays a pixel.
+/// Draws the floor z = 0 with 3 x 3 rays per pixel.
 fn draw(floor: u64, camera_from_world: &DAffine3, intrinsics: &Intrinsics) -> Rendering {
     let (width, height) = (intrinsics.width_px as usize, intrinsics.height_px as usize);
     let world_from_camera = camera_from_world.inverse();
@@ -93,7 +93,7 @@ fn a_photo_is_located_and_another_floor_is_lost() {
         let cosine = (turned[0] + turned[4] + turned[8] - 1.0) / 2.0;
         assert!(moved < 0.02 && cosine > 0.9999, "{moved} m, {cosine}, {} inliers", found.n_inliers);
         assert_eq!(found.is_verified, renderer.is_some());
-        // Three standard deviations hold the error; they are no larger than the accuracy asked for.
+        // The error is within three standard deviations, which do not exceed the required accuracy.
         let sigma = [0, 7, 14].map(|at| found.covariance[at]).iter().sum::<f64>().sqrt();
         assert!(moved < 3.0 * sigma && sigma < 0.05, "{moved} {sigma}");
         assert_eq!(locate(&map, &photo, renderer), Outcome::Found(found), "the same again");
@@ -110,14 +110,14 @@ fn a_photo_is_located_and_another_floor_is_lost() {
     };
     assert!(matches!(near(DVec3::new(0.0, 0.0, 1.7)), Outcome::Found(_)));
     assert_eq!(near(DVec3::new(0.6, -1.1, 4.0)), Outcome::Lost(Reason::Prior));
-    // Another floor; and the right pose, but the splat shows another floor, which verifies nothing.
+    // Another floor; then the right pose, but a splat of another floor, which verifies nothing.
     let other = draw(2, &truth, &INTRINSICS).grey;
     assert!(matches!(locate(&map, &Photo { grey: &other, ..photo }, None), Outcome::Lost(_)));
     let Outcome::Found(found) = locate(&map, &photo, Some(&Floor(2))) else { panic!("lost") };
     assert!(!found.is_verified);
 }
 
-/// The same floor twice, 50 m apart: both poses are told, unless it is known which it is.
+/// The same floor twice, 50 m apart: both poses are candidates, unless it is known which it is.
 #[test]
 fn places_that_look_alike_are_candidates() {
     let once = floor_landmarks(1);

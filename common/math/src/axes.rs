@@ -5,11 +5,11 @@ use half::f16;
 use crate::eigen::{EXTRA_VECTORS, leading_eigenvectors};
 use crate::matrix::{Panels, Rows};
 
-/// Vectors of the even sample that a covariance is taken from.
+/// Vectors in the even sample for a covariance.
 const COVARIANCE_SAMPLE: usize = 4096;
 
-/// Returns the coordinates `[vectors][n]` of vectors along their `n` principal axes through the origin: their
-/// scalar products are those of the vectors, less what lies across the axes (zeros, where there are fewer).
+/// Returns the coordinates `[vectors][n]` of vectors along their `n` principal axes through the origin; zeros
+/// beyond the rank. Scalar products are preserved, except for parts outside these axes.
 pub fn principal_coordinates(vectors: Rows<'_>, n: usize) -> Vec<f32> {
     let dim = vectors.width;
     let (mean, mut moments) = moments_of(vectors);

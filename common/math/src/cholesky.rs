@@ -1,18 +1,16 @@
 //! The Cholesky factor of a symmetric matrix.
 
-/// Treatment of pivots that rounding, or rows that depend on those before, leave too small.
+/// Treatment of pivots that are too small, from rounding or from rows that depend on earlier ones.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SmallPivots {
-    /// The square of a pivot is raised to this value, above 0: every pivot is positive.
+    /// The square of a pivot is raised to this value, above 0, so every pivot is positive.
     Raise(f64),
-    /// A pivot is 0, and so is its column, unless its square exceeds this share of the diagonal element: the row
-    /// depends on those before.
+    /// A pivot and its column are 0 (a dependent row) unless its square exceeds this share of the diagonal element.
     Drop(f64),
 }
 
 /// Returns the lower triangle L with L L' = `matrix`, zeros above, row by row (Golub and Van Loan, Matrix
-/// Computations,
-/// 4.2). Of the matrix `[n][n]` only the lower triangle is read.
+/// Computations, 4.2). Of the matrix `[n][n]` only the lower triangle is read.
 pub fn cholesky(mut matrix: Vec<f64>, n: usize, small: SmallPivots) -> Vec<f64> {
     for i in 0..n {
         for j in 0..i {
@@ -38,7 +36,7 @@ pub fn cholesky(mut matrix: Vec<f64>, n: usize, small: SmallPivots) -> Vec<f64> 
 mod tests {
     use super::*;
 
-    /// Oracle: the factor computed by hand. What lies above the diagonal is not read.
+    /// Oracle: the factor computed by hand. Elements above the diagonal are not read.
     #[test]
     fn the_factor_is_the_lower_triangle() {
         let matrix = [4.0, f64::NAN, f64::NAN, 12.0, 37.0, f64::NAN, -16.0, -43.0, 98.0];
@@ -49,7 +47,7 @@ mod tests {
         assert!(cholesky(Vec::new(), 0, SmallPivots::Drop(0.0)).is_empty());
     }
 
-    /// By hand: the second of three rows is twice the first, so that its pivot is 0.
+    /// By hand: the second of three rows is twice the first, so its pivot is 0.
     #[test]
     fn small_pivots_are_raised_or_dropped() {
         let matrix = vec![4.0, 0.0, 0.0, 8.0, 16.0, 0.0, 2.0, 5.0, 10.0];

@@ -1,12 +1,11 @@
-//! The exact squared Euclidean distance of each cell of a grid to the nearest source (Felzenszwalb and
-//! Huttenlocher, "Distance Transforms of Sampled Functions", Theory of Computing 8, 2012): rows first, then lower
-//! envelopes of parabolas along columns. The two steps are apart so that callers may share rows between threads.
+//! The exact squared Euclidean distance of each cell of a grid to the nearest source (Felzenszwalb and Huttenlocher,
+//! "Distance Transforms of Sampled Functions", Theory of Computing 8, 2012): rows first, then lower envelopes of
+//! parabolas along columns. The steps are separate so that callers can share rows between threads.
 
-/// Stands for a row or grid without a source.
+/// A row or grid without a source.
 pub const FAR: u32 = u32::MAX;
 
-/// Writes the squared distance of each cell of a row to the nearest source of the row, in cells; [`FAR`] without a
-/// source.
+/// Writes the squared distance of each cell of a row to the nearest source in it, in cells; [`FAR`] without a source.
 pub fn along_row(is_source: impl ExactSizeIterator<Item = bool>, out: &mut [u32]) {
     assert!(is_source.len() == out.len() && out.len() <= usize::from(u16::MAX), "a row of another length");
     let mut since = FAR;
@@ -25,12 +24,12 @@ pub fn along_row(is_source: impl ExactSizeIterator<Item = bool>, out: &mut [u32]
 /// Lower envelope of parabolas along a line.
 #[derive(Debug, Default)]
 pub struct Envelope {
-    /// Place and height of each parabola, and where it begins to be the lowest.
+    /// Place and height of each parabola, and from where on it is the lowest.
     parabolas: Vec<(f64, f64, f64)>,
 }
 
 impl Envelope {
-    /// Writes the least `(p - q)^2 + heights[q]` over q to each place p; [`FAR`] heights count nothing.
+    /// Writes the least `(p - q)^2 + heights[q]` over q to each place p; [`FAR`] heights are skipped.
     pub fn lowest(&mut self, heights: &[u32], out: &mut [u32]) {
         assert_eq!(heights.len(), out.len(), "a line of another length");
         self.parabolas.clear();
@@ -58,8 +57,7 @@ impl Envelope {
     }
 }
 
-/// Returns the squared distance of each cell of a grid, row-major, to the nearest source, in cells; [`FAR`] if
-/// there is none.
+/// Returns squared distances to the nearest source, in cells of a row-major grid; [`FAR`] without one.
 pub fn squared_distances(is_source: &[bool], width: usize) -> Vec<u32> {
     let height = is_source.len().checked_div(width).unwrap_or(0);
     let mut rows = vec![0; is_source.len()];

@@ -1,4 +1,4 @@
-//! Scalar products whose lanes are fixed, so that the compiler may vectorise them without changing a bit.
+//! Scalar products with fixed lanes, so that vectorising does not change a bit.
 
 /// Returns the scalar product of two vectors of equal length, accumulated in 16 fixed lanes.
 #[inline]

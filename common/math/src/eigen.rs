@@ -7,12 +7,12 @@ use crate::random::mix64;
 /// Rounds of subspace iteration: with [`EXTRA_VECTORS`] the last wanted eigenvalue is off by less than
 /// (ratio of the eigenvalues)^(2 * 4) (Halko, Martinsson and Tropp 2011, 4.5).
 const ITERATIONS: usize = 4;
-/// Vectors to iterate beside those that are wanted.
+/// Vectors iterated besides the wanted ones.
 pub const EXTRA_VECTORS: usize = 12;
 
-/// Returns the eigenvalues of a symmetric matrix `[n][n]`, largest first, and the eigenvectors as rows
-/// `[n][n]` (cyclic Jacobi; Golub and Van Loan, Matrix Computations, 8.5). Signs are arbitrary, but the
-/// same on any machine.
+/// Returns the eigenvalues of a symmetric matrix `[n][n]`, largest first, and the eigenvectors as rows `[n][n]`
+/// (cyclic Jacobi; Golub and Van Loan, Matrix Computations, 8.5). Signs are arbitrary, but the same on any
+/// machine.
 pub fn eigen_symmetric(mut a: Vec<f64>, n: usize) -> (Vec<f64>, Vec<f64>) {
     let mut vectors = vec![0.0; n * n];
     (0..n).for_each(|i| vectors[i * n + i] = 1.0);
@@ -56,8 +56,7 @@ fn rotate_rows(a: &mut [f64], n: usize, p: usize, q: usize, c: f64, s: f64) {
     }
 }
 
-/// Makes rows `[n][width]` orthonormal, in order (modified Gram-Schmidt, twice); rows that depend on those
-/// before become zero.
+/// Makes rows `[n][width]` orthonormal, in order (modified Gram-Schmidt, twice); dependent rows become zero.
 pub fn orthonormalise(rows: &mut [f64], width: usize) {
     for i in 0..rows.len() / width {
         let (before, rest) = rows.split_at_mut(i * width);
@@ -89,7 +88,7 @@ pub fn leading_eigenvectors(matrix: &[f32], dim: usize, n: usize) -> (Vec<f64>, 
         block = apply(&block);
     }
     orthonormalise(&mut block, dim);
-    // Rayleigh and Ritz: the eigenvectors within the block's span.
+    // Rayleigh-Ritz: the eigenvectors within the block's span.
     let applied = apply(&block);
     let mut small = vec![0.0; n * n];
     for i in 0..n {

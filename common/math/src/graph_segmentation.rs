@@ -1,24 +1,22 @@
 //! Graph-based segmentation (Felzenszwalb and Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV
 //! 59(2), 2004): components of any weighted graph, grown over edges of ascending weight.
 //!
-//! Edges are decided one after the other, but few of them join anything. Those that cannot are dropped by all
-//! threads before, block by block: their ends are in one component already, or an end's component refuses even the
-//! lightest edge of the block. Both stay so whatever is joined in between: components only grow, and one that
-//! refuses an edge refuses all heavier ones, so that it is never joined again. The result is that of deciding each
-//! edge in turn.
+//! Edges are decided in order, but few join anything. All threads first drop, block by block, those that cannot: their
+//! ends are in one component already, or an end's component refuses even the lightest edge of the block. Both stay true
+//! while others join: components only grow, and one that refuses an edge refuses all heavier ones, so it is never
+//! joined again. The result is that of deciding each edge in turn.
 
 use rayon::prelude::*;
 
 use crate::union_find::{Numbering, UnionFind};
 
-/// Edges that are looked at together.
+/// Edges tested in parallel at a time.
 const BLOCK: usize = 1 << 17;
 
 /// Components of a graph while they grow.
 ///
-/// The caller visits the edges in ascending order of weight and calls [`Self::join_if_similar`] for each, or
-/// [`Self::join_all_similar`] for all; a second visit with [`Self::join_if_small`] or [`Self::join_all_small`]
-/// removes components that are too small.
+/// Visit the edges in ascending order of weight with [`Self::join_if_similar`] or [`Self::join_all_similar`], then
+/// again with [`Self::join_if_small`] or [`Self::join_all_small`] to remove small components.
 #[derive(Clone, Debug)]
 pub struct Components {
     sets: UnionFind,
@@ -30,7 +28,7 @@ pub struct Components {
 }
 
 impl Components {
-    /// Returns the components of one vertex each. `scale`: the paper's k, "scale of observation".
+    /// `scale`: the paper's k, "scale of observation".
     pub fn new(n_vertices: usize, scale: f32) -> Self {
         let (sets, sizes) = (UnionFind::new(n_vertices), vec![1; n_vertices]);
         Self { sets, scale, sizes, thresholds: vec![scale; n_vertices] }
@@ -40,13 +38,13 @@ impl Components {
         self.sets.root(vertex)
     }
 
-    /// Returns the numbers of vertices of the components, `[n]`, valid for roots.
+    /// Vertices of the components, `[n]`, valid for roots.
     pub fn sizes(&self) -> &[u32] {
         &self.sizes
     }
 
-    /// Joins the components of an edge's ends if `weight` is at most the largest inner weight of either component
-    /// plus `scale` over its size. Returns whether the ends are in one component now.
+    /// Joins the components of an edge's ends if `weight` is at most the largest inner weight of each plus `scale`
+    /// over its size. Returns whether the ends are in one component now.
     pub fn join_if_similar(&mut self, a: u32, b: u32, weight: f32) -> bool {
         let (a, b) = (self.root(a), self.root(b));
         if a == b {
@@ -107,7 +105,7 @@ impl Components {
         }
     }
 
-    /// Joins two components, given by their roots, whatever their weights; returns the root of both.
+    /// Joins two components given by their roots; returns the common root.
     pub fn join_roots(&mut self, a: u32, b: u32) -> u32 {
         let is_larger = self.sizes[a as usize] >= self.sizes[b as usize];
         let (root, child) = if is_larger { (a, b) } else { (b, a) };
@@ -116,7 +114,7 @@ impl Components {
         root
     }
 
-    /// Numbers the components of some vertices in the order in which the vertices meet them.
+    /// Numbers the components of some vertices in the order of first occurrence.
     pub fn number(&mut self, vertices: impl IntoIterator<Item = u32>) -> Numbering {
         self.sets.number(vertices)
     }

@@ -1,8 +1,8 @@
 //! Numerical building blocks shared by the encoder and the robot.
 //!
-//! Sums run in a fixed order whatever the width of the machine's vectors, and results do not depend on the number of
-//! threads: every function returns the same bits on every machine. Exceptions are relevancies and normal numbers, which
-//! take `exp`, `ln` and `cos` from the system's library.
+//! Sums run in a fixed order whatever the vector width, and results do not depend on the number of threads: every
+//! function returns the same bits on every machine. Exceptions are relevancies and normal numbers, which take `exp`,
+//! `ln` and `cos` from the system's library.
 
 pub mod axes;
 pub mod cholesky;

@@ -1,16 +1,16 @@
-//! Dense products, fast and the same to the bit on any machine: lanes are columns, so that every element
-//! is one chain of fused multiply-adds whatever the width of the vectors.
+//! Dense products with the same bits on any machine: lanes are columns, so every element is one chain of fused
+//! multiply-adds whatever the vector width.
 
 use pulp::Simd;
 use rayon::prelude::*;
 
 use crate::simd::{InstructionSet, Work};
 
-/// Columns that are packed together: a multiple of every machine's lanes.
+/// Columns packed together: a multiple of every machine's lanes.
 const PANEL: usize = 32;
-/// Rows worked on together; with two vectors of columns their sums fill the registers.
+/// Rows processed together; with two vectors of columns their sums fill the registers.
 const TILE: usize = 4;
-/// Rows given to a thread at a time.
+/// Rows per task of a thread.
 const CHUNK: usize = 256;
 
 /// Some rows of a row-major matrix.
@@ -19,7 +19,7 @@ pub struct Rows<'a> {
     /// `[..][width]`.
     pub values: &'a [f32],
     pub width: usize,
-    /// Which rows, in order; absent: all.
+    /// Row numbers, in order; absent: all.
     pub index: Option<&'a [u32]>,
 }
 
@@ -42,7 +42,7 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// A matrix packed to be the right factor of products.
+/// A matrix packed as the right factor of products.
 pub struct Panels {
     /// `[ceil(n_columns / PANEL)][n_rows][PANEL]`, zeros past the last column.
     values: Vec<[f32; PANEL]>,
@@ -51,7 +51,6 @@ pub struct Panels {
 }
 
 impl Panels {
-    /// Packs a matrix of `[n_rows][n_columns]` given by its elements.
     pub fn new(n_rows: usize, n_columns: usize, at: impl Fn(usize, usize) -> f32) -> Self {
         let mut values = vec![[0.0; PANEL]; n_columns.div_ceil(PANEL) * n_rows];
         for (place, row_of_panel) in values.iter_mut().enumerate() {
@@ -72,8 +71,7 @@ impl Panels {
         out
     }
 
-    /// Returns for each row of the left factor the column whose product less its offset is largest, the
-    /// first of equals. `offsets`: `[n_columns]`.
+    /// Returns per row of `left` the first column with the largest product minus offset. `offsets`: `[n_columns]`.
     pub fn largest(&self, left: Rows<'_>, offsets: &[f32]) -> Vec<u32> {
         let mut padded = vec![[f32::INFINITY; PANEL]; self.n_columns.div_ceil(PANEL)];
         padded.as_flattened_mut()[..offsets.len()].copy_from_slice(offsets);
@@ -134,7 +132,7 @@ impl<S: Simd> Work<S> for Largest<'_> {
         for (tile, out) in self.out.chunks_mut(TILE).enumerate() {
             let rows = tile_rows(self.left, self.first + tile * TILE, out.len());
             let mut best = [[simd.splat_f32s(f32::NEG_INFINITY); 2]; TILE];
-            // Number of the pair of vectors in which each lane's best was found.
+            // Number of the vector pair in which each lane's best was found.
             let mut place = [[simd.splat_u32s(0); 2]; TILE];
             let n_pairs = PANEL / (2 * S::F32_LANES);
             for (at, panel) in self.right.values.chunks_exact(self.right.n_rows).enumerate() {
@@ -162,20 +160,19 @@ impl<S: Simd> Work<S> for Largest<'_> {
                         chosen = (*value, column(lane));
                     }
                 }
-                // Where every product is NaN or minus infinity, any column is as good.
+                // If every product is NaN or minus infinity, any column will do.
                 *out = if chosen.1 == u32::MAX { 0 } else { chosen.1 };
             }
         }
     }
 }
 
-/// Returns rows `first..first + n`, the last one repeated.
+/// Returns rows `first..first + n`; the last is repeated.
 #[inline(always)]
 fn tile_rows(left: Rows<'_>, first: usize, n: usize) -> [&[f32]; TILE] {
     std::array::from_fn(|row| left.get(first + row.min(n - 1)))
 }
 
-/// Returns the products of a tile's rows with two vectors of a panel's columns.
 #[inline(always)]
 fn tile_sums<S: Simd>(
     simd: S,

@@ -3,16 +3,16 @@
 
 use rayon::prelude::*;
 
-/// Fills the rows of points that have fewer neighbours than asked for.
+/// Fills rows of points with too few neighbours.
 pub const NO_POINT: u32 = u32::MAX;
 
-/// Ranges of at most so many points are searched one by one.
+/// Ranges of at most this many points are searched linearly.
 const LEAF_POINTS: usize = 12;
 /// Smaller ranges are sorted by one thread.
 const PARALLEL_POINTS: usize = 1 << 12;
 const POINTS_PER_TASK: usize = 1 << 10;
 
-/// Bytes that the search takes for each point: tree, and neighbours in the order of the tree and in the given one.
+/// Bytes per point of the search: tree, and neighbours in tree order and in the given order.
 pub fn working_bytes_per_point(n_neighbours: usize) -> usize {
     size_of::<Item>() + size_of::<u8>() + size_of::<u32>() * (2 * n_neighbours + 1)
 }
@@ -25,8 +25,8 @@ pub struct Neighbours {
 }
 
 impl Neighbours {
-    /// Finds the `n_neighbours` nearest others of each point. Of two at the same distance, the one with the lower
-    /// number is nearer, so the result does not depend on threads or on the tree. Coordinates must be finite.
+    /// Finds the `n_neighbours` nearest others of each point; ties go to the lower number, so the result does not
+    /// depend on threads or on the tree. Coordinates must be finite.
     pub fn new(points: &[[f64; 3]], n_neighbours: usize) -> Self {
         let mut items: Vec<Item> = points.iter().copied().zip(0..).collect();
         let mut axes = vec![0; items.len()];
@@ -54,7 +54,7 @@ impl Neighbours {
         Self { n_neighbours, rows }
     }
 
-    /// Returns the neighbours of a point, the nearest first.
+    /// Returns the neighbours of a point, nearest first.
     pub fn of(&self, point: u32) -> &[u32] {
         let row = &self.rows[point as usize * self.n_neighbours..][..self.n_neighbours];
         &row[..row.iter().position(|other| *other == NO_POINT).unwrap_or(row.len())]
@@ -65,12 +65,11 @@ type Item = ([f64; 3], u32);
 
 struct Tree<'a> {
     items: &'a [Item],
-    /// The axis that divides the range whose middle is here.
+    /// The split axis of each range, at its middle.
     axes: &'a [u8],
 }
 
-/// Orders points so that in each range the middle one divides the others along the longest side of the range's
-/// box.
+/// Orders points so that the middle of each range splits the others along the longest side of the range's box.
 fn sort(items: &mut [Item], axes: &mut [u8]) {
     if items.len() <= LEAF_POINTS {
         return;
@@ -85,7 +84,7 @@ fn sort(items: &mut [Item], axes: &mut [u8]) {
     let side = |axis: &usize| high[*axis] - low[*axis];
     let axis = (0..3).max_by(|a, b| side(a).total_cmp(&side(b))).unwrap_or(0);
     let middle = items.len() / 2;
-    // 0 and -0 are one place.
+    // 0 and -0 are equal.
     let along = |item: &Item| item.0[axis] + 0.0;
     items.select_nth_unstable_by(middle, |a, b| along(a).total_cmp(&along(b)).then(a.1.cmp(&b.1)));
     axes[middle] = axis as u8;
@@ -102,8 +101,7 @@ fn sort(items: &mut [Item], axes: &mut [u8]) {
 }
 
 impl Tree<'_> {
-    /// Adds what is nearer in a range than the farthest of `nearest`, which holds (squared distance, number),
-    /// ascending.
+    /// Adds points of a range that are nearer than the farthest of `nearest`: (squared distance, number), ascending.
     fn search(&self, from: usize, to: usize, item: &Item, n: usize, nearest: &mut Vec<(f64, u32)>) {
         if to - from <= LEAF_POINTS {
             self.items[from..to].iter().for_each(|other| consider(item, other, n, nearest));
@@ -116,10 +114,10 @@ impl Tree<'_> {
         let (near, far) = if beyond > 0.0 { (above, below) } else { (below, above) };
         self.search(near.0, near.1, item, n, nearest);
         consider(item, &self.items[middle], n, nearest);
-        // Rounding is monotone: no point beyond the plane has a smaller squared distance than the plane. An equal
-        // one may have a lower number.
+        // Rounding is monotone: no point beyond the plane has a smaller squared distance than the plane. One at
+        // the same distance may have a lower number.
         let reaches = |last: &(f64, u32)| {
-            // An export may have a million points at one place. They are found in the order of their numbers.
+            // An export may have a million points at one place; they are found by ascending number.
             let is_later = beyond == 0.0 && last.0 == 0.0 && last.1 < self.items[middle].1;
             beyond * beyond <= last.0 && !is_later
         };
@@ -129,7 +127,7 @@ impl Tree<'_> {
     }
 }
 
-/// Adds a point if it is among the `n` nearest so far and another than `item`.
+/// Adds a point, unless it is `item` itself, if it is among the `n` nearest so far.
 #[inline]
 fn consider((here, own): &Item, (point, number): &Item, n: usize, nearest: &mut Vec<(f64, u32)>) {
     let [x, y, z] = [0, 1, 2].map(|axis| point[axis] - here[axis]);

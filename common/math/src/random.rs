@@ -5,8 +5,7 @@ use std::fmt::Debug;
 use rand_core_09::{RngCore, SeedableRng};
 use rand_xoshiro::SplitMix64;
 
-/// Returns 64 well-mixed bits of an index: the `index + 1`-th output of SplitMix64 seeded with 0
-/// (Steele, Lea and Flood 2014).
+/// The `index + 1`-th output of SplitMix64 seeded with 0 (Steele, Lea and Flood 2014): 64 well-mixed bits.
 pub fn mix64(index: u64) -> u64 {
     let mut z = index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -33,29 +32,29 @@ impl Random {
         N::try_from(self.bits() % n).expect("less than n, which fits")
     }
 
-    /// Returns the next float64, uniform in `0..1`.
+    /// Uniform in `0..1`.
     pub fn unit(&mut self) -> f64 {
         (self.bits() >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// Returns the next float64, uniform in `low..high`.
+    /// Uniform in `low..high`.
     pub fn between(&mut self, low: f64, high: f64) -> f64 {
         low + self.unit() * (high - low)
     }
 
-    /// Returns the next float32, uniform in `-1..1`.
+    /// Uniform in `-1..1`.
     pub fn signed(&mut self) -> f32 {
         (self.bits() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
     }
 
-    /// Returns the next vector of length 1: a point of the cube `(-1..1)^dim`, normalised.
+    /// A point of the cube `(-1..1)^dim`, normalised to length 1.
     pub fn unit_vector(&mut self, dim: usize) -> Vec<f32> {
         let vector: Vec<f32> = (0..dim).map(|_| self.signed()).collect();
         let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
         vector.into_iter().map(|v| (f64::from(v) / length) as f32).collect()
     }
 
-    /// Returns the next normally distributed value (Box and Muller 1958): mean 0, variance 1.
+    /// Normally distributed, mean 0, variance 1 (Box and Muller 1958).
     pub fn normal(&mut self) -> f64 {
         let radius = (-2.0 * (1.0 - self.unit()).ln()).sqrt();
         radius * (std::f64::consts::TAU * self.unit()).cos()
@@ -67,7 +66,7 @@ pub struct Xorshift(u64);
 
 impl Xorshift {
     pub fn new(seed: u64) -> Self {
-        // Mixed (SplitMix64, Steele et al. 2014), so that neighbouring seeds have nothing in common.
+        // Mixed (SplitMix64, Steele et al. 2014), so that neighbouring seeds are unrelated.
         Self(Random::new(seed).bits() | 1)
     }
 
@@ -82,12 +81,12 @@ impl Xorshift {
         (self.next_u64() >> 32) as u32
     }
 
-    /// Returns the next value, uniform in -1..1.
+    /// Uniform in -1..1.
     pub fn signed(&mut self) -> f64 {
         2.0 * self.unit() - 1.0
     }
 
-    /// Returns the next value, uniform in 0..1.
+    /// Uniform in 0..1.
     pub fn unit(&mut self) -> f64 {
         (self.next_u64() >> 11) as f64 / (1u64 << 53) as f64
     }
@@ -96,12 +95,12 @@ impl Xorshift {
         low + (high - low) * self.unit()
     }
 
-    /// Returns a number below `n`, which is above 0.
+    /// Uniform in `0..n`; `n` must be above 0.
     pub fn below(&mut self, n: usize) -> usize {
         ((self.unit() * n as f64) as usize).min(n - 1)
     }
 
-    /// Returns one of some things, of which there is at least one.
+    /// Returns a random element; there must be one.
     pub fn pick<'a, T>(&mut self, of: &'a [T]) -> &'a T {
         &of[self.below(of.len())]
     }

@@ -3,14 +3,14 @@
 /// Steepness of [`relevancy`], from LERF.
 pub const RELEVANCY_STEEPNESS: f32 = 10.0;
 
-/// Maps a score with negatives to LERF's relevancy, `1 / (1 + exp(-t s))` with [t = 10](RELEVANCY_STEEPNESS):
-/// 0.5 where the thing asked for and the closest negative are equally near.
+/// Maps a score with negatives to LERF's relevancy, `1 / (1 + exp(-t s))` with [t = 10](RELEVANCY_STEEPNESS): 0.5
+/// where the query and the closest negative are equally near.
 pub fn relevancy(score: f32) -> f32 {
     let t = f64::from(RELEVANCY_STEEPNESS);
     (1.0 / (1.0 + (-t * f64::from(score)).exp())) as f32
 }
 
-/// Maps a relevancy to its score, the inverse of [`relevancy`]; infinite for 0 and 1.
+/// Inverse of [`relevancy`]; infinite for 0 and 1.
 pub fn score_of_relevancy(relevancy: f32) -> f32 {
     let p = f64::from(relevancy);
     ((p / (1.0 - p)).ln() / f64::from(RELEVANCY_STEEPNESS)) as f32

@@ -11,10 +11,8 @@ use pulp::aarch64::Neon;
 use pulp::x86::{V3, V4};
 use pulp::{NullaryFnOnce, Scalar};
 
-/// Work with the vectors `S` of an instruction set.
-///
-/// `run` and all functions that it calls must be `inline(always)`; otherwise they are compiled for the baseline
-/// instruction set.
+/// Work with the vectors `S` of an instruction set. `run` and all functions that it calls must be
+/// `inline(always)`, or they are compiled for the baseline instruction set.
 pub trait Work<S> {
     type Output;
     fn run(self, simd: S) -> Self::Output;
@@ -22,7 +20,7 @@ pub trait Work<S> {
 
 macro_rules! portable_work {
     ($($simd:ty),+) => {
-        /// [`Work`] for every instruction set of this architecture. Implemented for all work that is.
+        /// [`Work`] for every instruction set of this architecture.
         pub trait PortableWork<T>: $(Work<$simd, Output = T> +)+ {}
         impl<T, W: $(Work<$simd, Output = T> +)+> PortableWork<T> for W {}
     };
@@ -35,7 +33,6 @@ portable_work!(Scalar, Neon);
 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
 portable_work!(Scalar);
 
-/// Work bound to one instruction set.
 struct Bound<S, W>(S, W);
 
 impl<S, W: Work<S>> NullaryFnOnce for Bound<S, W> {
@@ -47,8 +44,7 @@ impl<S, W: Work<S>> NullaryFnOnce for Bound<S, W> {
     }
 }
 
-/// An instruction set of this processor: only detection makes one that is not portable, so tests compare
-/// [`Self::available`].
+/// An instruction set of this processor, from [`Self::available`]; only [`Self::Portable`] exists without detection.
 #[derive(Clone, Copy, Debug)]
 pub enum InstructionSet {
     /// Scalar code, for any processor.
@@ -116,7 +112,6 @@ impl InstructionSet {
 mod tests {
     use super::*;
 
-    /// Number of `f32` in a vector.
     struct Lanes;
 
     impl<S: pulp::Simd> Work<S> for Lanes {
@@ -128,7 +123,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the processor as the standard library detects it, and the widths of its registers.
+    /// Oracle: the standard library's detection, and the register widths.
     #[test]
     fn instruction_sets_are_those_of_the_processor_narrowest_first() {
         #[allow(unused_mut, reason = "other architectures have scalar code only")]

@@ -2,12 +2,12 @@
 
 use std::cmp::Ordering;
 
-/// Place of a quantile among `n` sorted values, counted from 0. `share` is that of [`quantile`].
+/// Position of a quantile among `n` sorted values, from 0; `share` as in [`quantile`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rank {
-    /// `ceil(n share) - 1`: the least value that is at or above this share of the values. Reports use it.
+    /// `ceil(n share) - 1`: the least value at or above this share of the values. Used by reports.
     Nearest,
-    /// `floor(n share)`: this share of the values comes before. The median of an even number is the upper of two.
+    /// `floor(n share)`: this share of the values precedes it. The median of an even number is the upper of two.
     After,
     /// `floor((n - 1) share)`: this share of the way from the first to the last.
     Between,
@@ -24,7 +24,7 @@ impl Rank {
     }
 }
 
-/// Numbers with a total order: floats as of IEEE 754, so that a NaN is beyond the infinities.
+/// Numbers with a total order; floats as in IEEE 754, so NaN is beyond the infinities.
 pub trait Ordered: Copy {
     fn order(&self, other: &Self) -> Ordering;
 }
@@ -48,25 +48,24 @@ impl Ordered for u64 {
 }
 
 /// Returns a quantile of values, which it reorders; `None` without any. `per_mille`: its share in thousandths, at
-/// most
-/// 1000. Shares are integers, because a rounded share could fall on the neighbouring place.
+/// most 1000; an integer, because a rounded share could select a neighbour.
 pub fn quantile<T: Ordered>(values: &mut [T], per_mille: usize, rank: Rank) -> Option<T> {
     let place = rank.place(values.len(), per_mille);
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(place, T::order).1)
 }
 
-/// Returns the median of values, which it reorders: of an even number, the upper of two.
+/// Returns the median of values, which it reorders; of an even number, the upper of two.
 pub fn median<T: Ordered>(values: &mut [T]) -> Option<T> {
     quantile(values, 500, Rank::After)
 }
 
-/// Returns the least and largest of the values that remain without the lowest and highest `trimmed` share, at most
-/// a half; `None` without any. It reorders the values.
+/// Returns least and largest value without the lowest and highest `trimmed` share (at most 0.5), if any are left. It
+/// reorders the values.
 pub fn trimmed_range<T: Ordered>(values: &mut [T], trimmed: f64) -> Option<(T, T)> {
     let cut = (trimmed * values.len().checked_sub(1)? as f64) as usize;
     let (_, low, above) = values.select_nth_unstable_by(cut, T::order);
     let low = *low;
-    // Place of the upper end among the values above the lower one.
+    // Position of the upper end among the values above the lower one.
     let place = above.len().checked_sub(1 + cut);
     Some((low, place.map_or(low, |place| *above.select_nth_unstable_by(place, T::order).1)))
 }

@@ -1,10 +1,10 @@
 //! Disjoint sets with path halving (Tarjan and van Leeuwen, "Worst-case Analysis of Set Union Algorithms", JACM
 //! 31(2), 1984).
 
-/// The number of an item that [`UnionFind::number`] was not asked about.
+/// Stands for the number of an item that [`UnionFind::number`] was not given.
 pub const NOT_NUMBERED: u32 = u32::MAX;
 
-/// A partition of the items `0..n` into disjoint sets. Each set is represented by one of its items, the root.
+/// A partition of the items `0..n` into disjoint sets, each represented by one of its items, the root.
 #[derive(Clone, Debug)]
 pub struct UnionFind {
     parents: Vec<u32>,
@@ -13,14 +13,14 @@ pub struct UnionFind {
 /// Consecutive numbers for the sets of a partition.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Numbering {
-    /// `[n]`: the number of each item's set, [`NOT_NUMBERED`] for items that were left out.
+    /// `[n]`: the number of each item's set, [`NOT_NUMBERED`] for omitted items.
     pub of_item: Vec<u32>,
-    /// Numbered items of each set.
+    /// Number of numbered items in each set.
     pub sizes: Vec<u32>,
 }
 
 impl UnionFind {
-    /// Returns the partition of `n` items into sets of one.
+    /// Begins with sets of one item.
     pub fn new(n: usize) -> Self {
         Self { parents: (0..n as u32).collect() }
     }
@@ -34,7 +34,7 @@ impl UnionFind {
         item
     }
 
-    /// Returns the root of an item's set without shortening its path: several threads can ask at once.
+    /// Returns the root of an item's set without path halving, so that threads can share it.
     pub fn root_of(&self, mut item: u32) -> u32 {
         while self.parents[item as usize] != item {
             item = self.parents[item as usize];
@@ -46,7 +46,7 @@ impl UnionFind {
         self.parents[child as usize] = root;
     }
 
-    /// Numbers the sets of some items in the order in which the items meet them.
+    /// Numbers the sets of some items in the order of first occurrence.
     pub fn number(&mut self, items: impl IntoIterator<Item = u32>) -> Numbering {
         let mut number_of_root = vec![NOT_NUMBERED; self.parents.len()];
         let mut of_item = vec![NOT_NUMBERED; self.parents.len()];
@@ -69,7 +69,7 @@ mod tests {
     use super::*;
     use crate::random::Random;
 
-    /// Oracle: labels that are rewritten at every union.
+    /// Oracle: labels rewritten at every union.
     #[test]
     fn sets_are_those_of_relabelling() {
         let mut random = Random::new(3);

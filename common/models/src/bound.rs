@@ -1,5 +1,5 @@
-//! Runs a model with its tensors bound to memory: inputs of the next model stay on the GPU, and other outputs go
-//! to page-locked memory, to which a GPU copies at the full speed of its link.
+//! Runs a model with bound tensors: inputs of the next model stay on the GPU, other outputs go to page-locked
+//! memory, to which a GPU copies at the full speed of its link.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -19,11 +19,10 @@ pub(crate) enum Place {
     Device,
 }
 
-/// Runs of large models that a GPU has at once: the second one fills the gaps before and after the first. More
-/// take no less time in all, and each then ends late.
+/// Concurrent runs per GPU: the second fills the gaps around the first; more only end later.
 const RUNS_AT_ONCE: usize = 2;
 
-/// The turns of a GPU: whoever has one runs a large model there.
+/// Permits to run a large model on a GPU.
 #[derive(Debug)]
 pub(crate) struct Turns {
     n_free: Mutex<usize>,
@@ -33,7 +32,7 @@ pub(crate) struct Turns {
 pub(crate) struct Turn<'a>(&'a Turns);
 
 impl Turns {
-    /// Returns the turns of a GPU, as CUDA numbers them.
+    /// `gpu`: as CUDA numbers them.
     pub(crate) fn of(gpu: u32) -> Arc<Self> {
         static TURNS: Mutex<BTreeMap<u32, Arc<Turns>>> = Mutex::new(BTreeMap::new());
         let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
@@ -57,8 +56,7 @@ impl Drop for Turn<'_> {
 }
 
 impl Model {
-    /// Runs the model on `inputs` and returns the given outputs, each where it is wanted. Other outputs are not
-    /// computed.
+    /// Runs the model and returns the given outputs, each in its place; other outputs are not computed.
     pub(crate) fn run_bound(
         &mut self,
         memory: &DeviceMemory,
@@ -75,8 +73,7 @@ impl Model {
         outputs: &[(&str, Place)],
     ) -> ort::Result<Vec<DynTensor>> {
         let session = &mut self.session;
-        // A new binding each time: a bound output is otherwise overwritten by the next run, while its reader has
-        // it.
+        // A new binding each time: the next run would overwrite a bound output while its reader has it.
         let mut binding = session.create_binding()?;
         for (name, value) in inputs {
             binding.bind_input(*name, *value)?;
@@ -88,7 +85,7 @@ impl Model {
             };
             binding.bind_output_to_device(*name, info)?;
         }
-        // The session's log level shows where nodes are placed; a run would tell of every node again.
+        // The session's log level reports the placement of nodes; each run would report it again.
         let mut quiet = RunOptions::new()?;
         quiet.set_log_level(LogLevel::Warning)?;
         let mut found = session.run_binding_with_options(&binding, &quiet)?;
@@ -106,7 +103,7 @@ mod tests {
 
     use super::*;
 
-    /// Eight threads take turns of one GPU: never more than two at once, and two do meet.
+    /// Eight threads share a GPU: never more than two run at once, and two do meet.
     #[test]
     fn a_gpu_has_two_turns() {
         let (turns, other) = (Turns::of(97), Turns::of(98));
@@ -124,7 +121,6 @@ mod tests {
             }
         });
         assert_eq!(most.into_inner(), RUNS_AT_ONCE);
-        // Another GPU has its own.
         let _held = [turns.take(), turns.take()];
         drop(other.take());
     }

@@ -1,7 +1,6 @@
-//! The embedded segmentation model: predicts boundaries between objects of any kind in a photo and its depths.
-//!
-//! A small U-Net (Ronneberger et al. 2015), trained on generated photos painted anew
-//! (`embedded/train_segmenter.py`). The graph segmenter joins pixels by its predictions.
+//! The embedded segmentation model: predicts boundaries between objects in a photo and its depths, by which the graph
+//! segmenter joins pixels. A small U-Net (Ronneberger et al. 2015), trained on repainted generated photos
+//! (`embedded/train_segmenter.py`).
 
 use std::path::Path;
 
@@ -19,11 +18,11 @@ const INPUT: &str = "pixel_values";
 const OUTPUT: &str = "boundaries";
 /// Width and height must be multiples of this: the model halves them five times.
 const MULTIPLE: u32 = 32;
-/// Red, green, blue, and those of [`depth_channels`].
+/// Red, green, blue and [`depth_channels`].
 const N_CHANNELS: usize = 7;
-/// Slopes of the logarithm of depth are taken from this many pixels before to as many after.
+/// Slopes of the logarithm of depth span this many pixels on both sides.
 const SLOPE_REACH_PX: usize = 2;
-/// Slopes of this size, per [`SLOPE_REACH_PX`] both ways, are halfway to the largest that the model tells apart.
+/// Factor of a slope (over twice [`SLOPE_REACH_PX`]) before tanh.
 const SLOPE_SCALE: f32 = 20.0;
 /// Neighbours of a pixel with a predicted boundary: right, below left, below, below right.
 pub const N_NEIGHBOURS: usize = 4;
@@ -38,7 +37,6 @@ impl Boundaries {
         Ok(Self(model))
     }
 
-    /// Returns the SHA-256 of the embedded model file, in hexadecimal.
     pub fn sha256() -> String {
         hex::encode(Sha256::digest(SEGMENT))
     }
@@ -46,7 +44,7 @@ impl Boundaries {
     /// Returns the probability that each pixel and its neighbour show different objects, `[4][height][width]`:
     /// right, below left, below, below right.
     ///
-    /// `depth_m`: `[height][width]`, along the camera's axis; 0, less or NaN where it is unknown.
+    /// `depth_m`: `[height][width]`, along the camera's axis; at most 0, or NaN, where it is unknown.
     pub fn of(&mut self, image: &RgbImage, depth_m: Option<&[f32]>) -> Result<Vec<f32>, SessionError> {
         let (width, height) = image.dimensions();
         let [wide, high] = [width, height].map(|side| side.next_multiple_of(MULTIPLE));
@@ -67,7 +65,7 @@ impl Boundaries {
                     }
                     (Some(_), None) => pixels.resize(start + width as usize, 0.0),
                 }
-                // The last row and column are repeated beyond the border.
+                // Repeats the last row and column beyond the border.
                 let last = pixels.last().copied().unwrap_or_default();
                 pixels.resize(start + wide as usize, last);
             }
@@ -82,11 +80,9 @@ impl Boundaries {
     }
 }
 
-/// Returns what the model sees of depth at each pixel: half the logarithm of depth over the median depth, its
-/// slopes to the right and down, and 1. The first and last are 0 where depth is unknown, and a slope where it is
-/// unknown at either end.
-///
-/// None of these changes with the scene's scale. `depth_m`: `[height][width_px]`.
+/// Returns the depth channels of each pixel: half the logarithm of depth over the median depth, its slopes to the
+/// right and down, and 1. The first and last are 0 where depth is unknown, a slope where it is unknown at either
+/// end. None changes with the scene's scale. `depth_m`: `[height][width_px]`.
 fn depth_channels(depth_m: &[f32], width_px: usize) -> Vec<[f32; 4]> {
     let logs: Vec<f32> =
         depth_m.iter().map(|depth_m| if *depth_m > 0.0 { depth_m.ln() } else { f32::NAN }).collect();
@@ -120,8 +116,7 @@ fn depth_channels(depth_m: &[f32], width_px: usize) -> Vec<[f32; 4]> {
 mod tests {
     use super::*;
 
-    /// Depth grows by a hundredth a column, so that the logarithm's slope over four columns is 0.04; worked out by
-    /// hand.
+    /// By hand: depth grows by a hundredth per column, so the slope of the logarithm over four columns is 0.04.
     #[test]
     fn depth_is_seen_as_slopes_whatever_its_scale() {
         for scale in [1.0, 300.0] {

@@ -1,14 +1,14 @@
-//! Text cleaning that OpenAI's CLIP applies before its tokenizer; `tokenizer.json` files leave it out.
+//! The text cleaning of OpenAI's CLIP before its tokenizer, which `tokenizer.json` files omit.
 //!
-//! Does what ftfy and `html.unescape` do to ordinary input: replaces character references, UTF-8 read as
-//! Windows-1252, curly quotes, ligatures and full-width forms, removes control characters, and collapses spaces.
+//! As ftfy and `html.unescape` do with ordinary input, it replaces character references, UTF-8 read as Windows-1252,
+//! curly quotes, ligatures and full-width forms, removes control characters, and collapses spaces.
 //!
-//! The crate `html-escape` is not used: its table of over 2,000 names would add some 0.2 MB to the robot's
-//! program, and it leaves references to control characters in the text.
+//! Not the crate `html-escape`: its table of over 2,000 names adds some 0.2 MB to the robot's program, and it keeps
+//! references to control characters.
 
 /// Returns `text` cleaned, trimmed, with single spaces.
 pub fn clean(text: &str) -> String {
-    // CLIP unescapes twice, after ftfy has done so once.
+    // CLIP unescapes twice, after ftfy has done it once.
     let unescaped = unescape(&unescape(&unescape(text)));
     let mut cleaned = String::with_capacity(unescaped.len());
     for c in repair_encoding(&unescaped).chars() {
@@ -60,7 +60,7 @@ fn unescape(text: &str) -> String {
     while let Some(start) = rest.find('&') {
         let (before, reference) = rest.split_at(start);
         result.push_str(before);
-        // The longest names have 8 letters; the longest number is "#x10ffff".
+        // The longest name has 8 letters; the longest number is "#x10ffff".
         let end = reference.bytes().take(10).position(|b| b == b';');
         match end.and_then(|end| Some((end, referenced(&reference[1..end])?))) {
             Some((end, c)) => {
@@ -89,8 +89,8 @@ fn referenced(name: &str) -> Option<char> {
     latin_1.and_then(|i| char::from_u32(0xa0 + i as u32)).or_else(other)
 }
 
-/// Undoes UTF-8 read as Windows-1252 for U+0080 to U+00FF and U+2000 to U+203F: the accents and quotes of
-/// western text. Other lead bytes are left alone: they also occur in correct text ("CAFÉ”").
+/// Undoes UTF-8 read as Windows-1252 for U+0080 to U+00FF and U+2000 to U+203F: accents and quotes of western text.
+/// Other lead bytes also occur in correct text ("CAFÉ”").
 fn repair_encoding(text: &str) -> String {
     let chars: Vec<char> = text.chars().collect();
     let mut result = String::with_capacity(text.len());

@@ -1,12 +1,12 @@
-//! The built-in stand-in: recognises colours and coarse shapes, not objects; needs neither files nor ONNX Runtime.
+//! The built-in stand-in: recognises colours and coarse shapes, not objects; needs no files and no ONNX Runtime.
 //!
-//! An image's vector is a soft histogram over the 11 basic colour terms (Berlin and Kay 1969), followed by
-//! shape terms from the mask. A text's vector is the sum of its words' prototypes; colour prototypes
-//! are centred, so that an absent colour scores below 0.
+//! An image's vector is a soft histogram over the 11 basic colour terms (Berlin and Kay 1969), then shape terms
+//! from the mask. A text's vector is the sum of its words' prototypes; colour prototypes are centred, so that an
+//! absent colour scores below 0.
 //!
-//! Pixels are judged in OKLab (Ottosson 2020). Shade multiplies linear light by k, and so L, a and b by the
-//! cube root of k: hue and chroma / L are invariant and decide between hues. Lightness matters only for names
-//! that depend on it (white, grey, black; orange, brown; red, pink), relative to the crop's own highlights.
+//! Pixels are judged in OKLab (Ottosson 2020). Shade multiplies linear light by k, and so L, a and b by the cube
+//! root of k: hue and chroma / L are invariant and decide between hues. Lightness, relative to the crop's
+//! highlights, matters only for names that depend on it (white, grey, black; orange, brown; red, pink).
 
 use std::sync::LazyLock;
 
@@ -17,11 +17,9 @@ use crate::error::InferenceError;
 
 pub const NAME: &str = "colour-shape-v1";
 
-/// A description for people.
 pub const ABOUT: &str = "built-in stand-in: knows 11 colours and 3 shapes, no objects";
 
-/// The cosine from which something counts as found: an object with the colour on half of its pixels scores 0.5 or
-/// more and passes; one with the colour on a fifth does not.
+/// Least cosine of a match: an object with the colour on half of its pixels passes (0.5 or more), on a fifth does not.
 pub const THRESHOLD: f32 = 0.35;
 
 const COLOURS: [&str; 11] =
@@ -49,8 +47,8 @@ const SHAPES: [&str; 3] = ["tall", "wide", "round"];
 /// Components of a vector: one for each colour and each shape.
 pub const DIM: usize = N_COLOURS + SHAPES.len();
 
-/// Length of a full shape term, next to colours of length at most 1: an object of one colour then scores 0.45 for
-/// its shape, above the threshold, and 0.88 for its colour.
+/// Length of a full shape term, with colours of length at most 1: an object of one colour then scores 0.45 for its
+/// shape, above the threshold, and 0.88 for its colour.
 const SHAPE_WEIGHT: f32 = 0.5;
 
 const SYNONYMS: [(&str, &str); 24] = [
@@ -88,7 +86,6 @@ fn known() -> Vec<String> {
     COLOURS.iter().chain(&SHAPES).map(|&word| word.to_owned()).collect()
 }
 
-/// The stand-in; both an image and a text encoder.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ColourShape;
 
@@ -124,7 +121,7 @@ impl TextEncoder for ColourShape {
         if is_empty {
             return Err(InferenceError::EmptyText);
         }
-        // All colours together cancel out, as if the text had only stop words.
+        // All colours together cancel out, as do stop words alone.
         if !unknown.is_empty() || !normalise(&mut vector) {
             return Err(InferenceError::UnknownWords { unknown, known: known() });
         }
@@ -150,7 +147,6 @@ impl ImageEncoder for ColourShape {
     }
 }
 
-/// A pixel inside the mask, in OKLab.
 struct Pixel {
     lightness: f32,
     /// Chroma over lightness.
@@ -173,7 +169,7 @@ fn encode_crop(crop: &Crop) -> Option<[f32; DIM]> {
         .map(|&i| oklab([0, 1, 2].map(|channel| linear_of_level[usize::from(levels[i * 3 + channel])])))
         .collect();
     let mut lightness: Vec<f32> = pixels.iter().map(|p| p.lightness).collect();
-    // The 90th percentile, so that a glint on a dark object does not count.
+    // The 90th percentile ignores a glint on a dark object.
     let highlight = quantile(&mut lightness, 900, Rank::After)?;
 
     let mut vector = [0.0; DIM];
@@ -210,8 +206,8 @@ fn ramp(x: f32, from: f32, to: f32) -> f32 {
     ((x - from) / (to - from)).clamp(0.0, 1.0)
 }
 
-/// Hues of the colour terms in OKLab, in degrees, the first repeated at the end: those of the sRGB colours of the
-/// same names, shifted slightly towards the middle of each name's range.
+/// Hues of the colour terms in OKLab, degrees, the first repeated at the end: those of the sRGB colours of these
+/// names, shifted slightly to the middle of each name's range.
 const HUES: [(f32, Colour); 8] = [
     (27.0, Colour::Red),
     (62.0, Colour::Orange),
@@ -234,8 +230,7 @@ fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let lit = ramp(lightness, darkest, darkest + 0.08);
     add(Colour::Black, 1.0 - lit);
 
-    // A third of the way to the highlight: white in shade stays white down to a quarter of the light, while a grey
-    // part of a white object stays grey.
+    // A third of the way to the highlight: white stays white down to a quarter of the light; grey on white stays grey.
     let relit = lightness + 0.35 * (highlight - lightness).max(0.0);
     let white = ramp(relit, 0.76, 0.84);
     add(Colour::White, lit * (1.0 - chromatic) * white);
@@ -244,12 +239,11 @@ fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let hue_deg = if hue_deg < HUES[0].0 { hue_deg + 360.0 } else { hue_deg };
     let between = HUES.windows(2).find(|pair| hue_deg < pair[1].0).unwrap_or(&HUES[HUES.len() - 2..]);
     let [(from, before), (to, after)] = [between[0], between[1]];
-    // A name fully covers half of the way to its neighbours.
+    // A name covers half of the way to each neighbour.
     let towards_after = ramp((hue_deg - from) / (to - from), 0.25, 0.75);
     for (hue, share) in [(before, 1.0 - towards_after), (after, towards_after)] {
         let share = lit * chromatic * share;
-        // Names of the same hue when dark, dull or light. They depend on the highlight, not the pixel, so colours
-        // in shade keep their name.
+        // Names of one hue when dark, dull or light, by the highlight, so that shaded colours keep their name.
         let (other, part) = match hue {
             Colour::Red => {
                 let pink = ramp(highlight, 0.68, 0.78) * (1.0 - ramp(saturation, 0.2, 0.3));
@@ -267,24 +261,23 @@ fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     }
 }
 
-/// Returns how tall, wide and round a mask is, 0 to 1 each; `inside`: row-major indices, not empty.
+/// How tall, wide and round a mask is, 0 to 1 each; `inside`: row-major indices, not empty.
 fn shape(inside: &[usize], width_px: usize) -> [f32; 3] {
     let n = inside.len() as f64;
     let centre = |i: usize| ((i % width_px) as f64 + 0.5, (i / width_px) as f64 + 0.5);
     let (sum_x, sum_y) = inside.iter().map(|&i| centre(i)).fold((0.0, 0.0), |s, p| (s.0 + p.0, s.1 + p.1));
     let from_mean = |i: usize| (centre(i).0 - sum_x / n, centre(i).1 - sum_y / n);
     let mut radii2 = Vec::with_capacity(inside.len());
-    // The variance of a square pixel is 1/12; without it, a line one pixel wide would have no width.
+    // A square pixel has a variance of 1/12; without it, a line one pixel wide would have no width.
     let (mut var_x, mut var_y) = (1.0 / 12.0, 1.0 / 12.0);
     for (x, y) in inside.iter().map(|&i| from_mean(i)) {
         var_x += x * x / n;
         var_y += y * y / n;
         radii2.push(x * x + y * y);
     }
-    // Natural logarithm of height over width; a height of 2.5 widths is fully tall.
+    // Logarithm of height over width; 2.5 is fully tall.
     let elongation = 0.5 * (var_y / var_x).ln() / 2.5f64.ln();
-    // The mask's share of its enclosing circle: disc 1, square 0.64, ellipse 2:1 0.5. The farthest 2 % of the
-    // pixels are left out, because masks have ragged edges.
+    // Share of the enclosing circle: disc 1, square 0.64, ellipse 2:1 0.5; without the ragged farthest 2 % of pixels.
     let (_, &mut radius2, _) = radii2.select_nth_unstable_by((inside.len() - 1) * 49 / 50, f64::total_cmp);
     let filled = n / (std::f64::consts::PI * (radius2.sqrt() + 0.5).powi(2) / 0.98);
     [elongation.clamp(0.0, 1.0) as f32, (-elongation).clamp(0.0, 1.0) as f32, ramp(filled as f32, 0.75, 0.9)]

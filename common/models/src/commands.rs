@@ -40,9 +40,8 @@ pub struct PullArgs {
     hub: Option<String>,
 }
 
-/// The name of the stand-in in `--models`.
 const COLOURS: &str = "colours";
-/// Help text of the robot's `--models`: the cases of [`open`].
+/// Help text of the robot's `--models`, the cases of [`open`].
 pub const MODELS_HELP: &str = "Folder with model.toml, or name of a pulled model (`models list`), or `colours`, \
     which recognises only colours and needs no ONNX Runtime [default: the text model that the scene carries, else \
     the embedded one]";
@@ -76,8 +75,7 @@ pub struct RunArgs {
 }
 
 impl RunArgs {
-    /// Returns the session options, with `default_threads` unless the user sets a number; `beside`: folders to
-    /// search for the runtime.
+    /// `default_threads` applies unless the user sets a number; `beside`: folders to search for the runtime.
     pub fn session_options(
         &self,
         beside: &[PathBuf],
@@ -90,7 +88,7 @@ impl RunArgs {
     }
 }
 
-/// The calling program's side of the commands.
+/// What the commands need from their program.
 pub struct Context<'a> {
     pub variable: &'a dyn Fn(&str) -> Option<std::ffi::OsString>,
     pub side: Side,
@@ -105,7 +103,6 @@ fn options(variable: &dyn Fn(&str) -> Option<std::ffi::OsString>) -> Option<HubO
     Some(HubOptions { proxy, ..HubOptions::new(root) })
 }
 
-/// Returns the folder of a model, given as a folder or the name of a pulled model.
 pub fn resolve(
     model: &Path,
     variable: &dyn Fn(&str) -> Option<std::ffi::OsString>,
@@ -116,8 +113,8 @@ pub fn resolve(
     }
 }
 
-/// Opens the model of `--models`: the embedded encoders by default, [`ModelDir::colours`] by that name, else a
-/// folder or a pulled model.
+/// Opens the model of `--models`: by default the embedded encoders, [`ModelDir::colours`] by name, else a folder or a
+/// pulled model.
 /// # Errors
 /// As [`resolve`] and [`ModelDir::open`].
 pub fn open(
@@ -131,8 +128,7 @@ pub fn open(
     })
 }
 
-/// Returns the folders that may hold ONNX Runtime, for the program `exe`: its own, `lib/slag` and `lib/PROGRAM` of its
-/// prefix, and the build folder above it.
+/// Folders that may hold ONNX Runtime: `exe`'s own, `lib/slag` and `lib/PROGRAM` of its prefix, the build folder above.
 pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
     let packaged = Path::new("lib").join(exe.file_stem().unwrap_or_default());
     let built = Path::new("onnxruntime").join(std::env::consts::ARCH);
@@ -141,7 +137,7 @@ pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
     above.flat_map(|folder| within.map(|below| folder.join(below))).collect()
 }
 
-/// Asks a question on the terminal; returns false without a terminal.
+/// Asks a question on the terminal; false without one.
 pub fn ask(question: &str) -> bool {
     if !io::stdin().is_terminal() || !io::stderr().is_terminal() {
         return false;

@@ -1,4 +1,4 @@
-//! The description of either kind of model directory: encoders or a segmenter.
+//! The description of a model directory: encoders or a segmenter.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ pub(crate) enum Described {
 }
 
 impl Described {
-    /// Reads the description in `folder`: a segmenter's has `[segment]`.
+    /// Reads `folder`'s description; a segmenter's has `[segment]`.
     pub(crate) fn read(folder: &Path) -> Result<Self, DescriptionError> {
         let path = folder.join(FILE_NAME);
         Ok(match read_toml::<toml::Table>(&path)?.contains_key("segment") {

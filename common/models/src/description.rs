@@ -160,7 +160,6 @@ pub struct PatchDescription {
 }
 
 impl ImageDescription {
-    /// Returns the patches along each side of the square, if the model has vectors of patches.
     pub fn patches_per_side(&self) -> Option<u32> {
         self.patches.as_ref().map(|patches| u32::from(self.size_px / patches.patch_px.max(1)))
     }
@@ -249,13 +248,13 @@ impl Description {
         Ok(description)
     }
 
-    /// Returns the files with their roles, image first; a file of weights has the role of its model.
+    /// Files with their roles, image first; a weights file has its model's role.
     pub fn files(&self) -> Vec<(&'static str, &FileRef)> {
         let files = self.files_by_role().into_iter();
         files.flat_map(|(role, file)| file.parts().map(move |part| (role, part))).collect()
     }
 
-    /// Returns the files with their roles, image first, without the files of weights.
+    /// Files with their roles, image first, without weights files.
     pub(crate) fn files_by_role(&self) -> Vec<(&'static str, &FileRef)> {
         let mut files = vec![("image.model", &self.image.file)];
         match &self.text {
@@ -280,7 +279,7 @@ impl Description {
         files
     }
 
-    /// Returns the identity of the space. Every file must have a hash.
+    /// Identity of the space; every file must have a hash.
     pub(crate) fn encoder_id(&self) -> EncoderId {
         let definition = serde_json::to_string(self).expect("every file has its hash");
         EncoderId { name: self.name.clone(), dim: self.dim, definition }
@@ -356,7 +355,7 @@ fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result
         .map_err(|cause| DescriptionError::Format { path: path.to_owned(), cause: Box::new(cause) })
 }
 
-/// Returns an error unless `holds`: field `field` is `found`, but should be `expected`.
+/// Fails unless `holds`: field `field` is `found`, but should be `expected`.
 pub(crate) fn require(
     path: &Path,
     holds: bool,
@@ -370,7 +369,7 @@ pub(crate) fn require(
     Err(DescriptionError::Value { path: path.to_owned(), field, found, expected })
 }
 
-/// Checks the fields common to all descriptions: the name, and the files below a root.
+/// Checks what all descriptions have: a name, and files below a root.
 pub(crate) fn check_common(
     path: &Path,
     name: &str,
@@ -406,8 +405,8 @@ pub struct EncoderId {
 }
 
 impl EncoderId {
-    /// Returns the SHA-256 of the id's canonical form: `slag-encoder-id 2`, a line feed, then the JSON array of
-    /// name, dim and definition (a string) without spaces.
+    /// SHA-256 of the canonical form: `slag-encoder-id 2`, a line feed, then the JSON array of name, dim and
+    /// definition (a string) without spaces.
     pub fn hash(&self) -> [u8; 32] {
         let mut hasher = sha2::Sha256::new();
         hasher.update(b"slag-encoder-id 2\n");
@@ -451,10 +450,9 @@ impl fmt::Display for ScoreDescription {
 }
 
 impl ScoreDescription {
-    /// Returns the cosine from which something counts as found: the threshold, or the solution of
-    /// 1 / (1 + exp(-(scale * cosine + bias))) = probability (Zhai et al. 2023, equation 1).
-    ///
-    /// `None` if the fields are not those of exactly one of the two, or give no cosine.
+    /// Least cosine of a match: the threshold, or the solution of 1 / (1 + exp(-(scale * cosine + bias))) =
+    /// probability (Zhai et al. 2023, equation 1). `None` unless the fields are those of exactly one of the two
+    /// and give a cosine.
     pub fn threshold(&self) -> Option<f32> {
         let threshold = match *self {
             Self { threshold, logit_scale: None, logit_bias: None, probability: None } => {

@@ -1,4 +1,4 @@
-//! Downloads over HTTP that resume: of models from a hub, and of shards from a store.
+//! Resumable downloads over HTTP: models from a hub, shards from a store.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -10,16 +10,16 @@ use slag_common::retry::{Backoff, Retries};
 use ureq::http::{HeaderName, Method, Request, Response, StatusCode, Uri, header};
 use ureq::tls::{PemItem, RootCerts, TlsConfig, parse_pem};
 
-/// Most bytes read of a file of authorities; that of all public ones has a quarter.
+/// Largest file of authorities read; that of all public ones has a quarter.
 const MAX_CA_BYTES: u64 = 1 << 20;
-/// Longest sleep between looks at the cancel flag.
+/// Longest sleep between checks of the cancel flag.
 const NAP: Duration = Duration::from_millis(50);
 
 #[derive(Clone, Debug)]
 pub struct NetworkLimits {
-    /// Failures in a row, without progress, before a download is given up.
+    /// Consecutive failures without progress before a download fails.
     pub attempts: u32,
-    /// Waits after failures, scaled by 0.5..1.5.
+    /// Pauses after failures, scaled by 0.5..1.5.
     pub backoff: Backoff,
     /// Longest `Retry-After` accepted; it is added to the backoff.
     pub longest_retry_after: Duration,
@@ -31,9 +31,9 @@ pub struct NetworkLimits {
     pub slowest_bytes_per_sec: u64,
     /// Bytes between two writes.
     pub chunk_bytes: usize,
-    /// A retry that gained as many bytes counts as progress.
+    /// Bytes that a retry must gain to count as progress.
     pub progress_bytes: u64,
-    /// Redirects followed, never from an encrypted connection to a plain one.
+    /// Most redirects; never from an encrypted connection to a plain one.
     pub redirects: usize,
 }
 
@@ -55,7 +55,7 @@ impl Default for NetworkLimits {
 
 /// Watches a download, from any of its threads.
 pub trait Watch: Sync {
-    /// Returns whether the download shall end; the next one resumes what arrived.
+    /// Whether to stop; the next download resumes what arrived.
     fn is_cancelled(&self) -> bool {
         false
     }
@@ -63,7 +63,7 @@ pub trait Watch: Sync {
     fn received(&self, _bytes: u64) {}
     /// Called when an attempt failed and another follows.
     fn retried(&self, _url: &str, _failure: &DownloadFailure) {}
-    /// Returns a number within 0..1, to spread retries.
+    /// A number within 0..1, to spread retries.
     fn random(&self) -> f64 {
         0.5
     }
@@ -75,7 +75,7 @@ pub enum DownloadFailure {
     Transport(#[from] Box<ureq::Error>),
     #[error("TLS failed: {what}; {advice}")]
     Tls { what: String, advice: &'static str },
-    /// In answer to a request without TLS.
+    /// The answer to a request without TLS.
     #[error("the answer is no HTTP ({what}); if the server speaks TLS there, give its address with https://")]
     NotHttp { what: String },
     #[error("the body ended at byte {found_bytes} of {expected_bytes}")]
@@ -97,7 +97,7 @@ impl From<ureq::Error> for DownloadFailure {
     fn from(e: ureq::Error) -> Self {
         match &e {
             ureq::Error::Rustls(tls) => Self::of_tls(tls.to_string()),
-            // What rustls finds wrong while it reads and writes.
+            // Errors of rustls while reading and writing.
             ureq::Error::Io(io) if io.kind() == io::ErrorKind::InvalidData => Self::of_tls(io.to_string()),
             _ => Self::Transport(Box::new(e)),
         }
@@ -131,7 +131,7 @@ impl DownloadFailure {
         Self::Tls { what, advice }
     }
 
-    /// Returns the failure of a request; without TLS, what is no HTTP may be the other side's TLS.
+    /// Without TLS, an answer that is not HTTP may be TLS.
     fn of_request(e: ureq::Error, uri: &Uri) -> Self {
         match &e {
             ureq::Error::Protocol(what) if uri.scheme_str() == Some("http") => match what.to_string() {
@@ -142,15 +142,14 @@ impl DownloadFailure {
         }
     }
 
-    /// Returns whether its text says what to do.
+    /// Whether the message says what to do.
     pub fn has_advice(&self) -> bool {
         matches!(self, Self::Tls { .. } | Self::NotHttp { .. } | Self::Redirect { .. })
     }
 
-    /// Returns whether another attempt may help.
     fn is_passing(&self) -> bool {
         match self {
-            // A certificate does not become another one by asking again.
+            // A certificate does not change on another attempt.
             Self::Redirect { .. } | Self::Tls { .. } | Self::NotHttp { .. } => false,
             Self::Status { status, .. } => *status >= 500 || matches!(status, 408 | 416 | 429),
             Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
@@ -174,7 +173,7 @@ pub enum DownloadError {
 pub enum Stop {
     /// Another attempt may help.
     Failed(DownloadFailure),
-    /// The same, but enough bytes arrived.
+    /// The same, after enough bytes arrived.
     Interrupted(DownloadFailure),
     /// No further attempt.
     Fatal(DownloadError),
@@ -207,18 +206,18 @@ impl From<io::Error> for Stop {
 /// A local file that arrives in pieces.
 pub trait Part {
     fn len_bytes(&self) -> io::Result<u64>;
-    /// Returns the strong entity tag of the content that they belong to; without one nothing is resumed.
+    /// Strong entity tag of its content; without one nothing is resumed.
     fn etag(&self) -> Option<String>;
-    /// Notes the entity tag of new content, before its first byte is written.
+    /// Records the entity tag of new content, before its first byte.
     fn begin(&self, _etag: &str) -> io::Result<()> {
         Ok(())
     }
-    /// Writes at an offset, and cuts the file off behind the new bytes.
+    /// Writes at an offset, and truncates the file after the new bytes.
     fn write_from(&self, offset_bytes: u64, bytes: &[u8]) -> io::Result<()>;
     fn discard(&self) -> io::Result<()>;
-    /// Makes the whole file durable and checks it; returns what is wrong with it.
+    /// Makes the complete file durable and checks it; the inner error is its fault.
     fn finish(&self) -> io::Result<Result<(), DownloadFailure>>;
-    /// Downloads with wrong content before it is given up.
+    /// Downloads with wrong content before giving up.
     fn max_wrong(&self) -> u32;
 }
 
@@ -234,7 +233,7 @@ impl Expected {
         bytes
     }
 
-    /// Refuses a file of `total` bytes, if it is known, of which `rest` are to come and `content` are announced.
+    /// Refuses a file of `total` bytes, if known, of which `rest` are missing and `content` announced.
     fn check(
         self,
         total: Option<u64>,
@@ -256,7 +255,7 @@ impl Expected {
     }
 }
 
-/// Sends requests to one server, and repeats them.
+/// Sends requests to one server, with retries.
 pub struct Client<'a> {
     agent: ureq::Agent,
     limits: NetworkLimits,
@@ -277,7 +276,7 @@ impl<'a> Client<'a> {
         let agent = ureq::Agent::config_builder()
             .tls_config(tls)
             .http_status_as_error(false)
-            // Followed here, where each response is seen.
+            // Redirects are followed here, where each response is seen.
             .max_redirects(0)
             .proxy(proxy)
             .timeout_resolve(Some(limits.connect_timeout))
@@ -291,7 +290,7 @@ impl<'a> Client<'a> {
         Self { agent, limits, watch, resumed_bytes, retries }
     }
 
-    /// Downloads a small file into memory; `None` if the server does not have it.
+    /// `None` if the server does not have it.
     pub fn small(&self, url: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, DownloadError> {
         self.retrying(url, || {
             let response = self.request(Method::GET, url, max_bytes, &[], &mut |_, _| {})?;
@@ -320,8 +319,8 @@ impl<'a> Client<'a> {
         })
     }
 
-    /// Downloads a file piece by piece, and resumes what an earlier attempt left. A server or proxy that answers a
-    /// range wrongly is asked for the whole file from then on.
+    /// Downloads a file piece by piece, resuming an earlier attempt. Once a server or proxy answers a range
+    /// wrongly, the complete file is requested.
     pub fn large(&self, url: &str, part: &dyn Part, expected: Expected) -> Result<(), DownloadError> {
         if matches!(expected, Expected::Exactly(bytes) if part.len_bytes()? > bytes) {
             part.discard()?;
@@ -348,7 +347,7 @@ impl<'a> Client<'a> {
         })
     }
 
-    /// Receives the bytes that are missing, or all if they cannot be resumed.
+    /// Receives the missing bytes, or all if they cannot be resumed.
     fn receive(
         &self,
         url: &str,
@@ -376,13 +375,13 @@ impl<'a> Client<'a> {
                 offset = 0;
                 content_bytes
             }
-            // A range that comes as if it were the whole file.
+            // A range sent as if it were the complete file.
             StatusCode::OK => None,
             StatusCode::RANGE_NOT_SATISFIABLE => {
                 part.discard()?;
                 return Err(refusal(&response).into());
             }
-            // Some proxies refuse ranges alone: the whole is asked for. One that is busy is asked again.
+            // Some proxies refuse ranges only: request the complete file. Ask busy ones again.
             status if offset > 0 && !matches!(status.as_u16(), 408 | 429 | 502..=504) => {
                 *may_resume = false;
                 return self.receive(url, part, expected, may_resume);
@@ -409,7 +408,7 @@ impl<'a> Client<'a> {
         self.write_body(response, part, offset, end, expected.most_bytes())
     }
 
-    /// Writes a body. `end`: where it ends, if known; never more than `most_bytes` are written.
+    /// Writes a body that ends at `end`, if known; never more than `most_bytes`.
     fn write_body(
         &self,
         response: Response<ureq::Body>,
@@ -428,7 +427,7 @@ impl<'a> Client<'a> {
             let n_read = *read.as_ref().unwrap_or(&0);
             n_filled += n_read;
             self.watch.received(n_read as u64);
-            // Also writes what arrived before a break: the next attempt resumes there.
+            // Also writes what arrived before a failure: the next attempt resumes there.
             if n_filled == chunk.len() || n_read == 0 || end == Some(offset + n_filled as u64) {
                 part.write_from(offset, &chunk[..n_filled])?;
                 offset += n_filled as u64;
@@ -450,7 +449,7 @@ impl<'a> Client<'a> {
         Ok(())
     }
 
-    /// Sends a request and follows redirects; `seen` gets each response with the address that it comes from.
+    /// Sends a request and follows redirects; `seen` gets each response with its address.
     pub(crate) fn request(
         &self,
         method: Method,
@@ -461,7 +460,7 @@ impl<'a> Client<'a> {
     ) -> Result<Response<ureq::Body>, Stop> {
         let body_secs = expected_bytes / self.limits.slowest_bytes_per_sec.max(1);
         let body_timeout = self.limits.read_timeout.saturating_add(Duration::from_secs(body_secs));
-        // A time limit beyond the clock's range is no limit.
+        // A timeout beyond the clock's range is none.
         let body_timeout = Instant::now().checked_add(body_timeout).is_some().then_some(body_timeout);
         let mut uri: Uri = url.parse().map_err(|_| ureq::Error::BadUri(url.to_owned()))?;
         for n_followed in 0.. {
@@ -487,7 +486,7 @@ impl<'a> Client<'a> {
         unreachable!("the last redirect is an error")
     }
 
-    /// Retries until an attempt succeeds or fails for good, or too many fail in a row without progress.
+    /// Retries until success, a permanent failure, or too many failures in a row without progress.
     pub(crate) fn retrying<T>(
         &self,
         url: &str,
@@ -514,7 +513,7 @@ impl<'a> Client<'a> {
                 }
                 _ => Duration::ZERO,
             };
-            // Added to the backoff, so that a fleet that got the same `Retry-After` does not return in step.
+            // Added to the backoff, so that a fleet with the same `Retry-After` does not return in step.
             let mut left = asked.saturating_add(pause.mul_f64(0.5 + self.watch.random().clamp(0.0, 1.0)));
             while !left.is_zero() {
                 self.check_cancelled()?;
@@ -530,7 +529,7 @@ impl<'a> Client<'a> {
     }
 }
 
-/// Returns whose certificates count: those of the authorities in a file (PEM), else the public ones.
+/// Authorities to trust: those in a file (PEM), else the public ones.
 pub fn tls(ca: Option<&Path>) -> Result<TlsConfig, String> {
     let Some(path) = ca else { return Ok(TlsConfig::default()) };
     let pem = files::read_short(path, MAX_CA_BYTES).map_err(|e| e.to_string())?;
@@ -553,19 +552,19 @@ pub(crate) fn refusal(response: &Response<ureq::Body>) -> DownloadFailure {
     DownloadFailure::Status { status: status.as_u16(), retry_after: may_ask.then(asked).flatten() }
 }
 
-/// Returns the length of the whole file, if a range is all of it from `offset` on.
+/// Returns the length of the complete file, if a range is all of it from `offset` on.
 fn total_of_rest(content_range: &str, offset: u64) -> Option<u64> {
     let total = content_range.rsplit_once('/')?.1.parse::<u64>().ok()?;
     (content_range == format!("bytes {offset}-{}/{total}", total.wrapping_sub(1))).then_some(total)
 }
 
-/// Returns a header as text, cut to 200 characters; empty if it is absent or not text.
+/// A header as text, cut to 200 characters; empty if it is absent or not text.
 pub(crate) fn header_text(response: &Response<ureq::Body>, name: HeaderName) -> String {
     let value = response.headers().get(name).and_then(|value| value.to_str().ok());
     value.unwrap_or_default().chars().take(200).collect()
 }
 
-/// Returns the target of a redirect if it may be followed: never from an encrypted connection to a plain one.
+/// Returns the target of a redirect, unless it leads from an encrypted connection to a plain one.
 fn redirected(from: &Uri, location: &str) -> Option<Uri> {
     let to: Uri = match location.starts_with('/') && !location.starts_with("//") {
         true => format!("{}://{}{location}", from.scheme_str()?, from.authority()?).parse().ok()?,
@@ -584,14 +583,13 @@ mod tests {
 
     impl Watch for Nobody {}
 
-    /// Answers each connection with some bytes, whatever it asks.
+    /// Answers each connection with the same bytes.
     fn answering(bytes: &'static [u8]) -> u16 {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
         let port = listener.local_addr().expect("bound").port();
         std::thread::spawn(move || {
             for mut stream in listener.incoming().flatten() {
                 let mut asked = [0; 4096];
-                // A client that leaves is none to answer.
                 let _ = stream.read(&mut asked).and_then(|_| io::Write::write_all(&mut stream, bytes));
             }
         });

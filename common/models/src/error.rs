@@ -34,7 +34,7 @@ pub enum TokenizerError {
     OtherVocabulary {
         path: PathBuf,
         expected: u32,
-        /// The last token of a text, if any.
+        /// Last token of a text, if any.
         found: Option<u32>,
     },
     #[error(

@@ -1,4 +1,4 @@
-//! References to the files of a model, by path and SHA-256.
+//! Files of a model, by path and SHA-256.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -12,22 +12,21 @@ use slag_common::files;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FileRef {
-    /// Its path below `files_root`.
+    /// Below `files_root`.
     pub path: PathBuf,
     pub sha256: Option<Sha256>,
-    /// The weights of an ONNX file that keeps them in a file of its own (`.onnx_data`), which it names relative to
-    /// its own folder.
+    /// Weights that an ONNX file keeps in a separate file (`.onnx_data`), which it names relative to its own folder.
     #[serde(default)]
     pub data: Option<Box<FileRef>>,
 }
 
 impl FileRef {
-    /// Returns the file and, if there is one, the file of its weights.
+    /// The file and, if separate, its weights.
     pub fn parts(&self) -> impl Iterator<Item = &Self> {
         std::iter::successors(Some(self), |file| file.data.as_deref())
     }
 
-    /// Mutable [`Self::parts`], called one after the other.
+    /// Mutable [`Self::parts`], one after the other.
     pub(crate) fn for_each_part<E>(
         &mut self,
         mut run: impl FnMut(&mut Self) -> Result<(), E>,
@@ -37,7 +36,7 @@ impl FileRef {
     }
 }
 
-/// Serialises the hashes alone: the encoder id must not depend on paths.
+/// Only the hashes: the encoder id must not depend on paths.
 impl Serialize for FileRef {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let sha256 =
@@ -80,7 +79,7 @@ impl TryFrom<String> for Sha256 {
 /// A file of a model: on disk, or embedded in the program.
 #[derive(Clone, Debug)]
 pub struct ModelFile {
-    /// Its path; for messages only if it is embedded.
+    /// For messages only if it is embedded.
     pub path: PathBuf,
     pub(crate) embedded: Option<&'static [u8]>,
 }

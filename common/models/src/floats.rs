@@ -1,4 +1,4 @@
-//! The numbers that a model returns, without a copy where the processor can read the runtime's memory.
+//! Output values of a model, copied only where the processor cannot read the runtime's memory.
 
 use std::fmt::Debug;
 use std::ops::Deref;
@@ -7,17 +7,17 @@ use half::f16;
 use ort::memory::AllocationDevice;
 use ort::value::{DynTensor, PrimitiveTensorElementType, TensorElementType};
 
-/// Numbers that a model returned: a copy, or the runtime's memory for as long as this lives.
+/// Output values: a copy, or the runtime's memory while this lives.
 pub struct Floats(Memory);
 
 enum Memory {
     Own(Vec<f32>),
-    /// A tensor of f32 that [`read`] has read once.
+    /// A tensor of f32 that [`read`] has read before.
     Runtime(DynTensor),
 }
 
 impl Floats {
-    /// Returns the shape and values of a tensor of f32 or f16.
+    /// Shape and values of a tensor of f32 or f16.
     pub(crate) fn of(tensor: DynTensor) -> ort::Result<(Vec<i64>, Self)> {
         let shape = tensor.shape().to_vec();
         let memory = match tensor.data_type() {
@@ -32,7 +32,7 @@ impl Floats {
         Ok((shape, Self(memory)))
     }
 
-    /// Returns the values as a vector, which is a copy where the runtime has them.
+    /// Copies values that the runtime holds.
     pub(crate) fn into_vec(self) -> Vec<f32> {
         match self.0 {
             Memory::Own(values) => values,
@@ -41,7 +41,7 @@ impl Floats {
     }
 }
 
-/// Returns the values of a tensor in the processor's memory or in page-locked memory.
+/// Values of a tensor in the processor's memory or in page-locked memory.
 fn read<T: PrimitiveTensorElementType>(tensor: &DynTensor) -> ort::Result<&[T]> {
     match tensor.try_extract_tensor::<T>() {
         Ok((_, values)) => Ok(values),
@@ -49,7 +49,7 @@ fn read<T: PrimitiveTensorElementType>(tensor: &DynTensor) -> ort::Result<&[T]> 
     }
 }
 
-/// Returns the values of a tensor of u8 in the processor's memory or in page-locked memory, to be written.
+/// The same of u8, to be written.
 pub(crate) fn bytes_mut(tensor: &mut DynTensor) -> ort::Result<&mut [u8]> {
     if page_locked::is_of::<u8>(tensor) {
         return Ok(page_locked::bytes_mut(tensor));
@@ -61,7 +61,6 @@ pub(crate) fn bytes_mut(tensor: &mut DynTensor) -> ort::Result<&mut [u8]> {
 mod page_locked {
     use super::*;
 
-    /// Returns whether a tensor of `T` lies in page-locked memory.
     pub(super) fn is_of<T: PrimitiveTensorElementType>(tensor: &DynTensor) -> bool {
         tensor.memory_info().allocation_device() == AllocationDevice::CUDA_PINNED
             && *tensor.data_type() == T::into_tensor_element_type()
@@ -76,7 +75,7 @@ mod page_locked {
         is_of::<T>(tensor).then(|| unsafe { std::slice::from_raw_parts(tensor.data_ptr().cast::<T>(), n) })
     }
 
-    /// The tensor must be one of u8 in page-locked memory.
+    /// `tensor` must be u8 in page-locked memory.
     pub(super) fn bytes_mut(tensor: &mut DynTensor) -> &mut [u8] {
         let n = tensor.shape().num_elements();
         // SAFETY: as above, and the tensor is borrowed mutably. The runtime copies bound inputs before it returns.
@@ -90,7 +89,7 @@ impl Deref for Floats {
     fn deref(&self) -> &[f32] {
         match &self.0 {
             Memory::Own(values) => values,
-            // It was read when it was made.
+            // Cannot fail: it was read when it was made.
             Memory::Runtime(tensor) => read(tensor).unwrap_or_default(),
         }
     }

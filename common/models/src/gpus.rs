@@ -9,7 +9,7 @@ use crate::placement::DeviceMemory;
 use crate::preprocess::{Filter, Preprocess, Resize};
 use crate::{Provider, SessionOptions};
 
-/// Where the driver of Linux lists a machine's GPUs.
+/// Where Linux's driver lists a machine's GPUs.
 const DRIVER_LIST: &str = "/proc/driver/nvidia/gpus";
 
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -17,20 +17,19 @@ pub enum GpuChoice {
     /// All that the runtime can use.
     #[default]
     All,
-    /// These, as CUDA numbers them.
+    /// As CUDA numbers them.
     Numbers(Vec<u32>),
 }
 
 impl GpuChoice {
-    /// Returns the numbers of the chosen GPUs, at least one. Without an NVIDIA provider it is 0, which then means
-    /// nothing.
+    /// Numbers of the chosen GPUs, at least one; 0, without a meaning, where there is no NVIDIA provider.
     pub fn numbers(&self, options: &SessionOptions) -> Vec<u32> {
         match self {
             Self::Numbers(numbers) => numbers.clone(),
             Self::All => {
                 let nvidia = |provider: &&Provider| matches!(provider, Provider::Cuda | Provider::TensorRt);
                 let Some(provider) = options.providers.iter().find(nvidia) else { return vec![0] };
-                // A GPU that does not open is reported by the runtime's log, so that none is tried in vain.
+                // The runtime logs GPUs that do not open, so none is tried in vain.
                 let listed = std::fs::read_dir(Path::new(DRIVER_LIST)).map_or(1, Iterator::count);
                 let opens = |gpu: &u32| {
                     *gpu == 0

@@ -1,20 +1,20 @@
-//! `--help` of the programs: one screen of what most people need; `--help-all` has every flag, in full.
+//! `--help` shows what most people need, on one screen; `--help-all` shows every flag in full.
 
 use clap::builder::StyledStr;
 use clap::{Arg, ArgAction, Command};
 
-/// What stands before the flags; examples come first.
+/// Examples precede the flags.
 const TEMPLATE: &str = "{about-with-newline}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
 
-/// Makes the help of a command and those below it short: the first sentence of each flag, without those that hide
-/// from the short help.
+/// Shortens the help of a command and its subcommands: the first sentence of each flag, without flags hidden from the
+/// short help.
 pub fn layered(command: Command) -> Command {
     let below: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_owned()).collect();
     let command = below.iter().fold(command, |command, name| command.mut_subcommand(name, layered));
     let short =
         Arg::new("help").short('h').long("help").action(ArgAction::HelpShort).help("Prints this help");
     let long = Arg::new("help-all").long("help-all").action(ArgAction::HelpLong);
-    // `--limit -5` is a wrong value, not an unknown flag.
+    // `--limit -5` is then a wrong value, not an unknown flag.
     command
         .allow_negative_numbers(true)
         .mut_args(first_sentence_first)
@@ -28,7 +28,7 @@ fn first_sentence_first(arg: Arg) -> Arg {
     let Some(all) = arg.get_help().map(StyledStr::to_string) else { return arg };
     let long = arg.get_long_help().map_or_else(|| all.clone(), StyledStr::to_string);
     let end = all.find(". ").into_iter().chain(all.find("; ")).min();
-    // Texts end with the default where the program chooses it.
+    // Texts end with the default if the program chooses it.
     let default = all.rfind(" [default:").map_or("", |at| &all[at..]);
     match end {
         Some(end) if end + default.len() < all.len() => arg.help(format!("{}{default}", &all[..end])),

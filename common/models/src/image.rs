@@ -20,23 +20,22 @@ use crate::{
     session::{Model, SessionError, SessionOptions},
 };
 
-/// Largest difference from length 1 in vectors that the model normalises itself.
+/// Largest deviation from length 1 of vectors that the model normalises itself.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// Batch size for models whose vectors depend on it: a constant, so that vectors are the same on every machine.
+/// Batch size of models whose vectors depend on it; constant, so that vectors are the same on every machine.
 const FIXED_BATCH: usize = 16;
 
-/// Batch size on a GPU, unless the description says otherwise: CLIP ViT-B/32 gains nothing from larger ones on an
-/// H100.
+/// Default batch size on a GPU: CLIP ViT-B/32 gains nothing from larger ones on an H100.
 const GPU_BATCH: usize = 256;
 
-/// Share of the time per crop that doubling the batch must save to be worth its memory.
+/// Least saving of time per crop for which doubling the batch is worth its memory.
 const WORTHWHILE: f64 = 0.05;
 
 /// An image encoder that runs an ONNX file.
 ///
-/// On an NVIDIA GPU, squares go to the GPU as bytes and batches have one shape: the last places of a batch that is
-/// not full are computed, too, so that a crop's vector is the same however many others come with it.
+/// On an NVIDIA GPU, squares go to the GPU as bytes and batches have one shape: unused places of a batch are computed
+/// too, so that a crop's vector does not depend on the number of others.
 ///
 /// On other devices, if the description states no batch size, the fastest of 1, 2, 4, 8, 16 and 32 is measured
 /// once a process, among those that leave a crop's vector bit for bit the same. Models whose vectors depend on the
@@ -52,9 +51,9 @@ pub struct OnnxImageEncoder {
     output: String,
     normalise: bool,
     batch: Option<usize>,
-    /// The output of patch vectors and the patches along a side.
+    /// Output of patch vectors; patches along a side.
     patches: Option<(String, u32)>,
-    /// The way through a GPU's memory, where the model runs on one that allows it.
+    /// GPU memory and conversion, if the model runs on a GPU that allows it.
     on_gpu: Option<OnGpu>,
 }
 
@@ -66,7 +65,7 @@ struct OnGpu {
 }
 
 impl OnnxImageEncoder {
-    /// Opens `file` according to `description`; `dim`: components of a vector.
+    /// `dim`: components of a vector.
     pub fn open(
         name: &str,
         dim: usize,
@@ -111,7 +110,7 @@ impl OnnxImageEncoder {
         Ok(encoder)
     }
 
-    /// Takes batches through this memory from now on.
+    /// Runs batches through this memory from now on.
     fn bind(&mut self, memory: DeviceMemory, options: &SessionOptions) -> Result<(), SessionError> {
         let batch = *self.batch.get_or_insert(GPU_BATCH);
         let levels = Levels::open(batch, &self.preprocess, self.is_f16, &memory, options)?;
@@ -119,7 +118,7 @@ impl OnnxImageEncoder {
         Ok(())
     }
 
-    /// Sets the batch size if the description leaves it open: to `measured`, which is measured if absent.
+    /// Sets a batch size that the description leaves open to `measured`, which is measured if absent.
     pub(crate) fn settle_batch(&mut self, measured: &mut Option<usize>) -> Result<(), SessionError> {
         if self.batch.is_none() {
             self.batch = Some(match *measured {
@@ -132,7 +131,7 @@ impl OnnxImageEncoder {
 
     fn measure_batch(&mut self) -> Result<usize, SessionError> {
         let n_values = 3 * (self.preprocess.size_px() as usize).pow(2);
-        // Noise of two strengths: scales computed at run time differ between them.
+        // Noise of two strengths, between which scales computed at run time differ.
         let mut state = 1u32;
         let mut noise = |strength: f32| -> Vec<f32> {
             let mut next = || {
@@ -169,7 +168,7 @@ impl OnnxImageEncoder {
         Ok(best)
     }
 
-    /// Returns the vectors of at most a batch of crops, `[n][dim]`.
+    /// Vectors of at most a batch of crops, `[n][dim]`.
     fn vectors(&mut self, crops: &[Crop]) -> Result<Vec<f32>, SessionError> {
         let Some(OnGpu { memory, levels, turns }) = &mut self.on_gpu else {
             let mut pixels = Vec::new();
@@ -192,13 +191,13 @@ impl OnnxImageEncoder {
         Ok(vectors[..crops.len() * self.dim].to_vec())
     }
 
-    /// Runs the model on pixel values `[n][3][size_px][size_px]`; returns its vectors, `[n][dim]`.
+    /// Runs the model on `[n][3][size_px][size_px]`; returns its vectors, `[n][dim]`.
     fn run(&mut self, pixels: &[f32], n: usize) -> Result<Vec<f32>, SessionError> {
         let (output, dim) = (self.output.clone(), self.dim as i64);
         self.run_for(pixels, n, &output, &[n as i64, dim])
     }
 
-    /// Runs the model on pixel values `[n][3][size_px][size_px]`; returns `output`, which has `shape`.
+    /// Runs the model on `[n][3][size_px][size_px]`; returns `output`, which has `shape`.
     fn run_for(
         &mut self,
         pixels: &[f32],
@@ -287,7 +286,7 @@ mod tests {
     use super::*;
     use crate::description::Description;
 
-    /// The way through bound memory gives the vectors of the plain way, whatever the batch and however full it is.
+    /// Bound memory gives the same vectors as the plain way, for any batch, full or not.
     #[test]
     fn bound_batches_give_the_same_vectors() {
         let folder = slag_test_support::workspace_root().join("common/models/embedded");
@@ -299,7 +298,7 @@ mod tests {
         let open = || OnnxImageEncoder::open("embedded", dim, &file, &description.image, &options);
         let crops: Vec<Crop> = (0..7u32)
             .map(|k| {
-                // Of the model's size, and of others.
+                // Squares of the model's size, and other shapes.
                 let (width, height) = if k % 2 == 0 { (64, 64) } else { (20 + 9 * k, 31) };
                 let level = |x: u32, y: u32, c: u32| (x * (3 + k) + y * (7 - k) + 83 * c) as u8;
                 Crop::whole(RgbImage::from_fn(width, height, |x, y| {
@@ -318,7 +317,7 @@ mod tests {
             let found = bound.encode(&crops).expect("runs");
             for (a, b) in found.chunks_exact(dim).zip(expected.chunks_exact(dim)) {
                 let cosine: f32 = a.iter().zip(b).map(|(a, b)| a * b).sum();
-                // Pixel values by a product and a sum differ from the table's in the last bit.
+                // Pixel values by product and sum differ from the table's in the last bit.
                 assert!(cosine > 1.0 - 1e-5, "batch {batch}: {cosine}");
             }
             assert!(first.get_or_insert(found.clone()) == &found, "batch {batch}");

@@ -1,6 +1,5 @@
-//! Turns squares of 8-bit levels into pixel values on the GPU that the image model runs on.
-//!
-//! A byte a value crosses to the GPU, where it becomes two or four; the processor only splits pixels into planes.
+//! Turns squares of 8-bit levels into pixel values on the image model's GPU: one byte per value crosses to the
+//! GPU, where it becomes two or four; the processor only splits pixels into planes.
 
 use std::path::Path;
 
@@ -15,14 +14,14 @@ use crate::placement::DeviceMemory;
 use crate::preprocess::Preprocess;
 use crate::session::{Model, SessionError, SessionOptions};
 
-/// `embedded/levels.py` makes them.
+/// Made by `embedded/levels.py`.
 const F16: &[u8] = include_bytes!("../embedded/levels_f16.onnx");
 const F32: &[u8] = include_bytes!("../embedded/levels_f32.onnx");
 
-/// Threads that split the pixels of a batch into planes: a single one takes longer than the model.
+/// Threads that split a batch into planes: one alone would take longer than the model.
 const N_THREADS: usize = 4;
 
-/// A batch of squares that a GPU turns into pixel values.
+/// A batch of squares, converted to pixel values by a GPU.
 #[derive(Debug)]
 pub(crate) struct Levels {
     model: Model,
@@ -34,7 +33,7 @@ pub(crate) struct Levels {
 }
 
 impl Levels {
-    /// Opens the conversion for batches of `batch` squares; `is_f16`: the type of pixel values.
+    /// Opens the conversion of `batch` squares; `is_f16`: the type of pixel values.
     pub(crate) fn open(
         batch: usize,
         preprocess: &Preprocess,
@@ -56,9 +55,8 @@ impl Levels {
         Ok(Self { squares, square_bytes: (3 * size * size) as usize, model, scale, offset })
     }
 
-    /// Returns the pixel values of a whole batch, `[batch][3][size_px][size_px]`, on the GPU. Places beyond
-    /// `squares` have any values: every batch has one shape, so that a vector does not depend on how many others
-    /// are computed with it.
+    /// Returns the pixel values of a batch, `[batch][3][size_px][size_px]`, on the GPU. Unused places have
+    /// arbitrary values: all batches have one shape, so that a vector does not depend on the number of others.
     pub(crate) fn values<'a>(
         &mut self,
         memory: &DeviceMemory,
@@ -101,8 +99,8 @@ mod tests {
     use crate::floats::Floats;
     use crate::preprocess::{Filter, Resize};
 
-    /// Oracle: the table of values by level, which the processor's way uses. In 16 bits a value of up to 4 is off
-    /// by half a unit in its last place (0.001), and so are scale times level and offset.
+    /// Oracle: the processor's table of values by level. In 16 bits a value of up to 4 is off by half a unit in
+    /// its last place (0.001), and so are scale times level and offset.
     #[test]
     fn levels_become_the_pixel_values_of_the_table() {
         let preprocess = Preprocess::new(
@@ -121,7 +119,7 @@ mod tests {
         let memory = DeviceMemory::of_processor();
         for (is_f16, tolerance) in [(false, 1e-6), (true, 4e-3)] {
             let mut levels = Levels::open(3, &preprocess, is_f16, &memory, &options).expect("opens");
-            // The second batch is not full, and must not be mixed up with the first.
+            // The second batch is not full, and must not mix with the first.
             for batch in [vec![0, 1, 2], vec![5, 6]] {
                 let squares = batch.iter().map(|k| Cow::Owned(square(*k)));
                 let (shape, found) =

@@ -1,11 +1,10 @@
 //! Model directories: image and text encoders that share one embedding space.
 //!
-//! A [`ModelDir`] is described by one TOML file ([`description`]). Its image side turns crops into
-//! vectors ([`ImageEncoder`]); its text side turns queries into vectors of the same space
-//! ([`TextEncoder`]). Both run through ONNX Runtime ([`session`]), or without a model: from a list of
-//! phrases ([`phrases`]) or by colour ([`colours`]). [`ModelDir::embedded`] opens the encoders that are
-//! part of the program. [`EncoderId`] identifies the space, so that a robot can refuse to compare
-//! vectors of two spaces. [`sam`] proposes masks; [`boundaries`] predicts where objects end.
+//! A [`ModelDir`] is described by one TOML file ([`description`]). Its image side turns crops into vectors
+//! ([`ImageEncoder`]); its text side turns queries into vectors of the same space ([`TextEncoder`]). Both use ONNX
+//! Runtime ([`session`]), a list of phrases ([`phrases`]) or colours ([`colours`]). [`ModelDir::embedded`] opens the
+//! encoders that are part of the program. [`EncoderId`] identifies the space, so that a robot can refuse vectors of
+//! another one. [`sam`] proposes masks; [`boundaries`] predicts where objects end.
 //!
 //! [`hub`] pulls public models; [`commands`] is its command line, shared by both programs.
 //!

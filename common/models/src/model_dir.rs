@@ -6,15 +6,15 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
-/// The files of `embedded/`, which are part of the program.
+/// Files of `embedded/`, compiled in.
 mod embedded {
     pub const DESCRIPTION: &str = include_str!("../embedded/model.toml");
     pub const IMAGE: &[u8] = include_bytes!("../embedded/image.onnx");
     pub const TEXT: &[u8] = include_bytes!("../embedded/text.onnx");
     pub const TOKENIZER: &[u8] = include_bytes!("../embedded/tokenizer.json");
-    /// The nouns that the models learnt, one a line.
+    /// Nouns that the models learnt, one per line.
     pub const NOUNS: &str = include_str!("../embedded/nouns.txt");
-    /// The words that they learnt for several nouns, one a line.
+    /// Words that they learnt for several nouns, one per line.
     pub const KINDS: &str = include_str!("../embedded/kinds.txt");
 }
 
@@ -29,7 +29,7 @@ use crate::{
     text_side::{TextSide, TextSideError},
 };
 
-/// A pair of image and text encoders: a directory with a description, or built into the program.
+/// A pair of image and text encoders: a described directory, or built in.
 #[derive(Clone, Debug)]
 pub struct ModelDir {
     id: EncoderId,
@@ -44,7 +44,7 @@ enum Source {
 
 #[derive(Clone, Debug)]
 struct Documented {
-    /// TOML; empty for one from a store, which has no image side to encode with.
+    /// TOML; empty for a model from a store, which cannot encode images.
     document: String,
     description: Description,
 }
@@ -64,8 +64,7 @@ enum Files {
 }
 
 impl Files {
-    /// Returns a file after comparing its hash with the recorded one, if any; `embedded`: the bytes
-    /// in the program.
+    /// Returns a file, checked against its hash if recorded; `embedded`: its compiled-in bytes.
     fn open(&self, file: &FileRef, embedded: &'static [u8]) -> Result<ModelFile, DescriptionError> {
         match self {
             Self::Embedded => Ok(ModelFile::embedded(&file.path, embedded)),
@@ -73,7 +72,7 @@ impl Files {
         }
     }
 
-    /// Returns the path of a file of a kind that embedded models do not have.
+    /// Returns the path of a file that embedded models do not have.
     fn on_disk(&self, file: &FileRef) -> Result<PathBuf, DescriptionError> {
         match self {
             Self::Embedded => Ok(file.path.clone()),
@@ -83,9 +82,8 @@ impl Files {
 }
 
 impl ModelDir {
-    /// Opens the directory `path` with a [`description`](crate::description) in `model.toml`.
-    ///
-    /// Files with a recorded hash are read and checked only when an encoder needs them.
+    /// Opens a directory with a [`description`](crate::description) in `model.toml`. Files with a recorded hash
+    /// are read and checked only when an encoder needs them.
     pub fn open(path: &Path) -> Result<Self, ModelError> {
         let file = path.join(FILE_NAME);
         let document = description::read_text(&file)?;
@@ -94,16 +92,14 @@ impl ModelDir {
         Self::with(Documented { document, description }, Files::Folder(files_root))
     }
 
-    /// Returns the encoders embedded in the program: trained on generated scenes, poor on real photos
-    /// (`embedded/CARD.md`). They need ONNX Runtime too.
+    /// The embedded encoders: trained on generated scenes, poor on real photos (`embedded/CARD.md`); need ONNX Runtime.
     pub fn embedded() -> Result<Self, ModelError> {
         let description = Description::parse(Path::new("(embedded)/model.toml"), embedded::DESCRIPTION)?;
         Self::with(Documented { document: embedded::DESCRIPTION.to_owned(), description }, Files::Embedded)
     }
 
-    /// Opens the text side that a store carries. `description`: [`TextSide::description`]; `path`: of the
-    /// description, for messages; `folder`: where its files lie, by their hashes. Their content is compared with
-    /// the description when the encoder is opened.
+    /// Opens the text side from a store. `description`: [`TextSide::description`]; `path`: of the description, for
+    /// messages; `folder`: has its files, named by hash. Their content is checked when the encoder is opened.
     pub fn carried(description: &[u8], path: &Path, folder: &Path) -> Result<Self, ModelError> {
         let description = Description::from_json(path, description)?;
         let described = Documented { document: String::new(), description };
@@ -122,7 +118,7 @@ impl ModelDir {
     fn with(description: Documented, files: Files) -> Result<Self, ModelError> {
         let root = match &files {
             Files::Folder(root) => root,
-            // Not used: the embedded description records every hash.
+            // Unused: the embedded description records every hash.
             Files::Embedded => Path::new(""),
         };
         let id = hashed(&description.description, root)?.encoder_id();
@@ -130,7 +126,7 @@ impl ModelDir {
         Ok(Self { id, source })
     }
 
-    /// Returns the stand-in for colours and shapes, which needs neither files nor ONNX Runtime.
+    /// The stand-in for colours and shapes, which needs no files and no ONNX Runtime.
     pub fn colours() -> Self {
         let id =
             EncoderId { name: colours::NAME.to_owned(), dim: colours::DIM as u32, definition: String::new() };
@@ -145,7 +141,7 @@ impl ModelDir {
         self.id.dim as usize
     }
 
-    /// Returns a description for people: what the model can recognise and what not.
+    /// What the model can recognise and what not, for people.
     pub fn about(&self) -> &str {
         match &self.source {
             Source::Colours => colours::ABOUT,
@@ -153,7 +149,7 @@ impl ModelDir {
         }
     }
 
-    /// Returns the cosine from which something counts as found, if the model states one.
+    /// Least cosine of a match, if the model states one.
     pub fn threshold(&self) -> Option<f32> {
         match &self.source {
             Source::Colours => Some(colours::THRESHOLD),
@@ -161,9 +157,7 @@ impl ModelDir {
         }
     }
 
-    /// Returns the steps from a crop to the image encoder's square; `None` if it takes any size.
-    ///
-    /// The square and its crop have the same vector.
+    /// Steps from a crop to the image encoder's square, which has the same vector; `None` if any size is accepted.
     pub fn preprocess(&self) -> Option<Preprocess> {
         match &self.source {
             Source::Colours => None,
@@ -171,7 +165,7 @@ impl ModelDir {
         }
     }
 
-    /// Returns the patches along each side of a photo that have vectors; `None` if the model has none.
+    /// Patches with vectors along each side of a photo; `None` without any.
     pub fn patches_per_side(&self) -> Option<u32> {
         match &self.source {
             Source::Colours => None,
@@ -179,8 +173,7 @@ impl ModelDir {
         }
     }
 
-    /// Returns the sizes of windows of a photo that masks take a share of; none if the model should see things
-    /// alone.
+    /// Sizes of windows of a photo that masks take a share of; empty if the model should see objects alone.
     pub fn windows(&self) -> &[u8] {
         match &self.source {
             Source::Colours => &[],
@@ -195,12 +188,12 @@ impl ModelDir {
         let image = &description.image;
         let file = files.open(&image.file, embedded::IMAGE)?;
         let mut encoder = OnnxImageEncoder::open(&description.name, self.dim(), &file, image, options)?;
-        // One encoder measures while others wait: parallel runs would disturb the timing.
+        // One encoder measures while others wait, because parallel runs would disturb the timing.
         encoder.settle_batch(&mut batch.lock().unwrap_or_else(PoisonError::into_inner))?;
         Ok(Box::new(encoder))
     }
 
-    /// Opens the text encoder; loads ONNX Runtime only if the text side is ONNX.
+    /// Loads ONNX Runtime only if the text side is ONNX.
     pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
         let Source::Files { files, description, .. } = &self.source else {
             return Ok(Box::new(colours::ColourShape));
@@ -239,7 +232,7 @@ fn hashed(description: &Description, root: &Path) -> Result<Description, Descrip
     Ok(hashed)
 }
 
-/// Returns the recorded hash of `file`, or else computes it.
+/// Returns the recorded hash, or computes it.
 pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], DescriptionError> {
     let path = files_root.join(&file.path);
     match file.sha256 {
@@ -251,7 +244,7 @@ pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], D
     }
 }
 
-/// Returns the path of `file` after comparing its hash, and that of its weights, with the recorded ones, if any.
+/// Returns the path of `file`, checked with its weights against recorded hashes.
 pub(crate) fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionError> {
     for part in file.parts() {
         let path = files_root.join(&part.path);
@@ -282,7 +275,7 @@ mod tests {
         ModelDir::with(described, Files::Embedded).expect("every hash is recorded").encoder_id().hash()
     }
 
-    /// The id depends on everything that affects vectors, and not on prose, paths or batch sizes.
+    /// The id depends on everything that affects vectors, and not on texts for people, paths or batch sizes.
     #[test]
     fn the_encoder_id_covers_the_description() {
         let text = embedded::DESCRIPTION;

@@ -1,15 +1,15 @@
-//! What a thing is called: the words that it scores best for, each with the chance that it is right.
+//! Names of objects: the words with the best scores, each with the chance that it is right.
 //!
-//! A score s stands z = (s - mean) / spread above the scores of all words and things of a scene, which makes models
-//! comparable. The confidence of a word is a softmax over all words and "none of these":
-//! exp(a z) / (exp(a c) + sum of exp(a z') over all words z').
+//! A score s is z = (s - mean) / spread above all scores of words and objects of a scene, which makes models
+//! comparable. The confidence of a word is a softmax over all words and "none of these": exp(a z) / (exp(a c) +
+//! sum of exp(a z') over all words z').
 
 use crate::everyday_nouns;
 
 pub const MAX_NAMES: usize = 3;
-/// Most words that things are named by: lists of phrases for people are shorter.
+/// Most words as names; phrase lists for people are shorter.
 const MAX_WORDS: usize = 4096;
-/// Least spread of scores: a smaller one says that nothing was measured.
+/// Least spread of scores; a smaller one means that nothing was measured.
 const MIN_SPREAD: f64 = 1e-3;
 
 #[derive(Clone, Copy, Debug)]
@@ -18,14 +18,12 @@ struct Fit {
     none_at: f64,
 }
 
-/// The likeliest for the names of things in two generated houses, with true and automatic masks: the model's 85 words
-/// are what is generated.
+/// Maximum likelihood for two generated houses, true and automatic masks; the model knows the 85 words generated.
 const EMBEDDED: Fit = Fit { sharpness: 1.5, none_at: 1.0 };
-/// The likeliest for ConSE's names of the things of house_a, with true and automatic masks. Other models were not
-/// measured: none could be had.
+/// Maximum likelihood for ConSE's names in house_a, with true and automatic masks; no other model was available.
 const OTHERS: Fit = Fit { sharpness: 1.0, none_at: 5.0 };
 
-/// Returns the words that things are named by: a model's own, or everyday nouns.
+/// Words for names: the model's own, or everyday nouns.
 pub fn words_of(vocabulary: Option<&[String]>) -> Vec<String> {
     match vocabulary {
         None | Some([]) => everyday_nouns().map(str::to_owned).collect(),
@@ -33,7 +31,7 @@ pub fn words_of(vocabulary: Option<&[String]>) -> Vec<String> {
     }
 }
 
-/// How the scores of a scene's things become confidences.
+/// Maps the scores of a scene's objects to confidences.
 #[derive(Clone, Copy, Debug)]
 pub struct Confidence {
     fit: Fit,
@@ -41,7 +39,7 @@ pub struct Confidence {
     spread: f64,
 }
 
-/// Measures the scores of all words and things of a scene, or of as many as represent them.
+/// Measures the scores of all words and objects of a scene, or of a sample.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Spread {
     sum: f64,
@@ -66,21 +64,20 @@ impl Confidence {
         Self { fit, mean, spread }
     }
 
-    /// Returns the weight of a word beside 1 for "none of these".
+    /// Weight of a word relative to "none of these".
     fn weight(&self, score: f32) -> f64 {
         let z = (f64::from(score) - self.mean) / self.spread;
-        // Thousands of such weights have a finite sum.
+        // Keeps the sum of thousands of weights finite.
         (self.fit.sharpness * (z - self.fit.none_at)).min(600.0).exp()
     }
 }
 
-/// Collects the scores of a thing, word by word.
+/// Collects the scores of an object, word by word.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Naming {
-    /// The best scores and their words, best first; of equal ones the first.
+    /// Best scores and their words, best first; of equal ones the first.
     best: [(f32, u32); MAX_NAMES],
     n: usize,
-    /// Sum of the weights of all words.
     sum: f64,
 }
 
@@ -95,7 +92,7 @@ impl Naming {
         }
     }
 
-    /// Returns the best words with their confidences, best first.
+    /// The best words with their confidences, best first.
     pub fn names(&self, confidence: &Confidence) -> impl Iterator<Item = (u32, f32)> {
         let whole = 1.0 + self.sum;
         let of = move |(score, word): &(f32, u32)| (*word, (confidence.weight(*score) / whole) as f32);
@@ -128,7 +125,7 @@ mod tests {
         assert_eq!(names_of("any", &[]), []);
     }
 
-    /// A word far above all others is nearly sure; where none stands out, no word is likely.
+    /// A word far above all others is nearly sure; otherwise no word is likely.
     #[test]
     fn what_stands_out_is_sure() {
         let mut scores = [0.1f32; 85];
@@ -136,7 +133,7 @@ mod tests {
         scores[7] = 0.7;
         let names = names_of("slag-embedded-1", &scores);
         assert!(names[0].0 == 7 && names[0].1 > 0.95 && names[1].1 < 0.01, "{names:?}");
-        // One word for thousands of things.
+        // One clear word among thousands.
         let mut scores = vec![0.0; 10_000];
         scores[0] = 1.0;
         assert!(names_of("any", &scores)[0].1 <= 1.0);

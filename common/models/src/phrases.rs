@@ -1,4 +1,4 @@
-//! A text encoder of fixed phrases with given vectors; needs no model and no ONNX Runtime.
+//! A text encoder of fixed phrases with given vectors; needs no ONNX Runtime.
 
 use std::{collections::HashMap, path::Path, sync::Arc};
 
@@ -11,7 +11,7 @@ use crate::{tensors, text::centred};
 
 const N_NEAR: usize = 5;
 
-/// Longer texts are sentences, not misspelt phrases: they get no suggestions.
+/// Longer texts are sentences, not misspelt phrases, and get no suggestions.
 const LONGEST_COMPARED: usize = 100;
 
 #[derive(Debug)]
@@ -25,9 +25,8 @@ pub struct PhraseEncoder {
 }
 
 impl PhraseEncoder {
-    /// Reads the phrases, one a line, and their vectors, (file, tensor) `[phrases][dim]`; `centre`: `[dim]`.
-    ///
-    /// If two lines are the same phrase, the first one counts.
+    /// Reads phrases, one per line, and their vectors, (file, tensor) `[phrases][dim]`; `centre`: `[dim]`. Of
+    /// equal phrases the first counts.
     pub fn open(
         dim: usize,
         phrases: &Path,
@@ -61,14 +60,14 @@ impl PhraseEncoder {
         Ok(Self { dim, phrases: lines, index_of_key, known, vectors })
     }
 
-    /// Returns the index of a phrase, which may be in the plural.
+    /// Returns the index of a phrase, also for its plural.
     fn find(&self, key: &str) -> Option<usize> {
         let spaced = without_hyphens(key);
         let mut keys = [key.to_owned(), spaced.clone()].into_iter().chain(singulars(&spaced));
         keys.find_map(|key| self.index_of_key.get(&key).copied())
     }
 
-    /// Returns known phrases similar to `key`: within a few edits, or with a word in common.
+    /// Known phrases within a few edits of `key`, or with a word in common.
     fn near(&self, key: &str) -> Vec<String> {
         let letters: Vec<char> = key.chars().collect();
         if letters.len() > LONGEST_COMPARED {
@@ -128,7 +127,7 @@ impl TextEncoder for PhraseEncoder {
     }
 }
 
-/// Returns what else a phrase is called: `barrel` and `bucket` for `barrel/bucket`, `tractor` for `tractor (farm equipment)`.
+/// Other names in a phrase: `barrel` and `bucket` for `barrel/bucket`, `tractor` for `tractor (farm equipment)`.
 fn other_keys(key: &str) -> impl Iterator<Item = String> {
     let bare = key.split(" (").next().unwrap_or(key);
     [key, bare].into_iter().chain(bare.split('/')).map(|key| without_hyphens(key.trim()))

@@ -1,4 +1,4 @@
-//! The providers that a model's nodes run on, read from ONNX Runtime's log.
+//! Providers that run a model's nodes, read from ONNX Runtime's log.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -16,24 +16,24 @@ use crate::provider::Provider;
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Placement {
     provider: Provider,
-    /// Number of nodes by the runtime's name of the provider; empty if only the CPU was requested.
+    /// Nodes by the runtime's provider name; empty if only the CPU was requested.
     nodes: BTreeMap<String, usize>,
 }
 
 impl Placement {
-    /// Returns the first requested provider that runs any node, else the CPU.
+    /// The first requested provider that runs a node, else the CPU.
     pub fn provider(&self) -> Provider {
         self.provider
     }
 
-    /// Returns this with [`Self::provider`] chosen among `asked`.
+    /// Chooses [`Self::provider`] among `asked`.
     pub(crate) fn of_asked(mut self, asked: &[Provider]) -> Self {
         let is_used = |provider: &Provider| self.nodes.contains_key(provider.runtime_name());
         self.provider = asked.iter().copied().find(is_used).unwrap_or_default();
         self
     }
 
-    /// Records a log message of the runtime that states the placement of nodes; ignores others.
+    /// Records the placement in a log message of the runtime; ignores other messages.
     fn record(&mut self, message: &str) {
         let placed = || {
             let (_, placed) = message.split_once("placed on [")?;
@@ -58,7 +58,7 @@ impl fmt::Display for Placement {
     }
 }
 
-/// Collects the placement from the log of one session; the runtime reports it nowhere else.
+/// Collects the placement from a session's log; the runtime reports it nowhere else.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Listener(Arc<Mutex<Placement>>);
 
@@ -80,7 +80,7 @@ impl Listener {
     }
 }
 
-/// Forwards the runtime's messages to `tracing`; by default it prints them.
+/// Forwards the runtime's messages, which it would print, to `tracing`.
 pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, message: &str) {
     match level {
         LogLevel::Error | LogLevel::Fatal => tracing::error!(category, "ONNX Runtime: {message}"),
@@ -89,7 +89,7 @@ pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location:
     }
 }
 
-/// Memory of a GPU, and that of the processor which it copies from and to.
+/// Memory of a GPU, and host memory for its copies.
 #[derive(Debug)]
 pub(crate) struct DeviceMemory {
     pub(crate) device: MemoryInfo<'static>,
@@ -98,7 +98,7 @@ pub(crate) struct DeviceMemory {
 }
 
 impl DeviceMemory {
-    /// Returns the memory of an NVIDIA GPU that `session` runs on.
+    /// Memory of the NVIDIA GPU that runs `session`.
     pub(crate) fn of_gpu(session: &Session, gpu: u32) -> ort::Result<Self> {
         let gpu = i32::try_from(gpu).map_err(|_| ort::Error::new("there is no GPU of that number"))?;
         let device =
@@ -113,7 +113,7 @@ impl DeviceMemory {
             .ok()?;
             Allocator::new(session, info.clone()).is_ok().then_some(info)
         };
-        // Runtimes differ in the number under which they offer page-locked memory: the GPU's, or 0.
+        // Runtimes offer page-locked memory under the GPU's number or under 0.
         let host = pinned(gpu).or_else(|| pinned(0)).unwrap_or_default();
         Ok(Self { device, host })
     }
@@ -122,7 +122,7 @@ impl DeviceMemory {
         Self { device: MemoryInfo::default(), host: MemoryInfo::default() }
     }
 
-    /// Returns a tensor of u8, zeros, in memory from which the GPU copies.
+    /// A tensor of u8, zeros, in memory from which the GPU copies.
     pub(crate) fn bytes(&self, session: &Session, shape: &[i64]) -> ort::Result<DynTensor> {
         let allocator = Allocator::new(session, self.host.clone())?;
         let mut tensor = DynTensor::new(&allocator, TensorElementType::Uint8, shape.to_vec())?;
@@ -135,7 +135,7 @@ impl DeviceMemory {
 mod tests {
     use super::*;
 
-    /// Messages in the wording of ONNX Runtime 1.17 to 1.31 (`session_state.cc`).
+    /// Wording of ONNX Runtime 1.17 to 1.31 (`session_state.cc`).
     #[test]
     fn placement_is_read_from_the_log() {
         let cpu = Placement::default().of_asked(&[Provider::Cuda]);

@@ -1,13 +1,12 @@
-//! Turns a crop into the pixel values that an image model expects: resize, centre crop, normalise.
+//! Turns a crop into an image model's pixel values: resize, centre crop, normalise.
 //!
-//! Resampling equals Pillow's `Image.resize` (libImaging/Resample.c: two passes, 8-bit between them,
-//! 22-bit fixed-point weights) pixel for pixel, because the models were trained and evaluated with it.
-//! Integer arithmetic gives the same result on every machine.
+//! Resampling equals Pillow's `Image.resize` (libImaging/Resample.c: two passes, 8-bit between them, 22-bit
+//! fixed-point weights) pixel for pixel, because the models were trained and evaluated with it. Integer arithmetic
+//! gives the same result on every machine.
 
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
-/// How a crop of any shape becomes the model's square.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Resize {
@@ -50,7 +49,7 @@ impl Filter {
     }
 }
 
-/// A part of a resized image, in pixels of the resized image.
+/// A part of a resized image, in its pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Window {
     pub left_px: u64,
@@ -59,7 +58,7 @@ pub struct Window {
     pub height_px: u32,
 }
 
-/// Returns (x / 255 - mean) / std for every level x, per channel.
+/// (x / 255 - mean) / std for every level x, per channel.
 pub(crate) fn values_of_levels(mean: [f64; 3], std: [f64; 3]) -> [[f32; 256]; 3] {
     let value = |channel: usize, level: usize| ((level as f64 / 255.0 - mean[channel]) / std[channel]) as f32;
     std::array::from_fn(|c| std::array::from_fn(|level| value(c, level)))
@@ -75,12 +74,11 @@ pub struct Preprocess {
 }
 
 impl Preprocess {
-    /// Returns the steps for a square of `size_px`; `mean` and `std` apply to x / 255, per channel RGB.
+    /// `mean` and `std` apply to x / 255, per channel RGB.
     pub fn new(size_px: u32, resize: Resize, filter: Filter, mean: [f64; 3], std: [f64; 3]) -> Self {
         Self { size_px, resize, filter, values: values_of_levels(mean, std) }
     }
 
-    /// Returns the same steps, but for stretching over the square.
     pub fn stretched(&self) -> Self {
         Self { resize: Resize::Stretch, ..self.clone() }
     }
@@ -89,16 +87,14 @@ impl Preprocess {
         self.size_px
     }
 
-    /// Returns a and b of pixel value = a * level + b, per channel RGB.
+    /// a and b of pixel value = a * level + b, per channel RGB.
     pub(crate) fn scale_and_offset(&self) -> ([f32; 3], [f32; 3]) {
         let scale = |of_level: [f32; 256]| (f64::from(of_level[255]) - f64::from(of_level[0])) / 255.0;
         (self.values.map(|of_level| scale(of_level) as f32), self.values.map(|of_level| of_level[0]))
     }
 
-    /// Returns the resized size of an image and the window of it that is kept. The window is smaller than the
-    /// square only with [`Resize::Pad`].
-    ///
-    /// Neither edge may be 0.
+    /// Returns the resized size of an image and the window of it that is kept, which is smaller than the square
+    /// only with [`Resize::Pad`]. Neither edge may be 0.
     pub fn plan(&self, width_px: u32, height_px: u32) -> ([u64; 2], Window) {
         let size = u64::from(self.size_px);
         let short = u64::from(width_px.min(height_px));
@@ -121,7 +117,7 @@ impl Preprocess {
         (resized, window)
     }
 
-    /// Returns the model's square, resized and cropped. `image` must have pixels.
+    /// Resizes and crops to the model's square. `image` must have pixels.
     pub fn square(&self, image: &RgbImage) -> RgbImage {
         let (resized, window) = self.plan(image.width(), image.height());
         let resized = resample(image, self.filter, resized, window);
@@ -155,7 +151,7 @@ struct Taps {
     weights: Vec<i32>,
 }
 
-/// Returns the taps of the output pixels `range` when `n_in` pixels are resized to `n_out`.
+/// Taps of the output pixels `range` when `n_in` pixels are resized to `n_out`.
 fn taps(filter: Filter, n_in: u32, n_out: u64, range: std::ops::Range<u64>) -> Vec<Taps> {
     let scale = f64::from(n_in) / n_out as f64;
     let filter_scale = scale.max(1.0);
@@ -182,9 +178,8 @@ fn to_level(sum: i32) -> u8 {
 /// Half a level, so that [`to_level`] rounds.
 const HALF: i32 = 1 << (WEIGHT_BITS - 1);
 
-/// Resizes `image` to `resized` (width, height) and returns `window` of the result; only the window is computed.
-///
-/// Neither `image` nor `resized` may be empty, and the window must lie within `resized`.
+/// Resizes `image` to `resized` (width, height) and returns `window` of it, the only part computed. Neither
+/// `image` nor `resized` may be empty; the window must lie within `resized`.
 pub fn resample(image: &RgbImage, filter: Filter, resized: [u64; 2], window: Window) -> RgbImage {
     let whole = Window { left_px: 0, top_px: 0, width_px: image.width(), height_px: image.height() };
     if window == whole && resized == [image.width(), image.height()].map(u64::from) {

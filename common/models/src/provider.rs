@@ -23,7 +23,7 @@ pub enum Provider {
 impl Provider {
     pub const ALL: [Self; 5] = [Self::Cpu, Self::Cuda, Self::TensorRt, Self::CoreMl, Self::DirectMl];
 
-    /// Returns its name in options and reports, in lower case.
+    /// In options and reports, in lower case.
     pub fn name(self) -> &'static str {
         match self {
             Self::Cpu => "cpu",
@@ -44,7 +44,7 @@ impl Provider {
         }
     }
 
-    /// Registers it with `builder`; `gpu`: the NVIDIA GPU to run on, as CUDA numbers them.
+    /// `gpu`: the NVIDIA GPU to use, as CUDA numbers them.
     pub(crate) fn register(self, builder: SessionBuilder, gpu: u32) -> ort::Result<SessionBuilder> {
         let gpu = i32::try_from(gpu).map_err(|_| ort::Error::new("there is no GPU of that number"))?;
         let (is_built_in, dispatch): (_, ExecutionProviderDispatch) = match self {
@@ -68,8 +68,7 @@ impl Provider {
     }
 }
 
-/// Returns CUDA's settings. Convolutions are chosen by rule, not by timing them: the same ones every time, and
-/// quicker ones for CLIP's patches on an H100.
+/// Convolutions are chosen by rule, not by timing: always the same, and faster for CLIP's patches on an H100.
 fn cuda(gpu: i32) -> ep::CUDA {
     ep::CUDA::default().with_device_id(gpu).with_conv_algorithm_search(ConvAlgorithmSearch::Heuristic)
 }
@@ -80,7 +79,6 @@ impl fmt::Display for Provider {
     }
 }
 
-/// Returns the names of providers, separated by commas.
 pub(crate) fn names(providers: &[Provider]) -> String {
     providers.iter().map(|provider| provider.name()).collect::<Vec<_>>().join(", ")
 }

@@ -26,17 +26,16 @@ pub use crate::error::SessionError;
 pub struct SessionOptions {
     /// The library, from [`find_runtime`].
     pub runtime: PathBuf,
-    /// Threads within one run. For small models, 1 and several sessions in parallel is fastest.
+    /// Threads per run. For small models, 1 and several sessions in parallel are fastest.
     pub intra_op_threads: usize,
-    /// The devices to run on, in order of preference. Without the CPU in the list, it is an error if none of them
-    /// can be used.
+    /// Devices in order of preference. Without the CPU among them, it is an error if none can be used.
     pub providers: Vec<Provider>,
-    /// The GPU to run on, as CUDA numbers them.
+    /// As CUDA numbers them.
     pub gpu: u32,
 }
 
 impl SessionOptions {
-    /// Returns the options for one thread on the CPU.
+    /// One thread on the CPU.
     pub fn new(runtime: PathBuf) -> Self {
         Self { runtime, intra_op_threads: 1, providers: vec![Provider::Cpu], gpu: 0 }
     }
@@ -63,7 +62,7 @@ pub(crate) struct Tensor {
     pub(crate) values: Floats,
 }
 
-/// An input or output: its name, and for tensors element type and shape; -1 is any size.
+/// Name of an input or output and, for tensors, element type and shape; -1 is any size.
 pub(crate) type Declared = (String, Option<(TensorElementType, Vec<i64>)>);
 
 pub(crate) fn declared(outlets: &[Outlet]) -> Vec<Declared> {
@@ -74,7 +73,7 @@ pub(crate) fn declared(outlets: &[Outlet]) -> Vec<Declared> {
     outlets.iter().map(|outlet| (outlet.name().to_owned(), tensor(outlet))).collect()
 }
 
-/// Names inputs or outputs with their types.
+/// Lists inputs or outputs with their types.
 pub(crate) fn listed(outlets: &[Outlet]) -> Vec<String> {
     outlets.iter().map(|outlet| format!("{} {}", outlet.name(), type_of(outlet))).collect()
 }
@@ -84,7 +83,7 @@ pub(crate) struct Model {
     pub(crate) path: PathBuf,
     pub(crate) session: Session,
     pub(crate) placement: Placement,
-    /// The memory of the GPU that runs the model; `None` where tensors cannot be bound to it.
+    /// Memory of the model's GPU; `None` where tensors cannot be bound to it.
     pub(crate) memory: Option<DeviceMemory>,
 }
 
@@ -100,8 +99,7 @@ impl Model {
         Self::open_sized(file, options, None)
     }
 
-    /// Opens the model for one size of a named dimension: all that follows from it is computed now, not in every
-    /// run.
+    /// Opens the model for one size of a named dimension, to compute dependent values only once.
     pub(crate) fn open_sized(
         file: &ModelFile,
         options: &SessionOptions,
@@ -114,7 +112,7 @@ impl Model {
         }
         let environment = environment(&options.runtime)?;
         let mut wanted = options.providers.clone();
-        // Providers after the CPU are never used: the CPU can run everything.
+        // Providers after the CPU are never used, because the CPU can run everything.
         let end = wanted.iter().position(|&p| p == Provider::Cpu);
         let may_be_cpu = end.is_some() || wanted.is_empty();
         wanted.truncate(end.unwrap_or(wanted.len()));
@@ -148,7 +146,7 @@ impl Model {
         Ok(Self { path: path.to_owned(), session, placement, memory })
     }
 
-    /// Opens the model with `providers`; `listens`: determine the placement of its nodes.
+    /// `listens`: determine the placement of its nodes.
     fn commit(
         file: &ModelFile,
         options: &SessionOptions,
@@ -202,7 +200,7 @@ impl Model {
         SessionError::Run { path: self.path.clone(), cause }
     }
 
-    /// Returns the name of a dimension of any size of input `name`.
+    /// The name of a dimension of any size of input `name`.
     pub(crate) fn dimension(&self, name: &str, axis: usize) -> Option<String> {
         let input = self.session.inputs().iter().find(|input| input.name() == name)?;
         let ValueType::Tensor { shape, dimension_symbols, .. } = input.dtype() else { return None };
@@ -210,14 +208,14 @@ impl Model {
         (shape.get(axis) == Some(&-1)).then(|| symbol.clone())
     }
 
-    /// Returns the element type of input `name`, if it exists and is a tensor.
+    /// The element type of input `name`, if it exists and is a tensor.
     pub(crate) fn input_element(&self, name: &str) -> Option<TensorElementType> {
         let input = self.session.inputs().iter().find(|input| input.name() == name)?;
         input.dtype().tensor_type()
     }
 
-    /// Returns input `name` (`None`: the only one that fits) if it takes `element`, with f16 accepted for f32, and
-    /// `shape`, where -1 is any size.
+    /// Returns input `name` (`None`: the only one that fits) if it has `shape` (-1: any size) and takes `element`,
+    /// or f16 for f32.
     pub(crate) fn expect_input<'a>(
         &self,
         name: impl Into<Option<&'a str>>,
@@ -286,7 +284,7 @@ impl Model {
         slot_of(outlet).ok_or_else(|| self.shape_error(role, name, type_of(outlet), element, expected))
     }
 
-    /// Returns the error for a model that takes only one length of text.
+    /// The error of a model that takes only one length of text.
     pub(crate) fn fixed_tokens(&self, slot: &Slot) -> SessionError {
         let n = slot.shape[1];
         SessionError::Shape {
@@ -321,7 +319,7 @@ impl Model {
         SessionError::Layout { path: self.path.clone(), found, expected }
     }
 
-    /// Runs the model on `inputs` and returns the f32 output `name`, which must have exactly `shape`.
+    /// Runs the model; returns the f32 output `name`, which must have exactly `shape`.
     pub(crate) fn run(
         &mut self,
         inputs: Vec<(&str, SessionInputValue<'_>)>,
@@ -331,7 +329,7 @@ impl Model {
         Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values.into_vec())
     }
 
-    /// Runs the model on `inputs` and returns the given f32 outputs in order; -1 in a shape is any size.
+    /// Runs the model; returns f32 outputs in the given order; -1 in a shape is any size.
     pub(crate) fn run_all(
         &mut self,
         inputs: Vec<(&str, SessionInputValue<'_>)>,
@@ -349,7 +347,7 @@ impl Model {
             .collect()
     }
 
-    /// Returns the values of output `name`, f32 or f16, which must fit `shape`; -1 is any size.
+    /// Values of output `name`, f32 or f16, which must fit `shape`; -1 is any size.
     pub(crate) fn floats(
         &self,
         value: Option<DynTensor>,
@@ -377,7 +375,6 @@ impl Model {
         Ok(tensor.into())
     }
 
-    /// Returns `values` as a bound input of `shape`.
     pub(crate) fn owned<T>(&self, shape: Vec<i64>, values: Vec<T>) -> Result<DynTensor, SessionError>
     where
         T: PrimitiveTensorElementType + Clone + Debug + 'static,
@@ -386,7 +383,7 @@ impl Model {
         Ok(tensor.upcast())
     }
 
-    /// Returns `values` as an input of `shape`, i32 or i64.
+    /// An input of `shape`, i32 or i64.
     pub(crate) fn integers(
         &self,
         shape: Vec<i64>,
@@ -411,19 +408,19 @@ fn type_of(outlet: &Outlet) -> String {
     }
 }
 
-/// Returns whether elements are as expected; f16 is accepted for f32 and converted.
+/// Accepts f16 for f32, which is converted.
 fn is_element(found: TensorElementType, expected: TensorElementType) -> bool {
     found == expected || (expected, found) == (TensorElementType::Float32, TensorElementType::Float16)
 }
 
-/// Returns whether a declared shape admits `expected`; -1 on either side is any size.
+/// -1 on either side is any size.
 pub(crate) fn shapes_fit(declared: &[i64], expected: &[i64]) -> bool {
     declared.len() == expected.len()
         && declared.iter().zip(expected).all(|(&d, &e)| d == e || d == -1 || e == -1)
 }
 
-/// Returns the library's path: `explicit`, else in the first of the folders `beside` that has it, else its bare
-/// name, which the system's loader resolves.
+/// Path of the library: `explicit`, else in the first of the folders `beside` that has it, else its bare name for the
+/// system's loader.
 pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathBuf, SessionError> {
     if let Some(path) = explicit {
         return if path.is_file() {
@@ -437,12 +434,12 @@ pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathB
     Ok(found.unwrap_or_else(|| name.into()))
 }
 
-/// The loaded library and its environment; a process may have only one.
+/// The loaded library and its environment; a process has only one.
 static RUNTIME: Mutex<Option<(PathBuf, Environment)>> = Mutex::new(None);
 
-/// Returns the library's environment; loads the library on first use.
+/// Loads the library on first use.
 pub(crate) fn environment(runtime: &Path) -> Result<Environment, SessionError> {
-    // The loader would look up a relative path with a folder beside the program first.
+    // The loader would try a relative path beside the program first.
     let path = if runtime.components().count() > 1 {
         runtime.canonicalize().map_err(|_| SessionError::NoRuntime { path: runtime.to_owned() })?
     } else {

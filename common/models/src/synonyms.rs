@@ -1,15 +1,15 @@
-//! Everyday words of nearly one meaning, for models that know some words and not others: `couch` is asked as `sofa`.
+//! Near synonyms, for models that do not know all words: `couch` is asked as `sofa`.
 
 use std::collections::HashSet;
 
-/// Groups of words of nearly one meaning, one group a line.
+/// Groups of near synonyms, one per line.
 const GROUPS: &str = include_str!("synonyms.txt");
-/// Longest phrase that is looked for in a text, words.
+/// Longest phrase that is searched in a text, words.
 const MAX_WORDS: usize = 4;
-/// Endings of plurals, and what takes their place.
+/// Endings of plurals and their singulars.
 const PLURALS: [(&str, &str); 5] = [("ies", "y"), ("ves", "f"), ("ves", "fe"), ("es", ""), ("s", "")];
 
-/// Returns the singulars that a phrase in lower case may have, that of the longest ending first.
+/// Possible singulars of a phrase in lower case, in the order of [`PLURALS`].
 pub(crate) fn singulars(phrase: &str) -> impl Iterator<Item = String> {
     PLURALS.iter().filter_map(move |(plural, end)| Some(phrase.strip_suffix(plural)?.to_owned() + end))
 }
@@ -18,7 +18,7 @@ pub(crate) fn without_hyphens(key: &str) -> String {
     key.replace('-', " ")
 }
 
-/// Returns the lookup key of a phrase: lower case, single spaces, no leading article.
+/// Lookup key of a phrase: lower case, single spaces, no leading article.
 pub(crate) fn key(text: &str) -> String {
     let text = text.to_lowercase();
     let mut words: Vec<&str> = text.split_whitespace().collect();
@@ -31,7 +31,7 @@ pub(crate) fn key(text: &str) -> String {
 #[derive(Debug)]
 pub struct KnownPhrases {
     phrases: HashSet<String>,
-    /// Whether the model takes these alone; otherwise they may stand within any text.
+    /// Whether the model takes these phrases only; otherwise they may occur within any text.
     is_closed: bool,
 }
 
@@ -41,8 +41,7 @@ impl KnownPhrases {
         Self { phrases: phrases.into_iter().collect(), is_closed }
     }
 
-    /// Returns how a text is asked of the model: with known phrases in place of unknown ones of nearly the same meaning,
-    /// `sofa` for `couch`. `None` if there is nothing to replace.
+    /// Replaces unknown phrases by known near synonyms (`sofa` for `couch`); `None` if there is nothing to replace.
     pub fn asked_as(&self, text: &str) -> Option<String> {
         let text = without_hyphens(&if self.is_closed { key(text) } else { text.to_lowercase() });
         let words: Vec<&str> = text.split_whitespace().collect();
@@ -60,7 +59,7 @@ impl KnownPhrases {
         (is_other && (!self.is_closed || self.phrases.contains(&asked))).then_some(asked)
     }
 
-    /// Returns a phrase that is known, also as a plural, as it is; of another one the first known synonym.
+    /// Returns a known phrase, also a plural, as it is; else the first known synonym.
     fn known_for(&self, phrase: &str) -> Option<String> {
         let forms: Vec<String> = [phrase.to_owned()].into_iter().chain(singulars(phrase)).collect();
         if forms.iter().any(|form| self.phrases.contains(form)) {
@@ -76,7 +75,7 @@ impl KnownPhrases {
 mod tests {
     use super::*;
 
-    /// By hand: known words stay, also as plurals and within longer texts, and so do words of no group.
+    /// By hand: known words stay, also as plurals and in longer texts, and so do words of no group.
     #[test]
     fn unknown_words_are_asked_as_known_ones() {
         let phrases = ["sofa", "trash can", "street lamp", "table"].map(str::to_owned);

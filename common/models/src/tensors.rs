@@ -19,12 +19,12 @@ pub enum TensorsError {
     NotFinite {
         path: PathBuf,
         name: String,
-        /// Index of the element, row-major.
+        /// Row-major.
         index: usize,
     },
 }
 
-/// Reads tensor `name` as f32, row-major; `n_rows`: `None` for a vector `[dim]`, else a matrix `[n_rows][dim]`.
+/// Reads tensor `name` as f32, row-major; `n_rows`: `None` for a vector `[dim]`, else of a matrix `[n_rows][dim]`.
 pub fn read(path: &Path, name: &str, n_rows: Option<usize>, dim: usize) -> Result<Vec<f32>, TensorsError> {
     let bytes = fs_err::read(path).map_err(|cause| TensorsError::Read { cause })?;
     let tensors = SafeTensors::deserialize(&bytes)

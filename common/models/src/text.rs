@@ -26,8 +26,7 @@ pub struct Tokens {
 }
 
 impl Tokens {
-    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last of them `end_token_id`
-    /// if there is one.
+    /// Reads `tokenizer.json`; a text becomes at most `max_tokens` ids, the last of them `end_token_id` if given.
     pub fn open(
         file: &ModelFile,
         max_tokens: usize,
@@ -38,7 +37,7 @@ impl Tokens {
         let bytes = file.read().map_err(|cause| TokenizerError::Read { cause })?;
         let mut tokenizer = Tokenizer::from_bytes(bytes)
             .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
-        // Padding and truncation are done here, the same for every file.
+        // Padding and truncation are done here, alike for every file.
         tokenizer.with_padding(None);
         tokenizer
             .with_truncation(None)
@@ -53,7 +52,7 @@ impl Tokens {
         }
     }
 
-    /// Returns the largest id that a text can have. Added tokens are left out: they need not occur in a text.
+    /// Largest id of a text, without added tokens, which need not occur.
     fn largest_id(&self) -> u32 {
         self.tokenizer.get_vocab(false).into_values().max().unwrap_or(0)
     }
@@ -66,10 +65,10 @@ impl Tokens {
         Ok(encoding.get_ids().to_vec())
     }
 
-    /// Returns the ids of `text`, without a prompt, up to and including the first end token.
+    /// Ids of `text`, without a prompt, up to and including the first end token.
     ///
     /// A text that is too long is truncated before the end token. CLIP's attention is causal and its vector is
-    /// read at the first end token, so padding after it would have no effect.
+    /// read at the first end token, so later padding would have no effect.
     pub fn ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
         let mut ids = self.raw_ids(text)?;
         ids.truncate(self.max_tokens);
@@ -93,19 +92,18 @@ pub struct OnnxTextEncoder {
     tokens: Tokens,
     description: OnnxText,
     output: String,
-    /// Whether ids and mask are i32; otherwise i64.
+    /// Ids and mask are i32 instead of i64.
     is_i32: bool,
     /// Subtracted from the unit vector, `[dim]`.
     centre: Option<Vec<f32>>,
-    /// The words of a model that knows some and not others.
+    /// The words of a model that does not know all.
     nouns: Option<Vec<String>>,
     known: Option<Arc<KnownPhrases>>,
 }
 
 impl OnnxTextEncoder {
-    /// Opens `model` and `tokenizer` according to `description`; `dim`: components of a vector; `centre`: `[dim]`.
-    ///
-    /// Runs a text with the tokenizer's largest id, to detect a tokenizer of another model at once.
+    /// `dim`: components of a vector; `centre`: `[dim]`. Runs a text with the tokenizer's largest id, to detect a
+    /// tokenizer of another model at once.
     pub fn open(
         name: &str,
         dim: usize,
@@ -149,7 +147,7 @@ impl OnnxTextEncoder {
         }
     }
 
-    /// Says which words the model knows: `nouns` name things, `kinds` several sorts of things. Otherwise it knows all.
+    /// Sets the known words: `nouns` name objects, `kinds` several sorts of objects. By default all are known.
     pub(crate) fn with_words<'a>(
         self,
         nouns: impl Iterator<Item = &'a str>,
@@ -161,7 +159,7 @@ impl OnnxTextEncoder {
         Self { nouns: Some(nouns), known: Some(known), ..self }
     }
 
-    /// Runs the model on token ids; returns its vector, `[dim]`.
+    /// Returns the vector of token ids, `[dim]`.
     fn run(&mut self, ids: &[u32]) -> Result<Vec<f32>, SessionError> {
         let (n_real, padding) = (ids.len(), self.description.padding);
         let n_tokens = padding.map_or(n_real, |padding| usize::from(padding.n_tokens));
@@ -215,8 +213,7 @@ impl TextEncoder for OnnxTextEncoder {
     }
 }
 
-/// Replaces `vector` v by normalize(normalize(v) - centre), both `[dim]`; returns false if that is zero or not
-/// finite.
+/// Replaces v by normalize(normalize(v) - centre), both `[dim]`; returns false if that is zero or not finite.
 pub(crate) fn centred(vector: &mut [f32], centre: Option<&[f32]>) -> bool {
     if !normalise(vector) {
         return false;

@@ -1,5 +1,4 @@
-//! The text side of a model as a store carries it to robots: files that are named by their content, and a
-//! description in JSON that names them so.
+//! The text side of a model in a store: files named by content, and a description in JSON with these names.
 
 use std::path::PathBuf;
 
@@ -10,7 +9,7 @@ use crate::EncoderId;
 use crate::description::{Description, DescriptionError, FileRef, Sha256};
 use crate::file_ref::ModelFile;
 
-/// Licences under which weights may be passed on, by their SPDX names.
+/// Licences that permit redistribution of weights, by SPDX name.
 const REDISTRIBUTABLE: [&str; 10] = [
     "Apache-2.0",
     "BSD-2-Clause",
@@ -24,7 +23,6 @@ const REDISTRIBUTABLE: [&str; 10] = [
     "Zlib",
 ];
 
-/// Reasons for which a store cannot carry a text model.
 #[derive(Debug, thiserror::Error)]
 pub enum TextSideError {
     #[error("{model} is part of every robot's program, so a store need not carry it; leave --text-model out")]
@@ -42,7 +40,7 @@ pub enum TextSideError {
     Other { model: String, what: String },
 }
 
-/// The text side of a model: its files, and the description without their new names.
+/// The text side of a model: its files, and the description before these are renamed.
 #[derive(Debug)]
 pub struct TextSide {
     id: EncoderId,
@@ -57,7 +55,7 @@ struct TextFile {
     sha256: Sha256,
 }
 
-/// Where a description in JSON names the file of a role.
+/// JSON pointer to the file of a role in a description.
 fn pointer(role: &str) -> &'static str {
     match role {
         "image.model" => "/image/file",
@@ -68,16 +66,15 @@ fn pointer(role: &str) -> &'static str {
     }
 }
 
-/// Returns whether a licence expression is known to permit redistribution: every part of it joined by AND, or any
-/// joined by OR.
+/// Whether a licence expression is known to permit redistribution: every part joined by AND, or any joined by OR.
 fn may_be_passed_on(licence: &str) -> bool {
     let is_known = |name: &str| REDISTRIBUTABLE.contains(&name.trim_matches(['(', ')', ' ']));
     licence.split(" OR ").any(|part| part.split(" AND ").all(is_known))
 }
 
 impl TextSide {
-    /// Takes a description apart. `document`: its TOML text; `hashed`: what it parses to, with the hash of every
-    /// file; `open`: returns a file of it after comparing its hash.
+    /// `document`: the description's TOML text; `hashed`: its parsed form, with the hash of every file; `open`:
+    /// returns a file after checking its hash.
     pub(crate) fn new(
         id: &EncoderId,
         document: &str,
@@ -92,7 +89,7 @@ impl TextSide {
         let table: toml::Table = toml::from_str(document).map_err(|e| other(e.to_string()))?;
         let mut description = serde_json::to_value(table).map_err(|e| other(e.to_string()))?;
         if let Some(fields) = description.as_object_mut() {
-            // The files lie beside each other.
+            // The files are in one folder.
             fields.remove("files_root");
         }
         let mut files: Vec<TextFile> = Vec::new();
@@ -103,7 +100,7 @@ impl TextSide {
             let named = named.ok_or_else(|| other(format!("{at} is missing")))?;
             named.insert("sha256".into(), sha256.to_string().into());
             if role == "image.model" {
-                // It stays behind; the encoder id needs its hashes.
+                // It is not carried, but the encoder id needs its hashes.
                 if let (Some(data), Some(Value::Object(named))) = (&file.data, named.get_mut("data")) {
                     named.insert("sha256".into(), data.sha256.map(|hash| hash.to_string()).into());
                 }
@@ -120,12 +117,12 @@ impl TextSide {
         Ok(Self { id: id.clone(), description, files })
     }
 
-    /// Returns the files, each once.
+    /// Each once.
     pub fn files(&self) -> impl Iterator<Item = &ModelFile> {
         self.files.iter().map(|file| &file.file)
     }
 
-    /// Returns the description in JSON. `names`: BLAKE3 of each of [`Self::files`].
+    /// The description in JSON. `names`: BLAKE3 of each of [`Self::files`].
     pub fn description(&self, names: &[Hash32]) -> Result<Vec<u8>, TextSideError> {
         let mut description = self.description.clone();
         let other = |what: String| TextSideError::Other { model: self.id.name.clone(), what };

@@ -1,18 +1,18 @@
-//! The words of a question, before a text model sees them.
+//! The words of a question, prepared for a text model.
 
 use crate::InferenceError;
 
-/// Words that name nothing to look for: alone, a text model would answer them with whatever lies nearest.
+/// Words that name nothing to find: alone, a text model would answer them with the nearest object.
 const NAMELESS: &str = "a an and are at behind beneath between biggest bring by closest farthest fifth find first for fourth \
     from furthest go here i in is it largest littlest look me my near nearest next no not of on one or over second show \
     smallest some take that the there these third this to under us what where where's which with your you";
 
-/// Returns the words of a text, with a space between them. Signs around words count for nothing: emoji, quotation
-/// marks, question marks, invisible characters. A text without a word that can name a thing is refused.
+/// Returns the words of a text, separated by a space, without signs around them (emoji, quotation and question marks,
+/// invisible characters). Refuses a text without a word that can name something.
 pub fn words_to_find(text: &str) -> Result<String, InferenceError> {
     let is_invisible = |c: &char| matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{2069}' | '\u{fe00}'..='\u{fe0f}' | '\u{feff}');
     let visible: String = text.chars().filter(|c| !is_invisible(c)).collect();
-    // A sign within a word, as in "t-shirt", belongs to it; emoji divide words.
+    // A sign within a word, as in "t-shirt", belongs to it; emoji separate words.
     let is_between = |c: char| c.is_whitespace() || !(c.is_ascii() || c.is_alphanumeric() || is_mark(c));
     let words = visible
         .split(is_between)
@@ -26,23 +26,21 @@ pub fn words_to_find(text: &str) -> Result<String, InferenceError> {
     }
 }
 
-/// Returns whether a character is a combining mark, or an apostrophe of typographers, and so part of a word.
+/// Combining marks and typographic apostrophes are part of a word.
 fn is_mark(c: char) -> bool {
     matches!(c, '\u{300}'..='\u{36f}' | '\u{2019}')
 }
 
-/// Phrases, one a line, as people ask them.
+/// Phrases as people ask them, one per line.
 const TEXTS: &str = include_str!("everyday.txt");
-/// Nouns of things, one a line, sorted.
+/// Nouns of objects, one per line, sorted.
 const NOUNS: &str = include_str!("nouns.txt");
 
-/// Returns phrases as people ask them, articles included.
 pub fn everyday_texts() -> impl Iterator<Item = &'static str> {
     TEXTS.lines()
 }
 
-/// Returns nouns of things indoors, outdoors and on the road: what a thing may be called by a model that has no words
-/// of its own.
+/// Nouns of objects indoors, outdoors and on the road, as names for models without words of their own.
 pub fn everyday_nouns() -> impl Iterator<Item = &'static str> {
     NOUNS.lines()
 }

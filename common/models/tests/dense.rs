@@ -49,8 +49,7 @@ fn wrong_patches_are_named() {
     assert!(message.contains("patches") && message.contains("patch_embeddings"), "{message}");
 }
 
-/// The made tokenizer ends texts with token 1; without `end_token_id`, ids are as they come, and lower case is a
-/// choice.
+/// The made tokenizer ends texts with token 1; without `end_token_id`, ids stay as they are. Lower case is optional.
 #[test]
 fn texts_need_no_end_token_and_may_be_lowered() {
     let tokenizer = made::tokenizer(&made::VOCABULARY).replace(r#"{"type":"Lowercase"},"#, "");

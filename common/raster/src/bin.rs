@@ -1,4 +1,4 @@
-//! The Gaussians of each tile, from near to far.
+//! The Gaussians of each tile, near to far.
 
 use rayon::prelude::*;
 use slag_common::Intrinsics;
@@ -8,29 +8,29 @@ use crate::constants::TILE_SIZE_PX;
 use crate::project::ScreenGaussian;
 
 const TILE: u32 = TILE_SIZE_PX as u32;
-/// Gaussians per task that assigns them to rows.
+/// Gaussians per task.
 const CHUNK: usize = 4096;
-/// Gaussians of a tile above which all threads sort it together.
+/// Larger tiles are sorted by all threads together.
 const MANY: usize = 1 << 16;
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tiles {
-    /// Rows of tiles, top to bottom. Each has one bucket per tile, left to right, with indices into the visible
-    /// Gaussians, from near to far.
+    /// Rows of tiles, top to bottom. Each has one bucket per tile, left to right: indices into the visible
+    /// Gaussians, near to far.
     pub rows: Vec<Buckets<u32>>,
     pub width_px: u32,
     pub height_px: u32,
 }
 
-/// A key that orders Gaussians from near to far, and the columns `first..=last` of tiles in a row.
+/// A key that sorts near to far, and the columns `first..=last` of tiles in a row.
 type Candidate = (u64, (u32, u32));
 
-/// Lists, for every tile, the Gaussians with a footprint that may contain one of its pixel centres. They are
-/// ordered by camera z as `f32`; ties are broken by index.
+/// Lists for every tile the Gaussians whose footprint may contain one of its pixel centres, by camera z as `f32`;
+/// ties are broken by index.
 pub fn bin(visible: &[ScreenGaussian], camera: &Intrinsics) -> Tiles {
     let (width_px, height_px) = (camera.width_px, camera.height_px);
     let n_rows = height_px.div_ceil(TILE) as usize;
-    // Everything that reads Gaussians happens here, where the access is sequential.
+    // All reads of Gaussians happen here, where access is sequential.
     let chunks: Vec<Buckets<Candidate>> = visible
         .par_chunks(CHUNK)
         .enumerate()
@@ -39,7 +39,7 @@ pub fn bin(visible: &[ScreenGaussian], camera: &Intrinsics) -> Tiles {
             for (g, index) in part.iter().zip((chunk * CHUNK) as u64..) {
                 let [low, high] = g.y_range_px();
                 let Some((a, b)) = ScreenGaussian::pixels_within(low, high, height_px) else { continue };
-                // Depths are positive, so their bits have the same order. The index makes keys unique.
+                // Bits of positive floats sort like the floats. The index makes keys unique.
                 let key = u64::from(g.depth.to_bits()) << 32 | index;
                 let footprint = Footprint::new(g);
                 for row in a / TILE..=b / TILE {
@@ -57,7 +57,6 @@ pub fn bin(visible: &[ScreenGaussian], camera: &Intrinsics) -> Tiles {
     Tiles { rows, width_px, height_px }
 }
 
-/// Lists the Gaussians of each tile in a row.
 fn tile_row<'a>(parts: impl Iterator<Item = &'a [Candidate]>, width_px: u32) -> Buckets<u32> {
     let candidates: Vec<Candidate> = parts.flatten().copied().collect();
     let mut tiles = Buckets::new(width_px.div_ceil(TILE) as usize, &candidates);
@@ -87,15 +86,15 @@ impl<'a> Footprint<'a> {
         Self { gaussian, reach2, extent_y_px: extent_px.y, y_of_rightmost }
     }
 
-    /// Returns the columns of tiles that the footprint touches in the row of tiles at `top_px`. Apart from the
-    /// margin of the reach, the result is exact to the pixel.
+    /// Returns the columns of tiles that the footprint touches in the row of tiles at `top_px`; exact to the
+    /// pixel, apart from the margin of the reach.
     fn columns(&self, top_px: u32, camera: &Intrinsics) -> Option<(u32, u32)> {
         let g = self.gaussian;
         let bottom_px = (top_px + TILE).min(camera.height_px) - 1;
         let first = (f64::from(top_px) + 0.5 - g.mean_px.y).max(-self.extent_y_px);
         let last = (f64::from(bottom_px) + 0.5 - g.mean_px.y).min(self.extent_y_px);
-        // Along y, the x of the outline is concave on the right and convex on the left. So its extreme within the
-        // row of tiles lies at the extreme of the ellipse, clamped to the row.
+        // Along y, the outline's x is concave on the right and convex on the left, so its extreme within the row
+        // of tiles lies at the ellipse's extreme, clamped to the row.
         let y_right = self.y_of_rightmost.max(first).min(last);
         let y_left = (-self.y_of_rightmost).max(first).min(last);
         let half = |y: f64| (self.reach2 - (y * g.inv_height).powi(2)).max(0.0).sqrt() / g.inv_width;

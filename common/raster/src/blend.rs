@@ -8,11 +8,10 @@ use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE_PX};
 use crate::project::ScreenGaussian;
 use crate::simd::Lanes;
 
-/// Gaussians that are fetched and prepared at once. Between batches, rows with only opaque pixels are identified,
-/// to skip them.
+/// Gaussians fetched and prepared at once. Between batches, rows whose pixels are all opaque are skipped.
 const BATCH: usize = 32;
 
-/// Largest exponent that matters: `exp(-6)` is below 1/255, so no alpha beyond it counts.
+/// Largest exponent that matters: `exp(-6)` is below 1/255, so alpha is too small beyond it.
 pub const MAX_POWER: f32 = 6.0;
 /// Polynomial for `exp(t - 3/4)` with `|t| <= 3/4`, interpolated at the Chebyshev nodes. Its fourth power has a
 /// relative error of at most 1.6e-7.
@@ -41,7 +40,6 @@ pub struct TileRect {
 }
 
 impl TileRect {
-    /// Returns the tile in a column and row of the grid over an image.
     pub fn new(column: usize, row: usize, image_width_px: usize, image_height_px: usize) -> Self {
         let (x_px, y_px) = (column * TILE_SIZE_PX, row * TILE_SIZE_PX);
         Self {
@@ -53,10 +51,9 @@ impl TileRect {
     }
 }
 
-/// Consumes the weights of the Gaussians of a tile, from near to far. `member` is an index into the visible
-/// Gaussians.
+/// Consumes the weights of a tile's Gaussians, near to far. `member` is an index into the visible Gaussians.
 pub trait WeightSink {
-    /// Consumes the weights at the pixels of vector `v` in row `y`; 0 at pixels without weight.
+    /// Consumes the weights at the pixels of vector `v` in row `y`; 0 means no weight.
     fn add<S: Lanes>(&mut self, simd: S, member: u32, y: usize, v: usize, weights: S::f32s);
     fn end<S: Lanes>(&mut self, simd: S, member: u32);
 }
@@ -85,7 +82,7 @@ impl<S: Lanes, K: WeightSink> Work<S> for Walk<'_, K> {
     #[inline(always)]
     fn run(self, simd: S) -> PerPixel<f32> {
         let Self { visible, members, rect, sink } = self;
-        // A negative value marks an opaque pixel: it needs no second array, and fails every comparison below.
+        // A negative value marks an opaque pixel: it saves a second array, and fails every comparison below.
         let mut transmittance = [[-1.0_f32; TILE_SIZE_PX]; TILE_SIZE_PX];
         for row in &mut transmittance[..rect.height_px] {
             row[..rect.width_px].fill(1.0);
@@ -102,7 +99,7 @@ impl<S: Lanes, K: WeightSink> Work<S> for Walk<'_, K> {
             if live == [false; TILE_SIZE_PX] {
                 break;
             }
-            // Copies all Gaussians before it uses any, so that their cache misses overlap.
+            // Copies all Gaussians before using any, so that cache misses overlap.
             for (fetched, &member) in fetched.iter_mut().zip(batch) {
                 *fetched = visible[member as usize];
             }
@@ -133,7 +130,7 @@ impl<S: Lanes, K: WeightSink> Work<S> for Walk<'_, K> {
     }
 }
 
-/// A Gaussian relative to a tile, in `f32`: coordinates are small there, so little precision is lost.
+/// A Gaussian relative to a tile: coordinates are small there, so `f32` loses little.
 #[derive(Clone, Copy, Default)]
 struct InTile {
     /// `u` at the centre of the tile's first pixel.
@@ -190,14 +187,13 @@ impl InTile {
         }
         let middle = -(self.u0 + self.u_y * y as f32) * self.width;
         let half = left.sqrt() * self.width;
-        // Rounds by truncation, a single instruction; `ceil` may be a call. One column too many is harmless.
+        // Truncation is a single instruction; `ceil` may be a call. One column too many is harmless.
         let first = (middle - half + 0.999).max(0.0) as i32;
         let last = (middle + half).min((TILE_SIZE_PX - 1) as f32);
         let touches = last >= 0.0 && first <= last as i32;
         touches.then_some((first as usize / n_lanes, last as usize / n_lanes + 1))
     }
 
-    /// Returns the weights in vector `v` of row `y`, and updates the transmittance.
     #[inline(always)]
     fn blend<S: Simd>(&self, simd: S, y: usize, v: usize, transmittance: &mut S::f32s) -> S::f32s {
         const COLUMNS: [f32; TILE_SIZE_PX] =
@@ -219,17 +215,15 @@ impl InTile {
     }
 }
 
-/// Selects `set` in the lanes of the mask and `unset` in the others. `select_f32s` is not always inlined, which
-/// costs AVX2 a call with its masks in memory.
+/// `select_f32s` is not always inlined, which costs AVX2 a call with its masks in memory.
 #[inline(always)]
 fn select<S: Simd>(simd: S, mask: S::m32s, set: S::f32s, unset: S::f32s) -> S::f32s {
     cast(simd.select_u32s(mask, cast(set), cast(unset)))
 }
 
-/// Returns `exp(-power)` for `power >= 0` with a relative error below 1e-6. Powers above [`MAX_POWER`] are
-/// clamped.
+/// Returns `exp(-power)` for `power >= 0` with a relative error below 1e-6; powers above [`MAX_POWER`] are clamped.
 ///
-/// It uses basic arithmetic instead of the platform's `exp`, which allows SIMD and gives the same bits everywhere.
+/// Basic arithmetic instead of the platform's `exp` allows SIMD and gives the same bits everywhere.
 #[inline(always)]
 fn exp_of_minus<S: Simd>(simd: S, power: S::f32s) -> S::f32s {
     let splat = |value| simd.splat_f32s(value);

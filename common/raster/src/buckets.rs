@@ -6,15 +6,14 @@ use rayon::prelude::*;
 /// Items grouped in buckets, in one contiguous array.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Buckets<T> {
-    /// Bucket `b` contains `items[starts[b]..starts[b + 1]]`; the length is the number of buckets plus one.
+    /// Bucket `b` is `items[starts[b]..starts[b + 1]]`.
     starts: Vec<usize>,
     items: Vec<T>,
 }
 
-/// Returns where each bucket starts, and where the last one ends. `spans`: the buckets `first..=last` of each
-/// item.
+/// Returns the start of each bucket, and the end of the last. `spans`: the buckets `first..=last` of each item.
 fn starts_of(n_buckets: usize, spans: impl Iterator<Item = (u32, u32)>) -> Vec<usize> {
-    // How many items begin and end at each bucket; of large ones there may be more than 2^32 in all.
+    // Items that begin and end at each bucket; all spans together may exceed 2^32.
     let (mut begin, mut end) = (vec![0_usize; n_buckets + 1], vec![0_usize; n_buckets + 1]);
     for (first, last) in spans {
         begin[first as usize] += 1;
@@ -73,7 +72,7 @@ impl<T> Buckets<T> {
     }
 }
 
-/// Concatenates parts. All threads copy, so that page faults are spread over them.
+/// Concatenates with all threads, to spread page faults over them.
 pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
     let mut joined: Vec<T> = bytemuck::zeroed_vec(parts.iter().map(Vec::len).sum());
     let mut rest = joined.as_mut_slice();
@@ -91,7 +90,7 @@ pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
 mod tests {
     use super::*;
 
-    /// By hand; then more than 2^32 items, without the items.
+    /// By hand; then more than 2^32 entries, without the items.
     #[test]
     fn buckets_start_where_those_before_end() {
         let spans = [(0, 1), (1, 3), (3, 3)];

@@ -11,16 +11,15 @@ pub const COVARIANCE_BLUR_PX2: f64 = 0.3;
 pub const MAX_ALPHA: f32 = 0.999;
 /// Smallest alpha that counts: the footprint of a Gaussian ends where its alpha falls below.
 pub const MIN_ALPHA: f32 = 1.0 / 255.0;
-/// Transmittance at which a pixel is opaque. The first Gaussian that would reach it ends the pixel and is not
-/// blended.
+/// Transmittance of an opaque pixel. The first Gaussian that would reach it is not blended and ends the pixel.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
-/// Margin around the image within which the Jacobian of the projection is exact, as a share of the tangent of half
-/// the field of view. Beyond it, the Jacobian is evaluated at the limit.
+/// Margin around the image within which the Jacobian is exact, as a share of the tangent of half the field of view;
+/// beyond it, the Jacobian is evaluated at the limit.
 pub const FOV_MARGIN: f64 = 0.3;
-/// Added to the squared Mahalanobis reach of a footprint before culling. The rounding error of `f32` is below 5e-5
-/// there, so no pixel with a sufficient alpha is culled.
+/// Added to the squared Mahalanobis reach of a footprint before culling. The rounding error of `f32` is below
+/// 5e-5, so no pixel with sufficient alpha is culled.
 pub const REACH2_MARGIN: f64 = 2e-4;
-/// Largest projected variance, px^2; above it, the `f32` arithmetic of the pixels loses its meaning.
+/// Largest projected variance, px^2; beyond it, the `f32` arithmetic of the pixels is meaningless.
 pub const MAX_VARIANCE_PX2: f64 = 1e24;
 /// Most pixels of one view (16k x 16k).
 pub const MAX_IMAGE_PX: u64 = 1 << 28;

@@ -18,7 +18,7 @@ use crate::view::RasterView;
 pub struct Drawing {
     pub width_px: u32,
     pub height_px: u32,
-    /// Colour over the background, `[height * width][3]`; at least 0, not limited to 1.
+    /// `[height * width][3]`, over the background; at least 0, not limited to 1.
     pub rgb: Vec<f32>,
     /// Expected camera z, weighted by contribution, world units; 0 at pixels without any Gaussian.
     pub depth: Vec<f32>,
@@ -28,7 +28,6 @@ pub struct Drawing {
 }
 
 impl Drawing {
-    /// Returns the colours as pixels, limited to 1.
     pub fn image(&self) -> RgbImage {
         let bytes = self.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
         RgbImage::from_raw(self.width_px, self.height_px, bytes).expect("three values per pixel")
@@ -47,7 +46,7 @@ impl PreparedScene<'_> {
     }
 }
 
-/// Draws the Gaussians of all tiles. `colours` contains the RGB colour of each visible Gaussian.
+/// Draws all tiles. `colours`: RGB of each visible Gaussian.
 pub fn draw(
     instructions: InstructionSet,
     visible: &[ScreenGaussian],
@@ -94,7 +93,6 @@ pub fn draw(
     }
 }
 
-/// Accumulates colour and depth per pixel of a tile.
 struct PixelSink<'a> {
     visible: &'a [ScreenGaussian],
     colours: &'a [[f32; 3]],
@@ -134,8 +132,7 @@ pub struct ViewCounters {
     /// Gaussians with a pixel of the image in their footprint; they may be occluded.
     pub visible: usize,
     pub pairs: usize,
-    /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once
-    /// projected.
+    /// Not drawable: not finite, without a rotation, or beyond `f32` once projected.
     pub unusable: usize,
 }
 

@@ -1,4 +1,4 @@
-//! Draws Gaussians on the CPU, without a GPU: the stages that the encoder's rasteriser and a robot share.
+//! Draws Gaussians on the CPU: the stages shared by the encoder's rasteriser and the robot.
 //!
 //! They follow gsplat 1.5.3: EWA projection, front-to-back blending, the constants of [`constants`].
 //!

@@ -25,7 +25,7 @@ pub struct ScreenGaussian {
     /// Camera z, world units.
     pub depth: f32,
     pub opacity: f32,
-    /// Largest `u^2 + v^2` at which alpha may count.
+    /// Largest `u^2 + v^2` at which alpha may reach its minimum.
     pub reach2: f32,
     /// Centre on the screen, pixels.
     pub mean_px: DVec2,
@@ -38,21 +38,20 @@ pub struct ScreenGaussian {
 }
 
 impl ScreenGaussian {
-    /// Returns half the size of the bounding box of the footprint, pixels.
+    /// Half the size of the footprint's bounding box, pixels.
     pub fn extent_px(&self) -> DVec2 {
         let cov_yy = self.inv_height.powi(-2);
         let cov_xx = self.inv_width.powi(-2) + self.slope * self.slope * cov_yy;
         DVec2::new(cov_xx, cov_yy).map(|v| (f64::from(self.reach2) * v).sqrt())
     }
 
-    /// Returns the highest and lowest y of the footprint, pixels.
+    /// Lowest and highest y of the footprint, pixels.
     pub fn y_range_px(&self) -> [f64; 2] {
         let extent = f64::from(self.reach2).sqrt() / self.inv_height;
         [self.mean_px.y - extent, self.mean_px.y + extent]
     }
 
-    /// Returns the pixels `first..=last` of an axis with centres in `[low, high]` and in the image; `None` if
-    /// there are none.
+    /// Returns the pixels `first..=last` of an axis whose centres are in `[low, high]` and in the image, if any.
     pub fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
         let first = (low - 0.5).max(0.0);
         let last = (high - 0.5).min(f64::from(size_px) - 1.0);
@@ -66,21 +65,19 @@ impl ScreenGaussian {
     }
 }
 
-/// The Gaussians of a scene that a view can see.
 #[derive(Clone, Debug, Default)]
 pub struct Projection {
-    /// Gaussians with at least one pixel centre of the image in the bounding box of their footprint, in scene
-    /// order.
+    /// In scene order: those with a pixel centre of the image in the bounding box of their footprint.
     pub visible: Vec<ScreenGaussian>,
     pub unusable: usize,
 }
 
-/// Gaussians per task of the thread pool; enough to hide its overhead.
+/// Gaussians per task; enough to hide its overhead.
 const CHUNK: usize = 4096;
 
-/// A scene with precomputed sizes, to exclude invisible Gaussians quickly.
+/// A scene with precomputed sizes, to exclude invisible Gaussians fast.
 pub struct PreparedScene<'s> {
-    /// The scene, with columns of matching lengths.
+    /// Its columns have matching lengths.
     pub scene: &'s Gaussians,
     sizes: Vec<Size>,
     unusable: usize,
@@ -90,12 +87,11 @@ pub struct PreparedScene<'s> {
 struct Size {
     /// Largest standard deviation, world units.
     max_scale: f32,
-    /// Largest `u^2 + v^2` at which alpha may count; negative if the Gaussian is never drawn.
+    /// Largest `u^2 + v^2` at which alpha may reach its minimum; negative if the Gaussian is never drawn.
     reach2: f32,
 }
 
 impl<'s> PreparedScene<'s> {
-    /// Bytes that it keeps for each Gaussian.
     pub const BYTES_PER_GAUSSIAN: usize = size_of::<Size>();
 
     pub fn new(scene: &'s Gaussians) -> Self {
@@ -119,7 +115,6 @@ impl<'s> PreparedScene<'s> {
         Self { scene, sizes, unusable }
     }
 
-    /// Projects the Gaussians that a view can see.
     pub fn project(&self, view: &RasterView) -> Projection {
         let bounds = Bounds::new(view);
         let parts: Vec<(Vec<ScreenGaussian>, usize)> = self
@@ -151,7 +146,7 @@ impl<'s> PreparedScene<'s> {
     }
 }
 
-/// The frustum of a view, for a cheap and conservative visibility test.
+/// The frustum of a view, for a fast conservative visibility test.
 struct Bounds {
     focal_px: DVec2,
     /// Distance from the centre of the first pixel to the principal point, pixels.
@@ -181,8 +176,8 @@ impl Bounds {
         }
     }
 
-    /// Returns whether the footprint of a Gaussian with this mean (camera frame) contains no pixel centre for
-    /// certain. All lengths are multiplied by z, which avoids divisions.
+    /// Returns whether the footprint of a Gaussian with this mean (camera frame) certainly contains no pixel
+    /// centre. All lengths are multiplied by z, which saves divisions.
     fn exclude(&self, mean: DVec3, size: Size) -> bool {
         if !(NEAR_Z..=FAR_Z).contains(&mean.z) {
             return true;
@@ -199,7 +194,7 @@ impl Bounds {
     }
 }
 
-/// Returns the squared Mahalanobis distance within which the alpha of a Gaussian may reach 1/255.
+/// Squared Mahalanobis distance within which alpha may reach 1/255.
 pub fn reach2(opacity: f32) -> f32 {
     ((2.0 * (255.0 * f64::from(opacity)).ln()).max(0.0) + REACH2_MARGIN) as f32
 }
@@ -266,7 +261,7 @@ fn jacobian_rows(mean: DVec3, camera: &Intrinsics) -> [DVec3; 2] {
     ]
 }
 
-/// Returns the lowest and highest tangents in x and y at which the Jacobian is evaluated.
+/// Lowest and highest tangents in x and y at which the Jacobian is evaluated.
 fn tangent_limits(camera: &Intrinsics) -> [[f64; 2]; 2] {
     let limits = |focal: f64, centre: f64, size: u32| {
         let margin = FOV_MARGIN * 0.5 * f64::from(size) / focal;
@@ -278,8 +273,8 @@ fn tangent_limits(camera: &Intrinsics) -> [[f64; 2]; 2] {
     ]
 }
 
-/// Factors of the real spherical harmonics of degree 1, 2 and 3, in the order and with the signs of 3DGS (Kerbl et
-/// al. 2023), which follows the polynomials of Ramamoorthi and Hanrahan.
+/// Factors of the real spherical harmonics of degree 1 to 3, in the order and with the signs of 3DGS (Kerbl et al.
+/// 2023), after the polynomials of Ramamoorthi and Hanrahan.
 const SH_C1: f32 = 0.488_602_51;
 const SH_C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_2];
 const SH_C3: [f32; 7] =
@@ -287,7 +282,6 @@ const SH_C3: [f32; 7] =
 /// Number of coefficients above degree 0, for degree 3.
 const MAX_REST: usize = 15;
 
-/// Returns the RGB colour of each visible Gaussian seen from a camera.
 pub fn colours(scene: &Gaussians, visible: &[ScreenGaussian], position_in_world: DVec3) -> Vec<[f32; 3]> {
     visible
         .par_iter()
@@ -295,7 +289,7 @@ pub fn colours(scene: &Gaussians, visible: &[ScreenGaussian], position_in_world:
         .collect()
 }
 
-/// Returns the RGB colour of a Gaussian seen from a camera: `max(0, SH(direction) + 0.5)`.
+/// Colour of a Gaussian seen from a camera: `max(0, SH(direction) + 0.5)`.
 pub fn colour(scene: &Gaussians, index: usize, position_in_world: DVec3) -> [f32; 3] {
     let n_rest = Gaussians::sh_rest_per_channel(scene.sh_degree).min(MAX_REST);
     let mut rgb = scene.sh_dc[index].map(|c| 0.5 + SH_C0 * c);

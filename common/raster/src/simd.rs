@@ -10,8 +10,8 @@ use pulp::{
     x86::{V3, V4},
 };
 
-/// Vector operations of an instruction set: those of [`Simd`], and a widening addition. All instruction sets give
-/// the same bits: multiply-adds are not fused, and sums with another order are exact.
+/// [`Simd`] with a widening addition. All instruction sets give the same bits: multiply-adds are not fused, and
+/// reordered sums are exact.
 pub trait Lanes: Simd {
     /// Adds each value, widened to `f64`, to the sum of its lane.
     fn add_to_f64(self, values: Self::f32s, sums: &mut [f64]);

@@ -14,7 +14,6 @@ pub struct RasterView {
 }
 
 impl RasterView {
-    /// Returns the camera of a view, at the size of its photo.
     pub fn of(view: &View) -> Self {
         Self { camera_from_world: view.camera_from_world, intrinsics: view.intrinsics }
     }
@@ -44,7 +43,6 @@ pub enum InputError {
     Pose { off: f64 },
 }
 
-/// Checks that the columns of a scene have matching lengths.
 pub fn check_scene(scene: &Gaussians) -> Result<(), InputError> {
     let n = scene.len();
     if u32::try_from(n).is_err() {
@@ -86,8 +84,7 @@ pub fn check_view(view: &RasterView) -> Result<(), InputError> {
             centre_px: [centre_x_px, centre_y_px],
         });
     }
-    // Poses are often stored as f32 or rounded text. A deviation of 1e-3 still is a rotation; a mirror or scale is
-    // not.
+    // Poses are often f32 or rounded text: a deviation of 1e-3 is still a rotation, a mirror or scale is not.
     let rotation = view.camera_from_world.matrix3;
     let excess = rotation.transpose() * rotation - DMat3::IDENTITY;
     let off =

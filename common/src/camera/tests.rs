@@ -6,8 +6,8 @@ const BROWN: Distortion =
     Distortion::Brown { k: [-0.28340811, 0.07395907, 0.01], p: [0.00019359, 1.76187114e-05] };
 const FISHEYE: Distortion = Distortion::Fisheye { k: [0.0034, 0.0007, -0.0018, 0.0004] };
 
-/// Oracle: OpenCV 4 (`cv2.projectPoints` and `cv2.fisheye.projectPoints`, identity camera),
-/// recorded; the Brown coefficients are those published with the EuRoC data set.
+/// Oracle: OpenCV 4 (`cv2.projectPoints` and `cv2.fisheye.projectPoints`, identity camera), recorded; the Brown
+/// coefficients are those of the EuRoC data set.
 #[test]
 fn distortion_is_opencvs() {
     let recorded: &[(Distortion, [f64; 2], [f64; 2])] = &[
@@ -51,8 +51,8 @@ fn the_monotonic_radius_is_where_the_image_folds() {
     }
 }
 
-/// Tangential terms fold the image along one axis, and farther out along the other, too. Oracle: a dense scan along each
-/// direction for the first place where a numeric derivative stops being positive; nothing beyond it has a place.
+/// Tangential terms fold the image along one axis first, farther out along the other too. Oracle: a dense scan
+/// along each direction for the first place where a numeric derivative stops being positive.
 #[test]
 fn nothing_beyond_a_fold_has_a_place() {
     for p in [[0.1, 0.0], [0.0, -0.2], [0.05, 0.08]] {

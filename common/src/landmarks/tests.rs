@@ -18,7 +18,7 @@ fn checked(bytes: &AlignedBytes) -> Result<Option<LandmarksLayout>, ContainerErr
 }
 
 /// By hand: the ends of an axis are exact, a third of it is the nearest of 65,535 steps; an axis without extent has
-/// one position; what is not finite is left out.
+/// one position; non-finite positions are dropped.
 #[test]
 fn landmarks_come_back_by_hand() {
     let code = 0x0123_4567_89ab_cdef_0011_2233_4455_6677;

@@ -3,7 +3,6 @@
 use super::records::CellRecord;
 use crate::frames::Aabb;
 
-/// An R-tree over the boxes of a manifest's cells.
 pub struct CellIndex {
     tree: rstar::RTree<IndexedCell>,
 }
@@ -28,7 +27,7 @@ impl rstar::PointDistance for IndexedCell {
 }
 
 impl CellIndex {
-    /// Builds the index (bulk load, O(n log n)).
+    /// Bulk load, O(n log n).
     pub fn new<'a>(cells: impl IntoIterator<Item = &'a CellRecord>) -> Self {
         let indexed = cells
             .into_iter()
@@ -37,7 +36,7 @@ impl CellIndex {
         Self { tree: rstar::RTree::bulk_load(indexed.collect()) }
     }
 
-    /// Returns the ascending positions of the cells with a box within a radius of a point.
+    /// Returns the positions of the cells whose box is within a radius of a point, ascending.
     pub fn within(&self, centre_in_world: glam::DVec3, radius: f64) -> Vec<usize> {
         let found = self.tree.locate_within_distance(centre_in_world.to_array(), radius * radius);
         let mut positions: Vec<usize> = found.map(|cell| cell.position).collect();

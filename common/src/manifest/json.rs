@@ -17,10 +17,10 @@ pub enum ManifestError {
         "the manifest has version {found}, expected {VERSION}; use a robot program and an encoder of matching versions"
     )]
     Version { found: u64 },
-    /// No JSON, or members are missing.
+    /// Not JSON, or members are missing.
     #[error("the manifest is damaged: {what}; fetch again, or encode again where it is published")]
     Damaged { what: String },
-    /// No member is missing, but one has another type or value than this version expects.
+    /// A member has another type or value than this version expects.
     #[error(
         "the text is not a manifest of version {VERSION}: {what}; use a robot program and an encoder of matching versions"
     )]
@@ -32,7 +32,7 @@ impl Manifest {
         serde_json::to_vec(self).expect("a manifest has no map with other keys than strings")
     }
 
-    /// Reads the JSON text. The signed metadata that lists it as a target proves whose it is.
+    /// Reads the JSON text; its origin is proved by the signed metadata that lists it as a target.
     pub fn parse(bytes: &[u8]) -> Result<Self, ManifestError> {
         if bytes.len() as u64 > MAX_BYTES {
             return Err(ManifestError::TooLong { len_bytes: bytes.len() as u64 });
@@ -42,7 +42,7 @@ impl Manifest {
         Ok(manifest)
     }
 
-    /// Checks the content, because the program of a publisher may be faulty too.
+    /// Checks the content, because a publisher's program may be faulty too.
     fn check_content(&self) -> Result<(), ManifestError> {
         let refuse = |what: String| Err(ManifestError::Content { what });
         if self.version != VERSION {
@@ -76,7 +76,7 @@ impl Manifest {
     }
 }
 
-/// Says what is wrong with a text that is no manifest of this version.
+/// Returns why a text is not a manifest of this version.
 fn refusal(bytes: &[u8], error: &serde_json::Error) -> ManifestError {
     #[derive(Deserialize)]
     struct Head {

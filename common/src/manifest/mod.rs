@@ -1,8 +1,7 @@
 //! The manifest: the list of a scene's shards.
 //!
-//! On disk and on the wire it is JSON text. The same scene gives the same bytes: fields in declaration order, no
-//! spaces. It is a target of the store's metadata ([`crate::tuf`]), which says whose it is and whether it is the
-//! newest.
+//! JSON on disk and on the wire. The same scene gives the same bytes: fields in declaration order, no spaces. It is a
+//! target of the store's metadata ([`crate::tuf`]), which proves that it is genuine and the newest.
 
 mod index;
 mod json;

@@ -15,7 +15,7 @@ fn manifest(n_cells: u32) -> Manifest {
     Manifest { generation: 3, ..sample::manifest_of("yard \"7\"\n", &cells) }
 }
 
-/// A manifest without a text model has the bytes that it had before there were any.
+/// Without a text model, the manifest has no member for it.
 #[test]
 fn text_models_are_optional_and_bounded() {
     let plain = manifest(1);
@@ -40,8 +40,7 @@ fn round_trip_and_refusals() {
     assert!(matches!(Manifest::parse(&unordered.to_bytes()), Err(ManifestError::Content { .. })));
 }
 
-/// A file that was cut is damaged, whatever is left of it; only one whose version can be read is of another version,
-/// whatever else it holds.
+/// A truncated file is damaged, wherever it was cut; another version is reported only if the version can be read.
 #[test]
 fn damaged_manifests_and_those_of_other_versions_are_told_apart() {
     let refused = |bytes: &[u8]| Manifest::parse(bytes).expect_err("refused");
@@ -64,7 +63,7 @@ fn damaged_manifests_and_those_of_other_versions_are_told_apart() {
     }
 }
 
-/// A field that this version does not know, in the manifest, its encoder and a cell.
+/// An unknown field in the manifest, its encoder or a cell.
 #[test]
 fn unknown_fields_are_refused() {
     let json = String::from_utf8(manifest(1).to_bytes()).expect("JSON");
@@ -77,7 +76,7 @@ fn unknown_fields_are_refused() {
     }
 }
 
-/// 64 MiB are parsed, and refused as malformed; one byte more is refused for its length.
+/// 64 MiB are parsed and refused as malformed; one byte more is refused for its length.
 #[test]
 fn manifests_above_64_mib_are_refused() {
     let parse = |len_bytes: usize| {

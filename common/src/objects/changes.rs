@@ -1,7 +1,7 @@
-//! Which things of two generations are the same.
+//! Which objects of two generations are the same.
 //!
-//! First those of the same Gaussians; then those that look alike and whose boxes overlap, most overlap first;
-//! then, of the rest, those that look alike and have the same size, nearest first. A thing is matched once.
+//! Matched first: equal Gaussians; then similar vectors and overlapping boxes, most overlap first; then, of the rest,
+//! similar vectors and equal size, nearest first. An object is matched once.
 
 use std::collections::BTreeMap;
 
@@ -12,19 +12,17 @@ use super::columns::Objects;
 use crate::frames::Aabb;
 use crate::shard::ShardView;
 
-/// Least cosine of the vectors of a thing that stayed. Other photos change a thing's vector; another thing at its
-/// place differs more.
+/// Least cosine of an object that stayed: new photos change its vector, another object in its place differs more.
 const STAYED_COSINE: f64 = 0.8;
-/// Least share of the union of two boxes that both cover, for a thing that stayed.
+/// Least intersection over union of the boxes of an object that stayed.
 const STAYED_OVERLAP: f64 = 0.25;
-/// Least cosine of the vectors of a thing that moved: more than for one that stayed, as its place says nothing.
+/// Least cosine for an object that moved: higher than for one that stayed, as its place is no evidence.
 const MOVED_COSINE: f64 = 0.9;
-/// Largest ratio of the edges of a thing that moved, the longest to the longest and so on: it may have turned.
+/// Largest ratio of the sorted box edges of an object that moved; sorted, because it may have turned.
 const MOVED_SIZE_RATIO: f64 = 1.5;
-/// Boxes are widened on each side by this share of their diagonal, so that flat things overlap as thick ones do.
+/// Boxes are widened on each side by this share of their diagonal, so that flat objects can overlap.
 const MARGIN: f64 = 0.05;
-/// Things of the later list that one of the earlier may be paired with, those of lowest cost: bounds memory where
-/// thousands are alike.
+/// Candidates kept for each earlier object, those of lowest cost: bounds memory where thousands are alike.
 const MAX_CANDIDATES: usize = 32;
 
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -34,8 +32,8 @@ pub struct Place {
     pub splat: u64,
 }
 
-/// Returns whether the splat is the same around a thing: another generation has every cell that the thing's box
-/// touches. Such a thing may be outlined in another way, but has neither come nor gone.
+/// Returns whether the splat around an object is unchanged: the other generation has every cell that its box touches.
+/// Such an object may be outlined differently, but has neither appeared nor gone.
 pub fn is_unchanged(thing: &Thing, own: &[Place], other: &[Place]) -> bool {
     let mut here = own.iter().filter(|place| place.bounds.touches(&thing.box_in_world)).peekable();
     here.peek().is_some() && here.all(|place| other.iter().any(|known| known.splat == place.splat))
@@ -51,25 +49,24 @@ pub struct Moved {
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Changes {
-    /// Things of exactly the same Gaussians.
+    /// With exactly the same Gaussians.
     pub n_same: usize,
-    /// Things at the same place whose Gaussians changed.
+    /// At the same place with other Gaussians.
     pub n_stayed: usize,
-    /// Things of one list alone that are not compared: the other does not know their place, or the splat there is
-    /// the same.
+    /// In one list only, and not compared: the other does not know their place, or the splat there is unchanged.
     pub n_not_compared: usize,
-    /// Things of the later list alone, by id.
+    /// In the later list only, by id.
     pub appeared: Vec<Thing>,
-    /// Things of the earlier list alone, by id.
+    /// In the earlier list only, by id.
     pub went: Vec<Thing>,
-    /// Things that lie elsewhere, by the ids that they had.
+    /// Moved, by their earlier ids.
     pub moved: Vec<Moved>,
 }
 
 /// Returns the changes between two lists, each ascending by id.
 ///
-/// `new_tells`: whether a thing of the earlier list that is absent from the later one is gone; `old_tells`: the
-/// reverse; other things are matched where they lie, and not compared otherwise.
+/// `new_tells`: whether an earlier object absent from the later list is gone; `old_tells`: the reverse. Others are only
+/// matched in place.
 pub fn changes(
     old: Vec<Thing>,
     new: Vec<Thing>,
@@ -103,7 +100,7 @@ pub fn changes(
     Changes { n_same, n_stayed: stayed.len(), n_not_compared, appeared, went, moved: list }
 }
 
-/// Pairs the things of two lists, lowest cost first; `None` for what cannot be a pair.
+/// Pairs objects of two lists, lowest cost first; a cost of `None` excludes a pair.
 fn pairs(old: &[Thing], new: &[Thing], cost: impl Fn(&Thing, &Thing) -> Option<f64>) -> Vec<(usize, usize)> {
     let mut candidates: Vec<(f64, usize, usize)> = Vec::new();
     for (at_old, old) in old.iter().enumerate() {
@@ -143,7 +140,7 @@ fn cosine(a: &Thing, b: &Thing) -> f64 {
     dot(&a.vector, &b.vector) / lengths.max(f64::MIN_POSITIVE)
 }
 
-/// Returns the share of the union of two boxes that both cover, 0 to 1, with margins.
+/// Intersection over union of two boxes, with margins.
 fn overlap(a: &Aabb, b: &Aabb) -> f64 {
     let [a, b] = [a, b].map(|of| {
         let margin = DVec3::splat(MARGIN * of.size().length());
@@ -154,7 +151,7 @@ fn overlap(a: &Aabb, b: &Aabb) -> f64 {
     both / (volume(a.size()) + volume(b.size()) - both).max(f64::MIN_POSITIVE)
 }
 
-/// Returns whether the edges of two boxes are alike, in whatever directions.
+/// Returns whether the sorted edges of two boxes are alike.
 fn have_one_size(a: &Thing, b: &Thing) -> bool {
     let edges = |of: &Thing| {
         let size = of.box_in_world.size();
@@ -184,12 +181,12 @@ pub struct Thing {
     pub vector: Vec<f64>,
 }
 
-/// Returns an object's id as answers name it: `o` and 16 hex digits.
+/// Returns the id used in answers: `o` and 16 hex digits.
 pub fn public_id(id: u64) -> String {
     format!("o{id:016x}")
 }
 
-/// Returns the id that answers name so: `o` and 16 hex digits.
+/// Inverse of [`public_id`].
 pub fn parse_public_id(text: &str) -> Option<u64> {
     let digits = text.strip_prefix('o')?;
     let is_hex = digits.len() == 16 && digits.bytes().all(|b| b.is_ascii_hexdigit());
@@ -207,8 +204,7 @@ fn from_hex<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error>
 }
 
 impl Thing {
-    /// Adds the objects of a shard to a generation's things, by id; of an object in several shards, the first is
-    /// taken.
+    /// Adds the objects of a shard, by id; of an object in several shards, the first is kept.
     pub fn add_all(things: &mut BTreeMap<u64, Self>, shard: &ShardView<'_>, objects: &Objects<'_>) {
         let dim = shard.header.dim as usize;
         let len = objects.header.n_vectors as usize * dim;

@@ -113,7 +113,6 @@ impl<'a> Objects<'a> {
         columns.into_iter().chain(self.thumbnails.iter().flat_map(Thumbnails::sections))
     }
 
-    /// Returns the name of the photo that shows an object best.
     pub fn photo(&self, record: &ObjectRecord) -> &'a str {
         let start = record.photo_start as usize;
         let name = self.photos.get(start..start + record.photo_bytes as usize);
@@ -125,7 +124,7 @@ impl<'a> Objects<'a> {
         run.checked_sub(1).map_or(0, |before| self.run_ends[before])..self.run_ends[run]
     }
 
-    /// Returns each run of Gaussians, as indices in the shard, with the index of its object.
+    /// Returns the runs of Gaussians, as indices in the shard, each with the index of its object.
     pub fn runs(&self) -> impl Iterator<Item = (Range<u32>, Option<usize>)> + 'a {
         let starts = std::iter::once(&0).chain(self.run_ends);
         let object = |object: u16| (object != NO_OBJECT).then_some(usize::from(object));
@@ -246,7 +245,7 @@ fn header_fault(header: &ObjectsHeader) -> Option<String> {
     })
 }
 
-/// Returns the Gaussians of each of `n` objects, or the object of a run that is none of them.
+/// Counts the Gaussians of each of `n` objects; the error is the object of a run that is out of range.
 fn n_by_object(ends: &[u32], of_runs: &[u16], n: usize) -> Result<Vec<u32>, u16> {
     let mut n_here = vec![0u32; n];
     let starts = std::iter::once(&0).chain(ends);
@@ -276,10 +275,8 @@ fn fault(record: &ObjectRecord, n_here: u32, photos: &str) -> Option<&'static st
     }
 }
 
-/// Rounds the vectors of an object (`[n][m]`, components) to 8 bits and pads them to `n_vectors` by repeating the
-/// last, which changes no score.
-///
-/// Returns components and steps; a step is 1/127 of its vector's largest component.
+/// Rounds the vectors of an object (`[n][m]`, components) to 8 bits; pads them to `n_vectors` by repeating the last,
+/// which changes no score. Returns components and steps; a step is 1/127 of its vector's largest component.
 pub fn quantise_vectors(vectors: &[f32], m: usize, n_vectors: usize) -> (Vec<i8>, Vec<f32>) {
     let (mut components, mut steps) = (Vec::new(), Vec::new());
     let last = (vectors.len() / m.max(1)).saturating_sub(1);
@@ -291,10 +288,8 @@ pub fn quantise_vectors(vectors: &[f32], m: usize, n_vectors: usize) -> (Vec<i8>
     (components, steps)
 }
 
-/// Collects runs of consecutive Gaussians of the same object.
-///
-/// `objects`: the object of each Gaussian of a shard, [`NO_OBJECT`] for none. Returns
-/// the end and the object of each run.
+/// Collects runs of consecutive Gaussians of one object. `objects`: per Gaussian, [`NO_OBJECT`] for none. Returns the
+/// end and the object of each run.
 pub fn collect_runs(objects: impl IntoIterator<Item = u16>) -> (Vec<u32>, Vec<u16>) {
     let (mut run_ends, mut run_objects) = (Vec::new(), Vec::new());
     for (index, object) in (0u32..).zip(objects) {

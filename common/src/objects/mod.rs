@@ -1,9 +1,8 @@
-//! The objects of a shard: things that the masks of several views agree on. The byte table is in
-//! `docs/formats.md`.
+//! The objects of a shard: things that the masks of several views agree on. The byte table is in `docs/formats.md`.
 //!
-//! A shard carries the complete record of every object that has Gaussians in its cell, so a robot that holds only
-//! part of the scene still knows the size and position of the objects it sees in part. Objects have sections of
-//! their own: readers that do not know them skip them.
+//! A shard has the complete record of every object with Gaussians in its cell, so a robot that holds part of the
+//! scene knows the size and position of objects that extend beyond it. Objects have sections of their own, which
+//! readers that do not know them skip.
 
 mod changes;
 mod columns;

@@ -13,7 +13,7 @@ pub mod section {
 
 pub const MAX_THUMBNAIL_BYTES: usize = 16 << 10;
 
-/// What JPEG files begin with.
+/// The first bytes of JPEG files.
 const JPEG: [u8; 3] = [0xff, 0xd8, 0xff];
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,7 +24,6 @@ pub struct Thumbnails<'a> {
 }
 
 impl<'a> Thumbnails<'a> {
-    /// Returns the JPEG file of an object, if it has one.
     pub fn get(&self, object: usize) -> Option<&'a [u8]> {
         let start = object.checked_sub(1).map_or(0, |before| self.ends[before]);
         let picture = &self.pictures[start as usize..self.ends[object] as usize];

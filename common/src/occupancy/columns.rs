@@ -117,8 +117,7 @@ impl<'a> Occupancy<'a> {
         ]
     }
 
-    /// Returns the runs of blocks, ascending. A run may be long: readers clip it before they go through its
-    /// blocks.
+    /// Returns the runs of blocks, ascending. Clip a run to the wanted blocks before iterating: it may be very long.
     pub fn runs(&self) -> impl Iterator<Item = BlockRun<'a>> + 'a {
         let mut masks = self.masks;
         self.runs.iter().filter_map(move |run| {
@@ -130,7 +129,6 @@ impl<'a> Occupancy<'a> {
         })
     }
 
-    /// Returns the block of an index, on the scene's lattice.
     pub fn block_at(&self, index: u32) -> [i32; 3] {
         let [_, n_y, n_z] = self.header.n_blocks;
         let (x, y, z) = (index / n_z / n_y, index / n_z % n_y, index % n_z);
@@ -139,7 +137,7 @@ impl<'a> Occupancy<'a> {
     }
 }
 
-/// Returns the state of a voxel of a block from its masks. `voxel`: 0..4 each.
+/// `voxel`: 0..4 each.
 pub(super) fn state_of(masks: [u64; 2], [x, y, z]: [i32; 3]) -> VoxelState {
     let bit = 1u64 << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x));
     match (masks[0] & bit != 0, masks[1] & bit != 0) {
@@ -150,8 +148,7 @@ pub(super) fn state_of(masks: [u64; 2], [x, y, z]: [i32; 3]) -> VoxelState {
 }
 
 impl Occupancy<'_> {
-    /// Returns the state of a voxel of the scene's lattice. Goes through the runs: for tests and judges, not for
-    /// maps.
+    /// Returns the state of a voxel of the scene's lattice. Scans the runs: for tests and evaluation, not for maps.
     pub fn state(&self, voxel: [i32; 3]) -> VoxelState {
         let block = voxel.map(|v| v.div_euclid(BLOCK_EDGE));
         let of_run = |run: BlockRun<'_>| {
@@ -274,9 +271,8 @@ pub struct BuiltOccupancy {
 }
 
 impl BuiltOccupancy {
-    /// Packs blocks, in any order, each at most once. Blocks without a known voxel are left out; so are those more
-    /// than 256 blocks from the median block along an axis, which stray Gaussians make: a robot takes both as
-    /// unknown.
+    /// Packs blocks, in any order, each at most once. Drops blocks without a known voxel and, as strays, those
+    /// more than 256 blocks from the median along an axis; robots treat both as unknown.
     pub fn pack(voxel: f64, min_opacity: f32, min_views: u32, blocks: &[Block]) -> Self {
         let mut known: Vec<Block> = blocks.iter().copied().filter(|b| b.occupied | b.free != 0).collect();
         for axis in 0..3 {

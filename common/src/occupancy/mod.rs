@@ -2,7 +2,7 @@
 //! definition in `docs/numerics.md`.
 //!
 //! Voxel (i, j, k) is the cube from (i, j, k) to (i + 1, j + 1, k + 1) times the voxel's edge, world frame: all
-//! shards of a scene share one lattice. 4 x 4 x 4 voxels are a block. Blocks that are nowhere stored are unknown.
+//! shards of a scene share one lattice. 4 x 4 x 4 voxels are a block. Blocks that are not stored are unknown.
 
 mod columns;
 

@@ -75,7 +75,7 @@ fn every_voxel_comes_back() {
     }
 }
 
-/// By hand: a stray block 4 km up does not make the box too large, and is unknown.
+/// By hand: a stray block 4 km up is dropped instead of enlarging the box.
 #[test]
 fn stray_blocks_are_left_out() {
     let block = |at| Block { at, occupied: 1, free: 0 };

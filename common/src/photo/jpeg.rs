@@ -2,10 +2,9 @@
 
 use std::io::{self, BufRead};
 
-/// Zeros in a row that coded data cannot have where they do not end blocks: ten blocks of the least coefficients.
+/// Zeros in a row that coded data can only have where zeros end blocks: ten blocks of the least coefficients.
 const MOST_ZEROS: usize = 256;
 
-/// What a copy may have lost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Damage {
     /// The end-of-image marker (ITU-T T.81, B.1.1).
@@ -14,10 +13,8 @@ pub(super) enum Damage {
     Zeros,
 }
 
-/// Returns what is missing of a file.
-///
-/// Segments are skipped by their lengths, so the marker of an embedded thumbnail does not count; coded data are
-/// searched.
+/// Returns what is missing from a file. Segments are skipped by their lengths, so the end marker of an embedded
+/// thumbnail does not count; coded data are searched.
 pub(super) fn damage(mut file: impl BufRead) -> io::Result<Option<Damage>> {
     match find_end(&mut file) {
         Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => Ok(Some(Damage::Cut)),
@@ -26,7 +23,7 @@ pub(super) fn damage(mut file: impl BufRead) -> io::Result<Option<Damage>> {
 }
 
 fn find_end(file: &mut impl BufRead) -> io::Result<Option<Damage>> {
-    // By number: whether the code of zeros in a table of coefficients ends a block, so that flat areas are zeros.
+    // Per coefficient table: whether its code of zeros ends a block, so that flat areas are zeros.
     let mut ends_block = [true; 16];
     let (mut is_sequential, mut may_be_zeros) = (false, true);
     loop {
@@ -59,7 +56,7 @@ fn find_end(file: &mut impl BufRead) -> io::Result<Option<Damage>> {
     }
 }
 
-/// Skips up to a byte 255 and over it; returns how many zeros lie in a row.
+/// Skips past the next byte 255; returns the longest run of zeros before it.
 fn skip_to_marker(file: &mut impl BufRead) -> io::Result<usize> {
     let (mut n, mut most) = (0, 0);
     loop {
@@ -115,12 +112,12 @@ mod tests {
         for len in 0..WHOLE.len() {
             assert_eq!(damage(&WHOLE[..len]).expect("memory reads"), Some(Damage::Cut), "cut after {len}");
         }
-        // Data that cameras append are harmless.
+        // Cameras append data, which are harmless.
         let appended = [&WHOLE[..], &[0; 999]].concat();
         assert_eq!(damage(&appended[..]).expect("memory reads"), None);
     }
 
-    /// A noisy photo whose middle is zeros; flat ones, whose coded data may be nothing else.
+    /// A noisy photo with zeros in the middle; flat photos, whose coded data may be all zeros.
     #[test]
     fn zeros_in_the_middle_are_seen() {
         let mut random = slag_math::random::Random::new(1);

@@ -1,4 +1,4 @@
-//! Photo files: what they are, and what is wrong with them that decoders do not tell.
+//! Photo files: formats, and damage that decoders do not report.
 
 mod jpeg;
 
@@ -9,8 +9,7 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Li
 use crate::files;
 use jpeg::Damage;
 
-/// Most bytes that a file takes before its pixels are read, with what they inflate to: its colour profile, its texts
-/// and a row of pixels. A decoder of JPEG copies the file besides.
+/// Most bytes of a file's inflated header: colour profile, texts, a row of pixels. JPEG decoders also copy the file.
 pub const HEAD_BYTES: u64 = 16 << 20;
 /// Bytes 4 to 12 of HEIF files, which phones write.
 const HEIF_BRANDS: [&[u8]; 9] = [
@@ -54,7 +53,7 @@ impl From<ImageError> for PhotoError {
     }
 }
 
-/// Reads what stands before the pixels, within [`HEAD_BYTES`].
+/// Reads everything before the pixels, within [`HEAD_BYTES`].
 pub fn head<'a>(input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDecoder + 'a>, PhotoError> {
     let mut reader = ImageReader::new(input).with_guessed_format()?;
     let mut limits = Limits::no_limits();
@@ -63,7 +62,7 @@ pub fn head<'a>(input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDecoder 
     Ok(Box::new(reader.into_decoder()?))
 }
 
-/// Opens a photo as [`head`] does. Refuses what is none, and what decoders would fill with grey or noise.
+/// Opens a photo as [`head`] does; refuses other files, and damage that decoders would fill with grey or noise.
 pub fn open<'a>(mut input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDecoder + 'a>, PhotoError> {
     let start = input.fill_buf()?;
     if let Some((what, advice)) = files::stand_in(start) {
@@ -75,7 +74,7 @@ pub fn open<'a>(mut input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDeco
     let stated_bytes = start.get(4..8).map_or(0, |len| u32::from_le_bytes([len[0], len[1], len[2], len[3]]));
     let damage = match image::guess_format(start) {
         Ok(ImageFormat::Jpeg) => jpeg::damage(&mut input)?,
-        // A piece of RIFF, behind its head of eight bytes; some writers count one that pads it.
+        // A RIFF chunk, after its header of eight bytes; some writers count a padding byte.
         Ok(ImageFormat::WebP) => {
             let is_cut = input.seek(SeekFrom::End(0))? + 1 < u64::from(stated_bytes) + 8;
             is_cut.then_some(Damage::Cut)
@@ -90,8 +89,8 @@ pub fn open<'a>(mut input: impl BufRead + Seek + 'a) -> Result<Box<dyn ImageDeco
     head(input)
 }
 
-/// Returns the colours of a photo, and, where some of its pixels are transparent, which are not. Those that are lie
-/// outside of the photo and are black: their colours are left from editing, or noise.
+/// Returns the colours of a photo and, if some pixels are transparent, which are opaque (at least half). Transparent
+/// pixels become black: their colours are leftovers of editing, or noise.
 pub fn colours(photo: DynamicImage) -> (RgbImage, Option<Vec<bool>>) {
     let opaque = photo.color().has_alpha().then(|| opaque_pixels(&photo)).filter(|all| all.contains(&false));
     let mut colours = photo.into_rgb8();
@@ -102,7 +101,6 @@ pub fn colours(photo: DynamicImage) -> (RgbImage, Option<Vec<bool>>) {
     (colours, opaque)
 }
 
-/// Returns which pixels are at least half opaque.
 fn opaque_pixels(photo: &DynamicImage) -> Vec<bool> {
     photo.to_luma_alpha8().pixels().map(|pixel| pixel.0[1] >= 128).collect()
 }

@@ -48,7 +48,7 @@ fn what_inflates_before_the_pixels_is_bounded() {
         let content = [b"iCCPp\0\0".as_slice(), &deflated_zeros(n_bytes)].concat();
         let len = (content.len() - 4) as u32;
         let checksum = crc32(&content).to_be_bytes();
-        // Behind the signature and the chunk of sizes.
+        // After the signature and the IHDR chunk.
         [&png[..33], &len.to_be_bytes(), &content, &checksum, &png[33..]].concat()
     };
     let bomb = with_profile(64 << 20);
@@ -65,22 +65,22 @@ fn deflated_zeros(n_bytes: usize) -> Vec<u8> {
     let n_copies = n_bytes.div_ceil(258);
     let mut bits: Vec<u8> = Vec::new();
     let mut push = |value: u32, n_bits: u32| bits.extend((0..n_bits).map(|at| (value >> at & 1) as u8));
-    // The last block, with codes of its own: 286 for literals and lengths, two for distances, 18 for their lengths.
+    // The last block, with dynamic codes: 286 for literals and lengths, two for distances, 18 for code lengths.
     [(1, 1), (2, 2), (29, 5), (1, 5), (14, 4)].iter().for_each(|(value, n)| push(*value, *n));
-    // Of the lengths: 18, a run of zeros, has the code 0, 1 the code 10, and 2 the code 11.
+    // Code lengths: 18, a run of zeros, has the code 0, 1 the code 10, and 2 the code 11.
     [0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 2].iter().for_each(|length| push(*length, 3));
-    // Two bits for the byte 0, and for the end (256); one for the length 258 (285), and for the distances.
+    // Two bits for the byte 0 and for the end (256); one for the length 258 (285) and for the distances.
     push(0b11, 2);
     [138, 117].iter().for_each(|run| push((run - 11) << 1, 8));
     push(0b11, 2);
     push((28 - 11) << 1, 8);
     (0..3).for_each(|_| push(0b01, 2));
-    // The byte, 10; copies, 0 and 0; the end, 11. Codes begin with their first bit.
+    // The byte, 10; copies, 0 and 0; the end, 11. Codes are written from their first bit.
     push(0b01, 2);
     (0..n_copies).for_each(|_| push(0, 2));
     push(0b11, 2);
     let bytes = bits.chunks(8).map(|bits| bits.iter().rev().fold(0u8, |byte, bit| byte << 1 | *bit));
-    // Of so many zeros the checksum's lower half is 1, its upper half their number.
+    // The checksum (Adler-32) of zeros has 1 as its lower half and their number as its upper half.
     let checksum = ((1 + 258 * n_copies) % 65_521) << 16 | 1;
     [0x78, 0x9c].into_iter().chain(bytes).chain((checksum as u32).to_be_bytes()).collect()
 }

@@ -69,7 +69,6 @@ fn faults_are_refused_by_name() {
     assert!(refused(|b| b.names.replace_range(0..1, "\n")).contains("control characters"));
 }
 
-/// Poses and lenses beyond the range of f32 do not make a shard that readers refuse.
 #[test]
 fn the_largest_numbers_saturate() {
     let mut built = BuiltPhotoPoses::default();

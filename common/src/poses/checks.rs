@@ -8,11 +8,10 @@ use crate::camera::{Distortion, Intrinsics};
 /// Largest image side accepted, pixels: that of the largest JPEG; pixel indices fit 32 bits.
 const MAX_SIDE_PX: u32 = 65_535;
 
-/// Largest deviation of a rotation from unit length or orthonormality that counts as rounding: a printout with 3
-/// decimals stays below it.
+/// Largest deviation from unit length or orthonormality that counts as rounding; printouts with 3 decimals are below.
 const ROTATION_TOLERANCE: f64 = 5e-3;
 
-/// Returns intrinsics after checking them: sizes within 1..=65,535, focal lengths positive, everything finite.
+/// Checks intrinsics: sizes within 1..=65,535, focal lengths positive, everything finite.
 pub(super) fn check_intrinsics(
     [width_px, height_px]: [f64; 2],
     [focal_x_px, focal_y_px]: [f64; 2],
@@ -64,7 +63,7 @@ pub(super) fn check_intrinsics(
     })
 }
 
-/// Returns the transform of a quaternion (w, x, y, z), which is normalised, and a translation.
+/// Returns the transform of a quaternion (w, x, y, z), which is normalised first, and a translation.
 pub(super) fn affine_from_wxyz(
     image: &str,
     wxyz: [f64; 4],
@@ -80,7 +79,7 @@ pub(super) fn affine_from_wxyz(
     Ok(DAffine3::from_rotation_translation(rotation.normalize(), translation))
 }
 
-/// Returns the transform of a rotation matrix, which is made exactly orthonormal, and a translation.
+/// Returns the transform of a rotation matrix, which is orthonormalised first, and a translation.
 fn affine_from_matrix(image: &str, rotation: DMat3, translation: [f64; 3]) -> Result<DAffine3, PoseProblem> {
     let gram = rotation.transpose() * rotation - DMat3::IDENTITY;
     let largest =
@@ -96,7 +95,7 @@ fn affine_from_matrix(image: &str, rotation: DMat3, translation: [f64; 3]) -> Re
     Ok(DAffine3::from_rotation_translation(DQuat::from_mat3(&rotation).normalize(), translation))
 }
 
-/// Returns the transform of the rows of a matrix, with its source's axes expressed by the columns of `axes`.
+/// Returns the transform of a matrix's rows; the columns of `axes` express the source's axes.
 pub(super) fn affine_from_rows(image: &str, rows: &[Vec<f64>], axes: DMat3) -> Result<DAffine3, PoseProblem> {
     let expected = "a matrix of 3 or 4 rows and 4 columns, the fourth row being 0 0 0 1";
     let row = |index: usize| rows.get(index).and_then(|row| <[f64; 4]>::try_from(row.as_slice()).ok());

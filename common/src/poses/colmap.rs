@@ -58,7 +58,7 @@ pub(super) fn read(
     Ok(set)
 }
 
-/// Returns what else could have been read: the other form of the model, and larger models beside it.
+/// Names what else could have been read: the model's other form, and larger models beside it.
 fn notes(model_dir: &Path, extension: &str, n_views: usize) -> Vec<String> {
     let mut notes = Vec::new();
     let other = if extension == "bin" { "txt" } else { "bin" };
@@ -84,7 +84,7 @@ fn notes(model_dir: &Path, extension: &str, n_views: usize) -> Vec<String> {
     notes
 }
 
-/// Returns the numbered COLMAP model (`0`, `1` ...) with most images in a folder.
+/// Returns the numbered COLMAP model (`0`, `1` ...) with the most images in a folder.
 pub(super) fn largest_model(folder: &Path) -> Option<PathBuf> {
     largest(models(folder).into_iter()).map(|(_, model)| model)
 }
@@ -102,7 +102,7 @@ fn models(folder: &Path) -> Vec<(u64, PathBuf)> {
     models.into_iter().filter_map(|(_, path)| Some((n_images(&path)?, path))).collect()
 }
 
-/// Returns the number of images that a model states, or that its lines suggest; `None` without a model.
+/// Returns the number of images that a model states or, as text, suggests by its lines; `None` without a model.
 fn n_images(model_dir: &Path) -> Option<u64> {
     if let Ok(mut file) = Binary::open(&model_dir.join("images.bin")) {
         return file.u64("the number of images").ok();
@@ -115,8 +115,8 @@ fn n_images(model_dir: &Path) -> Option<u64> {
     Some(n)
 }
 
-/// Returns the first of these folders that exists, or else the first: `images/` beside a parent folder `sparse`,
-/// beside the model's folder, in the model's folder.
+/// Returns the first folder that exists, else the first: `images/` beside a parent folder `sparse`, beside the
+/// model's folder, in the model's folder.
 fn default_images_dir(model_dir: &Path) -> Result<PathBuf, PoseError> {
     let beside = parent(model_dir)?;
     let mut candidates = vec![beside.join("images"), model_dir.join("images")];
@@ -159,7 +159,6 @@ struct Model<'a> {
     path: &'a Path,
 }
 
-/// An image record.
 struct Record<'a> {
     name: &'a str,
     camera_id: u32,
@@ -173,13 +172,13 @@ struct Images {
     views: Vec<View>,
     /// Images without a pose.
     damaged: Damaged,
-    /// Names that were paths of another machine: absolute, or above the folder of images.
+    /// Names that were paths of another machine: absolute, or above the image folder.
     foreign: BTreeSet<String>,
 }
 
 impl Images {
-    /// Adds an image record; one without a pose (zeros, NaN), as some exporters write it for photos that they
-    /// could not place, is left out, and so is one whose pose is none.
+    /// Adds an image record. Leaves out records without a pose (zeros, NaN), which some exporters write for photos
+    /// that they could not place, and those with an invalid one.
     fn push(&mut self, model: &Model<'_>, record: Record<'_>) -> Result<(), PoseError> {
         let Record { camera_id, wxyz, translation, place, .. } = record;
         if wxyz == [0.0; 4] || wxyz.iter().any(|q| q.is_nan()) {
@@ -208,7 +207,7 @@ impl Images {
     }
 }
 
-/// Returns an image's name as a path inside the folder of images, and whether it was one of another machine.
+/// Returns an image's name as a path inside the image folder, and whether it was a path of another machine.
 fn relative(name: &str) -> (String, bool) {
     let name = name.replace('\\', "/");
     let mut inside = name.strip_prefix("./").unwrap_or(&name);
@@ -226,7 +225,6 @@ fn insert(cameras: &mut Cameras, camera_id: u32, camera: Intrinsics) -> Result<(
     }
 }
 
-/// A text file that is read line by line, with line numbers.
 struct Lines {
     path: PathBuf,
     reader: BufReader<File>,
@@ -277,7 +275,6 @@ fn take<T: std::str::FromStr>(rest: &mut &str, expected: &'static str) -> Result
     word.parse().map_err(|_| PoseProblem::Expected { expected, found: excerpt(word) })
 }
 
-/// Returns the first 40 characters of a text, for a message.
 fn excerpt(text: &str) -> String {
     text.chars().take(40).collect()
 }
@@ -323,7 +320,7 @@ fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result
         let place = Place::Line(lines.number);
         let record = record_of_line(&lines.line, place).map_err(|problem| lines.fail(problem))?;
         images.push(&model, record)?;
-        // A line of features follows each image, perhaps an empty one; some exporters leave it out.
+        // A line of features follows each image, perhaps empty; some exporters omit it.
         has_record = lines.advance()?;
         if has_record && is_features(&lines.line) {
             has_record = lines.advance_to_record()?;
@@ -349,7 +346,7 @@ fn record_of_line(line: &str, place: Place) -> Result<Record<'_>, PoseProblem> {
     Ok(Record { name: rest.trim(), camera_id, wxyz, translation, place })
 }
 
-/// A binary file that is read front to back; counts are checked against its length.
+/// Counts in the file are checked against its length.
 struct Binary {
     path: PathBuf,
     reader: BufReader<File>,

@@ -113,7 +113,7 @@ impl From<io::Error> for PoseError {
 }
 
 impl PoseProblem {
-    /// Returns what is wrong with a pose, for a sentence that names its frame.
+    /// Returns the problem of a pose, for a sentence that names its frame.
     pub(super) fn of_pose(&self) -> String {
         match self {
             Self::NotARotation { deviation, .. } => format!("its rotation is off by {deviation:.3e}"),

@@ -5,12 +5,10 @@ use std::num::NonZeroU32;
 use super::view_set::ViewSet;
 
 impl ViewSet {
-    /// Keeps every `n`th frame, by its number.
+    /// Keeps every `n`th frame by number: the last run of digits in its file name (`frame_00040.jpg` is 40).
     ///
-    /// A frame's number is the last run of digits in its file name (`frame_00040.jpg` is 40). Counting begins at
-    /// the lowest number of its folder, frames without a pose included, so that the choice does not depend on
-    /// which poses are known. If any name has no number, all frames are counted in the order of their names
-    /// instead.
+    /// Counting begins at the lowest number of its folder, frames without a pose included, so the choice does not
+    /// depend on which poses are known. If any name has no number, all frames are counted by name.
     pub fn every(mut self, n: NonZeroU32) -> Self {
         let n = u64::from(n.get());
         let mut names: Vec<&str> = self
@@ -47,13 +45,11 @@ impl ViewSet {
     }
 }
 
-/// Returns the part of a name before its last slash.
 fn folder(name: &str) -> &str {
     name.rsplit_once('/').map_or("", |(folder, _)| folder)
 }
 
-/// Returns the last run of digits of a file name without its extension; `None` if there is none, or it exceeds 64
-/// bits.
+/// Returns the last run of digits of a file name without its extension; `None` without one or beyond 64 bits.
 fn number(name: &str) -> Option<u64> {
     let file = name.rsplit('/').next().unwrap_or(name);
     let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);

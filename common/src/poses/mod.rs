@@ -23,13 +23,12 @@ use crate::files;
 /// Reads the posed views at `path`.
 ///
 /// `path` is the folder of a COLMAP model (or one of its files, or a folder with `sparse/0`, `0` or `sparse`; of
-/// several numbered models the one with most images), or a nerfstudio `transforms.json` (or its folder), or a
-/// scene folder as ScanNet's SensReader exports it (`color/`, `pose/`, `intrinsic/`). COLMAP takes precedence over
+/// several numbered models the one with the most images), a nerfstudio `transforms.json` (or its folder), or a scene
+/// folder as exported by ScanNet's SensReader (`color/`, `pose/`, `intrinsic/`). COLMAP takes precedence over
 /// `transforms.json`, that over ScanNet, and binary over text, which is rounded.
 ///
-/// `images_dir` is the folder of the images. The default is `images/` beside COLMAP's `sparse/` (or beside or in
-/// the model's folder), the paths in a `transforms.json`, and ScanNet's `color/`. Images need not exist, except
-/// that ScanNet states their size nowhere else.
+/// `images_dir`: by default `images/` beside COLMAP's `sparse/` (or beside or in the model's folder), the paths in a
+/// `transforms.json`, or ScanNet's `color/`. Images need not exist, except ScanNet's: only they tell their size.
 pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
     if files::metadata(path)?.is_file() {
         return match path.extension().and_then(|e| e.to_str()) {

@@ -1,4 +1,4 @@
-//! Paths of pose files, and of photos that are not where the poses say.
+//! Paths in pose files, and photos that are not where the poses say.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io;
@@ -16,13 +16,13 @@ pub(super) fn parent(path: &Path) -> io::Result<PathBuf> {
     }
 }
 
-/// Endings of photos, in small letters.
+/// In lower case.
 const PHOTO_ENDINGS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 
-/// Finds photos whose path or ending differs from what the poses say.
+/// Finds photos whose path or extension differs from the one in the poses.
 pub(super) struct PhotoFinder {
     dir: PathBuf,
-    /// By folder: files by their name in small letters without its ending; `None` where two have the same.
+    /// Per folder: files by lower-case name without extension; `None` where two are equal.
     listed: HashMap<PathBuf, BTreeMap<String, Option<PathBuf>>>,
 }
 
@@ -31,9 +31,8 @@ impl PhotoFinder {
         Self { dir, listed: HashMap::new() }
     }
 
-    /// Returns the photo at the longest ending of `path` that exists in the folder, with the stated file name or
-    /// else in other letters or with the ending of another photo format, or with `%20` for a space as in addresses;
-    /// and that ending.
+    /// Returns the photo at the longest suffix of `path` that exists in the folder, and that suffix. The file name
+    /// may differ in case or photo extension, or have `%20` for a space as in URLs.
     pub(super) fn find(&mut self, path: &str) -> Option<(PathBuf, String)> {
         self.find_as_written(path).or_else(|| self.find_as_written(&without_escapes(path)?))
     }
@@ -64,8 +63,8 @@ impl PhotoFinder {
         files.get(&stem_of(path)?)?.clone()
     }
 
-    /// Finds the photos of the views whose file does not exist. Views of `foreign` names, paths of another machine,
-    /// are then called by the ending that exists. Returns sentences on what was found.
+    /// Finds the photos of views whose file does not exist. Views with `foreign` names (paths of another machine) are
+    /// renamed to the suffix that exists. Returns sentences on what was found.
     pub(super) fn find_missing(&mut self, views: &mut [View], foreign: &BTreeSet<String>) -> Vec<String> {
         let mut elsewhere: Vec<Option<Stated>> = Vec::with_capacity(views.len());
         for view in views.iter_mut() {
@@ -89,7 +88,7 @@ impl PhotoFinder {
     }
 }
 
-/// Returns the folders and the name of a path, without its root and its dots.
+/// Returns the components of a path, without root and dots.
 pub(super) fn parts_of(path: &str) -> Vec<&str> {
     let part = |part| match part {
         Component::Normal(part) => part.to_str(),
@@ -98,16 +97,15 @@ pub(super) fn parts_of(path: &str) -> Vec<&str> {
     Path::new(path).components().filter_map(part).collect()
 }
 
-/// What the poses say of a photo that was found elsewhere.
+/// What the poses say about a photo that was found elsewhere.
 pub(super) struct Stated {
     pub(super) image_path: PathBuf,
     pub(super) name: String,
-    /// The path as it is written.
     pub(super) said: String,
 }
 
-/// Gives back what the poses say to views of which several found the same photo, or found that of another view, and
-/// clears it in `elsewhere`, which has an entry a view. Returns a sentence on them, if there are any.
+/// Restores the stated paths of views that found the same photo as another view, and clears their entries in
+/// `elsewhere` (one per view). Returns a sentence on them, if there are any.
 pub(super) fn take_back_shared(views: &mut [View], elsewhere: &mut [Option<Stated>]) -> Option<String> {
     let mut n_views_of: HashMap<PathBuf, usize> = HashMap::new();
     views.iter().for_each(|view| *n_views_of.entry(view.image_path.clone()).or_default() += 1);
@@ -128,7 +126,7 @@ pub(super) fn take_back_shared(views: &mut [View], elsewhere: &mut [Option<State
     ))
 }
 
-/// Returns the text with `%20` and the like as the characters that they stand for; `None` without any.
+/// Decodes `%20` and other percent escapes; `None` without any.
 fn without_escapes(text: &str) -> Option<String> {
     let (mut bytes, mut rest) = (Vec::new(), text.as_bytes());
     while let [byte, after @ ..] = rest {
@@ -140,7 +138,7 @@ fn without_escapes(text: &str) -> Option<String> {
     String::from_utf8(bytes).ok().filter(|found| found != text)
 }
 
-/// Returns a file's name without its ending, in small letters and composed: archives of macOS take letters apart.
+/// Returns a file's lower-case name without extension, in NFC: archives of macOS decompose letters.
 fn stem_of(path: &Path) -> Option<String> {
     Some(path.file_stem()?.to_str()?.nfc().collect::<String>().to_lowercase())
 }

@@ -29,7 +29,6 @@ const MAX_MATRIX_BYTES: u64 = 4096;
 /// Largest distance of the principal point from the middle of the image, in image sides.
 const MAX_OFF_CENTRE: f64 = 0.25;
 
-/// A matrix of a text file, or its absence.
 enum Matrix {
     Known(Vec<Vec<f64>>),
     /// A value is `-inf`: tracking was lost.
@@ -64,7 +63,7 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
         let path = dir.join(POSES).join(format!("{stem}.txt"));
         let (image_path, extension) = existing(&photos.join(&stem));
         let name = format!("{stem}{extension}");
-        // Whatever is wrong with a frame's own file is wrong with its pose.
+        // Any fault of a frame's own file counts as a fault of its pose.
         let rows = match read_matrix(&path) {
             Ok(Matrix::Known(rows)) => rows,
             Ok(Matrix::Lost) => {
@@ -85,7 +84,7 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
     if posed.is_empty() {
         return view_set(&dir.join(POSES), Vec::new(), PoseSource::Scannet, damaged);
     }
-    // All photos have one size: that of the first that can be read.
+    // All photos have the size of the first readable one.
     let Some(size_px) = posed.iter().find_map(|(_, path, _)| image::image_dimensions(path).ok()) else {
         let problem = PoseProblem::NoImageSize { n_poses: posed.len(), folder: photos };
         return Err(problem.at(&intrinsics_path, Place::File));
@@ -109,7 +108,6 @@ fn intrinsics(camera: &[Vec<f64>], (width_px, height_px): (u32, u32)) -> Result<
     Ok(found)
 }
 
-/// Reads a matrix of 3 or 4 rows and 4 columns.
 fn read_matrix(path: &Path) -> Result<Matrix, PoseError> {
     let file = File::open(path)?;
     let mut bytes = Vec::new();

@@ -1,9 +1,8 @@
-//! The frame of a splat that was trained in another one than its poses': nerfstudio's
-//! `dataparser_transforms.json`.
+//! The frame of a splat trained in another frame than its poses': nerfstudio's `dataparser_transforms.json`.
 //!
 //! `ns-train` changes the world of its input poses and writes the change into the run's folder: `trained = scale *
-//! (transform * original)`. `ns-export gaussian-splat` writes the splat in the trained frame. Which frame is
-//! `original` depends on the dataparser (nerfstudio 1.1, `data/dataparsers/`):
+//! (transform * original)`. `ns-export gaussian-splat` uses the trained frame. `original` depends on the dataparser
+//! (nerfstudio 1.1, `data/dataparsers/`):
 //!
 //! | poses | `original` |
 //! |---|---|
@@ -11,7 +10,7 @@
 //! | `transforms.json` | the world before its `applied_transform` and `applied_scale` |
 //! | ScanNet | ScanNet's world with x and y swapped and z negated, which the file does not mention |
 //!
-//! The ScanNet dataparser never rotates further, so a file with a rotation is of another dataparser and begins at
+//! The ScanNet dataparser never rotates further, so a file with a rotation is from another dataparser and begins at
 //! the poses themselves.
 
 use std::fmt;
@@ -28,7 +27,6 @@ use super::view_set::{AppliedTransform, PoseSource};
 use crate::files;
 use crate::similarity::Similarity;
 
-/// Nerfstudio's name of the file.
 pub const FRAME_FILE: &str = "dataparser_transforms.json";
 /// Value of `from` in files of [`SplatFrame::to_json`].
 const FROM_POSES: &str = "poses";
@@ -47,7 +45,7 @@ pub struct SplatFrame {
 struct Json {
     transform: Vec<Vec<f64>>,
     scale: f64,
-    /// Ours: `poses` where the transform begins at the poses as they are read. Nerfstudio ignores it.
+    /// Ours: `poses` where the transform begins at the poses as read. Nerfstudio ignores it.
     #[serde(skip_serializing_if = "Option::is_none")]
     from: Option<String>,
 }
@@ -64,7 +62,7 @@ impl SplatFrame {
         let text = files::text_of(&bytes).map_err(|fault| fail(PoseProblem::NotUtf8(fault)))?;
         let json: Json =
             serde_json::from_str(text).map_err(|cause| PoseError::Frame { path: path.to_owned(), cause })?;
-        // A factor beyond this is no change of unit, and squares of lengths would leave the range of f32.
+        // A larger factor is no change of unit, and squared lengths would exceed f32.
         if !(1e-9..=1e9).contains(&json.scale) {
             let found = json.scale.to_string();
             return Err(fail(PoseProblem::Expected { expected: "a scale from 1e-9 to 1e9", found }));
@@ -73,7 +71,7 @@ impl SplatFrame {
         Ok(Self { transform, scale: json.scale, from_poses: json.from.as_deref() == Some(FROM_POSES) })
     }
 
-    /// Returns the text of a file that states `splat_from_poses`, in nerfstudio's format.
+    /// Returns a file's text for `splat_from_poses`, in nerfstudio's format.
     pub fn to_json(splat_from_poses: &Similarity) -> String {
         let Similarity { scale, rotation, translation } = *splat_from_poses;
         let rotation = DMat3::from_quat(rotation);
@@ -87,8 +85,7 @@ impl SplatFrame {
         serde_json::to_string_pretty(&json).unwrap_or_default() + "\n"
     }
 
-    /// Returns the transform from the world of poses to the splat's; `source` and `applied` are those of their
-    /// [`ViewSet`](super::ViewSet).
+    /// Transform from the poses' world to the splat's; for `source` and `applied` see [`ViewSet`](super::ViewSet).
     pub fn splat_from_poses(&self, source: PoseSource, applied: Option<AppliedTransform>) -> SplatFromPoses {
         let direct = |scale| Similarity::from_rigid_then_scale(self.transform, scale);
         let (similarity, begins_at) = match (self.from_poses, source, applied) {
@@ -113,14 +110,14 @@ pub struct SplatFromPoses {
     pub begins_at: Origin,
 }
 
-/// Where the transform of a file begins.
+/// The frame where a file's transform begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// At the poses as they are read.
+    /// The poses as read.
     Poses,
-    /// Before the `applied_transform` of the `transforms.json`.
+    /// The world before the `applied_transform` of the `transforms.json`.
     BeforeAppliedTransform,
-    /// At the axes of nerfstudio's ScanNet dataparser.
+    /// The axes of nerfstudio's ScanNet dataparser.
     ScannetDataparser,
 }
 

@@ -17,13 +17,13 @@ use super::view_set::{AppliedTransform, Damaged, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 use crate::files;
 
-/// Largest ratio of a focal length and that of an angle which say the same.
+/// Largest ratio between a stated focal length and that of a stated angle, if they agree.
 const MAX_FOCAL_RATIO: f64 = 1.02;
 
 /// Extensions tried, in this order, for a `file_path` without one.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "webp", "PNG", "JPG"];
 
-/// The camera keys of a frame, or those at the top of the file, which hold for frames without their own.
+/// Camera keys of a frame, or those at the top of the file, which are the defaults.
 #[derive(Clone, Default, Deserialize)]
 struct Camera {
     camera_model: Option<String>,
@@ -44,11 +44,11 @@ struct Camera {
     p2: Option<f64>,
 }
 
-/// An element of `frames`: an image and its pose.
+/// An element of `frames`.
 #[derive(Deserialize)]
 struct FrameEntry {
     file_path: String,
-    /// NaN, which is no JSON, was replaced by null. `None`: the frame was not placed.
+    /// NaN, which is not JSON, was replaced by null. `None`: the frame was not placed.
     transform_matrix: Option<Vec<Vec<Option<f64>>>>,
     mask_path: Option<IgnoredAny>,
     #[serde(flatten)]
@@ -119,7 +119,7 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
     Ok(ViewSet { applied, notes, ..view_set(path, views, PoseSource::Transforms, damaged)? })
 }
 
-/// Says what of the file has no effect, though it was meant to.
+/// Reports entries of the file that have no effect.
 fn not_read(transforms: &Transforms, views: &[View]) -> Vec<String> {
     let mut found = Vec::new();
     let n_masked = transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count();
@@ -141,7 +141,6 @@ fn not_read(transforms: &Transforms, views: &[View]) -> Vec<String> {
     found
 }
 
-/// Returns a frame's pose. `image`: its name.
 fn world_from_camera(frame: &FrameEntry, image: &str) -> Result<DAffine3, PoseProblem> {
     let expected = "a transform_matrix of finite numbers";
     let missing = |found: &str| PoseProblem::Expected { expected, found: found.to_owned() };
@@ -151,7 +150,7 @@ fn world_from_camera(frame: &FrameEntry, image: &str) -> Result<DAffine3, PosePr
     affine_from_rows(image, &rows, opencv_axes_in_opengl)
 }
 
-/// Replaces NaN and infinities, which some writers put into JSON, by null.
+/// Replaces NaN and infinities, which some writers put into JSON, with null.
 fn null_for_nan(json: &[u8]) -> Vec<u8> {
     let (mut out, mut rest, mut is_text) = (Vec::with_capacity(json.len() + 16), json, false);
     while let [byte, after @ ..] = rest {
@@ -173,7 +172,6 @@ fn finite(rows: &[Vec<Option<f64>>]) -> Option<Vec<Vec<f64>>> {
     rows.iter().map(|row| row.iter().copied().collect()).collect()
 }
 
-/// Where the photos of the frames are.
 struct Frames<'a> {
     paths: Vec<String>,
     images_dir: Option<&'a Path>,
@@ -189,8 +187,8 @@ struct FramePhoto {
 }
 
 impl Frames<'_> {
-    /// Returns the path of a frame's photo and its name: where the file says, or else at the longest ending of
-    /// that path that exists. `name`: by the file, perhaps without an ending.
+    /// Returns the path and the name of a frame's photo: as stated, or at the longest suffix of that path that
+    /// exists. `name`: as stated, perhaps without an extension.
     fn photo(&mut self, index: usize, name: Option<String>) -> Option<FramePhoto> {
         let (name, file_path) = (name?, &self.paths[index]);
         let (image_path, ending) = match self.images_dir {
@@ -208,8 +206,8 @@ impl Frames<'_> {
     }
 }
 
-/// Returns the earlier change of the world frame. Files of old versions of nerfstudio do not record it; it assumes
-/// [`COLMAP_AXES`] for them where the folder has `colmap/sparse/0` (its `nerfstudio_dataparser.py`).
+/// Returns the earlier change of the world frame. Old versions of nerfstudio do not record it and assume
+/// [`COLMAP_AXES`] where the folder has `colmap/sparse/0` (`nerfstudio_dataparser.py`).
 fn applied(transforms: &Transforms, folder: &Path) -> Result<Option<AppliedTransform>, PoseProblem> {
     let scale = transforms.applied_scale.unwrap_or(1.0);
     if !(scale.is_finite() && scale > 0.0) {
@@ -229,12 +227,11 @@ fn applied(transforms: &Transforms, folder: &Path) -> Result<Option<AppliedTrans
 pub(super) const COLMAP_AXES: DMat3 =
     DMat3::from_cols(DVec3::new(0.0, 1.0, 0.0), DVec3::new(1.0, 0.0, 0.0), DVec3::new(0.0, 0.0, -1.0));
 
-/// Returns the name of each image: its path relative to the folder of the images; `None` if it has none.
+/// Returns the name of each image: its path relative to the image folder; `None` if it has none.
 ///
-/// The folder of an image is the first one called `images` or `images_N` (nerfstudio's downscaled copies), so that
-/// names agree with COLMAP's. If these folders differ, as `left/images` and `right/images` do, names keep the
-/// folders that tell them apart: they are relative to the folder that holds all of them. A path without such a
-/// folder is a name.
+/// The image folder is the first one called `images` or `images_N` (nerfstudio's downscaled copies), so that names
+/// agree with COLMAP's. If several image folders differ (`left/images`, `right/images`), names are relative to their
+/// common parent. A path without an image folder is its name.
 fn names_of(file_paths: &[String]) -> Vec<Option<String>> {
     let split: Vec<(Vec<&str>, usize)> = file_paths
         .iter()
@@ -245,7 +242,6 @@ fn names_of(file_paths: &[String]) -> Vec<Option<String>> {
             (parts, images_at.map_or(0, |at| at + 1))
         })
         .collect();
-    // The folders above the one of the images.
     let mut parents = split.iter().map(|(parts, start)| &parts[..start.saturating_sub(1)]);
     let first = parents.next().unwrap_or_default();
     let (mut n_common, mut all_equal) = (first.len(), true);
@@ -260,15 +256,13 @@ fn names_of(file_paths: &[String]) -> Vec<Option<String>> {
     split.iter().map(name).collect()
 }
 
-/// Returns whether a folder is called `images` or `images_N`.
 fn is_image_folder(name: &str) -> bool {
     let is_number = |n: &str| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit());
     name.strip_prefix("images")
         .is_some_and(|rest| rest.is_empty() || rest.strip_prefix('_').is_some_and(is_number))
 }
 
-/// Returns the path and an empty text or, if it has no image extension, the first path with one that exists, and
-/// the text added.
+/// Returns the path or, without an image extension, the first existing path with one; and the text added.
 pub(super) fn existing(path: &Path) -> (PathBuf, String) {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
     if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || path.is_file() {
@@ -286,7 +280,7 @@ pub(super) fn existing(path: &Path) -> (PathBuf, String) {
 }
 
 impl Camera {
-    /// Returns this camera with missing keys taken from `shared`.
+    /// Fills missing keys from `shared`.
     fn or(self, shared: &Self) -> Self {
         // A frame's own angle takes precedence over a shared focal length.
         let unless = |own: Option<f64>, value: Option<f64>| if own.is_some() { None } else { value };

@@ -12,13 +12,13 @@ pub struct ViewSet {
     /// Sorted by name; names are unique.
     pub views: Vec<View>,
     pub source: PoseSource,
-    /// Names of frames that are listed without a pose (ScanNet's `-inf`), sorted; they are not in `views`.
+    /// Sorted names of frames listed without a pose (ScanNet's `-inf`); they are not in `views`.
     pub without_pose: Vec<String>,
-    /// Frames that are left out because their pose is no rotation and translation, with the reason.
+    /// Frames left out because their pose is invalid, each with the reason.
     pub damaged: Vec<(String, String)>,
-    /// What was guessed or chosen while reading, a sentence each.
+    /// What was guessed or chosen while reading, one sentence each.
     pub notes: Vec<String>,
-    /// The transform that `transforms.json` states was applied to its poses already.
+    /// The transform that `transforms.json` states as applied to its poses.
     pub applied: Option<AppliedTransform>,
 }
 
@@ -44,7 +44,7 @@ pub enum PoseSource {
 }
 
 impl ViewSet {
-    /// Returns a sentence on the frames that are left out, if there are any.
+    /// Returns a sentence on the omitted frames, if there are any.
     pub fn left_out(&self) -> Option<String> {
         let (lost, damaged) = (self.without_pose.len(), self.damaged.len());
         let of = self.views.len() + lost + damaged;
@@ -54,7 +54,7 @@ impl ViewSet {
     }
 }
 
-/// Frames that are left out, and what is wrong with the first of them.
+/// Omitted frames, and the problem of the first.
 #[derive(Default)]
 pub(super) struct Damaged {
     frames: Vec<(String, String)>,
@@ -62,19 +62,19 @@ pub(super) struct Damaged {
 }
 
 impl Damaged {
-    /// Adds a frame whose pose has a problem; where no frame is left, the first of them is the file's.
+    /// Adds a frame with a pose problem; if no frame remains, the first problem is reported as the file's.
     pub(super) fn add(&mut self, frame: &str, problem: PoseProblem, path: &Path, place: Place) {
         self.frames.push((frame.to_owned(), problem.of_pose()));
         self.first.get_or_insert_with(|| problem.at(path, place));
     }
 
-    /// Adds a frame without a pose, as programs write it that could not place the photo.
+    /// Adds a frame without a pose, as programs write it for photos that they could not place.
     pub(super) fn add_unplaced(&mut self, frame: &str, reason: String) {
         self.frames.push((frame.to_owned(), reason));
     }
 }
 
-/// Sorts views by name; an empty set or two equal names are errors.
+/// Sorts views by name; an empty set and equal names are errors.
 pub(super) fn view_set(
     path: &Path,
     mut views: Vec<View>,

@@ -12,14 +12,12 @@ use crate::container;
 use crate::frames::Aabb;
 use crate::hash::Hash32;
 
-/// Quantised means, in steps of `position_step` from `origin_in_world`.
+/// Quantised means (x, y, z), in steps of `position_step` from `origin_in_world`.
 #[derive(Clone, Copy, Debug)]
 pub enum Positions<'a> {
-    /// x, y and z from the lowest bit up, `position_bits` wide.
+    /// From the lowest bit up, `position_bits` wide.
     Packed(&'a [u32]),
-    /// x, y, z.
     Wide(&'a [[u16; 3]]),
-    /// x, y, z.
     Full(&'a [[u32; 3]]),
 }
 
@@ -88,7 +86,7 @@ pub struct ExactColumns<'a> {
     pub fine: Option<Fine<'a>>,
 }
 
-/// Residuals with 8 bits a component: a Gaussian's take an eighth of the bytes of its embedding.
+/// Residuals with 8 bits a component; a Gaussian's take an eighth of the bytes of its embedding.
 #[derive(Clone, Copy, Debug)]
 pub struct Fine<'a> {
     pub errors: ScoreErrors,
@@ -118,8 +116,7 @@ pub struct ShardView<'a> {
     /// The residual code, in the balanced and exact profiles.
     pub residuals: Option<Residuals<'a>>,
     pub exact: Option<ExactColumns<'a>>,
-    /// Indices in the input splat file, where the scene was encoded with them; exact shards have a column of their
-    /// own.
+    /// Indices in the input splat file, if encoded with them; exact shards have a column of their own.
     pub packed_indices: Option<PackedIndices<'a>>,
 }
 
@@ -131,8 +128,7 @@ impl ShardView<'_> {
         DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
     }
 
-    /// Returns a digest of the Gaussians' positions that does not depend on their order. Shards of one cell have the
-    /// same digest while the splat is unchanged.
+    /// Digest of the Gaussians' positions in any order: equal for shards of a cell while the splat is unchanged.
     pub fn splat_digest(&self) -> u64 {
         let chained = |digest: u64, bits: u64| mix64(digest ^ bits);
         let grid = self.header.origin_in_world.iter().chain(&self.header.position_step);
@@ -144,7 +140,6 @@ impl ShardView<'_> {
         (0..self.header.n_gaussians as usize).fold(0, |sum: u64, index| sum.wrapping_add(gaussian(index)))
     }
 
-    /// Returns whether the shard knows the Gaussians' indices in the input splat file.
     pub fn has_input_indices(&self) -> bool {
         self.exact.is_some() || self.packed_indices.is_some()
     }

@@ -1,12 +1,11 @@
-//! Embeddings and scores of a shard, decoded in float64: the reference that faster code is tested against.
+//! Decodes embeddings and scores of a shard in float64: the reference that faster code is tested against.
 
 use super::columns::{Fine, ShardView};
 use super::format::CODEWORDS;
 use crate::objects::{Objects, object_score};
 
 impl ShardView<'_> {
-    /// Writes the vector of a centroid to `out` (`[dim]`), in float64; the formula is in the module's
-    /// documentation.
+    /// Writes the vector of a centroid to `out` (`[dim]`); the formula is in the module's documentation.
     pub fn decode_centroid(&self, centroid: usize, out: &mut [f64]) {
         let m = self.header.n_components as usize;
         let step = f64::from(self.header.centroid_step);
@@ -15,8 +14,7 @@ impl ShardView<'_> {
         self.combine(&components, out);
     }
 
-    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), as accurately as this profile allows,
-    /// in float64.
+    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), as accurately as this profile allows.
     pub fn decode(&self, index: usize, out: &mut [f64]) {
         let dim = self.header.dim as usize;
         if let Some(exact) = &self.exact {
@@ -27,8 +25,7 @@ impl ShardView<'_> {
         self.combine(&self.components(index), out);
     }
 
-    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), decoded from its fine residual, in
-    /// float64.
+    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), decoded from its fine residual.
     pub fn decode_fine(&self, index: usize, fine: &Fine<'_>, out: &mut [f64]) {
         let m = self.header.n_components as usize;
         let centroid = self.centroid_of(index);
@@ -39,8 +36,7 @@ impl ShardView<'_> {
         self.combine(&of_centroid.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
     }
 
-    /// Returns the score of every Gaussian with evidence for a query (`[dim]`), from embeddings as this profile
-    /// decodes them, in float64.
+    /// Scores every Gaussian with evidence for a query (`[dim]`), from embeddings as decoded by this profile.
     pub fn scores(&self, query: &[f32]) -> Vec<f64> {
         let dim = self.header.dim as usize;
         let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
@@ -61,7 +57,7 @@ impl ShardView<'_> {
         (0..self.n_with_evidence()).map(score).collect()
     }
 
-    /// Returns the score of every centroid for a query (`[dim]`); products are in float64.
+    /// Returns the score of every centroid for a query (`[dim]`).
     pub fn centroid_scores(&self, query: &[f32]) -> Vec<f32> {
         let (offset, of_components) = self.components_of_query(query);
         let step = f64::from(self.header.centroid_step);
@@ -72,9 +68,8 @@ impl ShardView<'_> {
         (0..self.header.n_centroids as usize).map(|centroid| score(centroid) as f32).collect()
     }
 
-    /// Returns the products of a query (`[dim]`) with the mean and with each basis vector (`[m]`), in float64.
-    ///
-    /// The score of a vector with components c is the first plus the sum of `c[i]` times the second.
+    /// Returns the products of a query (`[dim]`) with the mean and with each basis vector (`[m]`): a vector with
+    /// components c has the score mean + the sum of `c[i]` times the i-th.
     pub fn components_of_query(&self, query: &[f32]) -> (f64, Vec<f64>) {
         let dim = self.header.dim as usize;
         let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
@@ -92,7 +87,7 @@ impl ShardView<'_> {
         }
     }
 
-    /// Returns the components of a Gaussian with evidence: the sum of its centroid's and its residual's.
+    /// Returns the components of a Gaussian with evidence: centroid plus residual.
     fn components(&self, index: usize) -> Vec<f64> {
         let m = self.header.n_components as usize;
         let centroid = self.centroid_of(index);
@@ -128,8 +123,7 @@ impl ShardView<'_> {
         }
     }
 
-    /// Returns the score of each of the shard's objects for a query (`[dim]`), see [`object_score`]; products are
-    /// in float64.
+    /// Returns the [`object_score`] of each of the shard's objects for a query (`[dim]`).
     pub fn object_scores(&self, objects: &Objects<'_>, query: &[f32]) -> Vec<f32> {
         let (offset, of_components) = self.components_of_query(query);
         let m = of_components.len();
@@ -142,7 +136,7 @@ impl ShardView<'_> {
         products.chunks_exact(objects.header.n_vectors as usize).map(object_score).collect()
     }
 
-    /// Returns the vectors of the shard's objects, `[n][n_vectors][dim]`.
+    /// `[n][n_vectors][dim]`.
     pub fn object_vectors(&self, objects: &Objects<'_>) -> Vec<f64> {
         let (m, dim) = (self.header.n_components as usize, self.header.dim as usize);
         let mut vectors = vec![0.0; objects.steps.len() * dim];

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 pub const MAGIC: [u8; 8] = *b"SLAGSHRD";
 /// Version of the shard format that is written and read.
 pub const VERSION: u32 = 2;
-/// Gaussians of a block of residual codes: a block holds one column of 32 bytes for each pair of subspaces.
+/// Gaussians in a block of residual codes, which has a column of 32 bytes for each pair of subspaces.
 pub const BLOCK: usize = 32;
 /// Codewords of a subspace: a code takes half a byte.
 pub const CODEWORDS: usize = 16;
@@ -54,9 +54,8 @@ pub mod section {
     pub const FINE_SCALES: u32 = 18;
     /// `[centroid_starts[K]][m]` i8.
     pub const FINE: u32 = 19;
-    /// [`crate::shard::IndicesHeader`]; 20 to 26 are those of [`crate::objects`], 50 to 52 those of
-    /// [`crate::occupancy`], 60 and 61 those of [`crate::photo_poses`], 70 and 71
-    /// those of [`crate::landmarks`].
+    /// [`crate::shard::IndicesHeader`]. Other ids: 20 to 26 and 29 to 30 [`crate::objects`], 50 to 52
+    /// [`crate::occupancy`], 60 and 61 [`crate::photo_poses`], 70 and 71 [`crate::landmarks`].
     pub const PACKED_INDICES_HEADER: u32 = 27;
     /// `[ceil(N * width_bits / 32)]` u32.
     pub const PACKED_INDICES: u32 = 28;
@@ -149,10 +148,9 @@ pub enum Profile {
 }
 
 impl Profile {
-    /// Every profile, smallest first.
+    /// Smallest first.
     pub const ALL: [Self; 3] = [Self::Compact, Self::Balanced, Self::Exact];
 
-    /// Returns the name used in manifests, URLs and flags.
     pub fn name(self) -> &'static str {
         match self {
             Self::Compact => "compact",

@@ -1,8 +1,7 @@
 //! Indices of Gaussians in the input splat file, packed into as few bits as a cell's range of indices needs.
 //!
-//! Every profile may have the column. Each index has the same width, so that a reader finds any one without
-//! reading the others: `index[i] = least + the width_bits bits from bit i * width_bits on`, bits counted from the
-//! lowest of each word.
+//! Every profile may have the column. All indices have the same width, so any one can be read alone: `index[i] =
+//! least + the width_bits bits from bit i * width_bits on`, bits counted from the lowest of each word.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -22,12 +21,10 @@ pub struct PackedIndices<'a> {
 }
 
 impl PackedIndices<'_> {
-    /// Returns the index of a Gaussian in the input splat file.
     pub fn get(&self, at: usize) -> u32 {
         self.header.least.wrapping_add(self.offset(at))
     }
 
-    /// Returns the packed bits of a Gaussian.
     fn offset(&self, at: usize) -> u32 {
         let width = u64::from(self.header.width_bits);
         if width == 0 {
@@ -39,8 +36,7 @@ impl PackedIndices<'_> {
         ((u64::from(self.words[word]) | high) >> shift & ((1 << width) - 1)) as u32
     }
 
-    /// Checks a column of `n` indices: a width of at most 32 bits, no index above the largest u32, zeros after the
-    /// last.
+    /// Checks a column of `n` indices: width at most 32 bits, no index above the largest u32, zeros after the last.
     pub(super) fn check(&self, n: usize) -> Result<(), String> {
         let IndicesHeader { least, .. } = self.header;
         if let Some(at) = (0..n).find(|at| least.checked_add(self.offset(*at)).is_none()) {
@@ -56,7 +52,7 @@ impl PackedIndices<'_> {
     }
 }
 
-/// Returns the words of `n` indices; `None` if there is no such width.
+/// `None` for a width above 32 bits.
 pub(super) fn n_words(n: usize, width_bits: u32) -> Option<usize> {
     (width_bits <= 32).then(|| (n as u64 * u64::from(width_bits)).div_ceil(32) as usize)
 }

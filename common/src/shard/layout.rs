@@ -1,4 +1,4 @@
-//! Checks the bytes of a shard before anything is read from them, and keeps where its columns lie.
+//! Checks the bytes of a shard before they are read, and keeps the places of its columns.
 
 use std::ops::Range;
 
@@ -20,14 +20,14 @@ use crate::objects::ObjectsLayout;
 use crate::occupancy::OccupancyLayout;
 use crate::photo_poses::PhotoPosesLayout;
 
-/// Largest length accepted: embeddings have unit length, and components are scaled to about that.
+/// Largest length accepted: embeddings have unit length, components about that.
 const MAX_LENGTH: f32 = 4096.0;
 
 /// First bytes of a shard that hold its header: preamble and table, padded, and the header.
 pub const HEADER_END_BYTES: u64 = 4096;
 
 impl ShardHeader {
-    /// Returns the header by the first [`HEADER_END_BYTES`] of a shard, unchecked; `None` where they have none.
+    /// Reads the header from the first [`HEADER_END_BYTES`] of a shard, unchecked; `None` if it is not there.
     pub fn of_start(start: &[u8]) -> Option<Self> {
         let at = section_by_start(start, MAGIC, section::HEADER)?;
         let header: Self = bytemuck::try_pod_read_unaligned(start.get(at)?).ok()?;
@@ -43,7 +43,6 @@ impl ShardHeader {
     }
 }
 
-/// The header of a checked shard and the places of its columns; [`ShardLayout::view`] gives the columns.
 #[derive(Clone, Debug)]
 pub struct ShardLayout {
     pub header: ShardHeader,
@@ -97,7 +96,7 @@ impl ShardLayout {
         })
     }
 
-    /// Returns the parts of a shard besides the columns of [`ShardLayout::view`]; `bytes` must be those checked.
+    /// Returns the parts besides the columns of [`ShardLayout::view`]; `bytes` must be those checked.
     pub fn additions<'a>(&self, bytes: &'a [u8]) -> Additions<'a> {
         let appearance = self.appearance.as_ref().map(|columns| {
             let [colours, sizes, rotations] = columns.clone().map(|range| &bytes[range]);
@@ -218,7 +217,7 @@ struct Checker<'a> {
     at_header: usize,
 }
 
-/// The errors of fine residuals; the ranges of their steps, scales and values.
+/// Errors of fine residuals; ranges of their steps, scales and values.
 type FineSections = (ScoreErrors, [Range<usize>; 3]);
 
 impl Checker<'_> {
@@ -226,14 +225,14 @@ impl Checker<'_> {
         self.layout.find(id).is_some()
     }
 
-    /// Returns the place of the first Gaussians of the centroids, and the number of Gaussians with evidence.
+    /// Returns the place of the centroid starts, and the number of Gaussians with evidence.
     fn centroid_starts(&self) -> Result<(Range<usize>, usize), ContainerError> {
         // Every centroid has members: an empty one would cost time, and K <= N bounds memory.
         let (k, most) = (self.header.n_centroids as usize, self.header.n_gaussians as usize);
         self.ascending(section::CENTROID_STARTS, "centroid starts", k + 1, most)
     }
 
-    /// Returns the place of numbers that ascend strictly from 0, and the last one, which is at most `most`.
+    /// Returns the place of numbers that ascend strictly from 0, and the last, which is at most `most`.
     fn ascending(
         &self,
         id: u32,
@@ -335,7 +334,7 @@ impl Checker<'_> {
         ]))
     }
 
-    /// Returns the place of a column of lengths after checking that each is within `0..=MAX_LENGTH`.
+    /// Returns the place of a column of lengths, each checked to be within `0..=MAX_LENGTH`.
     fn lengths(&self, id: u32, name: &'static str, len: usize) -> Result<Range<usize>, ContainerError> {
         let range = self.layout.column::<f32>(id, name, len)?;
         let values = self.bytes[range.clone()].as_chunks().0;
@@ -348,7 +347,7 @@ impl Checker<'_> {
         Ok(range)
     }
 
-    /// Returns the place of a column of half floats after checking that each is finite.
+    /// Returns the place of a column of half floats, each checked to be finite.
     fn halves(&self, id: u32, name: &'static str, len: usize) -> Result<Range<usize>, ContainerError> {
         let range = self.layout.column::<f16>(id, name, len)?;
         // Exponent bits all set is infinity or NaN (IEEE 754 binary16).

@@ -1,8 +1,8 @@
 //! A shard: the data of one cell in one file. The byte table and the reasons for it are in `docs/formats.md`.
 //!
 //! Gaussians are ordered by centroid of the codebook, then along a Morton curve. The members of centroid r are
-//! therefore the run `centroid_starts[r]..centroid_starts[r + 1]`, and no column of codes is needed. Gaussians
-//! without evidence follow the last run and have no centroid.
+//! therefore the run `centroid_starts[r]..centroid_starts[r + 1]`, without a column of codes. Gaussians without
+//! evidence follow the last run and have no centroid.
 //!
 //! Centroids have 8-bit components in a basis of the cell's own, because the embeddings of a cell span few
 //! dimensions: `P[r] = mean + centroid_step * sum over c of centroids[r][c] * basis_steps[c] * basis[c]`.

@@ -10,7 +10,6 @@ use crate::objects::{
     object_score, quantise_vectors,
 };
 
-/// The parts of a shard's objects that a test edits before they are written.
 struct Parts {
     header: ObjectsHeader,
     records: Vec<ObjectRecord>,
@@ -38,8 +37,7 @@ fn record(id: u64, n_here: u32, photo: std::ops::Range<u32>) -> ObjectRecord {
     }
 }
 
-/// Six Gaussians of three dimensions with one centroid: 0 and 1 of object 1, 2 of none, 3 and 4 of object 0, 5 of
-/// object 1.
+/// Six Gaussians of three dimensions, one centroid; objects 1, 1, none, 0, 0, 1.
 fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
     let mut parts = Parts {
         header: ObjectsHeader {
@@ -109,7 +107,7 @@ fn round_trip() {
     for (found, expected) in scores.iter().zip([0.5 * (0.5 + 0.25), 0.5 * -0.6]) {
         assert!((found - expected).abs() < 1e-6, "{scores:?}");
     }
-    // Writing both at once gives the same bytes; a shard without objects has none.
+    // Writing both at once gives the same bytes; a shard without objects has no sections for them.
     let again = objects;
     let mut out = Vec::new();
     layout
@@ -123,7 +121,7 @@ fn round_trip() {
     assert!(ShardLayout::check(&bytes).expect("valid").additions(&bytes).objects.is_none());
 }
 
-/// A hostile writer can compute correct checksums over invalid contents: each is refused.
+/// A hostile writer can compute correct checksums over invalid contents.
 #[test]
 fn invalid_contents_are_refused() {
     let refused =

@@ -1,4 +1,4 @@
-//! Shards of plain columns, for the tests and benchmarks of all crates.
+//! Shards of plain columns for tests and benchmarks.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -35,7 +35,6 @@ pub fn header(cell_id: u32, n_gaussians: usize, n_centroids: usize, dim: usize, 
     }
 }
 
-/// A shard without basis and codes.
 #[derive(Clone, Debug)]
 pub struct SampleShard {
     pub header: ShardHeader,
@@ -46,7 +45,7 @@ pub struct SampleShard {
     pub centroids: Vec<i8>,
     /// `[K]`.
     pub radii: Vec<f32>,
-    /// `[N][dim]`: makes it an exact shard.
+    /// `[N][dim]`; present in exact shards.
     pub embeddings: Option<Vec<f16>>,
 }
 
@@ -60,7 +59,6 @@ impl SampleShard {
         bytes
     }
 
-    /// Returns the columns without embeddings.
     pub fn view(&self) -> ShardView<'_> {
         ShardView {
             header: self.header,
@@ -104,7 +102,7 @@ pub struct SampleObjects {
 impl SampleObjects {
     const N_VECTORS: usize = 3;
 
-    /// Writes a shard again with these objects, beside other additions.
+    /// Rewrites a shard with these objects, besides other additions.
     pub fn add_to(&self, shard: &ShardView<'_>, others: Additions<'_>) -> Vec<u8> {
         let mut object_of = vec![NO_OBJECT; shard.header.n_gaussians as usize];
         let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
@@ -161,8 +159,7 @@ impl SampleObjects {
     }
 }
 
-/// Returns the manifest that lists shards, which may be several of a cell in different profiles. Their encoder is
-/// named after nothing; generation 1.
+/// Returns a manifest, generation 1, of shards in any profiles, with an unnamed encoder.
 pub fn manifest(scene: &str, shards: &[(Profile, &[u8])]) -> Manifest {
     let mut cells: BTreeMap<u32, CellRecord> = BTreeMap::new();
     let mut encoder = encoder();
@@ -190,7 +187,7 @@ pub fn manifest(scene: &str, shards: &[(Profile, &[u8])]) -> Manifest {
     of_cells(scene, encoder, cells.into_values().collect())
 }
 
-/// Returns the manifest of cells whose compact shards have these boxes, hashes and lengths.
+/// Returns a manifest of cells whose compact shards have these boxes, hashes and lengths.
 pub fn manifest_of(scene: &str, cells: &[(Aabb, Hash32, u64)]) -> Manifest {
     let cell = |(cell_id, (bounds, hash, len_bytes)): (u32, &(Aabb, Hash32, u64))| {
         let record = ShardRecord {

@@ -4,7 +4,6 @@ use half::f16;
 use super::*;
 use crate::container::AlignedBytes;
 
-/// The parts of a shard that a test edits before it is written.
 struct Parts {
     header: ShardHeader,
     centroid_starts: Vec<u32>,
@@ -104,7 +103,7 @@ fn round_trip() {
     assert!((shard.scores(&query)[2] - score).abs() < 1e-12);
 }
 
-/// A hostile writer can compute correct checksums over invalid contents: each is refused.
+/// A hostile writer can compute correct checksums over invalid contents.
 #[test]
 fn invalid_contents_are_refused() {
     let refused =
@@ -137,7 +136,7 @@ fn invalid_contents_are_refused() {
     assert!(refused(|p| p.index_words[1] |= 1 << 4).contains("not zero"));
 }
 
-/// The first bytes of a file are enough for its header, and too few or others have none.
+/// The first bytes of a file suffice for its header; fewer, or those of another file, do not.
 #[test]
 fn a_header_is_read_from_the_start_of_a_file() {
     let bytes = written(|_| {});

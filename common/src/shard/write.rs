@@ -11,16 +11,16 @@ use crate::objects::Objects;
 use crate::occupancy::Occupancy;
 use crate::photo_poses::PhotoPoses;
 
-/// What a shard may carry beyond what questions need.
+/// The optional parts of a shard, which questions do not need.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Additions<'a> {
     pub objects: Option<Objects<'a>>,
-    /// How its Gaussians look.
+    /// Appearance of its Gaussians.
     pub appearance: Option<Appearance<'a>>,
     pub occupancy: Option<Occupancy<'a>>,
-    /// Where the photos of its cell were taken.
+    /// Poses of the photos taken in its cell.
     pub photo_poses: Option<PhotoPoses<'a>>,
-    /// What robots recognise their place by.
+    /// Points by which robots find their place.
     pub landmarks: Option<Landmarks<'a>>,
 }
 

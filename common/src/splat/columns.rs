@@ -1,15 +1,13 @@
-//! The columns to fill: which of them, and for how many Gaussians.
+//! The columns to read, and for how many Gaussians.
 
 use std::path::Path;
 
 use super::error::{Place, SplatError};
 use crate::Gaussians;
 
-/// The parts of a splat file to read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Whether to read the spherical harmonics above degree 0. If not, the result has degree 0 and the higher
-    /// coefficients are never held in memory.
+    /// Whether to read spherical harmonics above degree 0; otherwise they are never held in memory.
     pub with_sh_rest: bool,
 }
 
@@ -22,14 +20,14 @@ impl ReadOptions {
 /// Highest degree of spherical harmonics that [`Gaussians`] holds.
 pub(super) const MAX_SH_DEGREE: u8 = 3;
 
-/// Largest ratio of decoded to compressed size accepted. Trained scenes take at least 8 bytes a Gaussian even as
-/// SPZ or SOG (measured: 14 and 25) and decode to 68 bytes, or 248 with all harmonics: a ratio of 31 at most. A
-/// larger ratio means a wrong count.
+/// Largest ratio of decoded to compressed size accepted; a larger one means a wrong count. Trained scenes take at
+/// least 8 bytes a Gaussian even as SPZ or SOG (measured: 14 and 25) and decode to 68 bytes, or 248 with all
+/// harmonics: a ratio of 31 at most.
 const MAX_EXPANSION: u64 = 32;
 /// Decoded bytes accepted beyond that ratio.
 const EXPANSION_FREE_BYTES: u64 = 32 << 20;
 
-/// Returns `count` if a compressed file of `len_bytes` can plausibly hold that many Gaussians.
+/// Returns `count` if a compressed file of `len_bytes` can hold that many Gaussians.
 pub(super) fn plausible_count(
     path: &Path,
     place: Place,

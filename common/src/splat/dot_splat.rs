@@ -11,7 +11,7 @@ use crate::Gaussians;
 
 const ROW_BYTES: usize = 32;
 
-/// Reads a `.splat` file; the format has no spherical harmonics above degree 0.
+/// The format has no spherical harmonics above degree 0.
 pub(super) fn read(mut input: Input) -> Result<Gaussians, SplatError> {
     let len_bytes = input.len_bytes();
     if len_bytes == 0 || !len_bytes.is_multiple_of(ROW_BYTES as u64) {

@@ -44,7 +44,6 @@ impl Display for Place {
     }
 }
 
-/// Advice for content that contradicts the format.
 const COPY_AGAIN: &str = "the file is damaged or incomplete: copy or export it again";
 
 impl From<io::Error> for SplatError {
@@ -54,7 +53,7 @@ impl From<io::Error> for SplatError {
 }
 
 impl SplatError {
-    /// Returns a [`SplatError::Malformed`] with the advice to copy or export the file again.
+    /// Returns a [`SplatError::Malformed`] that advises to copy or export the file again.
     pub(super) fn malformed(path: &Path, place: Place, expected: impl Display, found: impl Display) -> Self {
         Self::Malformed {
             path: path.into(),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::error::{Place, SplatError};
 use crate::files;
 
-/// Large enough to make system calls negligible, small compared with the columns.
+/// Makes system calls negligible, and is small compared with the columns.
 const BUFFER_BYTES: usize = 1 << 18;
 
 pub(super) struct Input {
@@ -49,19 +49,17 @@ impl Input {
         self.len_bytes.saturating_sub(self.offset_bytes)
     }
 
-    /// Returns the current offset as the place of an error.
     pub fn place(&self) -> Place {
         Place::Byte(self.offset_bytes)
     }
 
-    /// Returns the next `n` bytes without consuming them, or fewer if the file is shorter; only for a file that
-    /// was just opened, and small `n`.
+    /// Returns up to `n` bytes without consuming them. Only for small `n` and a file just opened.
     pub fn peek(&mut self, n: usize) -> Result<&[u8], SplatError> {
         let buffered = self.reader.fill_buf()?;
         Ok(&buffered[..n.min(buffered.len())])
     }
 
-    /// Fills `buffer`. If the file ends too early, the error says that `what` was expected.
+    /// Fills `buffer`; the error of a file that ends too early says that `what` was expected.
     pub fn fill(&mut self, buffer: &mut [u8], what: &str) -> Result<(), SplatError> {
         self.require(buffer.len() as u64, what)?;
         Ok(self.read_exact(buffer)?)
@@ -102,8 +100,7 @@ impl Input {
         }
     }
 
-    /// Reads a line, line feed included, into `line`, at most `limit_bytes`; `line` is empty at the end of the
-    /// file.
+    /// Reads a line with its line feed, at most `limit_bytes`; `line` is empty at the end of the file.
     pub fn read_line(&mut self, line: &mut Vec<u8>, limit_bytes: u64) -> Result<(), SplatError> {
         line.clear();
         Ok(self.take(limit_bytes).read_until(b'\n', line).map(drop)?)

@@ -8,8 +8,8 @@
 //! | SOG 1 and 2, bundle or folder with `meta.json` | `PK`, `.json`, a folder | `sog` |
 //! | .splat (antimatter15), 32 bytes a Gaussian | `.splat` | `dot_splat` |
 //!
-//! A file is read front to back directly into the columns, so memory is the decoded size plus one buffer (SOG: one
-//! or two images). Counts in a file are compared with its length before memory is reserved.
+//! A file is read front to back into the columns, so memory is the decoded size plus one buffer (SOG: one or two
+//! images). Counts in a file are compared with its length before memory is reserved.
 
 use std::path::Path;
 

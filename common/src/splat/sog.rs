@@ -18,10 +18,9 @@ use crate::{Gaussians, files};
 
 /// Meta files take about 15 kB, mostly three codebooks of 256 numbers.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Images may be larger than the count requires: their last row is filled up, or they are squares of a power of
-/// two.
+/// Images may exceed the count: their last row is filled up, or they are squares of a power of two.
 const SPARE_PIXELS: u64 = 1 << 16;
-/// The codebook of harmonics has this many entries per row, and at most 65,536 entries: labels have 16 bits.
+/// Entries per row of the harmonics' codebook, which has at most 65,536 entries: labels have 16 bits.
 const CODEBOOK_COLUMNS: usize = 64;
 const MAX_CODEBOOK_ROWS: u64 = 1024;
 /// Alpha of a rotation's pixel if the first component is the largest; 253 to 255 for the others.
@@ -79,15 +78,14 @@ impl OneOrMany {
 }
 
 impl Quantised {
-    /// Returns the number of each byte of a channel; NaN beyond the end of a short codebook, which makes the
-    /// Gaussians that use it unusable.
+    /// Returns the number of each byte of a channel; NaN, hence unusable Gaussians, beyond a short codebook's end.
     fn table(&self, channel: usize) -> Option<[f64; 256]> {
         if let Some(codebook) = &self.codebook {
             let mut table = [f64::NAN; 256];
             for (value, entry) in table.iter_mut().zip(codebook) {
                 *value = entry.unwrap_or(f64::NAN);
             }
-            // Some exporters write null as the first entry; PlayCanvas extrapolates it this way.
+            // Some exporters write null as the first entry; PlayCanvas extrapolates so.
             if codebook.first() == Some(&None) {
                 table[0] = table[1] + (table[1] - table[255]) / 255.0;
             }
@@ -104,13 +102,12 @@ enum Parts {
 }
 
 struct Sog {
-    /// The bundle or the meta file, named in errors.
+    /// Bundle or meta file, named in errors.
     path: PathBuf,
     parts: Parts,
     len_bytes: u64,
 }
 
-/// An image with four bytes per pixel.
 struct Pixels {
     width: usize,
     rgba: Vec<u8>,
@@ -178,7 +175,7 @@ impl Sog {
         SplatError::malformed(&self.path, Place::Part(part.into()), expected, found)
     }
 
-    /// Returns the path of a part; it must lie directly in the folder.
+    /// Returns the path of a part, which must lie directly in the folder.
     fn path_in_folder(&self, part: &str) -> Result<PathBuf, SplatError> {
         let mut components = Path::new(part).components();
         match (&self.parts, components.next(), components.next()) {
@@ -256,7 +253,6 @@ impl Sog {
         Ok(Pixels { width: width as usize, rgba })
     }
 
-    /// Returns the tables of the first `N` channels.
     fn tables<const N: usize>(
         &self,
         name: &str,
@@ -275,7 +271,6 @@ impl Sog {
         Ok(tables)
     }
 
-    /// Returns the number of Gaussians that the meta file states.
     fn count(&self, meta: &Meta) -> Result<u64, SplatError> {
         let stated = match meta.version {
             None => meta.means.shape.as_ref().and_then(|shape| shape.first()).copied(),
@@ -361,7 +356,7 @@ impl Sog {
     ) -> Result<(), SplatError> {
         let quats = self.pixels(&meta.quats.files, 0, n_pixels)?;
         let behind = quats.rgba.as_chunks::<4>().0.get(n..).unwrap_or_default();
-        // What fills up the last rows is alike everywhere.
+        // Padding pixels are all equal.
         if behind.iter().any(|pixel| *pixel != behind[0] && pixel[3] >= ROTATION_TAG) {
             let expected = "a number of Gaussians (`count`) that takes in all those of the images";
             return Err(self.malformed("meta.json", expected, format_args!("{n}, and more behind them")));
@@ -377,7 +372,7 @@ impl Sog {
         Ok(())
     }
 
-    /// Decodes the harmonics: each Gaussian has a label, and each label is a run of pixels in the codebook.
+    /// Decodes the harmonics: each Gaussian has a label, a run of pixels in the codebook.
     fn decode_sh_rest(
         &mut self,
         sh_rest: &Quantised,

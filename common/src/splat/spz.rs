@@ -1,8 +1,7 @@
 //! SPZ files (nianticlabs/spz): columns of quantised values, in one gzip stream (versions 2 and 3) or in a
 //! Zstandard stream per column (version 4).
 //!
-//! Stored axes are right, up, back; the reader turns them to right, down, front, the frame of the PLY: y and z
-//! change sign.
+//! Stored axes are right, up, back; the PLY's are right, down, front, so y and z change sign.
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
@@ -30,7 +29,7 @@ const MIN_WINDOW_BYTES: u64 = 8 << 20;
 const ROWS_AT_ONCE: usize = 4096;
 
 /// Signs of the coefficients above degree 0 when y and z change sign: -1 where the powers of y and z in the basis
-/// function add up to an odd number. Order: y z x, xy yz zz xz xx-yy, then degree 3.
+/// function have an odd sum. Order: y z x, xy yz zz xz xx-yy, then degree 3.
 const SH_SIGNS: [f32; 15] =
     [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
@@ -86,8 +85,7 @@ impl Header {
         Ok(header)
     }
 
-    /// Returns the stored bytes per Gaussian of each column: position, opacity, colour, scale, rotation and, from
-    /// degree 1, harmonics.
+    /// Bytes per Gaussian of each column: position, opacity, colour, scale, rotation and, from degree 1, harmonics.
     fn row_bytes(&self) -> VecDeque<usize> {
         let rotation = if self.version == 2 { 3 } else { 4 };
         let sh = 3 * Gaussians::sh_rest_per_channel(self.sh_degree);
@@ -104,14 +102,14 @@ struct Columns {
 }
 
 enum Payload {
-    /// One stream, and the bytes read from it so far.
+    /// One stream; bytes read so far.
     Whole { stream: Box<dyn Read>, offset_bytes: u64 },
-    /// A stream per column, and the compressed sizes of those still to come.
+    /// A stream per column; compressed sizes of those to come.
     Streams { input: Input, compressed_bytes: VecDeque<u64> },
 }
 
 impl Columns {
-    /// Reads the next column and passes its rows on in fields of `N` bytes.
+    /// Passes the rows of the next column on in fields of `N` bytes.
     fn each<const N: usize>(&mut self, mut row: impl FnMut([u8; N])) -> Result<(), SplatError> {
         let row_bytes = self.row_bytes.pop_front().unwrap_or(0);
         let total = row_bytes as u64 * self.count as u64;
@@ -241,10 +239,10 @@ fn read_whole(
     if header.flags & FLAG_EXTENSIONS != 0 {
         check_extensions(&path, &place, &mut stream)?;
     }
-    // Read to the end: gzip's checksum stands there.
+    // Read to the end, where gzip's checksum is.
     match io::copy(&mut stream, &mut io::sink()) {
         Ok(0) => Ok(out),
-        // With another count in the header, columns begin elsewhere.
+        // A wrong count in the header moves the columns.
         Ok(n) => {
             Err(SplatError::malformed(&path, place, "the end of the stream", format_args!("{n} more bytes")))
         }
@@ -252,8 +250,8 @@ fn read_whole(
     }
 }
 
-/// Reads and checks the part of version 4 that precedes the streams: the rest of the header, the extensions and
-/// the table of contents. Returns the compressed size of each stream.
+/// Reads and checks what precedes the streams of version 4: rest of the header, extensions, table of contents.
+/// Returns the compressed size of each stream.
 fn read_contents(
     input: &mut Input,
     raw: &[u8; Header::BYTES],
@@ -312,8 +310,7 @@ fn read_contents(
     Ok(compressed_bytes)
 }
 
-/// Reads extension records (type, length, content) to the end and refuses coordinate systems other than right, up,
-/// back.
+/// Reads extension records (type, length, content) to the end; refuses coordinate systems other than right, up, back.
 fn check_extensions(path: &Path, place: &Place, stream: &mut impl Read) -> Result<(), SplatError> {
     let failed = |source| SplatError::undecodable(path, place.clone(), "the extensions", source);
     loop {
@@ -337,7 +334,7 @@ fn check_extensions(path: &Path, place: &Place, stream: &mut impl Read) -> Resul
     }
 }
 
-/// Decodes the columns into `out`; its degree limits the harmonics that are kept.
+/// Decodes the columns into `out`, whose degree limits the harmonics that are kept.
 fn decode(header: &Header, columns: &mut Columns, mut out: Gaussians) -> Result<Gaussians, SplatError> {
     let step = (-f64::from(header.fractional_bits)).exp2();
     columns.each(|[x0, x1, x2, y0, y1, y2, z0, z1, z2]| {
@@ -376,8 +373,8 @@ fn decode(header: &Header, columns: &mut Columns, mut out: Gaussians) -> Result<
     Ok(out)
 }
 
-/// Returns a rotation `wxyz` packed as the index of its largest component (of x y z w) in two bits, and a sign and
-/// nine bits of magnitude, 0..=1/sqrt(2), for each of the others.
+/// Unpacks a rotation `wxyz`: the index of its largest component (of x y z w) in two bits, and a sign and nine
+/// bits of magnitude, 0..=1/sqrt(2), for each of the others.
 fn smallest_three(word: u32) -> [f64; 4] {
     let others = [20, 10, 0].map(|shift| {
         let magnitude = f64::from((word >> shift) & 0x1ff) / 511.0 * std::f64::consts::FRAC_1_SQRT_2;

@@ -1,5 +1,4 @@
-//! Canonical JSON, the form of metadata that signatures cover: members by name, no spaces, two escapes, no
-//! fractions.
+//! Canonical JSON, the signed form of metadata: sorted members, no spaces, two escapes, no fractions.
 
 use serde_json::Value;
 
@@ -33,7 +32,7 @@ fn write(value: &Value, out: &mut Vec<u8>) -> Result<(), NotCanonical> {
             out.push(b']');
         }
         Value::Object(members) => {
-            // Sorted here, because another crate of the build may have serde_json keep the order of the text.
+            // Sorted here, because another crate may enable serde_json's `preserve_order`.
             let mut members: Vec<(&String, &Value)> = members.iter().collect();
             members.sort_by_key(|(name, _)| *name);
             out.push(b'{');

@@ -1,4 +1,4 @@
-//! Reasons to refuse metadata, by the attack that they stop.
+//! Reasons to refuse metadata, by the attack that they prevent.
 
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TufError {

@@ -1,4 +1,4 @@
-//! What the roles sign. Members that are not listed here are ignored, as the specification asks.
+//! The signed content of the roles. Unknown members are ignored, as the specification demands.
 
 use std::collections::BTreeMap;
 
@@ -11,22 +11,22 @@ use sha2::{Digest, Sha256, Sha512};
 use super::canonical::canonical_json;
 use super::error::TufError;
 
-/// What a role signs, beside the head.
+/// The signed content of a role, without the head.
 pub trait Body: Serialize + DeserializeOwned {
     /// `_type` of the metadata.
     const TYPE: &'static str;
 
-    /// Checks what types alone do not say; returns what is wrong.
+    /// Checks what the types do not; returns the fault.
     fn check(&self) -> Result<(), String> {
         Ok(())
     }
 }
 
-/// The keys of a role, and how many of them must sign.
+/// The keys of a role, and how many must sign.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RoleKeys {
     pub keyids: Vec<String>,
-    /// Signatures by different keys that are enough.
+    /// Least number of signatures by different keys.
     pub threshold: u32,
 }
 
@@ -86,7 +86,6 @@ impl FileMeta {
         Self { version, length: Some(bytes.len() as u64), hashes: Some(hashes_of(bytes)) }
     }
 
-    /// Checks bytes against length and hashes, where they are stated.
     pub(super) fn check(&self, role: &str, bytes: &[u8]) -> Result<(), TufError> {
         check_content(role, bytes, self.length, self.hashes.as_ref())
     }
@@ -95,7 +94,7 @@ impl FileMeta {
 /// Timestamp: which snapshot is the newest.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Timestamp {
-    /// `snapshot.json` alone.
+    /// `snapshot.json` only.
     pub meta: BTreeMap<String, FileMeta>,
     /// Time of signing; a member of our own, which other clients ignore.
     #[serde(rename = "x-slag-signed-at", skip_serializing_if = "Option::is_none", default)]
@@ -142,7 +141,7 @@ pub struct TargetFile {
     pub length: u64,
     /// Hashes by algorithm, hex.
     pub hashes: BTreeMap<String, String>,
-    /// Anything that the publisher states of it.
+    /// Anything that the publisher states about it.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub custom: Option<Value>,
 }
@@ -155,7 +154,7 @@ impl TargetFile {
     /// Returns the name of the file at a path in a repository with consistent snapshots.
     pub fn file_name(&self, path: &str) -> Result<String, TufError> {
         let hash = ["sha256", "sha512"].into_iter().find_map(|algorithm| self.hashes.get(algorithm));
-        // A hash becomes part of a name: nothing but hex digits may.
+        // Only hex digits may become part of a name.
         let hash =
             hash.filter(|hash| hash.bytes().all(|byte| byte.is_ascii_hexdigit())).ok_or_else(|| {
                 let fault = "no hash of a known kind is stated, expected sha256 or sha512".into();
@@ -172,7 +171,7 @@ impl TargetFile {
     }
 }
 
-/// Targets: the files. Delegations to other roles are not followed.
+/// Targets: the files. Delegations are not followed.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Targets {
     pub targets: BTreeMap<String, TargetFile>,
@@ -222,7 +221,7 @@ fn check_content(
 
 const ED25519: &str = "ed25519";
 
-/// A public key as metadata lists it. Only Ed25519 keys can verify; others are kept and never count.
+/// A public key in metadata. Only Ed25519 keys verify; others are kept and never count.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Key {
     pub keytype: String,
@@ -238,10 +237,10 @@ impl Key {
         Self { keytype: ED25519.into(), scheme: ED25519.into(), keyval }
     }
 
-    /// Returns the key's id: the SHA-256 of its canonical form, in hex.
+    /// Returns the key id: the SHA-256 of its canonical form, in hex.
     pub fn id(&self) -> String {
         let value = json!({ "keytype": self.keytype, "scheme": self.scheme, "keyval": self.keyval });
-        // A value that is no text makes the key useless, not the id wrong: no such key verifies.
+        // A value that is not text makes the key useless, not the id wrong: such a key never verifies.
         let canonical = canonical_json(&value).unwrap_or_default();
         hex::encode(Sha256::digest(canonical))
     }

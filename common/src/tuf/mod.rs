@@ -1,4 +1,4 @@
-//! The Update Framework: which files of a store may be believed, whoever carried them.
+//! The Update Framework: proves which files of a store are genuine, whatever carried them.
 //!
 //! The client workflow of the TUF specification 1.0 (section 5) without network, clock or files: bytes come from a
 //! [`Source`], the time is an argument, and what must be remembered is [`Kept`]. A store is a TUF repository with
@@ -34,7 +34,7 @@ pub use update::{Source, refresh};
 pub const SPEC_VERSION: &str = "1.0.31";
 pub const MAX_ROOT_BYTES: u64 = 256 << 10;
 pub const MAX_TIMESTAMP_BYTES: u64 = 16 << 10;
-/// Longest snapshot metadata read. A client keeps root, timestamp and snapshot; this bounds what it keeps.
+/// Longest snapshot metadata read; bounds what a client keeps (root, timestamp, snapshot).
 pub const MAX_SNAPSHOT_BYTES: u64 = 256 << 10;
 pub const MAX_TARGETS_BYTES: u64 = 5 << 20;
 pub const MAX_ROOTS: u32 = 256;

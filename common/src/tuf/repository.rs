@@ -1,4 +1,4 @@
-//! The smallest repository: one target, and one key for all roles. For benchmarks and tests.
+//! The smallest repository: one target, one key for all roles. For benchmarks and tests.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use ed25519_dalek::SigningKey;
 use super::metadata::{FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp};
 use super::signed::sign;
 
-/// Returns metadata by file name. `version` is that of all roles but root, which stays the same.
+/// Returns metadata by file name. `version` applies to all roles but root, which stays the same.
 pub fn one_key_repository(
     key: &SigningKey,
     version: u64,

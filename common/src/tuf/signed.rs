@@ -12,7 +12,7 @@ use super::error::TufError;
 use super::metadata::{Body, Key, RoleKeys};
 use super::time::{format_utc, parse_utc};
 
-/// What all metadata begins with.
+/// The members that all metadata has.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Head {
     #[serde(rename = "_type")]
@@ -56,7 +56,7 @@ pub struct SignedMetadata<T> {
 }
 
 impl<T: Body> SignedMetadata<T> {
-    /// Parses metadata of a role; `role` is for messages.
+    /// Parses metadata; `role` is for messages.
     pub fn parse(role: &str, bytes: &[u8]) -> Result<Self, TufError> {
         let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
         let Envelope { signatures, signed } =
@@ -83,7 +83,6 @@ impl<T: Body> SignedMetadata<T> {
         Ok(Self { head, expires_unix_secs, body, signatures, canonical })
     }
 
-    /// Checks that enough different keys of a role signed it.
     pub fn check_signatures(
         &self,
         role: &str,
@@ -123,7 +122,7 @@ impl<T: Body> SignedMetadata<T> {
     }
 }
 
-/// Signs metadata with keys in a fixed order; the same content and keys give the same bytes.
+/// Signs metadata; the same content and keys give the same bytes.
 pub fn sign<T: Body>(version: u64, expires_unix_secs: u64, body: &T, keys: &[&SigningKey]) -> Vec<u8> {
     let head = Head {
         kind: T::TYPE.into(),
@@ -149,7 +148,7 @@ pub fn sign<T: Body>(version: u64, expires_unix_secs: u64, body: &T, keys: &[&Si
     serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON")
 }
 
-/// Says what came in the place of JSON, where its first bytes tell.
+/// Names what was received instead of JSON, if its first bytes tell.
 fn in_place_of_json(bytes: &[u8], error: &serde_json::Error) -> String {
     match bytes.trim_ascii_start() {
         [b'<', ..] => "a web page came in its place, such as a network's log-in".into(),
@@ -158,7 +157,7 @@ fn in_place_of_json(bytes: &[u8], error: &serde_json::Error) -> String {
     }
 }
 
-/// Adds the signatures of keys that have not signed metadata yet.
+/// Adds missing signatures of these keys.
 pub fn add_signatures(role: &str, bytes: &[u8], keys: &[SigningKey]) -> Result<Vec<u8>, TufError> {
     let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
     let Envelope { mut signatures, signed } =
@@ -175,7 +174,6 @@ pub fn add_signatures(role: &str, bytes: &[u8], keys: &[SigningKey]) -> Result<V
     Ok(serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON"))
 }
 
-/// Generates a signing key from the system's randomness.
 pub fn generate_key() -> SigningKey {
     SigningKey::generate(&mut rand_core::OsRng)
 }

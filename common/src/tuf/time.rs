@@ -5,11 +5,11 @@ use std::time::{Duration, UNIX_EPOCH};
 /// The last second of the year 9999.
 const LAST_UNIX_SECS: u64 = 253_402_300_799;
 
-/// Reads a time of metadata as seconds since 1970; `None` for any other spelling, and before 1970.
+/// Reads a time of metadata as seconds since 1970; `None` for other spellings and before 1970.
 pub fn parse_utc(text: &str) -> Option<u64> {
     let time = humantime::parse_rfc3339(text).ok()?;
     let unix_secs = time.duration_since(UNIX_EPOCH).ok()?.as_secs();
-    // Also fractions of seconds and leap seconds are other spellings.
+    // Rejects fractions of seconds and leap seconds too.
     (format_utc(unix_secs) == text).then_some(unix_secs)
 }
 

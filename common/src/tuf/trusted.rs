@@ -1,7 +1,5 @@
-//! The rules of each step: what a new file must satisfy, given what is trusted already.
-//!
-//! Steps come in the order of the specification: roots, timestamp, snapshot, targets. A step that fails leaves the
-//! rest as it was.
+//! The rules of each step: what a new file must satisfy, given what is already trusted. Steps follow the
+//! specification: roots, timestamp, snapshot, targets. A step that fails changes nothing.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,9 +10,9 @@ use super::time::parse_utc;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Offered {
-    /// It replaces the file before.
+    /// Replaces the previous file.
     New,
-    /// It has the version of the file before, which stays.
+    /// Has the version of the previous file, which is kept.
     Same,
 }
 
@@ -28,7 +26,7 @@ pub struct Trusted {
 }
 
 impl Trusted {
-    /// Begins with a root that is trusted. `now_unix_secs`: the clock.
+    /// Begins with a trusted root. `now_unix_secs`: the clock.
     pub fn new(root: &[u8], now_unix_secs: u64) -> Result<Self, TufError> {
         let root = parse_own_root(root)?;
         Ok(Self { root, timestamp: None, snapshot: None, targets: None, now_unix_secs })
@@ -59,8 +57,7 @@ impl Trusted {
         self.now_unix_secs
     }
 
-    /// Takes the next root (5.3.4 and 5.3.5): the version after the present one, signed by the present root's keys
-    /// and by its own.
+    /// Accepts the next root (5.3.4, 5.3.5): version plus one, signed by the present root's keys and by its own.
     pub fn add_root(&mut self, bytes: &[u8]) -> Result<(), TufError> {
         self.before_timestamp(Root::TYPE)?;
         let next = SignedMetadata::<Root>::parse(Root::TYPE, bytes)?;
@@ -74,7 +71,7 @@ impl Trusted {
         Ok(())
     }
 
-    /// Takes the timestamp of an earlier update, whatever its expiry.
+    /// Accepts the timestamp of an earlier update, whatever its expiry.
     ///
     /// # Errors
     /// [`TufError`], if the present root does not vouch for it; it then counts as absent.
@@ -87,7 +84,7 @@ impl Trusted {
         Ok(())
     }
 
-    /// Takes a timestamp (5.4): signed, not older than the one before, not expired.
+    /// Accepts a timestamp (5.4): signed, not older than the previous one, not expired.
     pub fn add_timestamp(&mut self, bytes: &[u8]) -> Result<Offered, TufError> {
         if self.snapshot.is_some() {
             return Err(TufError::Order { role: Timestamp::TYPE.into() });
@@ -105,15 +102,15 @@ impl Trusted {
             check_not_older(Snapshot::TYPE, seen, offered)?;
         }
         new.check_expiry(Timestamp::TYPE, self.now_unix_secs)?;
-        // The newest signed time may be later than the clock by which the root was good.
+        // The newest signed time may be later than the clock at which the root was valid.
         let now_unix_secs = self.now_unix_secs.max(signed_unix_secs(&new).unwrap_or(0));
         self.root.check_expiry(Root::TYPE, now_unix_secs)?;
         (self.now_unix_secs, self.timestamp) = (now_unix_secs, Some(new));
         Ok(Offered::New)
     }
 
-    /// Takes a snapshot (5.5): the one that the timestamp states, signed, not expired. `before`: the snapshot of
-    /// an earlier update, whose targets metadata must all be there, none of them older.
+    /// Accepts a snapshot (5.5): the one in the timestamp, signed, not expired. `before`: the snapshot of an earlier
+    /// update; all its targets metadata must still be listed, none with a lower version.
     pub fn add_snapshot(&mut self, bytes: &[u8], before: Option<&[u8]>) -> Result<(), TufError> {
         let order = || TufError::Order { role: Snapshot::TYPE.into() };
         let meta = self.timestamp.as_ref().filter(|_| self.targets.is_none()).ok_or_else(order)?;
@@ -123,7 +120,7 @@ impl Trusted {
         self.check_signatures(Snapshot::TYPE, &new)?;
         check_version(Snapshot::TYPE, meta, new.head.version)?;
         let before = before.and_then(|bytes| SignedMetadata::<Snapshot>::parse(Snapshot::TYPE, bytes).ok());
-        // A snapshot that the present root does not vouch for says nothing (recovery from a fast-forward attack).
+        // Ignore a snapshot that the present root does not vouch for (recovery from a fast-forward attack).
         let before = before.filter(|before| self.check_signatures(Snapshot::TYPE, before).is_ok());
         for (name, seen) in before.iter().flat_map(|before| &before.body.meta) {
             match new.body.meta.get(name) {
@@ -136,7 +133,7 @@ impl Trusted {
         Ok(())
     }
 
-    /// Takes targets metadata (5.6): the one that the snapshot states, signed, not expired.
+    /// Accepts targets metadata (5.6): the one in the snapshot, signed, not expired.
     pub fn add_targets(&mut self, bytes: &[u8]) -> Result<(), TufError> {
         let meta = self.targets_meta()?;
         meta.check(Targets::TYPE, bytes)?;
@@ -183,21 +180,20 @@ fn check_version(role: &str, stated: &FileMeta, found: u64) -> Result<(), TufErr
     }
 }
 
-/// Metadata that was accepted, byte for byte. It is checked again whenever it is used, against the newest root.
+/// Accepted metadata, byte for byte. Checked again at each use, against the newest root.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Kept {
     pub root: String,
     pub timestamp: Option<String>,
     pub snapshot: Option<String>,
-    /// The newest targets metadata: saves a download, and need not outlive the process, because the snapshot
-    /// states its version.
+    /// Saves a download; need not outlive the process, because the snapshot states its version.
     #[serde(skip)]
     pub targets: Option<String>,
 }
 
 impl Kept {
-    /// Begins with a root that was trusted by hand.
+    /// Begins with a root trusted by hand.
     pub fn from_root(bytes: &[u8]) -> Result<Self, TufError> {
         parse_own_root(bytes)?;
         Ok(Self { root: text(Root::TYPE, bytes)?, timestamp: None, snapshot: None, targets: None })
@@ -207,34 +203,32 @@ impl Kept {
         SignedMetadata::<Root>::parse(Root::TYPE, self.root.as_bytes()).ok().map(|root| root.head.version)
     }
 
-    /// Returns when the newest timestamp expires, seconds since 1970.
+    /// Expiry of the newest timestamp, seconds since 1970.
     pub fn expires_unix_secs(&self) -> Option<u64> {
         let bytes = self.timestamp.as_ref()?.as_bytes();
         Some(SignedMetadata::<Timestamp>::parse(Timestamp::TYPE, bytes).ok()?.expires_unix_secs)
     }
 
-    /// Returns the time of signing that the newest timestamp states, seconds since 1970; it lies before its
-    /// expiry.
+    /// Time of signing in the newest timestamp, seconds since 1970; before its expiry.
     pub fn signed_unix_secs(&self) -> Option<u64> {
         let bytes = self.timestamp.as_ref()?.as_bytes();
         signed_unix_secs(&SignedMetadata::parse(Timestamp::TYPE, bytes).ok()?)
     }
 }
 
-/// Returns the time of signing that a timestamp states.
 pub(super) fn signed_unix_secs(timestamp: &SignedMetadata<Timestamp>) -> Option<u64> {
     let signed = timestamp.body.signed_at.as_deref().and_then(parse_utc)?;
     (signed < timestamp.expires_unix_secs).then_some(signed)
 }
 
-/// Parses a root that is signed as it asks for itself.
+/// Parses a root signed by its own keys.
 pub(super) fn parse_own_root(bytes: &[u8]) -> Result<SignedMetadata<Root>, TufError> {
     let root = SignedMetadata::<Root>::parse(Root::TYPE, bytes)?;
     root.check_signatures(Root::TYPE, &root.body.keys, &root.body.roles[Root::TYPE])?;
     Ok(root)
 }
 
-/// Returns accepted metadata as text; JSON that was parsed is UTF-8.
+/// Metadata as text: parsed JSON is UTF-8.
 pub(super) fn text(role: &str, bytes: &[u8]) -> Result<String, TufError> {
     String::from_utf8(bytes.to_vec())
         .map_err(|e| TufError::Format { role: role.to_owned(), what: e.to_string() })

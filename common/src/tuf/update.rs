@@ -1,5 +1,4 @@
-//! The client workflow (section 5 of the specification): which files are read, in which order, and how much of
-//! each.
+//! The client workflow (section 5 of the specification): the files read, their order, and their largest lengths.
 
 use super::error::TufError;
 use super::metadata::{Body, Root, Snapshot, Targets, Timestamp};
@@ -7,16 +6,14 @@ use super::trusted::{Kept, Trusted, text};
 use super::{MAX_ROOT_BYTES, MAX_ROOTS, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES};
 
 pub trait Source {
-    /// Reads a metadata file, such as `2.root.json`: at most `max_bytes + 1` bytes, so that a longer one shows.
-    /// `None` if there is no such file.
+    /// Reads a file such as `2.root.json`, if it exists: up to `max_bytes + 1` bytes, so that a longer one is noticed.
     fn metadata(&mut self, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, String>;
 }
 
-/// Brings what is kept up to date and returns it, checked: roots, timestamp, snapshot and top-level targets.
+/// Updates `kept` and returns it, checked: roots, timestamp, snapshot and top-level targets.
 ///
-/// `kept` holds what was accepted, also after an error, so that a root that names new keys counts even if the rest
-/// does not arrive. The caller makes it durable in both cases. `clock_unix_secs`: the time; a later signed time
-/// counts instead.
+/// `kept` has what was accepted even after an error, so that a root with new keys counts although the rest does not
+/// arrive; the caller makes it durable in both cases. A signed time later than `clock_unix_secs` counts instead.
 pub fn refresh(kept: &mut Kept, source: &mut dyn Source, clock_unix_secs: u64) -> Result<Trusted, TufError> {
     let mut trusted = Trusted::new(kept.root.as_bytes(), clock_unix_secs)?;
     add_roots(&mut trusted, kept, source)?;
@@ -38,7 +35,7 @@ fn add_roots(trusted: &mut Trusted, kept: &mut Kept, source: &mut dyn Source) ->
         trusted.add_root(&bytes)?;
         kept.root = text(Root::TYPE, &bytes)?;
         n_new += 1;
-        // Recovery from a fast-forward attack (5.3.11): new keys begin to count anew.
+        // Recovery from a fast-forward attack (5.3.11): with new keys, versions start anew.
         let last = &trusted.root().body;
         let changed = |role: &str| {
             first.roles[role] != last.roles[role]

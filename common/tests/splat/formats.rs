@@ -1,5 +1,5 @@
-//! All formats against `expected.json`, which was recorded with splat-transform 2.7.1 and confirmed by a second
-//! reader; trained scenes against a separate parser of their layout.
+//! All formats against `expected.json` (splat-transform 2.7.1, confirmed by a second reader); trained scenes against a
+//! separate parser.
 
 use std::io::Read;
 
@@ -35,8 +35,8 @@ fn every_format_gives_the_recorded_gaussians() {
                 assert_near(found.expect("not empty"), bound, 1e-6, &format!("{name} {side}"));
             }
         }
-        // .splat stores rotations as bytes, and readers take 127.5 or 128 as zero: up to 0.9 degrees, and half of
-        // that between quaternions. For other formats: f32 rounding of the recorded values.
+        // .splat stores rotations as bytes, and readers take 127.5 or 128 as zero: up to 0.9 degrees, half of that
+        // between quaternions. Other formats: f32 rounding of the recorded values.
         let rotation_tolerance = if name.ends_with(".splat") { 0.008 } else { 2e-6 };
         for row in expected["gaussians"].as_array().expect("an array") {
             let i = row["index"].as_u64().expect("an index") as usize;
@@ -180,7 +180,7 @@ fn a_missing_file_is_named_once() {
     assert_eq!(text.matches("absent.ply").count(), 1, "{text}");
 }
 
-/// More rows than the header counts, or two columns of a name, would be half read in silence.
+/// Extra rows, or two columns of one name, would be read by half without a word.
 #[needs_shared]
 #[test]
 fn files_that_go_on_behind_their_last_row_are_refused() {

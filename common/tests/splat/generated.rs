@@ -1,5 +1,4 @@
-//! Generated files for cases without a recorded file: SPZ of degree 3 and 4 and its extensions, SOG version 1, and
-//! false counts.
+//! Generated files for cases without a recorded file: SPZ of degree 3 and 4 and its extensions, SOG 1, false counts.
 
 use std::io::Write;
 use std::path::Path;
@@ -68,7 +67,7 @@ fn basis([x, y, z]: [f64; 3]) -> [f64; 15] {
     ]
 }
 
-/// Oracle: the colour along a direction is the same before and after the axes are turned.
+/// Oracle: the colour along a direction does not change when the axes turn.
 #[test]
 fn spz_harmonics_turn_with_the_axes() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -156,7 +155,7 @@ fn false_counts_are_refused_before_memory_is_reserved() {
     assert!(error.contains("Gaussians in") && error.contains("4294967295"), "{error}");
 }
 
-/// Streams that decompress to far more than the table of contents states are refused without being held in memory.
+/// Streams that inflate far beyond the table of contents are refused without being held in memory.
 #[test]
 fn zstandard_bombs_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -229,7 +228,7 @@ fn sog_version_1() {
     write_sog_v1(folder.path());
     let found = read_all(folder.path()).unwrap_or_else(|error| panic!("{error}"));
     assert_eq!((found.len(), found.sh_degree), (6, 1));
-    // Its text as programs of Windows save it.
+    // The text as programs of Windows save it.
     let path = folder.path().join("meta.json");
     let meta = std::fs::read_to_string(&path).expect("was written");
     std::fs::write(&path, format!("\u{feff}{meta}")).expect("writes");
@@ -258,7 +257,7 @@ fn sog_version_1() {
         }
         let logit = -8.0 + 16.0 * byte(4, 3) / 255.0;
         assert_near(found.opacities[i].into(), 1.0 / (1.0 + (-logit).exp()), 1e-6, "opacity");
-        // Tags 250 and 251 are none: such rows stay, unusable.
+        // Tags 250 and 251 are invalid: such rows are kept, unusable.
         assert_eq!(found.is_usable(i), i >= 2, "{i}");
         if let Some(largest) = i.checked_sub(2) {
             let mut others = (0..3).map(|c| (byte(5, c) / 255.0 * 2.0 - 1.0) / 2_f64.sqrt());
@@ -273,7 +272,7 @@ fn sog_version_1() {
     }
 }
 
-/// A count below that of the images would drop Gaussians in silence.
+/// A count below that of the images would drop Gaussians silently.
 #[test]
 fn sog_counts_take_in_all_gaussians() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -312,8 +311,7 @@ fn sog_labels_and_codebooks_out_of_range() {
     let error = read_all(path).expect_err("is refused").to_string();
     assert!(error.contains("shN: expected labels below 128, found 128"), "{error}");
 
-    // Version 2 with a codebook null, 1, ... 255, where PlayCanvas takes 1 + (1 - 255) / 255 for the
-    // null; and a short one, 1 to 99.
+    // Version 2 with a codebook null, 1, ... 255 (PlayCanvas takes 1 + (1 - 255) / 255 for null), and a short one.
     let numbers = |n: usize| (1..n).map(|i| i.to_string()).collect::<Vec<_>>().join(",");
     let meta = std::fs::read_to_string(path.join("meta.json")).expect("was written");
     let start = meta.find("\"scales\"").expect("is there");

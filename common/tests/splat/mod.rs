@@ -1,4 +1,4 @@
-//! Splat files: recorded values of other readers, and oracles of our own.
+//! Splat files: values recorded with other readers, and our own oracles.
 
 mod formats;
 mod generated;
@@ -33,7 +33,7 @@ fn assert_columns_agree(gaussians: &Gaussians) {
     assert_eq!((lengths, gaussians.sh_rest.len()), ([n; 4], rest));
 }
 
-/// Asserts that `found` is within `tolerance` of `expected`, relative to 1 or the value if larger.
+/// Relative to 1, or to the value if larger.
 #[track_caller]
 fn assert_near(found: f64, expected: f64, tolerance: f64, what: &str) {
     let error = (found - expected).abs() / expected.abs().max(1.0);

@@ -5,7 +5,7 @@ use slag_common::splat::ply;
 
 use super::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
 
-/// Returns the properties and rows of a plain PLY of floats, with a parser of the test's own.
+/// Returns the properties and rows of a plain PLY of floats, read by a separate parser.
 fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {
     let end = bytes.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
     let names: Vec<_> = String::from_utf8_lossy(&bytes[..end])
@@ -18,7 +18,7 @@ fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {
     (names, rows)
 }
 
-/// Writes rows with their properties in reverse order among foreign ones, after a foreign element with lists.
+/// Writes rows with reversed properties among foreign ones, after a foreign element with lists.
 fn variant(encoding: &str, kind: &str, names: &[String], rows: &[Vec<f32>]) -> Vec<u8> {
     let mut out = format!("ply\r\nformat {encoding} 1.0\r\ncomment made here\r\nelement face 2\r\n");
     out += "property double area\r\nproperty list uchar int vertex_indices\r\nproperty uchar flag\r\n";
@@ -130,8 +130,8 @@ fn missing_properties_are_named() {
     assert!(error.ends_with("give the PLY of the splat"), "{error}");
 }
 
-/// Returns a compressed PLY with `n_chunks` chunks without colour ranges (as in the first version) and five
-/// Gaussians with harmonics of degree 1; all harmonics of a Gaussian have the same byte of `sh`.
+/// A compressed PLY with `n_chunks` chunks without colour ranges (as in the first version) and five Gaussians with
+/// harmonics of degree 1; all harmonics of a Gaussian have the same byte of `sh`.
 fn compressed(n_chunks: usize, sh: &[u8]) -> Vec<u8> {
     let axes = ["x", "y", "z", "scale_x", "scale_y", "scale_z"];
     let ranges = axes.map(|axis| format!("property float min_{axis}\nproperty float max_{axis}\n")).concat();
@@ -154,7 +154,7 @@ fn compressed(n_chunks: usize, sh: &[u8]) -> Vec<u8> {
     out
 }
 
-/// Oracle: PlayCanvas' description of the format, computed by hand.
+/// Oracle: PlayCanvas's description of the format, by hand.
 #[test]
 fn compressed_ply_by_hand() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -169,8 +169,7 @@ fn compressed_ply_by_hand() {
         assert_near(found.into(), expected, 1e-6, "colour");
     }
     assert_eq!(found.opacities[4], 1.0);
-    // w, x, y are 0.5 * sqrt(2) * (2 n / 1023 - 1) for n = 1023, 512, 511; z, the largest, follows from unit
-    // length.
+    // w, x, y are 0.5 * sqrt(2) * (2 n / 1023 - 1) for n = 1023, 512, 511; z, the largest, follows from unit length.
     let small = 0.5_f64.sqrt() / 1023.0;
     for (found, expected) in
         found.rotations_wxyz[4].into_iter().zip([0.5_f64.sqrt(), small, -small, 0.5_f64.sqrt()])
@@ -191,7 +190,7 @@ fn compressed_ply_by_hand() {
     }
 }
 
-/// Returns random Gaussians of a degree, including the ends of the ranges.
+/// Random Gaussians, including the ends of the ranges.
 fn random_gaussians(n: usize, sh_degree: u8) -> Gaussians {
     let mut random = slag_math::random::Random::new(7);
     let mut unit = || random.unit() as f32;
@@ -232,7 +231,7 @@ fn what_is_written_is_read_back() {
                 assert_near(found.into(), written.into(), 2e-7, "rotation");
             }
         }
-        // The layout itself, by name and place: reading back would not reveal a consistent swap.
+        // The layout itself, by name and place: a round trip would not reveal a consistent swap.
         let (names, rows) = rows_of(&std::fs::read(&path).expect("is there"));
         let per_channel = Gaussians::sh_rest_per_channel(degree);
         assert_eq!(names.len(), 17 + 3 * per_channel);
@@ -259,8 +258,7 @@ fn one_row(properties: &[(&str, &str, f64)]) -> Vec<u8> {
     format!("ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n{}\n", row.join(" ")).into_bytes()
 }
 
-/// Flat Gaussians of 2DGS, colours as numbers of 0 to 1, harmonics of degree 4; and files that are no splats are
-/// named.
+/// Flat Gaussians of 2DGS, colours of 0 to 1, harmonics of degree 4; other files are named.
 #[test]
 fn files_of_other_kinds_are_read_or_named() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -281,7 +279,7 @@ fn files_of_other_kinds_are_read_or_named() {
     for (found, expected) in flat.rgb_dc(0).into_iter().zip([1.0, 0.5, 0.0]) {
         assert_near(found.into(), expected, 1e-6, "colour");
     }
-    // One scale is that of all axes.
+    // A single scale holds for all axes.
     let ball: Vec<_> = geometry("float").into_iter().filter(|(_, name, _)| *name != "scale_1").collect();
     assert_eq!(read_back(&[&ball[..], &colours].concat()).expect("balls").scales[0], [1.0; 3]);
     let rest: Vec<String> = (0..72).map(|i| format!("f_rest_{i}")).collect();

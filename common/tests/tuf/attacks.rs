@@ -17,14 +17,14 @@ fn an_honest_repository_is_followed() {
     assert!(matches!(target.check(PATH, b"owt"), Err(TufError::Content { .. })), "another file");
     assert!(matches!(target.check(PATH, b"two "), Err(TufError::Content { .. })), "a longer file");
     assert_eq!(trusted.target("other"), None);
-    // Nothing new: only the next root and the timestamp are asked for.
+    // Nothing new: only the next root and the timestamp are requested.
     repo.reads.clear();
     update(&mut kept, &mut repo).expect("the same again");
     let names: Vec<&str> = repo.reads.iter().map(|(name, _)| name.as_str()).collect();
     assert_eq!(names, ["2.root.json", "timestamp.json"]);
 }
 
-/// What is kept survives being written and read, but for the targets metadata, which is read again.
+/// Everything kept survives a round trip, except targets metadata, which is read again.
 #[test]
 fn what_is_kept_goes_round_as_json() {
     let mut repo = Repo::new();
@@ -61,7 +61,7 @@ fn rollback_of_the_snapshot() {
     assert_eq!(error, TufError::Rollback { role: "snapshot".into(), seen: 2, offered: 1 });
 }
 
-/// With the keys of timestamp and snapshot: old targets, or none, under a new snapshot.
+/// With the keys of timestamp and snapshot: old or missing targets under a new snapshot.
 #[test]
 fn rollback_of_the_targets() {
     let mut repo = Repo::new();
@@ -88,7 +88,7 @@ fn a_role_that_vanishes_from_the_snapshot() {
     assert_eq!(error, TufError::Missing { what: "other.json".into() });
 }
 
-/// The same timestamp for ever: refused once it has expired, whichever file it is.
+/// The same timestamp for ever is refused once any file has expired.
 #[test]
 fn freeze() {
     let mut repo = Repo::new();
@@ -96,7 +96,7 @@ fn freeze() {
     let error = refresh(&mut kept.clone(), &mut repo, EXPIRES).expect_err("a frozen store");
     assert!(matches!(error, TufError::Expired { .. }), "{error}");
     refresh(&mut kept.clone(), &mut repo, EXPIRES - 1).expect("the last second");
-    // Each role alone.
+    // Each role separately.
     for expired in ["timestamp", "snapshot", "targets"] {
         let mut repo = Repo::new();
         if expired == "targets" {
@@ -132,7 +132,7 @@ fn freeze_with_a_clock_that_was_set_back() {
     let error =
         refresh(&mut kept, &mut late, 0).expect_err("a root that had expired when the timestamp was signed");
     assert!(matches!(error, TufError::Expired { .. }) && role_of(&error) == "root", "{error}");
-    // A timestamp that is refused moves no clock: the same client goes on with the time that it had.
+    // A refused timestamp does not move the clock of its client.
     let mut trusted = slag_common::tuf::Trusted::new(repo.root(), NOW).expect("a root");
     trusted.add_timestamp(&late.files["timestamp.json"]).expect_err("signed after the root's expiry");
     assert_eq!(trusted.now_unix_secs(), NOW);
@@ -152,7 +152,7 @@ fn mix_and_match() {
         let error = update(&mut client(&repo), &mut mixed).expect_err(name);
         assert!(matches!(error, TufError::Content { .. }), "{error}");
     }
-    // The same where lengths and hashes are not stated, which the specification allows.
+    // The same without stated lengths and hashes, which the specification allows.
     let bare = |version| FileMeta { version, length: None, hashes: None };
     let mut mixed = repo.clone();
     mixed.sign_timestamp_as(3, bare(2), NOW);
@@ -168,7 +168,7 @@ fn mix_and_match() {
     assert_eq!(error, TufError::Version { role: "targets".into(), expected: 2, found: 1 });
 }
 
-/// Every file longer than stated, or than is read at most.
+/// Every file longer than stated, or than the limit.
 #[test]
 fn endless_data() {
     let repo = Repo::new();
@@ -181,7 +181,7 @@ fn endless_data() {
             assert!(*max_bytes <= MAX_ROOT_BYTES, "{name}: {max_bytes} bytes are asked for");
         }
     }
-    // New roots without an end.
+    // Endless new roots.
     let mut endless = Repo::new();
     for _ in 0..300 {
         endless.rotate(endless.owner.clone());
@@ -208,7 +208,7 @@ fn wrong_keys() {
     }
 }
 
-/// One key cannot stand for two: neither by signing twice nor under two ids.
+/// One key cannot count twice, neither by signing twice nor under two ids.
 #[test]
 fn a_threshold_counts_keys() {
     let mut repo = Repo::new();
@@ -236,7 +236,7 @@ fn a_threshold_counts_keys() {
     assert!(matches!(error, TufError::Format { .. }), "{error}");
 }
 
-/// Targets metadata in the place of a snapshot, with one key for both roles.
+/// Targets metadata instead of a snapshot, with one key for both roles.
 #[test]
 fn one_role_in_the_place_of_another() {
     let mut repo = Repo::new();
@@ -250,7 +250,7 @@ fn one_role_in_the_place_of_another() {
     assert!(matches!(&error, TufError::Format { what, .. } if what.contains("_type")), "{error}");
 }
 
-/// Any flipped bit: refused, or the content is the same (the case of hex digits and of escapes).
+/// Any flipped bit is refused, or leaves the content unchanged (case of hex digits, escapes).
 #[test]
 fn every_flipped_bit_is_refused() {
     let repo = Repo::new();
@@ -271,7 +271,7 @@ fn every_flipped_bit_is_refused() {
     }
 }
 
-/// What networks send in the place of a store's files is named.
+/// Names what networks send instead of a store's files.
 #[test]
 fn pages_and_packed_files_are_named() {
     for (bytes, word) in [

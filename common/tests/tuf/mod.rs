@@ -1,4 +1,4 @@
-//! The attacks that TUF names, each against a client that has updated once, and other people's TUF.
+//! The attacks that TUF names, each against a client that has updated once; repositories of other TUF programs.
 
 mod attacks;
 

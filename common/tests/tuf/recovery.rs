@@ -1,4 +1,4 @@
-//! Roots: who may name the next one, and what a new one makes good.
+//! Roots: who may name the next one, and what a new root repairs.
 
 use slag_common::tuf::{FileMeta, Kept, TufError};
 
@@ -23,7 +23,7 @@ fn a_root_needs_the_old_keys_and_its_own() {
     assert_eq!(error, TufError::Signatures { role: "root".into(), found: 1, threshold: 2 });
     let error = offer(others().sign_root(2, EXPIRES, &[]), 2).expect_err("new keys alone");
     assert_eq!(error, TufError::Signatures { role: "root".into(), found: 0, threshold: 2 });
-    // The old keys alone: the new root's own are missing.
+    // The old keys only: the new root's own are missing.
     let silent = slag_common::tuf::sign(2, EXPIRES, &others().root_body(), &[&old[0], &old[1]]);
     let error = offer(silent, 2).expect_err("old keys alone");
     assert_eq!(error, TufError::Signatures { role: "root".into(), found: 0, threshold: 2 });
@@ -59,8 +59,7 @@ fn a_new_root_is_kept_after_an_error() {
     assert!(kept.timestamp.is_some(), "its keys have not changed");
 }
 
-/// Who holds the online keys signs the highest versions; honest metadata is then a rollback, until a root names
-/// new keys.
+/// A thief of the online keys signs the highest versions; honest metadata is a rollback until a root names new keys.
 #[test]
 fn fast_forward_is_made_good_by_a_new_root() {
     for taken in ["timestamp", "snapshot", "targets"] {
@@ -93,7 +92,7 @@ fn fast_forward_is_made_good_by_a_new_root() {
     }
 }
 
-/// A time of signing in the far future would expire everything; new timestamp keys take it back.
+/// A signed time in the far future would expire everything; new timestamp keys revoke it.
 #[test]
 fn a_signed_time_in_the_future_is_made_good_by_a_new_root() {
     let mut repo = Repo::new();
@@ -111,7 +110,7 @@ fn a_signed_time_in_the_future_is_made_good_by_a_new_root() {
     assert_eq!(kept.signed_unix_secs(), Some(NOW));
 }
 
-/// Keys that a root has withdrawn sign nothing any more, though what they signed is on board.
+/// Signatures by keys that a root has withdrawn are refused, even of metadata on board.
 #[test]
 fn a_withdrawn_key_is_refused() {
     let mut repo = Repo::new();
@@ -123,15 +122,14 @@ fn a_withdrawn_key_is_refused() {
     evil.publish(b"evil");
     let error = update(&mut kept.clone(), &mut evil).expect_err("the old key");
     assert_eq!(error, TufError::Signatures { role: "targets".into(), found: 0, threshold: 1 });
-    // Not even what was accepted before: it is asked for again.
+    // Even what was accepted before is requested again.
     let error = update(&mut kept.clone(), &mut repo).expect_err("old targets");
     assert!(matches!(error, TufError::Signatures { .. }), "{error}");
     repo.publish(b"two");
     update(&mut kept, &mut repo).expect("the new key");
 }
 
-/// All online keys without the root: what they say counts until a root withdraws them, and they cannot name
-/// others.
+/// All online keys without the root: what they sign counts until a root withdraws them, but they cannot name keys.
 #[test]
 fn online_keys_cannot_name_keys() {
     let mut repo = Repo::new();
@@ -141,7 +139,7 @@ fn online_keys_cannot_name_keys() {
     repo.put("2.root.json", thief.sign_root(2, EXPIRES, &online));
     let error = update(&mut kept, &mut repo).expect_err("a root by online keys");
     assert_eq!(error, TufError::Signatures { role: "root".into(), found: 0, threshold: 2 });
-    // With a threshold of root keys, the thief owns the repository: nothing but trust by hand helps.
+    // With a threshold of root keys, the thief owns the repository; only new trust by hand helps.
     repo.put("2.root.json", thief.sign_root(2, EXPIRES, &repo.owner.root[..2]));
     update(&mut kept, &mut repo).expect("root keys decide");
 }

@@ -1,4 +1,4 @@
-//! A repository in memory, as its owner would write it, or somebody who took a key.
+//! A repository in memory, as written by its owner or by a thief of keys.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use slag_common::tuf::{
     format_utc, refresh, sign,
 };
 
-/// The clock of the tests, and when metadata expires unless a test says otherwise.
+/// The clock of the tests, and the default expiry of metadata.
 pub const NOW: u64 = 1_800_000_000;
 pub const EXPIRES: u64 = NOW + 86_400;
 pub const PATH: &str = "scene/manifest";
@@ -54,7 +54,7 @@ impl Owner {
     }
 }
 
-/// Files of a repository. Reads count what was asked for.
+/// Files of a repository; records what was read.
 #[derive(Clone)]
 pub struct Repo {
     pub owner: Owner,
@@ -67,7 +67,7 @@ pub struct Repo {
 }
 
 impl Repo {
-    /// A repository with version 1 of everything.
+    /// All roles at version 1.
     pub fn new() -> Self {
         let (files, reads) = (BTreeMap::new(), Vec::new());
         let (root_version, version, timestamp_version) = (1, 0, 0);
@@ -125,7 +125,7 @@ impl Repo {
         self.put("timestamp.json", sign(version, self.expires, &body, &[&self.owner.timestamp]));
     }
 
-    /// Publishes the next root with other keys; the present root's keys sign it too.
+    /// Publishes the next root with other keys, also signed by the present root's keys.
     pub fn rotate(&mut self, next: Owner) {
         self.root_version += 1;
         let bytes = next.sign_root(self.root_version, EXPIRES, &self.owner.root);
@@ -133,7 +133,7 @@ impl Repo {
         self.owner = next;
     }
 
-    /// Signs everything anew with the present keys.
+    /// Signs everything again with the present keys.
     pub fn publish_again(&mut self, content: &[u8], version: u64, timestamp_version: u64) {
         self.timestamp_version = timestamp_version - 1;
         self.version = version - 1;

@@ -9,35 +9,34 @@ use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 pub struct Backend {
     pub name: &'static str,
     pub rasterizer: Box<dyn Rasterizer>,
-    /// Factor on the bounds that the rows claim.
+    /// Factor on the errors that the rows claim.
     pub bound_factor: f64,
-    /// Relative error of alpha within which either side of a cut is right.
+    /// Relative error of alpha within which either side of a cut is accepted.
     pub cut_tolerance: f64,
-    /// Whether depth order and sides of cuts equal the oracle's wherever rounding does not decide. An f32
-    /// projection swaps neighbours in depth, which changes single weights but hardly their sum.
+    /// Whether depth order and sides of cuts equal the oracle's unless rounding decides. An f32 projection swaps
+    /// neighbours in depth, which changes single weights but hardly their sum.
     pub keeps_order: bool,
-    /// Whether it runs on a processor through a graphics driver: a hundred times slower than a GPU.
+    /// Whether the processor imitates it: a hundred times slower than a GPU.
     pub is_software_gpu: bool,
 }
 
-/// Cases from which a software GPU takes a part, and every how many.
+/// From this many cases on, a software GPU runs one in `SOFTWARE_GPU_STEP`.
 const MANY_CASES: usize = 40;
 const SOFTWARE_GPU_STEP: usize = 4;
 
 impl Backend {
-    /// Every how many of `n` cases it is tested on.
+    /// Step through `n` cases.
     pub fn case_step(&self, n: usize) -> usize {
         if self.is_software_gpu && n >= MANY_CASES { SOFTWARE_GPU_STEP } else { 1 }
     }
 }
 
-/// Returns the rasterisers that every test of this binary runs on.
 pub fn backends() -> &'static [Backend] {
     static BACKENDS: OnceLock<Vec<Backend>> = OnceLock::new();
     BACKENDS.get_or_init(|| {
         let mut backends = vec![
-            // `u` and `v` are below 32 at the start of a tile where they matter, so off by 6e-6 at most
-            // after three roundings of f32, and alpha by 3.4 times that.
+            // Where they matter, `u` and `v` are below 32 at the start of a tile, so off by at most 6e-6 after
+            // three roundings of f32, and alpha by 3.4 times that.
             Backend {
                 name: "cpu",
                 rasterizer: Box::new(CpuRasterizer),
@@ -78,7 +77,7 @@ pub fn backends() -> &'static [Backend] {
     })
 }
 
-/// Returns whether an adapter is required: the set-up installs one for CI.
+/// CI installs an adapter.
 pub fn gpu_is_expected() -> bool {
     std::env::var("CI").as_deref() == Ok("true")
 }

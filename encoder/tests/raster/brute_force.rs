@@ -102,7 +102,7 @@ fn nothing_to_see_is_no_error() {
     }
 }
 
-/// A broken higher coefficient costs the Gaussian its colour, no more.
+/// A broken higher coefficient costs only the Gaussian's colour.
 #[test]
 fn broken_coefficients_cost_a_colour() {
     for Backend { rasterizer, .. } in backends() {

@@ -17,7 +17,7 @@ use slag_encoder::raster::{
 
 use super::fixtures::{needs_shared, photo, read_splat, shared, shrunk};
 
-/// PSNR over all photos that the trainer (gsplat) reports at 1000 x 562.
+/// PSNR over all photos, as reported by the trainer (gsplat) at 1000 x 562.
 const TRAINER_PSNR_DB: f64 = 25.02;
 
 fn read_scene(root: &Path) -> Gaussians {
@@ -56,7 +56,7 @@ fn a_scene_that_fits_its_photos_passes() {
     assert_eq!((picture.width(), picture.height()), (2000, 562));
 }
 
-/// Plants each mistake as the inverse of its correction, written independently of the code.
+/// Plants each mistake as the inverse of its correction, written independently.
 #[needs_shared]
 #[test]
 fn planted_mistakes_are_diagnosed() {
@@ -106,7 +106,7 @@ fn planted_mistakes_are_diagnosed() {
     };
     assert_eq!(diagnosed(&scene, &double_focal), Some(Mistake::FocalScale(0.5)));
 
-    // (x, y, z) of a z-up world is (x, z, -y) of a y-up one: turned back by three quarters.
+    // (x, y, z) of a z-up world is (x, z, -y) of a y-up one: turned by three quarters.
     let y_up = |view: &mut RasterView| {
         let m = &mut view.camera_from_world.matrix3;
         (m.y_axis, m.z_axis) = (m.z_axis, -m.y_axis);
@@ -162,7 +162,7 @@ fn tiny_view() -> CheckView {
     }
 }
 
-/// What the data alone say: each fault planted by hand, with the correction that the drawings confirm.
+/// Faults visible in the data alone: each planted by hand, with the correction that the drawings confirm.
 #[needs_shared]
 #[test]
 fn faults_of_the_data_are_suspected_and_confirmed() {
@@ -195,7 +195,7 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     let all: Vec<u32> = (0..scene.len() as u32).collect();
     let twice = suspicions(&scene.select(&[all.clone(), all].concat()), &views(&photos));
     assert!(twice.len() == 1 && twice[0].text.contains("stand where another one alike stands"), "{twice:?}");
-    // Tiny Gaussians are no sign of large coordinates.
+    // Tiny Gaussians do not mean large coordinates.
     let mut tiny = scene.clone();
     tiny.scales.iter_mut().flatten().for_each(|s| *s = 1e-9);
     assert_eq!(suspicions(&tiny, &views(&photos)), []);
@@ -206,7 +206,7 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     let report = run(&scene, &[swapped[..2].to_vec(), others.clone()].concat(), &CheckOptions::default());
     assert!(report.diagnosis.is_none() && report.suspicions.len() == 1, "{report}");
     assert!(report.suspicions[0].starts_with("2 of 32 views look less like"), "{report}");
-    // A photo under a lens cap says nothing against them.
+    // A photo under a lens cap is no evidence against them.
     let mut capped = others;
     capped[0].image.fill(0);
     let report = run(&scene, &capped, &CheckOptions::default());
@@ -236,7 +236,7 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     flat.scales.iter_mut().for_each(|s| *s = [s[0].exp(), s[1].exp(), 0.0]);
     let suspected = Mistake::Activated { scales: true, opacities: false };
     assert!(suspicions(&flat, &views(&photos)).iter().any(|found| found.mistake == Some(suspected)));
-    // Logarithms taken for scales are negative.
+    // Logarithms read as scales are negative.
     let mut points = scene.clone();
     points.deactivate(true, false);
     assert!(suspicions(&points, &views(&photos))[0].text.ends_with("leave out --activated scales"));
@@ -255,18 +255,18 @@ fn faults_of_the_data_are_suspected_and_confirmed() {
     let at_zero = with_camera(&|camera| (camera.centre_x_px, camera.centre_y_px) = (0.0, 0.0));
     assert_eq!(at_zero, Some(Mistake::CentreAtZero));
     assert_eq!(with_camera(&|camera| camera.centre_x_px = 0.0), Some(Mistake::CentreAtZero));
-    // An offset of UTM's size in doubles: exact, once it is subtracted.
+    // An offset of UTM's size in f64 is exact once subtracted.
     let mut shifted = scene.clone();
     shifted.means_in_world.iter_mut().for_each(|mean| *mean += DVec3::new(500_000.0, 5_400_000.0, 0.0));
     let found = diagnosed(&shifted, &photos);
     assert!(matches!(found, Some(Mistake::Frame(f)) if f.cause == FrameCause::Shifted), "{found:?}");
-    // The same in 32 bits has lost the scene, which only the data tell.
+    // In f32 it destroys the scene, which only the data show.
     shifted.means_in_world.iter_mut().for_each(|mean| *mean = mean.as_vec3().as_dvec3());
     let texts: Vec<String> = suspicions(&shifted, &views(&photos)).into_iter().map(|s| s.text).collect();
     assert!(texts.len() == 2 && texts[0].contains("UTM"), "{texts:?}");
 }
 
-/// Photos that cannot be read are left out and named; transparent parts do not count.
+/// Unreadable photos are omitted and named; transparent parts do not count.
 #[test]
 fn unreadable_photos_are_left_out_and_hidden_pixels_do_not_count() {
     let unreadable = || Err(IngestError::Photo { path: "b.jpg".into(), fault: PhotoError::Cut });
@@ -277,7 +277,7 @@ fn unreadable_photos_are_left_out_and_hidden_pixels_do_not_count() {
     let none = check(&Gaussians::default(), [unreadable()], &CpuRasterizer, &CheckOptions::default());
     assert!(matches!(none, Err(CheckError::NoPhotos { n_views: 1, .. })));
 
-    // Black everywhere, but for a white pixel that is hidden or not.
+    // All black, except for one white pixel, hidden or not.
     let mut view = tiny_view();
     view.image.put_pixel(1, 2, image::Rgb([255; 3]));
     let psnr_db = |view: CheckView| {
@@ -296,7 +296,7 @@ fn unreadable_photos_are_left_out_and_hidden_pixels_do_not_count() {
 struct Counting {
     loads: AtomicUsize,
     draws: AtomicUsize,
-    /// Pairs that each drawing after the first two counts.
+    /// Pairs counted by each drawing after the first two.
     pairs_of_trials: usize,
 }
 
@@ -315,7 +315,6 @@ impl LoadedScene for CountingScene<'_> {
     }
 }
 
-/// A rasterizer that lives as long as the test.
 struct Counted(&'static Counting);
 
 impl Rasterizer for Counted {
@@ -329,8 +328,8 @@ impl Rasterizer for Counted {
     }
 }
 
-/// Each photo is loaded after the previous view was drawn: one photo is in memory, whatever their number. The
-/// scene is loaded once, and once more for each correction of the splat itself.
+/// Each photo is loaded after the previous view was drawn, so one is in memory at a time. The scene is loaded
+/// once, and once more per correction of the splat itself.
 #[test]
 fn photos_are_loaded_one_at_a_time_and_the_scene_once() {
     let counting: &'static Counting = Box::leak(Box::default());
@@ -340,13 +339,13 @@ fn photos_are_loaded_one_at_a_time_and_the_scene_once() {
     });
     let report = check(&Gaussians::default(), views, &Counted(counting), &CheckOptions::default()).unwrap();
     assert_eq!(report.views.len(), 9);
-    // Of 190 corrections two views are drawn each, since neither looks like its photo.
+    // Two views per correction, of 190, since neither looks like its photo.
     let n_draws = counting.draws.load(Ordering::Relaxed);
     assert!(report.diagnosis.is_some() && (300..450).contains(&n_draws), "{n_draws}");
     assert_eq!(counting.loads.load(Ordering::Relaxed), 1 + 5, "mirrored along three axes, rotations turned");
 }
 
-/// A correction that only takes Gaussians out of sight gains much, and explains nothing.
+/// A correction that only moves Gaussians out of sight gains much, but is not accepted.
 #[test]
 fn black_is_no_explanation() {
     let mut view = tiny_view();
@@ -362,7 +361,7 @@ fn black_is_no_explanation() {
     assert_eq!(diagnosis.mistake, None);
 }
 
-/// Corrections that draw a heap of Gaussians everywhere are tried until 200 million pairs were drawn.
+/// Corrections that draw a heap of Gaussians everywhere are tried up to 200 million pairs.
 #[test]
 fn a_heap_of_gaussians_ends_the_search() {
     let counting = Counting { pairs_of_trials: 50_000_000, ..Counting::default() };

@@ -1,4 +1,4 @@
-//! Geometry and opacity at the extremes: rows of the table in docs/numerics.md, each against float64.
+//! Geometry and opacity at the extremes: rows of the table in docs/numerics.md, against float64.
 
 use glam::{DAffine3, DVec3};
 use slag_common::splat::{self, ReadOptions};
@@ -13,7 +13,7 @@ use super::table::{Case, Row};
 use slag_math::random::Random;
 use slag_test_support::{is_nightly, trials};
 
-/// Many views of few Gaussians each: none hides the others. Focal lengths lie between two.
+/// Many views of few Gaussians, so that none hides the others. Focal lengths lie within a range.
 fn cases(
     n: u64,
     size_px: [u32; 2],
@@ -47,7 +47,7 @@ fn scales() {
     Row { name: "scales", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
-/// Returns views with needles and discs whose longest axis is up to `max_ratio` times the shortest.
+/// Views of needles and discs whose axes differ by up to `max_ratio`.
 fn needles(max_ratio: f64, focal_px: [f64; 2]) -> Vec<Case> {
     cases(60, [40, 30], focal_px, |scene, view, random| {
         for _ in 0..12 {
@@ -67,7 +67,7 @@ fn anisotropy() {
     Row { name: "anisotropy", range, claimed: 1e-5, unit_px: 1.0 }.check(&needles(1e4, [50.0; 2]));
 }
 
-/// The determinant of such a covariance, taken as a difference, has no correct digit in float64.
+/// As a difference, the determinant of such a covariance has no correct digit in float64.
 #[test]
 fn anisotropy_through_long_lenses() {
     let range = "ratio to 1e9, focal lengths 2,000 to 20,000 px, to 6e7 px long";
@@ -81,7 +81,7 @@ fn opacities() {
         for i in 0..24 {
             let mean = random.in_view(view, [0.5, 8.0]);
             let scales = std::array::from_fn(|_| random.log_between(0.02, 1.0));
-            // Spread towards both ends.
+            // Dense at both ends.
             let share = random.log_between(1e-4, 1.0);
             push(scene, view, random, mean, scales, if i % 2 == 0 { share } else { 1.0 - share });
         }
@@ -89,7 +89,7 @@ fn opacities() {
     Row { name: "opacities", range: "1e-4 to 0.9999", claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
-/// Writes the PLY that trainers write, with double properties.
+/// A trainer's PLY, with double properties.
 fn ply(rows: &[[f64; 14]]) -> Vec<u8> {
     let names = "x y z rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 opacity f_dc_0 f_dc_1 f_dc_2";
     let mut bytes = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", rows.len());
@@ -105,7 +105,7 @@ pub fn read_ply(rows: &[[f64; 14]]) -> Gaussians {
     splat::read(file.path(), &ReadOptions::default()).unwrap()
 }
 
-/// Oracle of the reader: the logistic function by hyperbolic tangent.
+/// Oracle: the logistic function by hyperbolic tangent.
 #[test]
 fn logits() {
     let read = cases(40, [24, 20], [30.0; 2], |scene, view, random| {
@@ -132,8 +132,7 @@ fn logits() {
     Row { name: "logits", range, claimed: 1e-5, unit_px: 1.0 }.check(&read);
 }
 
-/// Pixels within a few f32 steps of both cuts, beside an isolated Gaussian, so that pixels on a cut are a small
-/// share.
+/// Pixels within a few f32 steps of both cuts, beside an isolated Gaussian, so that pixels on a cut are few.
 #[test]
 fn on_the_cuts() {
     let steps = |value: f32, n: i32| f64::from(f32::from_bits(value.to_bits().wrapping_add_signed(n)));
@@ -141,7 +140,7 @@ fn on_the_cuts() {
         for i in 0..20 {
             let (x, y) = (f64::from(4 * (i % 5)) + 2.5, f64::from(4 * (i / 5)) + 2.5);
             let (dx, dy) = (random.between(0.0, 0.05), random.between(0.0, 0.05));
-            // Without an extent of its own a Gaussian has the variance of the blur.
+            // Without an extent of its own, a Gaussian has the blur's variance.
             let falloff = (-0.5 * (dx * dx + dy * dy) / 0.3).exp();
             let mut layer = |depth: f64, alpha: f64| {
                 let mean = unproject(view, x + dx, y + dy, depth);
@@ -151,7 +150,7 @@ fn on_the_cuts() {
             if i % 2 == 0 {
                 layer(1.0, steps(1.0 / 255.0, n));
             } else {
-                // 0.01 of the light goes through each; what is behind sees all or nothing of the rest.
+                // 0.01 of the light passes each; what is behind gets all or nothing of the rest.
                 layer(1.0, f64::from(0.99_f32));
                 layer(2.0, steps(0.99, n));
                 layer(3.0, 0.5);
@@ -163,7 +162,7 @@ fn on_the_cuts() {
     Row { name: "on the cuts", range, claimed: 1e-5, unit_px: 1e-2 }.check(&cases);
 }
 
-/// Contributions are compared relative to themselves: 2,300 layers of alpha 1/255 leave the last one 1e-4.
+/// Relative to themselves: 2,300 layers of alpha 1/255 leave 1e-4 for the last.
 #[test]
 fn pile() {
     let n_gaussians = trials(20_000, 100_000);
@@ -172,7 +171,7 @@ fn pile() {
         let view = posed(random, [2, 2], 50.0);
         let mut scene = Gaussians::default();
         for _ in 0..n_gaussians {
-            // 8,000 different depths as f32: most are ties, which the index decides.
+            // 8,000 different depths in f32: most are ties, broken by index.
             let mean = unproject(
                 &view,
                 random.between(0.0, 2.0),
@@ -207,8 +206,7 @@ fn near_plane() {
     Row { name: "near plane", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
-/// The oracle sees the scene at the origin: its coordinates are multiples of 2^-20, so that moving it by
-/// whole units is exact.
+/// The oracle sees the scene at the origin: coordinates are multiples of 2^-20, so moving it by whole units is exact.
 #[test]
 fn far_from_the_origin() {
     let case = |seed: u64| {
@@ -268,8 +266,8 @@ fn image_sizes() {
     }
 }
 
-/// Closed form: a very wide Gaussian adds its opacity at every pixel, and the one behind it the rest. An f32
-/// running sum stops growing at 2^24 steps of its own size.
+/// Closed form: a very wide Gaussian adds its opacity at every pixel, the one behind it the rest. A running sum in
+/// f32 stops growing at 2^24 steps.
 #[test]
 fn sums_over_many_pixels() {
     let random = &mut Random::new(1);
@@ -290,7 +288,7 @@ fn sums_over_many_pixels() {
         }
         let found = rasterizer.weights(&scene, &view, &regions).unwrap();
         if !keeps_order {
-            // Wider than the squares that f32 holds.
+            // Wider than f32 holds squared.
             assert_eq!((found.counters.unusable, found.entries.len()), (3, 0));
             println!("| sums | {n_px} px of one region | {name} | rejected, counted |");
             continue;

@@ -21,7 +21,7 @@ pub fn photo(view: &View) -> CheckView {
     CheckView { name: loaded.view.name, image: loaded.image, valid: None, view }
 }
 
-/// Shrinks a photo by averaging pixels, which makes repeated checks quicker.
+/// Averages pixels, so that repeated checks are faster.
 pub fn shrunk(photo: CheckView, width_px: u32) -> CheckView {
     let intrinsics = photo.view.intrinsics.scaled_to_width(width_px);
     let image = image::imageops::thumbnail(&photo.image, intrinsics.width_px, intrinsics.height_px);
@@ -40,7 +40,6 @@ impl Npz {
         NpyFile::new(member).unwrap().into_vec().unwrap()
     }
 
-    /// Returns the scene, with the means of the named array.
     pub fn scene(&mut self, means_in_world: Vec<DVec3>) -> Gaussians {
         let n = means_in_world.len();
         Gaussians {
@@ -54,7 +53,7 @@ impl Npz {
         }
     }
 
-    /// Returns a camera of the size that the archive states.
+    /// A camera with the archive's image size.
     pub fn intrinsics(&mut self, matrix: &[f32]) -> Intrinsics {
         Intrinsics {
             width_px: self.array::<i64>("width")[0] as u32,
@@ -91,7 +90,7 @@ pub fn points(values: &[f32]) -> Vec<DVec3> {
     rows::<3, f32>(values).map(|p| DVec3::from_array(p.map(f64::from))).collect()
 }
 
-/// Returns a pose from a row-major 4x4 matrix.
+/// From a row-major 4x4 matrix.
 pub fn view(matrix: &[f64], intrinsics: Intrinsics) -> RasterView {
     let m = |r: usize, c: usize| matrix[r * 4 + c];
     let column = |c: usize| DVec3::new(m(0, c), m(1, c), m(2, c));

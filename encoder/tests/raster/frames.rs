@@ -1,4 +1,4 @@
-//! Splats in another frame than their poses: the labelled house, moved on purpose.
+//! Splats in another frame than their poses: the labelled house, moved.
 
 use glam::{DMat3, DQuat, DVec3};
 use slag_common::{Gaussians, Similarity, View, poses};
@@ -36,7 +36,7 @@ impl House {
         report
     }
 
-    /// Returns the largest distance between the images of cameras under two similarities, in units of the first.
+    /// Largest distance between camera positions under two similarities, in units of the first.
     fn off(&self, a: &Similarity, b: &Similarity) -> f64 {
         let off = |view: &View| {
             let centre = view.position_in_world();
@@ -53,14 +53,14 @@ fn moved_splats_are_brought_back() {
     let house = House::read();
     assert_eq!(house.check(&Similarity::IDENTITY, Vec::new()).diagnosis, None);
 
-    // nerfstudio's training frame, as its own formulas state it of all poses.
+    // nerfstudio's training frame, by its formulas from all poses.
     let defaults = nerfstudio_defaults(&house.views);
     let trained = defaults[0].splat_from_poses;
     let found = house.check(&trained, defaults.clone()).diagnosis.expect("a diagnosis");
     assert!(matches!(found.mistake, Some(Mistake::Frame(f)) if f.cause == FrameCause::NerfstudioDefaults));
     let off = house.off(&found.splat_from_poses.expect("a similarity"), &trained);
     assert!(off < 1e-3, "{off} world units");
-    // Trained on some of the photos only: the frame is a little off, and the drawings mend it.
+    // Trained on some photos only: the frame is slightly off, and the drawings correct it.
     let some: Vec<View> = house.views.iter().step_by(3).cloned().collect();
     let trained = nerfstudio_defaults(&some)[0].splat_from_poses;
     let before = house.off(&defaults[0].splat_from_poses, &trained);
@@ -69,7 +69,7 @@ fn moved_splats_are_brought_back() {
     println!("{before} -> {off} world units");
     assert!(off < 0.7 * before, "{before} -> {off} world units");
 
-    // Any similarity, where a second set of poses is in the splat's frame.
+    // Any similarity, where other poses are in the splat's frame.
     let stated = Similarity {
         scale: 0.31,
         rotation: DQuat::from_axis_angle(DVec3::new(0.2, 1.0, -0.7).normalize(), 1.9),
@@ -102,7 +102,7 @@ fn other_axes_and_scales_are_named() {
     let found = report.diagnosis.expect("a diagnosis");
     assert_eq!(found.mistake, Some(Mistake::WorldAxes([2, 1, -3])));
     assert!(house.off(&found.splat_from_poses.expect("a similarity"), &swap) < 1e-9);
-    // A scale that is no power of ten.
+    // A scale that is not a power of ten.
     let scaled = Similarity { scale: 3.7, ..Similarity::IDENTITY };
     let found = house.check(&scaled, Vec::new()).diagnosis.expect("a diagnosis");
     let off = house.off(&found.splat_from_poses.expect("a similarity"), &scaled);

@@ -23,7 +23,7 @@ fn weights(scene: &dyn LoadedScene, view: &RasterView, regions: &RegionMap) -> V
     scene.weights(view, regions).unwrap()
 }
 
-/// The second view is as large as the buffers that the first left behind; later ones are larger.
+/// The second view fits the buffers of the first exactly; later ones are larger.
 const SIZES_PX: [(u32, u32); 4] = [(70, 90), (70, 90), (131, 40), (33, 200)];
 
 #[test]
@@ -32,10 +32,10 @@ fn chunks_and_bands_change_no_bit() {
     let random = &mut Random::new(20);
     let view = random_view(random, 70, 90);
     let scene = random_scene(random, 3000, &view, 0);
-    // 56 bytes a visible Gaussian, 64 a Gaussian, 16 a sum of a tile: 937 a chunk, 1,071 visible and 3,750
-    // sums a band. Of the second, part of the scene stays on the device, of the third none.
+    // 56 bytes per visible Gaussian, 64 per Gaussian, 16 per sum of a tile: 937 a chunk, 1,071 visible and 3,750
+    // sums a band. In the second case part of the scene stays on the device, in the third nothing.
     let mut n_with_bands = 0;
-    // The last has next to no room at first, which must grow to the whole image in one band.
+    // The last begins with almost no capacity, which must grow to the whole image in one band.
     for (max_binding_bytes, max_resident_bytes, first_capacity) in [
         (60_000, u64::MAX, 1 << 19),
         (90_000, 100_000, 1 << 19),
@@ -105,7 +105,7 @@ fn the_same_bits_each_time_from_every_thread() {
     });
 }
 
-/// Buffers that earlier views left behind, with fewer and with more regions, change no bit.
+/// Buffers left by earlier views, with fewer or more regions, do not change a bit.
 #[test]
 fn earlier_views_change_no_bit() {
     let Some(gpu) = open(GpuOptions { views_in_flight: 1, ..GpuOptions::default() }) else { return };
@@ -118,7 +118,7 @@ fn earlier_views_change_no_bit() {
         let expected = gpu.weights(&scene, &view, &regions).unwrap();
         assert!(weights(loaded.as_ref(), &view, &regions) == expected, "{n_regions} regions");
     }
-    // More regions than a device can number.
+    // More regions than a device numbers.
     let mut many = random_regions(random, &view, 3);
     many.n_regions = 1 << 16;
     let error = gpu.weights(&scene, &view, &many).unwrap_err();
@@ -166,7 +166,7 @@ fn a_lost_device_loses_no_view() {
     devices.gpus[1].lose();
     let found = all();
     assert!(found.chunks(views.len()).all(|views| views == expected), "the CPU's own bits");
-    // A scene that comes after the loss goes to the CPU, too.
+    // A scene loaded after the loss also goes to the CPU.
     assert!(matches!(devices.gpus[0].load(&scene), Err(RasterError::Device { .. })));
     assert_eq!(weights(devices.load(&scene).unwrap().as_ref(), &views[0], &regions), expected[0]);
 }
@@ -190,7 +190,7 @@ fn choices() {
     assert!(open(DeviceChoice::Cpu).unwrap().gpus.is_empty());
     let error = open(DeviceChoice::Adapters(vec![999, 0])).err().unwrap();
     assert!(matches!(error, DeviceError::NoSuchAdapter { number: 999, .. }), "{error}");
-    // Imitated GPUs are slower than the CPU itself.
+    // Software GPUs are slower than the CPU itself.
     let auto = open(DeviceChoice::Auto).unwrap();
     assert!(auto.gpus.iter().all(|gpu| !gpu.report().is_software()));
     match open(DeviceChoice::Gpu) {

@@ -1,4 +1,4 @@
-//! Compares with recorded weights: a float64 reference, and gsplat 1.5.3.
+//! Comparison with recorded weights: a float64 reference, and gsplat 1.5.3.
 
 use super::backends::{Backend, backends};
 use super::fixtures::{Npz, needs_shared, points, view, widened};
@@ -9,7 +9,7 @@ fn recorded(npz: &mut Npz, k: &str, l: &str, w: &str) -> Sums {
     k.into_iter().zip(l).zip(w).map(|((k, l), w)| ((k.into(), l.into()), w)).collect()
 }
 
-/// Returns the absolute differences over the union of both sets of pairs.
+/// Absolute differences over the union of both sets of pairs.
 fn differences(found: &Sums, expected: &Sums) -> Sums {
     let at = |sums: &Sums, key| sums.get(key).copied().unwrap_or(0.0);
     found
@@ -19,8 +19,8 @@ fn differences(found: &Sums, expected: &Sums) -> Sums {
         .collect()
 }
 
-/// A pixel may fall on the other side of the cut at alpha = 1/255 (0.004 of weight): gsplat itself
-/// differs from the reference by up to 0.0045 in an entry and 4.8e-6 in all.
+/// A pixel may fall on the other side of the cut at alpha = 1/255 (0.004 of weight): gsplat itself differs from the
+/// reference by up to 0.0045 in an entry, 4.8e-6 in total.
 #[needs_shared]
 #[test]
 fn garden_weights_are_those_of_the_float64_reference() {
@@ -76,8 +76,7 @@ const GROUPS: [&str; 11] = [
     "beyond the field of view",
 ];
 
-/// gsplat's own single-precision kernel reaches 4.6e-4 (needles) near the origin, and is wrong by
-/// 2.5 at 500 km from it.
+/// gsplat's single-precision kernel reaches 4.6e-4 (needles) near the origin, and is wrong by 2.5 at 500 km.
 #[needs_shared]
 #[test]
 fn extremes_are_those_of_the_float64_reference_also_500_km_from_the_origin() {

@@ -1,8 +1,8 @@
 //! Brute force in float64: every pixel over all Gaussians sorted by depth, no tiles.
 //!
-//! Written from the conventions of the recorded data; it shares no arithmetic with the rasteriser.
-//! Where rounding decides on which side of a cut a pixel falls (alpha = 1/255, transmittance = 1e-4),
-//! both sides are right: the truth is then an interval, and no wider than that.
+//! Written from the conventions of the recorded data; shares no arithmetic with the rasteriser. Where rounding
+//! decides the side of a cut (alpha = 1/255, transmittance = 1e-4), both are right: the truth is an interval, and
+//! no wider.
 
 use std::collections::BTreeMap;
 
@@ -16,12 +16,12 @@ pub struct Projected {
     /// Camera z.
     pub depth: f64,
     mean_px: DVec2,
-    /// The principal axes of the ellipse, each divided by its standard deviation.
+    /// Principal axes of the ellipse, each divided by its standard deviation.
     axes: [DVec2; 2],
     opacity: f64,
 }
 
-/// Returns the view's visible Gaussians, near to far.
+/// Visible Gaussians, near to far.
 fn project(scene: &Gaussians, view: &RasterView) -> Vec<Projected> {
     let camera = &view.intrinsics;
     let (fx, fy) = (camera.focal_x_px, camera.focal_y_px);
@@ -57,8 +57,8 @@ fn project(scene: &Gaussians, view: &RasterView) -> Vec<Projected> {
 
 /// Returns the principal axes of `F F' + 0.3 I` over their standard deviations, for the rows of F.
 ///
-/// A rotation that makes the rows orthogonal (one-sided Jacobi; Hestenes 1958) gives the short axis of
-/// a needle to the condition of F; the textbook inverse of the covariance has the square of it.
+/// One-sided Jacobi (Hestenes 1958) makes the rows orthogonal, which gives a needle's short axis to the condition
+/// of F; the textbook inverse of the covariance has its square.
 fn whitening_axes(row_x: DVec3, row_y: DVec3) -> [DVec2; 2] {
     let angle = 0.5 * (2.0 * row_x.dot(row_y)).atan2(row_x.length_squared() - row_y.length_squared());
     let (sin, cos) = angle.sin_cos();
@@ -68,22 +68,21 @@ fn whitening_axes(row_x: DVec3, row_y: DVec3) -> [DVec2; 2] {
     })
 }
 
-/// A value, and its bounds where rounding decides on a cut.
+/// A value, and its bounds if rounding decides on a cut.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Truth {
-    /// In float64.
     pub value: f64,
-    /// The least right value.
+    /// Least right value.
     pub low: f64,
-    /// The greatest right value.
+    /// Largest right value.
     pub high: f64,
-    /// How far the value moves, per relative error of every alpha: its own, and in the light that
-    /// surfaces of opacity near 1 leave, the share `alpha / (1 - alpha)` of theirs.
+    /// Change of the value per relative error of every alpha: its own, and, in the light past surfaces of opacity
+    /// near 1, the share `alpha / (1 - alpha)` of theirs.
     pub sensitivity: f64,
 }
 
 impl Truth {
-    /// Returns the distance of a value from the right interval.
+    /// Distance of a value from the right interval.
     pub fn distance(&self, found: f64) -> f64 {
         (self.low - found).max(found - self.high).max(0.0)
     }
@@ -98,9 +97,8 @@ impl std::ops::AddAssign for Truth {
     }
 }
 
-/// Calls `f(Gaussian, pixel, weight)` for each Gaussian that counts at a pixel.
-///
-/// `cut_tolerance`: the relative error of alpha within which a pixel may fall on either side of a cut.
+/// Calls `f(Gaussian, pixel, weight)` for each Gaussian that counts at a pixel. `cut_tolerance`: relative error of
+/// alpha within which a pixel may fall on either side of a cut.
 pub fn each_weight(
     scene: &Gaussians,
     view: &RasterView,
@@ -140,7 +138,7 @@ pub fn each_weight(
                 sensitivity: high * own_sensitivity,
             };
             f(gaussian, pixel, weight);
-            // A pixel that may be finished has no light left at worst.
+            // A pixel that may be opaque has no light left in the worst case.
             light.low = gate(low_goes_on, light.low * (1.0 - alpha));
             if counts {
                 light.value = gate(value_goes_on, light.value * (1.0 - alpha));
@@ -155,7 +153,6 @@ pub fn each_weight(
 /// Contributions by (Gaussian, region).
 pub type Sums = BTreeMap<(u32, u32), Truth>;
 
-/// Returns the sums of [`each_weight`] over regions.
 pub fn weights(scene: &Gaussians, view: &RasterView, regions: &RegionMap, cut_tolerance: f64) -> Sums {
     let mut sums = Sums::new();
     each_weight(scene, view, cut_tolerance, |gaussian, pixel, weight| {
@@ -167,8 +164,7 @@ pub fn weights(scene: &Gaussians, view: &RasterView, regions: &RegionMap, cut_to
     sums
 }
 
-/// Colour by the published formula of real spherical harmonics in factored form (Sloan 2008, A2), not
-/// by the polynomials that renderers use.
+/// Colour by the factored formula of real spherical harmonics (Sloan 2008, A2), not by the renderers' polynomials.
 pub fn colour(scene: &Gaussians, index: usize, view: &RasterView) -> DVec3 {
     let position = view.camera_from_world.inverse().translation;
     let d = (scene.means_in_world[index] - position).normalize();
@@ -190,7 +186,7 @@ pub fn colour(scene: &Gaussians, index: usize, view: &RasterView) -> DVec3 {
     colour.max(DVec3::ZERO)
 }
 
-/// Returns the real spherical harmonic with the Condon-Shortley phase, as 3DGS has it.
+/// Real spherical harmonic with the Condon-Shortley phase, as in 3DGS.
 fn spherical_harmonic(l: i32, m: i32, d: DVec3) -> f64 {
     let (theta_cos, phi) = (d.z, d.y.atan2(d.x));
     let factorial = |n: i32| (1..=n).map(f64::from).product::<f64>();
@@ -205,7 +201,7 @@ fn spherical_harmonic(l: i32, m: i32, d: DVec3) -> f64 {
     }
 }
 
-/// Returns P_l^m with the factor (-1)^m, by recurrence (Press et al., Numerical Recipes, 6.7).
+/// P_l^m with the factor (-1)^m, by recurrence (Press et al., Numerical Recipes, 6.7).
 fn associated_legendre(l: i32, m: i32, x: f64) -> f64 {
     let mut p_mm = 1.0;
     for i in 1..=m {

@@ -13,7 +13,6 @@ use slag_math::random::Random;
 
 type Edit = Box<dyn Fn(&mut Gaussians, usize)>;
 
-/// Every field with every invalid value.
 fn poisons() -> Vec<(String, Edit)> {
     let mut all: Vec<(String, Edit)> = Vec::new();
     for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
@@ -44,7 +43,6 @@ fn poisons() -> Vec<(String, Edit)> {
     all
 }
 
-/// Poisons a Gaussian in front of the scene in every way.
 #[test]
 fn values_that_are_no_numbers() {
     let random = &mut Random::new(8);
@@ -78,7 +76,7 @@ fn values_that_are_no_numbers() {
     }
 }
 
-/// Finite numbers beyond the arithmetic: seen nowhere or rejected, never an infinity in the result.
+/// Finite numbers beyond the arithmetic: invisible or rejected, never an infinity in the result.
 #[test]
 fn numbers_beyond_the_arithmetic() {
     let random = &mut Random::new(9);
@@ -88,7 +86,7 @@ fn numbers_beyond_the_arithmetic() {
     let world_from_camera = view.camera_from_world.inverse();
     let ahead = world_from_camera.transform_vector3(DVec3::Z);
     let mut beyond = scene.clone();
-    // A variance that f32 does not hold, a mean beyond the far plane, and products that overflow f64.
+    // A variance beyond f32, a mean beyond the far plane, and products that overflow f64.
     for (mean, scale) in [
         (world_from_camera.transform_point3(DVec3::Z), f64::from(f32::MAX)),
         (ahead * 1e20, 1.0),
@@ -111,7 +109,7 @@ fn numbers_beyond_the_arithmetic() {
     }
 }
 
-/// Rotations of files, and whether a reader can normalise them.
+/// Rotations in files, and whether a reader can normalise them.
 const QUATERNIONS: [([f64; 4], bool); 9] = [
     ([0.0; 4], false),
     ([f64::NAN, 0.0, 0.0, 1.0], false),
@@ -125,7 +123,7 @@ const QUATERNIONS: [([f64; 4], bool); 9] = [
     ([3e38, -1e38, 2e38, 0.0], true),
 ];
 
-/// Oracle: the quaternion normalised after scaling by its largest component.
+/// Oracle: normalisation after scaling by the largest component.
 #[test]
 fn rotations_through_the_readers() {
     let cases: Vec<Case> = (0..20)
@@ -162,7 +160,7 @@ fn rotations_through_the_readers() {
     Row { name: "rotations", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
-/// Rotations of .splat files are bytes; four zeros are no rotation.
+/// .splat files store rotations as bytes; four zeros are invalid.
 #[test]
 fn rotations_of_dot_splat() {
     let row = |rotation: [u8; 4]| {
@@ -179,7 +177,7 @@ fn rotations_of_dot_splat() {
     assert_eq!((0..3).map(|i| scene.is_usable(i)).collect::<Vec<_>>(), [false, true, true]);
 }
 
-/// A rotation given in memory must have unit length to 5e-4; it is then normalised in f64.
+/// In memory, a rotation must have unit length to 5e-4; it is then normalised in f64.
 #[test]
 fn rotations_in_memory() {
     let lengths = [0.0, 1e-45, 1e-20, 0.5, 0.999, 0.9996, 1.0, 1.0004, 1.001, 2.0, 1e20, 3e38];

@@ -7,9 +7,9 @@ use slag_encoder::raster::RasterView;
 use slag_math::random::Random;
 
 pub trait SceneRandom {
-    /// Returns a number whose logarithm is evenly spread.
+    /// Log-uniform.
     fn log_between(&mut self, low: f64, high: f64) -> f64;
-    /// Returns a point of the image or of a border as wide as a quarter of it, and a depth.
+    /// A point in the image or in a border of a quarter of its width, and a depth.
     fn in_view(&mut self, view: &RasterView, depths: [f64; 2]) -> DVec3;
     fn direction(&mut self) -> DVec3;
 }
@@ -71,7 +71,7 @@ pub fn random_scene(random: &mut Random, n: usize, view: &RasterView, sh_degree:
 
 pub fn random_regions(random: &mut Random, view: &RasterView, n_regions: u32) -> RegionMap {
     let (width_px, height_px) = (view.intrinsics.width_px, view.intrinsics.height_px);
-    // Runs of random length, so that there are both uniform and mixed stretches.
+    // Runs of random length give uniform and mixed stretches.
     let mut region_of_pixel = Vec::new();
     while region_of_pixel.len() < (width_px * height_px) as usize {
         let region = if random.below(5) == 0 { NO_REGION } else { random.below(n_regions) };
@@ -82,7 +82,7 @@ pub fn random_regions(random: &mut Random, view: &RasterView, n_regions: u32) ->
     RegionMap { width_px, height_px, region_of_pixel, n_regions }
 }
 
-/// Returns a camera somewhere near the origin, its principal point near the middle.
+/// A camera near the origin, its principal point near the middle.
 pub fn posed(random: &mut Random, [width_px, height_px]: [u32; 2], focal_px: f64) -> RasterView {
     let mut view = random_view(random, width_px, height_px);
     view.intrinsics.focal_x_px = focal_px;
@@ -98,7 +98,6 @@ pub fn unproject(view: &RasterView, x_px: f64, y_px: f64, depth: f64) -> DVec3 {
     DVec3::new(x, y, 1.0) * depth
 }
 
-/// Appends a Gaussian of random rotation.
 pub fn push(
     scene: &mut Gaussians,
     view: &RasterView,

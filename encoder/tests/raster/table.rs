@@ -1,4 +1,4 @@
-//! Rows of the table in docs/numerics.md: a range of inputs, and the error that is claimed for it.
+//! Rows of the table in docs/numerics.md: a range of inputs and its claimed error.
 
 use std::collections::BTreeMap;
 
@@ -32,13 +32,12 @@ pub struct Row {
     pub range: &'static str,
     /// Largest error of a contribution over its sensitivity; see [`oracle::Truth`].
     pub claimed: f64,
-    /// Least sensitivity that errors are divided by.
+    /// Least sensitivity by which errors are divided.
     pub unit_px: f64,
 }
 
 impl Row {
-    /// Compares every contribution of every case with the oracle, on every backend, and prints the row, with the
-    /// backend's distance from the first one outside cuts.
+    /// Checks every contribution on every backend against the oracle; prints the row, with distances from the first.
     pub fn check(&self, cases: &[Case]) {
         let mut of_first: Vec<Weights> = Vec::new();
         for (b, backend) in backends().iter().enumerate() {

@@ -1,5 +1,5 @@
-//! `slag-manual`: writes manual pages and shell completions of all programs, from the definitions that parse their
-//! command lines. A program of its own, so that the others carry neither generator.
+//! `slag-manual`: writes manual pages and shell completions of all programs from their command-line definitions. A
+//! separate program, so that the others carry neither generator.
 
 use std::path::{Path, PathBuf};
 
@@ -34,7 +34,6 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// Writes the pages and completions of one program.
 fn write(mut program: Command, out: &Path) -> Result<()> {
     let name = program.get_name().to_owned();
     let place = || format!("{name}: {} cannot be written to", out.display());

@@ -1,9 +1,8 @@
-//! What tests of several crates share: the test data beside the project, and an allocator that counts.
+//! Shared by tests of several crates: test data beside the project, and an allocator that counts.
 //!
-//! Some tests use scenes and models that are too large for the repository. They lie in `../shared`, or in the
-//! folder that `SLAG_SHARED` names. Mark such a test with [`needs_shared`]: where the data is absent, `cargo test`
-//! lists the test as ignored; in CI it runs and fails. Tests that take minutes and guard against rare faults are
-//! marked with [`nightly`].
+//! Scenes and models that are too large for the repository are in `../shared`, or in the folder `SLAG_SHARED`.
+//! Mark tests that use them with [`needs_shared`]: without the data, `cargo test` lists them as ignored; in CI
+//! they run and fail. Tests that take minutes and guard against rare faults are marked with [`nightly`].
 
 mod loop_disk;
 mod memory;
@@ -14,7 +13,7 @@ pub use loop_disk::{BLOCK_BYTES, LoopDisk};
 pub use memory::{CountingAllocator, Taken, memory_of};
 pub use slag_test_needs::{needs_loop_disk, needs_shared, nightly};
 
-/// Returns how often a test tries: `few` times, or `many` in the nightly checks.
+/// Number of trials: `few`, or `many` in the nightly checks.
 pub fn trials<T>(few: T, many: T) -> T {
     if is_nightly() { many } else { few }
 }
@@ -27,7 +26,7 @@ pub fn workspace_root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
 }
 
-/// Returns the folder of the shared test data, or `None` where it is absent.
+/// The folder of the shared test data, if it exists.
 pub fn shared_folder() -> Option<PathBuf> {
     let folder = std::env::var_os("SLAG_SHARED");
     let folder = folder.map_or_else(|| workspace_root().join("../shared"), PathBuf::from);
@@ -45,7 +44,7 @@ pub fn shared(path: &str) -> PathBuf {
     found
 }
 
-/// Returns the path of the ONNX Runtime library that `scripts/setup.sh` installs.
+/// The ONNX Runtime library that `scripts/setup.sh` installs.
 pub fn onnx_runtime() -> PathBuf {
     let library = format!("target/onnxruntime/{}/libonnxruntime.so", std::env::consts::ARCH);
     let library = workspace_root().join(library);

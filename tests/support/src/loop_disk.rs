@@ -1,10 +1,10 @@
-//! A small real disk whose sectors can be broken.
+//! A small real disk with sectors that can be broken.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Blocks of a file that its inode names itself; the others are named by an indirect block.
+/// Blocks that a file's inode lists itself; an indirect block lists the others.
 pub const N_DIRECT_BLOCKS: usize = 12;
 pub const BLOCK_BYTES: usize = 1024;
 
@@ -16,7 +16,6 @@ pub struct LoopDisk {
 }
 
 impl LoopDisk {
-    /// Makes and mounts a disk of 8 MiB in a folder.
     pub fn new(dir: &Path) -> Self {
         let disk = Self { image: dir.join("disk.img"), at: dir.join("disk") };
         fs::create_dir_all(&disk.at).expect("a folder");
@@ -42,7 +41,7 @@ impl LoopDisk {
         run(Command::new("debugfs").args(["-w", "-R", request]).arg(&self.image))
     }
 
-    /// Lets a block of a file lie beyond the disk, so that reading it fails with EIO. No program may use the disk.
+    /// Moves a block of a file beyond the disk, so that reading it fails with EIO. No program may use the disk.
     pub fn break_block(&self, file: &Path, block: usize) {
         let name = file.strip_prefix(&self.at).expect("on the disk").display();
         self.unmount();
@@ -54,7 +53,7 @@ impl LoopDisk {
         self.mount();
     }
 
-    /// Breaks the inode of a file, so that the file can neither be looked at, nor opened, nor replaced.
+    /// Breaks a file's inode, so that it can be neither examined, nor opened, nor replaced.
     pub fn break_inode(&self, file: &Path) {
         let name = file.strip_prefix(&self.at).expect("on the disk").display();
         self.unmount();
@@ -65,7 +64,7 @@ impl LoopDisk {
 
 impl Drop for LoopDisk {
     fn drop(&mut self) {
-        // Lazily: a program that a failed test left behind may use it.
+        // Lazily: a program left by a failed test may use it.
         let _ = Command::new("umount").arg("-l").arg(&self.at).status();
     }
 }

@@ -4,7 +4,7 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-/// The system's allocator; it counts the bytes of each thread. A test crate makes it its `#[global_allocator]`.
+/// The system's allocator, counting bytes per thread. Test crates make it their `#[global_allocator]`.
 pub struct CountingAllocator;
 
 thread_local! {
@@ -41,16 +41,15 @@ unsafe impl GlobalAlloc for CountingAllocator {
     }
 }
 
-/// Memory that a piece of work took on its thread, in bytes.
+/// Memory that work took on its thread, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Taken {
-    /// Peak of all that it held at once.
     pub peak_bytes: usize,
     /// Largest single request.
     pub largest_bytes: usize,
 }
 
-/// Returns the result of `work` and the memory that it took, where [`CountingAllocator`] is the global allocator.
+/// Returns the result of `work` and its memory, if [`CountingAllocator`] is the global allocator.
 pub fn memory_of<T>(work: impl FnOnce() -> T) -> (T, Taken) {
     let before = LIVE_BYTES.get();
     PEAK_BYTES.set(before);

@@ -1,5 +1,6 @@
-//! Oracle: poselib 2.0.5 (`poselib.p3p`), problems from `numpy.random.default_rng(47)`: a random rotation, a translation of up
-//! to 3 along each axis, points at depths of 2 to 8; rays are `R X + t` normalised, centres `-R' t`, rounded.
+//! Oracle: poselib 2.0.5 (`poselib.p3p`) on problems from `numpy.random.default_rng(47)`: a random rotation, a
+//! translation of up to 3 along each axis, points at depths of 2 to 8; rays are `R X + t` normalised, centres `-R'
+//! t`, rounded.
 
 use super::*;
 

@@ -1,6 +1,6 @@
 use super::*;
 
-/// A path of two flat stretches, a step between them and one vertex apart; worked out by hand.
+/// A path of two flat stretches, a step between them and an outlier vertex; worked out by hand.
 #[test]
 fn a_step_separates_and_a_small_component_joins_its_neighbour() {
     let heights = [0.0_f32, 0.1, 0.2, 0.3, 5.0, 5.1, 5.2, 9.0];
@@ -17,7 +17,7 @@ fn a_step_separates_and_a_small_component_joins_its_neighbour() {
     assert_eq!((numbering.of_item, numbering.sizes), (vec![0, 0, 0, 0, 1, 1, 1, 1], vec![4, 4]));
 }
 
-/// Oracle: each edge in turn. Weights repeat, so that equal ones come in one block.
+/// Oracle: each edge in turn. Weights repeat, so that blocks have equal ones.
 #[test]
 fn all_at_once_is_as_one_by_one() {
     let mut random = crate::random::Random::new(17);
@@ -45,7 +45,6 @@ fn all_at_once_is_as_one_by_one() {
     }
 }
 
-/// The threshold of a component falls with its size: what one vertex accepts, ten do not.
 #[test]
 fn large_components_accept_less() {
     let mut components = Components::new(12, 3.0);

@@ -5,7 +5,7 @@ fn random(n: usize, seed: u64) -> Vec<f32> {
     (0..n as u64).map(|i| (mix64(seed << 32 | i) >> 40) as f32 / (1u64 << 23) as f32 - 1.0).collect()
 }
 
-/// Oracle: the same sums in float64, and the first column of the largest.
+/// Oracle: the same sums in float64; the first column of the largest.
 #[test]
 fn products_and_largest_columns() {
     for (n, k, width) in [(1, 1, 1), (7, 5, 33), (300, 96, 70), (9, 130, 512)] {
@@ -30,7 +30,7 @@ fn products_and_largest_columns() {
     }
 }
 
-/// Whatever vectors the machine has, the bits are those of single numbers.
+/// Whatever the vector width, the bits are those of scalar code.
 #[test]
 fn every_width_of_vectors_gives_the_same_bits() {
     let (a, b) = (random(30 * 65, 1), random(65 * 77, 2));

@@ -20,7 +20,7 @@ fn by_sorting(points: &[[f64; 3]], n: usize) -> Vec<Vec<u32>> {
 #[test]
 fn neighbours_are_those_of_sorting() {
     let mut random = Random::new(3);
-    // Spread, on a coarse lattice (many equal distances), in heaps of equal points, on a line, and far away.
+    // Scattered, on a coarse lattice (many equal distances), in heaps of equal points, on a line, and far away.
     let spread: Vec<[f64; 3]> = (0..1500).map(|_| [0; 3].map(|_| random.between(-1.0, 1.0))).collect();
     let lattice = (0..1500).map(|_| [0; 3].map(|_| random.between(0.0, 6.0).floor())).collect();
     let heaps = spread.iter().map(|p| p.map(|v| (v * 2.0).round())).collect();
@@ -56,7 +56,7 @@ fn threads_do_not_show() {
     assert_eq!(with(1), with(3));
 }
 
-/// Some exports move pruned Gaussians to one place. Comparing all pairs of these would take 4e10 comparisons.
+/// Some exports move pruned Gaussians to one place; comparing all their pairs would take 4e10 comparisons.
 #[test]
 fn a_heap_takes_no_longer_than_spread_points() {
     let found = Neighbours::new(&vec![[1.0; 3]; 200_000], 8);

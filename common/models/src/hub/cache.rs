@@ -1,4 +1,4 @@
-//! The models of the table, and those in the user's cache.
+//! Models of the table, and those in the user's cache.
 
 use std::path::{Path, PathBuf};
 
@@ -24,7 +24,6 @@ pub enum Here {
     All,
 }
 
-/// The models of the table and those in a folder.
 #[derive(Debug)]
 pub struct Hub {
     table: Table,
@@ -32,7 +31,6 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// Returns the hub with the built-in table.
     pub fn new(options: HubOptions) -> Result<Self, HubError> {
         Ok(Self { table: Table::embedded()?, options })
     }
@@ -54,7 +52,7 @@ impl Hub {
         self.table.find(name).ok_or_else(|| HubError::Unknown { name: name.to_owned(), known: known() })
     }
 
-    /// Returns the part of a model that is in the cache; files are not read.
+    /// Returns the part of a model that is in the cache, without reading files.
     pub fn here(&self, entry: &Entry) -> Here {
         let folder = self.folder(entry);
         if entry.export.is_some() {
@@ -71,8 +69,8 @@ impl Hub {
 
     /// Pulls the missing files of a model and writes its `model.toml`.
     ///
-    /// Only one pull runs at a time; others wait. An interrupted pull leaves whole files, and partial ones that
-    /// the next pull resumes.
+    /// Only one pull runs at a time; others wait. An interrupted pull leaves complete files, and partial ones for
+    /// the next pull to resume.
     /// # Errors
     /// [`HubError`]; [`HubError::Licence`] if the licence restricts use and was not accepted, now or earlier.
     pub fn pull(&self, name: &str, side: Side, accepts_licence: bool) -> Result<Vec<PulledFile>, HubError> {
@@ -98,7 +96,7 @@ impl Hub {
         fs_err::create_dir_all(root)?;
         let guard = fs_err::File::create(root.join(".pull"))?;
         guard.file().lock()?;
-        // Another pull may have changed it meanwhile.
+        // Another pull may have changed it.
         lock = Lock::read(root)?;
         lock.entry(name).licence.clone_from(&entry.licence);
         let client = client(&self.options)?;
@@ -120,7 +118,7 @@ impl Hub {
         Ok(pulled)
     }
 
-    /// Compares the hash of every file of a model with the recorded one.
+    /// Compares the hash of every file with the recorded one.
     pub fn verify(folder: &Path) -> Result<Vec<String>, HubError> {
         let described = Described::read(folder)?;
         let root = folder.join(described.files_root());
@@ -141,12 +139,11 @@ impl Hub {
         Ok(verified)
     }
 
-    /// Returns the folder of the model `name`: that of a pulled model if `name` is one and not itself a folder
-    /// with a `model.toml`, else `name`.
+    /// Returns `name` if it has a `model.toml` or is not in the table, else the pulled model's folder.
     pub fn resolve(&self, name: &Path) -> Result<PathBuf, HubError> {
         let entry = name.to_str().and_then(|name| self.table.find(name));
         match entry {
-            // A folder of that name without a model in it does not hide the name.
+            // A folder without a model does not hide the name.
             Some(entry) if !name.join(description::FILE_NAME).is_file() => match self.here(entry) {
                 Here::No => Err(HubError::NotPulled { name: entry.name.clone() }),
                 _ => Ok(self.folder(entry)),

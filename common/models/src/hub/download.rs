@@ -1,4 +1,4 @@
-//! Files of the hub: their metadata, and downloads into files beside their places.
+//! Files of the hub: metadata, and downloads into partial files.
 
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -13,11 +13,11 @@ use crate::download::{
     Client, DownloadError, DownloadFailure, Expected, NetworkLimits, Part, Watch, header_text, refusal,
 };
 
-/// Limit on the size of a file: ONNX files of 2 GiB and more are split.
+/// Largest file: ONNX files of 2 GiB and more are split.
 pub const MAX_FILE_BYTES: u64 = 2 << 30;
-/// Limit on redirects of a request; the hub redirects large files to its store.
+/// Most redirects; the hub redirects large files to its store.
 const MAX_REDIRECTS: usize = 5;
-/// Limit on consecutive attempts without progress.
+/// Most consecutive attempts without progress.
 const MAX_ATTEMPTS: u32 = 5;
 
 #[derive(Clone, Debug)]
@@ -29,7 +29,7 @@ pub struct HubOptions {
     /// Proxy, in the format of `HTTPS_PROXY`.
     pub proxy: Option<String>,
     pub timeout: Duration,
-    /// Wait before the second attempt; doubled before each further one.
+    /// Pause before the second attempt; doubled each time.
     pub first_backoff: Duration,
 }
 
@@ -51,7 +51,7 @@ impl Watch for Log {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Advertised {
     pub revision: Option<String>,
-    /// Its SHA-256: the hub's ETag of a file kept in large-file storage.
+    /// The hub's ETag of a file in large-file storage.
     pub sha256: Option<Sha256>,
     pub len_bytes: Option<u64>,
 }
@@ -75,7 +75,7 @@ pub(super) fn ask(client: &Client<'_>, url: &str) -> Result<Advertised, Download
     let own = host(url);
     client.retrying(url, || {
         let mut advertised = Advertised::default();
-        // Only the hub's own responses have the metadata, not its store's.
+        // Only responses of the hub itself have the metadata.
         let mut seen = |uri: &ureq::http::Uri, response: &Response<ureq::Body>| {
             if uri.authority() == own.as_ref() {
                 advertised.take(response);
@@ -105,11 +105,11 @@ impl Advertised {
     }
 }
 
-/// A file on its way, and its entity tag beside it.
+/// A partial file, with its entity tag beside it.
 pub(super) struct PartialFile(pub PathBuf);
 
 impl PartialFile {
-    /// Downloads until the file is whole; returns whether it existed before. `len_bytes`: its length, if known.
+    /// Downloads the file completely; returns whether a part existed. `len_bytes`: its length, if known.
     pub fn receive(
         &self,
         client: &Client<'_>,

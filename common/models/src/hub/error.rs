@@ -27,7 +27,7 @@ pub enum HubError {
     NotExported { name: String, repository: String, script: String, folder: PathBuf },
     #[error("{name} finds masks in photos, which a robot does not do; pull it with slag-encoder")]
     NoTextSide { name: String },
-    // A line for each file: together they are too long to be read.
+    // A line per file; in one line they would be unreadable.
     #[error("{url}: {failure}; try again, or place these files by hand:{}", wanted.iter().map(Wanted::to_string).collect::<String>())]
     Unreachable { url: String, failure: Box<DownloadError>, wanted: Vec<Wanted> },
     #[error("{name} is not pulled yet; run `models pull {name}`, or give the folder of your own model")]
@@ -85,9 +85,9 @@ pub enum Source {
     Table,
     /// The hub, which advertises it.
     Hub,
-    /// None: it is the hash of the first download.
+    /// Trust on first use: the hash of the first download.
     FirstPull,
-    /// None: it is the hash of a file placed by hand.
+    /// The hash of a file placed by hand.
     PlacedByHand,
 }
 

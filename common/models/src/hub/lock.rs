@@ -1,4 +1,4 @@
-//! `models.lock`: the hashes accepted in a model's first pull, so that later pulls give the same files.
+//! `models.lock`: hashes accepted in a model's first pull, so that later pulls give the same files.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -32,19 +32,18 @@ pub struct LockedFile {
 }
 
 impl LockedFile {
-    /// Returns the error for a file with another hash.
+    /// The error for a file with another hash.
     pub(super) fn refusal(self, path: PathBuf, found: Sha256, advice: &'static str) -> HubError {
         HubError::Hash { path, found, expected: self.sha256, by: self.hash_source, advice }
     }
 }
 
-/// Returns the path of the lock in the folder of models.
 fn path_in(root: &Path) -> PathBuf {
     root.join("models.lock")
 }
 
 impl Lock {
-    /// Reads the lock in the folder of models; returns an empty one if there is none.
+    /// Reads the lock; empty if there is none.
     pub fn read(root: &Path) -> Result<Self, HubError> {
         let path = path_in(root);
         match fs_err::read(&path) {
@@ -64,7 +63,6 @@ impl Lock {
         self.models.get(name)
     }
 
-    /// Returns the mutable entry of a model; creates it if absent.
     pub(super) fn entry(&mut self, name: &str) -> &mut Accepted {
         self.models.entry(name.to_owned()).or_default()
     }

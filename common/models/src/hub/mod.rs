@@ -1,8 +1,7 @@
 //! Pulls public models into the user's cache, checks their hashes, and writes their [`ModelDir`](crate::ModelDir).
 //!
-//! A file's expected SHA-256 is that of the [`Table`], else that of the [`Lock`], else the one that the hub
-//! advertises. If none of them has it (small files), the hash of the first download from the pinned commit is
-//! accepted, recorded in the lock, and reported as such.
+//! A file's expected SHA-256 comes from the [`Table`], else the [`Lock`], else the hub. If none has it (small
+//! files), the hash of the first download from the pinned commit is accepted, recorded in the lock, and reported.
 
 mod cache;
 mod download;

@@ -1,4 +1,4 @@
-//! One pull: downloads and checks the files of a model and records them in the lock.
+//! One pull: downloads and checks a model's files and records them in the lock.
 
 use std::path::{Path, PathBuf};
 
@@ -19,10 +19,10 @@ pub enum Side {
     Both,
 }
 
-/// A pulled file, or one that was already present.
+/// A file that was pulled or already present.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PulledFile {
-    /// Its path below the model's folder.
+    /// Below the model's folder.
     pub path: String,
     pub sha256: Sha256,
     pub hash_source: Source,
@@ -47,7 +47,6 @@ impl Pull<'_> {
         format!("{hub}/{}/resolve/{revision}/{path}", self.entry.repository)
     }
 
-    /// Returns the expected hash of a file from the table or the lock.
     pub(super) fn expected(&self, path: &str) -> Option<LockedFile> {
         let known = self.entry.known.get(path);
         let known = known.map(|known| LockedFile { sha256: known.sha256, hash_source: Source::Table });
@@ -73,7 +72,7 @@ impl Pull<'_> {
         HubError::Unreachable { url: url.to_owned(), failure: Box::new(failure), wanted: wanted.collect() }
     }
 
-    /// Requests a file's metadata from the hub; it must belong to the pulled commit.
+    /// Requests a file's metadata, which must belong to the pulled commit.
     fn ask(&mut self, url: &str) -> Result<Advertised, HubError> {
         let advertised = ask(&self.client, url).map_err(|failure| self.unreachable(url, failure))?;
         if let Some(found) = advertised.revision.clone() {
@@ -88,7 +87,7 @@ impl Pull<'_> {
         Ok(advertised)
     }
 
-    /// Obtains the image model's hashes even if its files are not pulled: they are part of the encoder id.
+    /// Records the image model's hashes even if its files are not pulled: they are part of the encoder id.
     pub(super) fn name_image(&mut self) -> Result<(), HubError> {
         for path in self.entry.image_paths() {
             if self.expected(path).is_some() {
@@ -112,7 +111,7 @@ impl Pull<'_> {
         let found = Sha256(hash_file(&target)?);
         let expected = match self.expected(path) {
             Some(expected) => expected,
-            // Placed by hand, with no expected hash in the table or the lock.
+            // Placed by hand, without an expected hash.
             None => match ask(&self.client, &self.url(path)).ok().and_then(|advertised| advertised.sha256) {
                 Some(sha256) => LockedFile { sha256, hash_source: Source::Hub },
                 None => LockedFile { sha256: found, hash_source: Source::PlacedByHand },
@@ -126,7 +125,7 @@ impl Pull<'_> {
         Ok(PulledFile { path: path.to_owned(), sha256, hash_source, was_here })
     }
 
-    /// Downloads a file to `target`; returns its hash and the source of the expected hash.
+    /// Returns the file's hash and the source of the expected hash.
     fn download(&mut self, path: &str, target: &Path) -> Result<LockedFile, HubError> {
         let url = self.url(path);
         let expected = self.expected(path);
@@ -155,7 +154,7 @@ impl Pull<'_> {
                 return Ok(expected);
             }
             part.discard()?;
-            // The existing part may belong to another version of the file: try once more from the start.
+            // The part may belong to another version of the file: retry once from the start.
             if !was_begun {
                 let advice = "the download was discarded: pull again, or give another --hub";
                 return Err(expected.refusal(target.to_owned(), found, advice));
@@ -164,8 +163,7 @@ impl Pull<'_> {
     }
 }
 
-/// Returns the folder of the user's caches: `$XDG_CACHE_HOME/slag`, else `~/.cache/slag`; `variable` looks up
-/// environment variables.
+/// The user's cache folder, `$XDG_CACHE_HOME/slag`, else `~/.cache/slag`; `variable` looks up environment variables.
 pub fn cache_folder(variable: impl Fn(&str) -> Option<std::ffi::OsString>) -> Option<PathBuf> {
     // The XDG base directory specification ignores relative paths.
     let absolute = |name: &str| variable(name).map(PathBuf::from).filter(|path| path.is_absolute());

@@ -6,7 +6,6 @@ use serde::Deserialize;
 
 use crate::description::Sha256;
 
-/// The contents of `models.toml`.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Table {
@@ -16,44 +15,41 @@ pub struct Table {
     pub models: Vec<Entry>,
 }
 
-/// The common part of all models of one kind of export.
+/// What all models of one kind of export share.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Layout {
-    /// The end of a `model.toml`, with the role of each file in capitals in place of its path.
+    /// The end of a `model.toml`, with roles in capitals as file paths.
     description: String,
 }
 
-/// A public model.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Entry {
-    /// Its name, here and in `model.toml`.
+    /// Also the name in `model.toml`.
     pub name: String,
-    /// A description for people.
+    /// For people.
     pub about: String,
     layout: String,
-    /// Components of a vector; segmenters have none.
+    /// Dimension of vectors; segmenters have none.
     dim: Option<u32>,
     pub licence: String,
     #[serde(default)]
     pub licence_note: String,
     pub licence_url: String,
-    /// Whether the licence restricts the use of the weights (research only, for example), so that the user must
-    /// accept it.
+    /// Whether the licence restricts use (research only, for example) and must be accepted.
     #[serde(default)]
     pub restricts_use: bool,
     /// Owner and name at the hub.
     pub repository: String,
-    /// The commit; default: that of the first pull.
+    /// A commit; default: that of the first pull.
     pub revision: Option<String>,
-    /// The script that makes the files from the published weights, where no export is published; nothing is pulled
-    /// then.
+    /// Script that makes the files from published weights where no export is published; nothing can be pulled then.
     pub export: Option<String>,
     /// Files at the hub by role: `image`, `text` and `tokenizer`, or `image_encoder` and `mask_decoder`.
     #[serde(default)]
     files: BTreeMap<String, String>,
-    /// Files of weights, of ONNX files that keep them apart, by the same roles.
+    /// Separate files of weights, by the same roles.
     #[serde(default)]
     data: BTreeMap<String, String>,
     /// Known lengths and hashes of files, by path.
@@ -61,7 +57,7 @@ pub struct Entry {
     pub known: BTreeMap<String, Known>,
 }
 
-/// The roles of files, in the order of their pull; a robot needs those from [`FIRST_OF_TEXT`].
+/// Roles of files, in the order of their pull; a robot needs those from [`FIRST_OF_TEXT`].
 const ROLES: [&str; 5] = ["image_encoder", "mask_decoder", "image", "text", "tokenizer"];
 const FIRST_OF_TEXT: usize = 3;
 
@@ -73,16 +69,14 @@ pub struct Known {
 }
 
 impl Entry {
-    /// Returns the files' paths, the image side first, each followed by its file of weights; `text_only`: without
-    /// the image side.
+    /// Paths of the files, image side first, each followed by its weights; `text_only` omits the image side.
     pub fn paths(&self, text_only: bool) -> Vec<&str> {
         let roles = &ROLES[if text_only { FIRST_OF_TEXT } else { 0 }..];
         let parts = |role: &&str| [self.files.get(*role), self.data.get(*role)];
         roles.iter().flat_map(parts).flatten().map(String::as_str).collect()
     }
 
-    /// Returns the paths of the image model: the ONNX file, then its weights if they are separate. Empty without
-    /// one.
+    /// Paths of the image model: the ONNX file, then its separate weights. Empty without one.
     pub(super) fn image_paths(&self) -> Vec<&str> {
         [self.files.get("image"), self.data.get("image")].into_iter().flatten().map(String::as_str).collect()
     }
@@ -103,7 +97,7 @@ impl Table {
 
     /// Returns the `model.toml` of `entry`, with the hashes of its files.
     pub fn description(&self, entry: &Entry, sha256_of: &dyn Fn(&str) -> Option<Sha256>) -> String {
-        // Plain ASCII text, which Rust and TOML quote alike.
+        // Plain ASCII, which Rust and TOML quote alike.
         let quoted = |text: &str| format!("{text:?}");
         let dim = entry.dim.map_or(String::new(), |dim| format!("dim = {dim}\n"));
         let head = format!(
@@ -131,7 +125,7 @@ mod tests {
     use crate::description::{Description, FileRef};
     use crate::sam::SamDescription;
 
-    /// Every entry has a valid description, a unique name, and hashes of its own files only.
+    /// Every entry has a valid description, a unique name, and no hashes of foreign files.
     #[test]
     fn every_entry_can_be_pulled() {
         let table = Table::embedded().expect("it parses");

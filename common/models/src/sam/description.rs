@@ -10,7 +10,7 @@ use crate::description::{DescriptionError, FileRef, check_common, read_toml, req
 #[serde(deny_unknown_fields)]
 pub struct SamDescription {
     pub name: String,
-    /// Its strengths and limits, for people.
+    /// Strengths and limits, for people.
     #[serde(default)]
     pub about: String,
     pub licence: String,
@@ -85,7 +85,7 @@ impl SamDescription {
         Ok(description)
     }
 
-    /// Returns the files with their roles, each followed by its weights' file if there is one.
+    /// Files with their roles, each followed by separate weights.
     pub fn files(&self) -> Vec<(&'static str, &FileRef)> {
         let files = self.segment.files();
         let both =

@@ -18,9 +18,9 @@
 //! std = [0.229, 0.224, 0.225]
 //! ```
 //!
-//! Inputs and outputs are not named in the description: the decoder's inputs are matched with the encoder's
-//! outputs by name, points, labels and boxes by type and shape. Boxes, where a decoder takes them, are none. SAM
-//! 2's decoder takes one prompt a call and tells whether there is an object at all (`object_score_logits`).
+//! The description does not name inputs and outputs: the decoder's inputs are matched with the encoder's outputs
+//! by name, points, labels and boxes by type and shape. Boxes, where a decoder takes them, are left empty. SAM 2's
+//! decoder takes one prompt a call and scores the presence of an object (`object_score_logits`).
 
 mod description;
 mod names;
@@ -54,9 +54,9 @@ pub struct Sam {
     encoder: Mutex<Model>,
     decoder: Mutex<Model>,
     names: Names,
-    /// The memory of the GPU that runs both files, if one does: embeddings then stay there.
+    /// Memory of the GPU that runs both files, if one does: embeddings then stay there.
     memory: Option<DeviceMemory>,
-    /// Prompts of every call of the decoder, where it was opened for one number of them.
+    /// Prompts per call of the decoder, if it was opened for a fixed number.
     prompts_per_call: Option<usize>,
 }
 
@@ -67,16 +67,15 @@ pub struct Embedding {
     pub letterbox: Letterbox,
 }
 
-/// Where a tensor of an embedding is.
 #[derive(Debug)]
 enum Held {
     Host(Tensor),
-    /// On the GPU that the decoder runs on, too.
+    /// On the decoder's GPU.
     Device(DynTensor),
 }
 
 impl Embedding {
-    /// Returns the tensors in the processor's memory: name of the decoder's input, shape, values.
+    /// Tensors in the processor's memory: name of the decoder's input, shape, values.
     pub fn tensors(&self) -> impl Iterator<Item = (&str, &[i64], &[f32])> {
         self.tensors.iter().filter_map(|(name, held)| match held {
             Held::Host(tensor) => Some((name.as_str(), &tensor.shape[..], &tensor.values[..])),
@@ -89,8 +88,7 @@ impl Embedding {
 pub struct Decoded {
     /// The model's estimate of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
     pub predicted_ious: Vec<f32>,
-    /// The model's logit of each prompt that there is an object at all, `[prompts]`; empty if the model does not
-    /// tell.
+    /// Logit of each prompt that there is an object, `[prompts]`; empty for models without it.
     pub object_logits: Vec<f32>,
     /// Logits of the whole square, padding included: `[prompts][MASKS_PER_PROMPT][rows][columns]`.
     pub logits: Floats,
@@ -99,13 +97,12 @@ pub struct Decoded {
 }
 
 impl Sam {
-    /// Opens the directory `dir`; its `model.toml` must have `[segment]`.
+    /// `dir` must have a `model.toml` with `[segment]`.
     pub fn open(dir: &Path, options: &SessionOptions) -> Result<Self, ModelError> {
         Self::open_for(dir, options, None)
     }
 
-    /// Opens the directory `dir` with a decoder for `n_prompts` at a time, which is quicker on GPUs: fewer are
-    /// filled up.
+    /// Opens `dir` with a decoder for `n_prompts` at a time, which is faster on GPUs; fewer prompts are padded.
     pub fn open_for(
         dir: &Path,
         options: &SessionOptions,
@@ -145,13 +142,13 @@ impl Sam {
         })
     }
 
-    /// Returns the model's identity: its name, the hashes of its files, and its preprocessing.
+    /// Identity: the model's name, the hashes of its files, and its preprocessing.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// Returns an image's pixel values, `[3][size_px][size_px]`: resized (Pillow's bilinear) to fill the square
-    /// with the longer edge or, for SAM 2, with both, normalised, and padded with zeros. `image` must have pixels.
+    /// Pixel values, `[3][size_px][size_px]`: resized (Pillow's bilinear) to fill the square with the longer edge
+    /// or, for SAM 2, with both, normalised, and padded with zeros. `image` must have pixels.
     pub fn pixel_values(&self, image: &RgbImage) -> Vec<f32> {
         let Letterbox { resized_px: [width_px, height_px], .. } = self.letterbox_of(image);
         let whole = Window { left_px: 0, top_px: 0, width_px, height_px };
@@ -175,7 +172,7 @@ impl Sam {
         place(self.size_px, [image.width(), image.height()])
     }
 
-    /// Computes an image's embedding; `image` must have pixels.
+    /// `image` must have pixels.
     pub fn embed(&self, image: &RgbImage) -> Result<Embedding, SessionError> {
         let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
         let shape = vec![1, 3, size, size];
@@ -200,10 +197,8 @@ impl Sam {
         Ok(Embedding { tensors: inputs.zip(found).collect(), letterbox: self.letterbox_of(image) })
     }
 
-    /// Proposes masks for `n_prompts` prompts with the same number of points each.
-    ///
-    /// `points`: `[n_prompts][points]` in pixels of the square, see [`Letterbox::point`]. `labels`: for each
-    /// point, 1 inside the object, 0 outside, -1 no point.
+    /// Proposes masks for prompts with the same number of points. `points`: `[n_prompts][points]`, pixels of the square
+    /// ([`Letterbox::point`]). `labels` of points: 1 inside the object, 0 outside, -1 no point.
     pub fn decode(
         &self,
         embedding: &Embedding,
@@ -262,7 +257,7 @@ impl Sam {
         })
     }
 
-    /// Returns the decoder's scores, masks and, if it has them, logits of objects.
+    /// The decoder's scores, masks and, if it has them, object logits.
     fn run_decoder(
         &self,
         decoder: &mut Model,
@@ -341,27 +336,25 @@ impl Decoded {
 }
 
 /// Placement of an image in the encoder's square: the longer edge fills it and the rest is padding at the right or
-/// the bottom (SAM), or the image is stretched over it (SAM 2).
+/// bottom (SAM), or the image is stretched over it (SAM 2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Letterbox {
     pub size_px: u32,
     pub image_px: [u32; 2],
     pub resized_px: [u32; 2],
-    /// Whether the image is stretched over the square; masks then go to the image's size in one step.
+    /// Whether the image is stretched over the square; masks are then resized to the image in one step.
     pub is_stretched: bool,
 }
 
 impl Letterbox {
-    /// Returns the placement of an image of `image_px` (width, height; neither 0) in a square of `size_px` that
-    /// keeps its proportions.
+    /// Keeps the proportions of an image of `image_px` (width, height; neither 0) in a square of `size_px`.
     pub fn new(size_px: u32, image_px: [u32; 2]) -> Self {
         let scale = f64::from(size_px) / f64::from(image_px[0].max(image_px[1]));
         let resized_px = image_px.map(|edge| ((f64::from(edge) * scale + 0.5) as u32).max(1));
         Self { size_px, image_px, resized_px, is_stretched: false }
     }
 
-    /// Returns the placement of an image of `image_px` (width, height; neither 0) that is stretched over a square
-    /// of `size_px`.
+    /// Stretches an image of `image_px` (width, height; neither 0) over a square of `size_px`.
     pub fn stretched(size_px: u32, image_px: [u32; 2]) -> Self {
         Self { size_px, image_px, resized_px: [size_px; 2], is_stretched: true }
     }
@@ -378,7 +371,7 @@ impl Letterbox {
 mod tests {
     use super::*;
 
-    /// Tensors that stay in place between the two files give the same bits as copies of them.
+    /// Tensors left on the GPU between the two files give the same bits as copies.
     #[slag_test_support::needs_shared]
     #[test]
     fn bound_tensors_give_the_same_masks() {
@@ -403,7 +396,7 @@ mod tests {
         assert!(plain.logits.iter().any(|logit| *logit > 0.0) && plain.predicted_ious.len() == 9);
         sam.memory = Some(DeviceMemory::of_processor());
         assert!(decoded(&sam) == plain);
-        // A decoder for two prompts runs twice, the second time filled up.
+        // A decoder for two prompts runs twice, the second time padded.
         let mut sam = Sam::open_for(dir.path(), &options, Some(2)).expect("opens");
         assert_eq!(sam.prompts_per_call, Some(2));
         for memory in [None, Some(DeviceMemory::of_processor())] {

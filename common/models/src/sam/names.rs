@@ -1,10 +1,10 @@
-//! The inputs and outputs of SAM's two files, matched by name, type and shape.
+//! Inputs and outputs of SAM's two files, matched by name, type and shape.
 
 use ort::value::TensorElementType::{Float32, Int64};
 
 use crate::session::{Declared, Model, SessionError, declared, listed, shapes_fit};
 
-/// Masks that SAM proposes for a prompt: subpart, part and whole, in that order.
+/// SAM's masks per prompt: subpart, part and whole, in that order.
 pub const MASKS_PER_PROMPT: usize = 3;
 
 #[derive(Debug)]
@@ -14,13 +14,13 @@ pub(super) struct Names {
     pub(super) embeddings: Vec<Link>,
     pub(super) points: String,
     pub(super) labels: String,
-    /// The input for boxes, if there is one; it gets none.
+    /// Input for boxes, if there is one; it stays empty.
     pub(super) boxes: Option<String>,
     /// Whether the decoder takes one prompt a call.
     pub(super) is_one_by_one: bool,
     pub(super) scores: String,
     pub(super) masks: String,
-    /// The output that scores the presence of an object, if there is one.
+    /// Output that scores the presence of an object, if there is one.
     pub(super) objects: Option<String>,
 }
 
@@ -78,7 +78,6 @@ impl Inputs {
 }
 
 impl Names {
-    /// Matches the inputs and outputs of the two files.
     pub(super) fn discover(encoder: &Model, decoder: &Model, size_px: i64) -> Result<Self, SessionError> {
         let pixels = match &declared(encoder.session.inputs())[..] {
             [(name, Some((Float32, shape)))] if matches!(shape[..], [_, 3 | -1, _, _]) => name.clone(),
@@ -125,13 +124,13 @@ impl Names {
     }
 }
 
-/// Returns the decoder's f32 output of shape `expected`: the one called `name`, else the first that fits.
+/// Finds the decoder's f32 output of shape `expected`: the one called `name`, else the first that fits.
 fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, SessionError> {
     let outputs = declared(decoder.session.outputs());
     let fits =
         |declared: &&Declared| matches!(&declared.1, Some((Float32, shape)) if shapes_fit(shape, expected));
     let named = outputs.iter().filter(fits).find(|(found, _)| found == name);
-    // Any output fits where sizes are not declared; the object score is therefore found by its name alone.
+    // Any output fits where sizes are not declared, so the object score is found by name only.
     let by_shape = || outputs.iter().find(|declared| expected.last() != Some(&1) && fits(declared));
     let found = named.or_else(by_shape);
     found.map(|(name, _)| name.clone()).ok_or_else(|| {

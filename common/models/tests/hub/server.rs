@@ -152,7 +152,7 @@ pub fn serve_one(stream: TcpStream, files: &Mutex<Files>, seen: &Mutex<Vec<Asked
     if asked.method == "GET" {
         (&stream).write_all(&answer.body[..answer.sent_bytes.min(answer.body.len())])?;
     }
-    // What the client still has to say is read, or its kernel drops what it has not read.
+    // Read the rest of the request; otherwise the client's kernel drops unread parts of the answer.
     stream.shutdown(std::net::Shutdown::Write)?;
     stream.set_read_timeout(Some(Duration::from_secs(5)))?;
     std::io::copy(&mut reader.take(1 << 16), &mut std::io::sink())?;

@@ -43,7 +43,7 @@ fn each_change_is_named() {
     assert_eq!((moved.from.id, moved.to.id, moved.distance), (3, 6, 5.0));
 }
 
-/// Of two alike things, each goes to the nearer place; one of another size is none of them.
+/// Of two similar objects, each matches the nearer place; one of another size matches neither.
 #[test]
 fn a_thing_is_matched_once_and_to_the_nearest() {
     let at = |id, x: f64, size: f64| thing(id, [x, 0.0, 0.0], [size; 3], CHAIR);
@@ -62,9 +62,8 @@ fn overlaps_by_hand() {
     assert_eq!(overlap(&of(0.0, 1.0), &of(3.0, 1.0)), 0.0);
 }
 
-/// Both lists end at x = 10, the earlier one at x = 0 as well. By hand: a thing that only one can know is neither
-/// new nor gone, one across the border that changed a little stays, and one does not move to where it may have
-/// been all the time.
+/// Both lists end at x = 10, the earlier one at x = 0 as well. By hand: an object that only one can know is neither
+/// new nor gone, one across the border that changed a little stays, and none moves to a place unknown before.
 #[test]
 fn what_one_list_cannot_know_is_not_compared() {
     let at = |id, x: f64| thing(id, [x, 0.0, 0.0], [1.0; 3], CHAIR);
@@ -78,7 +77,7 @@ fn what_one_list_cannot_know_is_not_compared() {
     assert_eq!(found.moved.iter().map(|m| (m.from.id, m.to.id)).collect::<Vec<_>>(), [(3, 6)]);
 }
 
-/// A hundred alike things that all moved by one: each is matched, though each has more candidates than are kept.
+/// A hundred similar objects moved by one: each is matched, though each has more candidates than are kept.
 #[test]
 fn many_alike_things_are_all_matched() {
     let row = |first: u64, shift: f64| -> Vec<Thing> {

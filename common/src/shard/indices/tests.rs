@@ -6,7 +6,7 @@ fn unpacked(indices: &[u32]) -> Vec<u32> {
     (0..indices.len()).map(|at| column.view().get(at)).collect()
 }
 
-/// Oracle: the indices themselves, of every width, also those that cross words.
+/// Oracle: the indices themselves, in every width, so that some cross words.
 #[test]
 fn every_width_comes_back() {
     let mut random = slag_math::random::Random::new(5);
@@ -16,7 +16,7 @@ fn every_width_comes_back() {
             let least = (u64::from(u32::MAX) - most).min(random.bits() >> 40) as u32;
             let mut indices: Vec<u32> =
                 (0..n).map(|_| least + (u64::from(random.bits() as u32) & most) as u32).collect();
-            // The range is reached, so the width is the one meant.
+            // The range is reached, so that the width is the intended one.
             indices[0] = least;
             indices[n - 1] = least + if n > 1 { most as u32 } else { 0 };
             assert_eq!(unpacked(&indices), indices, "{width} bits");

@@ -29,12 +29,12 @@ const COLOUR_RANGES: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "
 const PACKED: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
 const EXPORT_AGAIN: &str = "export the compressed PLY again";
 
-/// The ranges of a chunk: minima and maxima of position, log scale and colour.
+/// Ranges of a chunk: minima and maxima of position, log scale and colour.
 #[derive(Clone, Copy)]
 struct Chunk([f32; 18]);
 
 impl Chunk {
-    /// Maps `unit`, 0..=1 on each axis, to the range that starts at entry `start`.
+    /// Maps `unit`, 0..=1 on each axis, to the range that begins at entry `start`.
     fn lerp(&self, start: usize, unit: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|axis| {
             let (min, max) = (f64::from(self.0[start + axis]), f64::from(self.0[start + 3 + axis]));
@@ -54,8 +54,7 @@ fn unit_11_10_11(word: u32) -> [f64; 3] {
     [unit(word, 21, 11), unit(word, 11, 10), unit(word, 0, 11)]
 }
 
-/// Returns a rotation packed as the index of its largest component and 10 bits for each of the others, which lie
-/// within +-1/sqrt(2).
+/// Unpacks a rotation: the index of its largest component, and 10 bits for each of the others, within +-1/sqrt(2).
 fn unpack_rotation(word: u32) -> [f64; 4] {
     let others = [20, 10, 0].map(|shift| (unit(word, shift, 10) - 0.5) * std::f64::consts::SQRT_2);
     with_largest((word >> 30) as usize, others)
@@ -79,7 +78,7 @@ fn read_chunks(ply: &mut Ply) -> Result<Vec<Chunk>, SplatError> {
     Ok(chunks)
 }
 
-/// Reads the rows of a file with its header already read.
+/// Reads the rows; the header is already read.
 pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let packed = ply.properties(vertex, &PACKED, EXPORT_AGAIN)?;
     let chunks = read_chunks(&mut ply)?;

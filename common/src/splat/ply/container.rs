@@ -54,8 +54,7 @@ impl Scalar {
         }
     }
 
-    /// Returns the value at the start of `bytes`, which holds at least [`Scalar::bytes`]; f64 represents every
-    /// value of every type exactly.
+    /// Returns the value at the start of `bytes`, of at least [`Scalar::bytes`]; f64 is exact for every type.
     fn decode(self, bytes: &[u8], encoding: Encoding) -> f64 {
         let mut raw = [0; 8];
         let n = self.bytes();
@@ -102,7 +101,6 @@ impl Element {
         self.properties.iter().position(|p| p.name == name)
     }
 
-    /// Returns whether a property is a number with a fraction.
     pub fn is_float(&self, index: usize) -> bool {
         matches!(self.properties[index].kind, Kind::Scalar(Scalar::F32 | Scalar::F64))
     }
@@ -172,7 +170,7 @@ impl Ply {
         self.element(name).ok_or_else(missing)
     }
 
-    /// Returns the indices of properties of an element, or an error if one is missing.
+    /// Returns the indices of properties of an element, all of which must exist.
     pub fn properties(
         &self,
         element: usize,
@@ -200,7 +198,7 @@ impl Ply {
         }
     }
 
-    /// Returns the number of rows of the next element after checking that they fit into the rest of the file.
+    /// Returns the number of rows of the next element, checked to fit into the rest of the file.
     pub fn checked_count(&self, element: usize) -> Result<usize, SplatError> {
         let element = &self.elements[element];
         let row_bytes = match (self.encoding, element.row_bytes()) {
@@ -244,8 +242,8 @@ impl Ply {
         Ok(())
     }
 
-    /// Reads all rows of the next element and passes the properties `wanted` of each row, in that order, to
-    /// `each`. Call [`Ply::seek_element`] and [`Ply::checked_count`] first.
+    /// Passes the properties `wanted` of each row of the next element, in that order, to `each`. Call
+    /// [`Ply::seek_element`] and [`Ply::checked_count`] first.
     pub fn rows(&mut self, wanted: &[usize], mut each: impl FnMut(&[f64])) -> Result<(), SplatError> {
         let element = &self.elements[self.next];
         let mut values = vec![0.0; wanted.len()];
@@ -298,7 +296,7 @@ impl Ply {
         Ok(())
     }
 
-    /// Checks that the file ends where its header says: rows beyond would be left out in silence.
+    /// Checks that the file ends where its header says: further rows would be omitted silently.
     pub fn finish(mut self) -> Result<(), SplatError> {
         while self.next < self.elements.len() {
             self.skip_element()?;
@@ -324,7 +322,7 @@ impl Ply {
                         Kind::List { len, item } => {
                             let mut raw = [0; 8];
                             self.input.fill(&mut raw[..len.bytes()], &element.name)?;
-                            // A negative or huge length saturates, and `skip` rejects it.
+                            // A negative or huge length saturates; `skip` rejects it.
                             let n = match len.decode(&raw, self.encoding) {
                                 n if n >= 0.0 => n as u64,
                                 _ => u64::MAX,
@@ -377,7 +375,7 @@ fn read_ascii_row(
     Ok(())
 }
 
-/// Reads a number. C libraries of Windows write what is none as `-nan(ind)` or `1.#QNAN`.
+/// C libraries of Windows write NaN as `-nan(ind)` or `1.#QNAN`.
 fn number(word: &[u8]) -> Option<f64> {
     let text = std::str::from_utf8(word).ok()?;
     let bare = text.trim_start_matches('-').to_ascii_lowercase();
@@ -385,7 +383,6 @@ fn number(word: &[u8]) -> Option<f64> {
     if is_none { Some(f64::NAN) } else { text.parse().ok() }
 }
 
-/// The part of a header read so far.
 struct Header {
     encoding: Option<Encoding>,
     elements: Vec<Element>,

@@ -1,9 +1,8 @@
 //! PLY files of trained splats, as 3DGS (Kerbl et al. 2023), gsplat, nerfstudio and brush write them, and
 //! compressed PLY files of PlayCanvas. Properties may have any order and type.
 //!
-//! Per vertex: mean `x y z`, rotation `rot_0..3` (wxyz), scale `scale_0..2` (logarithm), `opacity`
-//! (logit), colour `f_dc_0..2` (or `red green blue`), `f_rest_*` (channel by channel); other
-//! properties are ignored.
+//! Per vertex: mean `x y z`, rotation `rot_0..3` (wxyz), scale `scale_0..2` (logarithm), `opacity` (logit), colour
+//! `f_dc_0..2` (or `red green blue`), `f_rest_*` (channel by channel); other properties are ignored.
 
 mod compressed;
 mod container;
@@ -26,14 +25,13 @@ use crate::Gaussians;
 use container::Ply;
 use sh_rest::sh_rest_properties;
 
-/// Advice for a PLY without the properties of a splat.
 const NOT_A_SPLAT: &str =
     "this is not a trained splat but perhaps a point cloud or mesh: give the PLY of the splat";
 const VERTEX: &str = "vertex";
 const GEOMETRY: [&str; 9] = ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "scale_0"];
-/// The second scale, which balls lack as they do the third.
+/// Balls lack the second and third scale.
 const SECOND_SCALE: &str = "scale_1";
-/// The third scale, which the flat Gaussians of 2DGS lack.
+/// Flat Gaussians of 2DGS lack the third.
 const THIRD_SCALE: &str = "scale_2";
 
 pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, SplatError> {
@@ -45,12 +43,12 @@ pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, Spla
     }
 }
 
-/// Reads the rows of a file with a property for each number.
+/// Reads the rows of an uncompressed PLY.
 fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let mut wanted = ply.properties(vertex, &GEOMETRY, NOT_A_SPLAT)?;
     let [second_scale, third_scale] =
         [SECOND_SCALE, THIRD_SCALE].map(|name| ply.elements[vertex].property(name));
-    // A ball has one scale for all axes; a flat Gaussian's third axis is read as some other number and set to 0.
+    // A ball has one scale for all axes; a flat Gaussian's third scale is read from another property and set to 0.
     let is_ball = second_scale.is_none() && third_scale.is_none();
     if is_ball {
         wanted.extend([wanted[8]; 2]);
@@ -60,7 +58,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
     }
     let rgb_names = ["red", "green", "blue"];
     let rgb: Option<Vec<usize>> = rgb_names.iter().map(|name| ply.elements[vertex].property(name)).collect();
-    // nerfstudio exports plain colours on request ("rgb"), others as numbers of 0 to 1.
+    // nerfstudio exports plain colours on request ("rgb"), others write numbers of 0 to 1.
     let white = match (&rgb, ply.elements[vertex].property("f_dc_0")) {
         (Some(rgb), None) => Some(if ply.elements[vertex].is_float(rgb[0]) { 1.0 } else { 255.0 }),
         _ => None,
@@ -93,7 +91,7 @@ fn read_plain(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gauss
     Ok(out)
 }
 
-/// Reads properties of the vertices of a mesh or point cloud: a row per vertex, in the order of `names`.
+/// Reads properties of a mesh or point cloud: a row per vertex, in the order of `names`.
 pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Vec<[f64; N]>, SplatError> {
     const NO_VERTICES: &str = "give a PLY with this property";
     let mut ply = Ply::open(Input::open(path)?)?;

@@ -1,4 +1,4 @@
-//! Writes answers as a PLY of points: positions, scores, and which Gaussian each is.
+//! Writes answers as a PLY of points: positions, scores and indices of Gaussians.
 //!
 //! | property | type | content |
 //! |---|---|---|
@@ -34,8 +34,7 @@ pub struct Point {
 }
 
 impl PointProperties {
-    /// Returns the header of a file of `n` points. `comments`: a line each; control characters and all that is not
-    /// ASCII are escaped.
+    /// Returns the header for `n` points. `comments`: one line each; control and non-ASCII characters are escaped.
     pub fn header(self, n: u64, comments: &[String]) -> String {
         let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
         for comment in comments {
@@ -78,7 +77,7 @@ impl PointProperties {
     }
 }
 
-/// Returns a character of a header: the format's headers are lines of ASCII.
+/// PLY headers are lines of ASCII.
 fn escaped(c: char) -> String {
     match c {
         ' '..='~' => c.to_string(),

@@ -5,11 +5,11 @@ use crate::Gaussians;
 use crate::splat::columns::MAX_SH_DEGREE;
 use crate::splat::error::{Place, SplatError};
 
-/// A higher degree that some trainers write; it is cut to [`MAX_SH_DEGREE`].
+/// A degree that some trainers write; it is truncated to [`MAX_SH_DEGREE`].
 const HIGHER_SH_DEGREE: u8 = MAX_SH_DEGREE + 1;
 
-/// Returns the degree of the spherical harmonics in the `f_rest_*` of an element, and the properties in the order
-/// of [`Gaussians::sh_rest`]; the file stores them channel by channel.
+/// Returns the degree of the harmonics in `f_rest_*` and the properties in the order of [`Gaussians::sh_rest`];
+/// the file stores them channel by channel.
 pub(super) fn sh_rest_properties(ply: &Ply, element: usize) -> Result<(u8, Vec<usize>), SplatError> {
     let property = |i: usize| ply.elements[element].property(&format!("f_rest_{i}"));
     let in_file: Vec<_> = (0..).map_while(property).collect();

@@ -7,8 +7,7 @@ use crate::Gaussians;
 use crate::durable;
 use crate::splat::error::SplatError;
 
-/// Writes Gaussians in the layout of 3DGS: binary little-endian, zero normals, logarithms of scales, logits of
-/// opacities.
+/// Writes the layout of 3DGS: binary little-endian, zero normals, logarithms of scales, logits of opacities.
 pub fn write(path: &Path, gaussians: &Gaussians) -> Result<(), SplatError> {
     Ok(durable::write_result(path, |file| write_to(file, gaussians))?)
 }
@@ -52,7 +51,7 @@ pub fn write_rows(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Res
     Ok(())
 }
 
-/// Beyond these bounds exp and the sigmoid give 0 and 1 in f32 anyway; other readers reject infinities.
+/// Beyond these bounds exp and the sigmoid give 0 and 1 in f32; other readers reject infinities.
 const MIN_LOG: f64 = -110.0;
 const MAX_LOGIT: f64 = 40.0;
 

@@ -1,7 +1,7 @@
-//! Attributes that ignore a test: where the machine lacks what it needs, or outside the nightly checks.
+//! Attributes that ignore a test where the machine lacks its requirements, or outside the nightly checks.
 //!
-//! Macros of their own rather than a `cfg` from build scripts: a build script that watches a folder that does not
-//! exist runs at every build, and each crate's library would be compiled again with it.
+//! Macros instead of a `cfg` from build scripts: a build script that watches a missing folder runs at every build,
+//! and recompiles each crate's library.
 
 use std::path::{Path, PathBuf};
 
@@ -9,8 +9,7 @@ use proc_macro::TokenStream;
 
 /// Ignores a test where `../shared` is absent, except in CI. Stands above `#[test]`.
 ///
-/// The data is looked for when the test is compiled. Where it has arrived since, `cargo test -- --ignored` runs
-/// the test.
+/// Decided when the test is compiled; if the data has arrived since, `cargo test -- --ignored` runs the test.
 #[proc_macro_attribute]
 pub fn needs_shared(_: TokenStream, test: TokenStream) -> TokenStream {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..");
@@ -26,7 +25,7 @@ pub fn nightly(why: TokenStream, test: TokenStream) -> TokenStream {
     marked(test, &["SLAG_NIGHTLY"], std::env::var_os("SLAG_NIGHTLY").is_none().then_some(&reason))
 }
 
-/// `variables`: what the mark depends on, so that the compiler looks again when one changes.
+/// `variables`: recompile the test when one changes.
 fn marked(test: TokenStream, variables: &[&str], reason: Option<&str>) -> TokenStream {
     let code = test.to_string();
     if !code.contains("#[test]") {
