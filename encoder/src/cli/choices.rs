@@ -1,4 +1,4 @@
-//! The choices of an encode that a preset makes, flags override and a measured front knows.
+//! Choices of an encode, from presets, flags and measured fronts.
 
 use clap::Args;
 
@@ -75,7 +75,7 @@ fn set<T: Clone>(to: &mut T, value: &Option<T>) {
 }
 
 impl ChoiceArgs {
-    /// Makes the choices in settings that have the defaults.
+    /// Applies the choices to default settings.
     pub(super) fn apply(&self, settings: &mut EncodeSettings) {
         self.preset.apply(settings);
         let EncodeSettings { view, aggregation, cells, run, .. } = settings;
@@ -106,7 +106,7 @@ fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
     }
 }
 
-/// Parses a number of views, or a share of them in per cent.
+/// Parses a number of views or a percentage.
 fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
     let limit = match text.strip_suffix('%') {
         Some(percent) => {

@@ -1,4 +1,4 @@
-//! The command line, a file a command: flags in, exit code out. Data goes to stdout, everything else to stderr.
+//! The command line, one file per command: flags in, exit code out. Data goes to stdout, everything else to stderr.
 
 mod check;
 mod choices;
@@ -188,7 +188,7 @@ pub fn exit_of(result: Result<Exit>, json: bool) -> Exit {
 mod tests {
     use super::*;
 
-    /// A bucket or database that hangs up breaks a pipe, too.
+    /// A bucket or database that hangs up breaks a pipe, too, and that is a failure.
     #[test]
     fn only_the_reader_of_stdout_may_leave() {
         let of_network = io::Error::from(io::ErrorKind::BrokenPipe);

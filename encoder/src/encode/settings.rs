@@ -18,13 +18,12 @@ use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
 use crate::viewpoints::ViewpointSettings;
 
-/// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and
-/// no better answers (generated scenes of seeds 601 to 605, and the labelled house).
+/// Scales of the built-in segmenter by default. A fourth gives a third more masks and no better answers (generated
+/// scenes of seeds 601 to 605, and the labelled house).
 pub const DEFAULT_MASK_LEVELS: usize = 3;
-/// Widest raster where the settings do not ask for more: masks are coarser than this, and time grows with the
-/// square.
+/// Widest raster by default: masks are coarser than this, and time grows with the square.
 pub(crate) const MAX_RASTER_WIDTH_PX: u32 = 1024;
-/// Gaussians of a cell at most: shards number them with 16 bits.
+/// Shards number a cell's Gaussians with 16 bits.
 pub(crate) const MAX_CELL_GAUSSIANS: usize = 65_536;
 pub(crate) const DEFAULT_CELL_WIDTH_M: f64 = 25.0;
 

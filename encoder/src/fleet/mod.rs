@@ -1,6 +1,5 @@
-//! The views of an encode on many machines: a bucket keeps everything that is made, workers do views, a
-//! coordinator plans, waits, makes the cells and publishes. A queue only hands out work: a view that the bucket
-//! has is done.
+//! The views of an encode on many machines: a bucket keeps all results, workers do views, a coordinator plans, waits,
+//! makes the cells and publishes. A queue only hands out work: a view is done if the bucket has it.
 //!
 //! | key in the bucket | content |
 //! |---|---|
@@ -12,8 +11,8 @@
 //! | `jobs/N/end.json` | how run N ended: published, or superseded by the next. The first one to put it decides |
 //! | `views/IDENTITY` | a view's contributions: it is done when this is there |
 //!
-//! Inputs and views are named by what they are made of, and put on condition that they are not there: work that is
-//! done twice, by a worker that was thought dead, changes nothing, and a run takes up what earlier ones left.
+//! Inputs and views are named by content and put only if absent: work that is done twice, by a worker that was thought
+//! dead, changes nothing, and a run reuses the results of earlier ones.
 
 pub(crate) mod coordinator;
 mod dispatch;

@@ -1,12 +1,11 @@
-//! The runs in a bucket. They have consecutive numbers, and the highest one counts. A run ends once: by its
-//! coordinator's word that it publishes, or by that of the next run's coordinator. Both put the same object on
-//! condition that it is not there, so one put decides whether a run is published.
+//! The runs in a bucket, numbered consecutively; the highest counts. A run ends once: its coordinator publishes, or the
+//! next run's coordinator supersedes it. Both put the same key on condition that it is absent, so one put decides.
 
 use super::documents::{self, End, PlannedBy, RunPlan};
 use super::error::FleetError;
 use crate::blobs::Bucket;
 
-/// Objects of a run: how it ended; all its views are done.
+/// Keys of a run: how it ended; all its views are done.
 const END: &str = "end.json";
 const DONE: &str = "done";
 
@@ -34,7 +33,7 @@ impl Run {
         self.key("heartbeat")
     }
 
-    /// Returns the newest run, and the names of all objects of runs.
+    /// The newest run, and the names of all runs' objects.
     fn newest(bucket: &Bucket) -> Result<Option<(Self, Vec<String>)>, FleetError> {
         let names = bucket.list("jobs")?;
         let number = |name: &String| name.strip_suffix("/plan.json")?.parse().ok();
@@ -63,7 +62,7 @@ impl Run {
         }
     }
 
-    /// Returns the newest run and its plan, unless its views are done or it has ended.
+    /// The newest run and its plan, unless it has ended or its views are done.
     pub(super) fn open(bucket: &Bucket) -> Result<Option<(Self, RunPlan)>, FleetError> {
         let Some((run, names)) = Self::newest(bucket)? else { return Ok(None) };
         if [DONE, END].iter().any(|name| run.has(&names, name)) {
@@ -91,12 +90,12 @@ impl Run {
         Ok(bucket.len_of(&self.key(END))?.is_some())
     }
 
-    /// Lets workers go: all views are in the bucket, or have failed.
+    /// Dismisses the workers: all views are in the bucket, or have failed.
     pub(super) fn views_are_done(self, bucket: &Bucket) -> Result<(), FleetError> {
         Ok(bucket.put(&self.key(DONE), "")?)
     }
 
-    /// Returns whether another coordinator has taken the run's place: its own run follows at once.
+    /// Whether another coordinator has superseded the run; its own run follows at once.
     ///
     /// # Errors
     /// [`FleetError::Blob`]; a document that is none.
@@ -106,7 +105,7 @@ impl Run {
         Ok(documents::parse::<End>(bucket, &key, &bytes)? == End::Superseded)
     }
 
-    /// Fails if another coordinator has taken the run's place.
+    /// Fails if the run is superseded.
     pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
         match self.has_ended(bucket)? {
             true => Err(self.superseded(bucket)),
@@ -114,7 +113,7 @@ impl Run {
         }
     }
 
-    /// Ends the run by its publication.
+    /// Ends the run by publishing it.
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
         // Only the run's own coordinator puts this.
         match bucket.claim(&self.key(END), documents::to_bytes(&End::Published)?)? {

@@ -1,5 +1,4 @@
-//! Brings the contributions of all views together by Gaussian: each group of parts is transposed from the views'
-//! order to the Gaussians'.
+//! Transposes groups of parts from view-major to Gaussian-major contributions.
 
 use rayon::prelude::*;
 use slag_common::container::ContainerError;
@@ -15,7 +14,7 @@ struct SliceRun<'a> {
     entries: &'a [PackedEntry],
 }
 
-/// A slice to be transposed, and the places of its results.
+/// A slice to transpose, and where its results go.
 struct SliceTask<'a> {
     runs: Vec<SliceRun<'a>>,
     starts: &'a mut [u64],
@@ -26,7 +25,6 @@ struct SliceTask<'a> {
 }
 
 impl ContributionIndex {
-    /// Transposes the entries of a group from the views' order to the Gaussians'.
     pub fn transpose(
         &self,
         raw: &RawGroup,
@@ -73,7 +71,7 @@ impl ContributionIndex {
         Ok(contributions)
     }
 
-    /// A counting sort by Gaussian that keeps the order of the views.
+    /// Counting sort by Gaussian that keeps the views' order.
     fn transpose_slice(
         &self,
         task: SliceTask<'_>,

@@ -1,4 +1,4 @@
-//! Yes or no for each of many pixels, a bit each.
+//! One bit per pixel.
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Bits {

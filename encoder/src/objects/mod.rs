@@ -1,8 +1,6 @@
-//! Stage 5: superpoints that the masks of most views show together become objects.
-//!
-//! No model and no training are needed: the contributions tell which Gaussians each mask shows.
-//!
-//! The contributions are needed once, part by part; the result takes four bytes a Gaussian.
+//! Stage 5: superpoints that most views' masks show together become objects. Needs no model and no training: the
+//! contributions tell which Gaussians each mask shows. They are needed once, part by part; the result takes four bytes
+//! a Gaussian.
 
 mod choice;
 mod find;
@@ -19,8 +17,7 @@ pub(crate) use find::find;
 pub use object::{NONE, Object, ObjectsReport, SceneObjects};
 pub(crate) use thumbnails::cut as cut_thumbnails;
 
-/// Reserves what finding the objects of a scene takes, and the object of each Gaussian. `has_superpoints`: they
-/// are given.
+/// Reserves the search for objects, and each Gaussian's object. `has_superpoints`: they are given.
 pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, has_superpoints: bool) {
     let labels_bytes = (n_gaussians * size_of::<u32>()) as u64;
     memory.reserve(Phase::Always, "the object of each Gaussian", labels_bytes);
@@ -31,7 +28,7 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, has_superpoin
     }
 }
 
-/// Reserves what depends on the contributions, once all views are done.
+/// Reserves what depends on the contributions, after the views.
 pub(crate) fn reserve_contributions(memory: &mut MemoryPlan, n_entries: u64) {
     sightings::reserve(memory, n_entries);
 }

@@ -1,4 +1,4 @@
-//! Stands in for the GPU backend in builds without the feature `gpu`: no adapter is found.
+//! Replaces the GPU backend in builds without the feature `gpu`: no adapter is found.
 
 use std::convert::Infallible;
 
@@ -17,7 +17,7 @@ pub struct Device {
     none: Infallible,
 }
 
-/// The GPU backend; it cannot be made.
+/// The GPU backend, which cannot be made.
 pub struct GpuRasterizer {
     none: Infallible,
 }

@@ -121,7 +121,6 @@ pub(crate) fn run(args: &QueryArgs) -> Result<QueryReport> {
 /// Times both kinds of answers, with buffers that a process keeps between queries.
 fn time(shards: &[ShardView<'_>], questions: &[Question], limit: usize, args: &QueryArgs) -> Result<Timing> {
     let mut scratch = Scratch::default();
-    // An answer has positions.
     let position = |shard: u32, index: u32| shards[shard as usize].position_in_world(index as usize);
     let n_runs = args.runs as usize;
     let question = |turn: usize| &questions[turn % questions.len()];

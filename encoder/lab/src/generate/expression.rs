@@ -31,7 +31,7 @@ impl Expression {
         }
     }
 
-    /// Returns the value; `variables` are in the order of the names.
+    /// `variables` are in the order of the names.
     pub fn value(&self, variables: &[f64], random: &mut Xorshift) -> f64 {
         match self {
             Self::Number(number) => *number,

@@ -43,7 +43,7 @@ impl Service {
         self.send(path, "application/json", body.to_string().as_bytes())
     }
 
-    /// Sends a PNG as [`Self::post`] sends JSON.
+    /// Like [`Self::post`], with a PNG.
     pub(crate) fn post_image(&self, path: &str, png: &[u8]) -> Result<Value> {
         self.send(path, "image/png", png)
     }
@@ -55,7 +55,7 @@ impl Service {
     }
 }
 
-/// Returns a client that asks without a proxy and returns replies of every status.
+/// A client without a proxy, for which no status is an error.
 fn agent() -> ureq::Agent {
     let config = ureq::Agent::config_builder().proxy(None).http_status_as_error(false);
     config.timeout_global(Some(TIMEOUT)).build().into()
@@ -69,7 +69,6 @@ pub(crate) fn fetch_all(store: &Path, cache: &Path, profile: &str) -> Result<()>
 
 /// Generated scenes on robots, of each kind and seed in a folder of its own: `scene`, `store` and `cache`.
 pub(crate) struct Prepared<'a> {
-    /// Folder of the scenes' folders.
     pub(crate) out: &'a Path,
     pub(crate) kinds: &'a [SceneKind],
     pub(crate) seeds: &'a [u64],
@@ -80,7 +79,7 @@ pub(crate) struct Prepared<'a> {
 }
 
 impl Prepared<'_> {
-    /// Judges each scene by its kind, seed and folder; returns their names.
+    /// Judges each scene by kind, seed and folder; returns the names.
     pub(crate) fn judge(
         &self,
         progress: &dyn Progress,
@@ -102,7 +101,7 @@ impl Prepared<'_> {
         Ok(names)
     }
 
-    /// Generates, encodes and fetches a scene, as far as that was not done before.
+    /// Generates, encodes and fetches a scene, skipping what is done.
     fn make(&self, kind: SceneKind, seed: u64, dir: &Path) -> Result<()> {
         let [scene, store, cache] = ["scene", "store", "cache"].map(|name| dir.join(name));
         let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));
