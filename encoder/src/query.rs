@@ -41,7 +41,7 @@ pub enum QueryError {
     NoObjects,
 }
 
-/// The profiles to name in an error: exact shards tell which Gaussian is which.
+/// The profiles that a command needs beside any others: exact shards tell which Gaussian is which.
 fn with_exact(profile: Profile) -> String {
     match profile {
         Profile::Exact => "exact".into(),

@@ -63,7 +63,7 @@ pub(super) struct Sizes<'a> {
     pub(super) is_standing: &'a [bool],
     /// `[n]`: Gaussians of each superpoint.
     pub(super) of_superpoints: &'a [u32],
-    /// `[n]`: superpoints on the ground; empty without any.
+    /// `[n]`: ground that each superpoint covers; empty without any.
     pub(super) footprints: &'a [Footprint],
     pub(super) standing: &'a Standing,
     pub(super) min_gaussians: u32,

@@ -36,7 +36,8 @@ pub(super) fn by_cell(blocks: &[Block], split: &CellSplit, lattice: Lattice) -> 
     of_cell
 }
 
-/// Cells that may be nearest to a point in a box: no farther from its centre than the nearest cell plus its diagonal.
+/// Cells that may be nearest to a point in a box: no farther from its centre than the nearest cell plus the box's
+/// diagonal.
 fn candidates(bounds: &Aabb, split: &CellSplit) -> Vec<usize> {
     let distance = |cell: usize| split.cells[cell].mean_bounds.distance_to(bounds.centre());
     let all = 0..split.cells.len();

@@ -12,7 +12,7 @@ use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
 /// Smallest mask, pixels: a traffic cone from 40 m.
 const MIN_AREA_PX: u32 = 24;
-/// Largest share of a photo: parts of nearer things are shown better by others.
+/// Largest share of a photo: nearer things show their parts better.
 const MAX_AREA: f64 = 0.1;
 /// A mask this similar to another one is left out.
 const SAME_IOU: f64 = 0.8;

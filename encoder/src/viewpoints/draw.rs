@@ -18,7 +18,7 @@ use crate::progress::Progress;
 use crate::raster::{Drawing, LoadedScene, RasterError, RasterView, Rasterizer};
 
 pub const POSES_FILE: &str = "transforms.json";
-/// Size of drawings, pixels: slightly larger than the segmenter's training photos.
+/// Size of drawings, pixels: that of the photos that the segmenter learnt on, enlarged little.
 const SIZE_PX: [u32; 2] = [800, 600];
 /// Shows through holes: grey is no thing's outline.
 const BACKGROUND: [f32; 3] = [0.5; 3];

@@ -74,7 +74,7 @@ impl Stages {
         dispatch(pass, &device.kernels.scan, group, [1, 1]);
     }
 
-    /// Sorts by a key of `key_bits`; returns the index of the buffer with the order.
+    /// Sorts by a key of `bits` bits; returns the index of the buffer with the order.
     pub fn sort(
         &mut self,
         device: &Device,
