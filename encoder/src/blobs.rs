@@ -38,7 +38,6 @@ pub(crate) enum BlobError {
     Missing { url: String, key: String },
 }
 
-/// A bucket below a prefix.
 #[derive(Clone, Debug)]
 pub(crate) struct Bucket {
     store: Arc<dyn ObjectStore>,

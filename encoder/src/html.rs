@@ -29,7 +29,6 @@ pub(crate) struct Page {
     body: String,
 }
 
-/// Escapes text for HTML.
 pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for letter in text.chars() {

@@ -45,7 +45,6 @@ impl std::fmt::Display for Machine {
     }
 }
 
-/// Value of a `key: value` line.
 fn field(lines: &str, key: &str) -> Option<String> {
     let mut fields = lines.lines().filter_map(|line| line.split_once(':'));
     fields.find(|(found, _)| found.trim() == key).map(|(_, value)| value.trim().to_owned())

@@ -67,7 +67,6 @@ pub(super) struct Means {
     /// PSNR of photos against their mean colour.
     pub(super) flat_psnr_db: f64,
     pub(super) covered_share: f64,
-    /// Whether more than half of the views fit.
     pub(super) most_fit: bool,
 }
 
@@ -177,7 +176,6 @@ struct Search<'a> {
     rasterizer: &'a dyn Rasterizer,
     flat_psnr_db: f64,
     given_psnr_db: f64,
-    /// Remaining budget of pairs.
     pairs_left: Cell<usize>,
     suspected: Vec<Mistake>,
 }

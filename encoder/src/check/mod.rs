@@ -146,7 +146,6 @@ fn means_of(checks: &[ViewCheck]) -> Means {
     }
 }
 
-/// Names the views that do not fit.
 fn odd_views(checks: &[ViewCheck]) -> impl Iterator<Item = String> {
     let mut odd = checks.iter().filter(|view| !view.fits());
     let first = odd.next();

@@ -73,7 +73,6 @@ impl CheckView {
         all + 10.0 * share.log10()
     }
 
-    /// PSNR of the photo's mean colour, dB.
     pub(super) fn flat_psnr_db(&self) -> f64 {
         let is_valid = |pixel: usize| self.valid.as_ref().is_none_or(|valid| valid.as_raw()[pixel] > 0);
         let pixels = || self.image.pixels().enumerate().filter(|(pixel, _)| is_valid(*pixel));

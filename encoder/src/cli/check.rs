@@ -72,7 +72,6 @@ struct Inputs {
     frames: Vec<FrameCandidate>,
     suspicions: Vec<Suspicion>,
     notes: Vec<String>,
-    /// Whether frames or photos are left out.
     is_partial: bool,
 }
 

@@ -150,7 +150,6 @@ pub fn parse_frame(text: &str) -> Result<FrameChoice, String> {
     })
 }
 
-/// Parses seconds above 0.
 pub(crate) fn parse_secs(text: &str) -> Result<Duration, String> {
     let secs = text.parse().ok().filter(|secs: &f64| *secs > 0.0);
     secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok())
@@ -208,7 +207,6 @@ pub(super) fn warn_of_expiry(store: &Path) {
     }
 }
 
-/// Opens the named models, and returns how they are run.
 pub fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
     let models = commands::open(args.models.as_deref(), &|name| std::env::var_os(name))?;
     Ok((models, session_options(&args.how)?))

@@ -75,7 +75,6 @@ pub(crate) struct CoordinatorArgs {
 }
 
 impl CoordinatorArgs {
-    /// Encodes with the fleet of the flags, or on this machine.
     pub(super) fn encode(
         &self,
         settings: &EncodeSettings,

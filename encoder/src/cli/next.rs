@@ -76,7 +76,6 @@ pub(super) fn of_check(input: &InputArgs) -> String {
     format!("\nnext\n  slag-encoder encode{}{every}{activated} --store STORE\n", of_input(input))
 }
 
-/// Flags of splat, poses, photos and frame.
 fn of_input(input: &InputArgs) -> String {
     let frame = match &input.splat_frame {
         FrameChoice::Auto => None,
@@ -137,7 +136,6 @@ fn host_name() -> String {
     if name.is_empty() { "BASE".into() } else { name.into() }
 }
 
-/// Quotes a path for a shell where it needs it.
 fn shell_word(path: &Path) -> String {
     let text = path.display().to_string();
     let is_plain = |c: char| c.is_alphanumeric() || "/._-+,:@%=".contains(c);

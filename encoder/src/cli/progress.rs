@@ -11,7 +11,6 @@ use crate::progress::{Progress, Silent};
 
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Shows progress on stderr, or discards it.
 pub fn shown(is_shown: bool) -> Box<dyn Progress> {
     if is_shown { Box::new(TerminalProgress::new()) } else { Box::new(Silent) }
 }
@@ -33,7 +32,6 @@ struct Stage {
 }
 
 impl TerminalProgress {
-    /// Draws bars if stderr is a terminal, else writes lines.
     fn new() -> Self {
         Self { terminal: std::io::stderr().is_terminal(), stage: Mutex::default() }
     }

@@ -121,7 +121,6 @@ fn of_hit(hit: &Hit) -> String {
     format!("{:.3}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z)
 }
 
-/// Fails if the splat is not the store's.
 fn read_scene(path: &Path, reader: &StoreReader, hits: &[Hit]) -> Result<Gaussians> {
     let scene = splat::read(path, &ReadOptions { with_sh_rest: true })?;
     query::check_scene(reader, &scene, hits).with_context(|| path.display().to_string())?;

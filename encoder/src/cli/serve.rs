@@ -16,7 +16,6 @@ use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
 use crate::view::{self, Viewed, Viewer};
 
-/// Interval of checks whether metadata expires soon.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(86_400);
 
 const EXAMPLES: &str = "Examples:\n\

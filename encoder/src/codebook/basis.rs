@@ -27,7 +27,6 @@ const LARGE_BANK: usize = 19 * HELD_OUT_STEP;
 #[derive(Clone, Debug, PartialEq)]
 pub struct TextBank {
     pub dim: usize,
-    /// `[n][dim]`.
     pub vectors: Vec<f32>,
 }
 

@@ -7,7 +7,6 @@ use slag_math::matrix::{Panels, Rows};
 
 /// Rounds of 2-means when a cluster is split; the halves hardly move after the third.
 const SPLIT_ROUNDS: usize = 3;
-/// Rounds of k-means over all centroids at the end.
 const REFINE_ROUNDS: usize = 1;
 /// Up to this many clusters are all split: each is still far too large.
 const FEW_CLUSTERS: usize = 16;
@@ -24,7 +23,6 @@ pub struct Clusters {
 
 /// Points in the order of their centroids.
 pub(super) struct Members {
-    /// The points, in that order.
     pub(super) order: Vec<u32>,
     /// `[K + 1]`: start of each centroid in `order`.
     pub(super) starts: Vec<u32>,

@@ -10,7 +10,6 @@ use super::measure;
 
 const CHUNK: usize = 1024;
 
-/// Decodes components as readers do.
 #[derive(Clone, Copy)]
 pub(super) struct Decoder<'a> {
     pub(super) dim: usize,
@@ -42,7 +41,6 @@ impl Decoder<'_> {
     }
 }
 
-/// The embeddings, and their centroids as readers decode them.
 pub(super) struct Reference<'a> {
     pub(super) embeddings: Rows<'a>,
     pub(super) members: &'a Members,

@@ -179,7 +179,6 @@ pub fn build(
     }
 }
 
-/// Embeddings in the cell's coordinates, and their clusters.
 struct Clustered {
     basis: Basis,
     /// `[n][m]`.

@@ -28,7 +28,6 @@ fn score_context(dim: usize, vectors: &[f32]) -> ScoreMetricContext {
     ScoreMetricContext { metric, bank, spread }
 }
 
-/// Writes a codebook as a shard of one profile and reads it back.
 fn shard_of(codebook: &Codebook, dim: usize, balanced: bool) -> AlignedBytes {
     let n = codebook.order.len() as u32;
     let residuals = codebook.residuals.as_ref().filter(|_| balanced);

@@ -33,7 +33,6 @@ pub(crate) struct SharedEncoders {
 
 struct Shared {
     open: Box<OpenEncoder>,
-    /// Encoders are opened on first use.
     lanes: Lanes<Option<Box<dyn ImageEncoder>>>,
     queue: Mutex<Queue>,
     /// Wakes a lane's thread for new crops or the end.
@@ -61,7 +60,6 @@ struct Request {
     vectors: Vec<Vec<f32>>,
     n_left: usize,
     error: Option<Failure>,
-    /// Wakes its view.
     is_done: Arc<Condvar>,
 }
 
@@ -104,7 +102,6 @@ impl SharedEncoders {
         self.shared.lanes.loads()
     }
 
-    /// Takes a lane for the caller's own work.
     pub(crate) fn with_encoder<T>(
         &self,
         work: impl FnOnce(&mut dyn ImageEncoder) -> T,
@@ -185,7 +182,6 @@ impl Shared {
         Ok(lane.as_mut().expect("opened").as_mut())
     }
 
-    /// Runs at most a batch of crops from the head of the queue.
     fn run_batch(&self, lane: &mut Lane<'_, Option<Box<dyn ImageEncoder>>>) -> Vec<Done> {
         let encoder = match self.opened(lane) {
             Ok(encoder) => encoder,

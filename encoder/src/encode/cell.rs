@@ -32,7 +32,6 @@ pub(super) struct CellMaker<'a> {
     pub(super) refinement: Refinement,
     pub(super) objects: Option<SceneObjects>,
     pub(super) occupancy: Option<SceneOccupancy>,
-    /// Metric and texts for the errors of scores.
     pub(super) score_context: ScoreMetricContext,
     /// Camera poses by cell, if the shards store them.
     pub(super) photo_poses: Option<Vec<BuiltPhotoPoses>>,
@@ -129,7 +128,6 @@ impl CellMaker<'_> {
         if context.is_cancelled() { Err(ContributionError::Cancelled.into()) } else { Ok(finished) }
     }
 
-    /// Appends the next part's embeddings, and keeps its field.
     fn add_part(
         &self,
         mut contributions: PartContributions,
@@ -152,7 +150,6 @@ impl CellMaker<'_> {
         Ok(())
     }
 
-    /// Makes a cell's codebook and shards, and stores the shards.
     fn finish(&self, cell_id: u32, in_work: &mut CellInWork) -> Result<FinishedCell, EncodeError> {
         let cell = &self.split.cells[cell_id as usize];
         let Self { scene, settings, encoder_id, score_context, .. } = self;

@@ -142,7 +142,6 @@ struct Refined {
     objects: Option<SceneObjects>,
 }
 
-/// Weighs masks, finds objects, and refines by both.
 fn refine(
     plan: &Plan<'_>,
     scene: &SceneContributions<'_>,
@@ -197,7 +196,6 @@ fn thumbnails(
     Ok(thumbnails)
 }
 
-/// Stores what later queries need beside the cells.
 fn put_extras(plan: &Plan<'_>, table: &RegionTable, context: &RunContext<'_>) -> Result<Extras, EncodeError> {
     let Plan { store, settings, .. } = *plan;
     let mut extras = Extras::new();
@@ -210,7 +208,6 @@ fn put_extras(plan: &Plan<'_>, table: &RegionTable, context: &RunContext<'_>) ->
     Ok(extras)
 }
 
-/// Texts like the expected queries.
 fn text_bank(plan: &Plan<'_>, context: &RunContext<'_>) -> TextBank {
     let models = plan.engines.models;
     context.time("texts", || match models.text_encoder(plan.engines.session) {
@@ -259,7 +256,6 @@ struct Opened {
 }
 
 impl Opened {
-    /// Opens the contributions and checks the budget against them.
     fn of(
         plan: &Plan<'_>,
         views: &DoneViews<'_>,

@@ -27,7 +27,6 @@ impl<'a> Engines<'a> {
     }
 }
 
-/// Time per stage, summed over all threads.
 #[derive(Default)]
 struct StageTimes(Mutex<BTreeMap<&'static str, f64>>);
 

@@ -40,7 +40,6 @@ const STEEPNESS: f64 = 2.0;
 /// Steps of `g` = 1; at [`MAX_SUM`] a step of quality is still 2^8 of them.
 const GAIN_STEPS: f64 = (1 << 24) as f64;
 
-/// How well each view shows each Gaussian.
 #[derive(Clone, Debug)]
 pub struct Coverage {
     n_gaussians: usize,
@@ -200,7 +199,6 @@ mod tests {
         (0..n_views).map(|_| view()).collect()
     }
 
-    /// The definition in f64.
     fn worth(weights: &[Vec<(u32, f32)>], n_gaussians: usize, chosen: &[usize]) -> f64 {
         let mut best = vec![0.0f64; n_gaussians];
         weights.iter().flatten().for_each(|(k, a)| best[*k as usize] = best[*k as usize].max((*a).into()));

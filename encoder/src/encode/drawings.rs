@@ -53,7 +53,6 @@ pub(super) fn make(
     Ok(())
 }
 
-/// Returns the hash of everything that decides plan and drawings.
 fn identity(scene: &Gaussians, planned: &ViewpointSettings, device: &str) -> Result<Hash32, EncodeError> {
     let columns: [&[u8]; 6] = [
         bytemuck::cast_slice(&scene.means_in_world),

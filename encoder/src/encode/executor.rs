@@ -32,7 +32,6 @@ pub(crate) trait Executor {
 
 pub(crate) struct ViewsRun {
     pub(crate) stages: Vec<StageReport>,
-    /// Left out for an error.
     pub(crate) skipped: Vec<SkippedView>,
     /// Device of the image model, if it ran.
     pub(crate) images_on: Option<String>,

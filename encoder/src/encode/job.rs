@@ -50,7 +50,6 @@ pub(crate) fn job_status(db: &sled::Db) -> Result<Option<JobStatus>, EncodeError
     }))
 }
 
-/// The unfinished encode of a store.
 pub(crate) struct Job {
     records: sled::Tree,
     folder: PathBuf,
@@ -149,7 +148,6 @@ impl Job {
         Ok(())
     }
 
-    /// This encode's views with contributions on disk.
     pub(crate) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
         let mut done = BTreeMap::new();
         for (name, id) in &self.id_of_view {
@@ -207,7 +205,6 @@ impl Job {
         self.flush()
     }
 
-    /// Whether the store keeps views of this scene.
     pub(super) fn is_kept(store: &Store, of_scene: Hash32) -> Result<bool, EncodeError> {
         let tree = store.db().open_tree(TREE)?;
         let found = tree.get(IDENTITY_KEY)?;
@@ -336,7 +333,6 @@ fn first_clause(error: &ContainerError) -> String {
     text.split("; ").next().unwrap_or_default().to_owned()
 }
 
-/// Whether a file is gone, or shorter than it says.
 fn is_lost(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::UnexpectedEof)
 }

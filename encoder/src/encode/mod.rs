@@ -50,7 +50,6 @@ pub(crate) use settings::ViewSettings;
 pub(crate) use settings::{DEFAULT_CELL_WIDTH_M, InputSettings, MAX_CELL_GAUSSIANS, RasterWidth};
 pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, Regions, Restart, ViewOrder, ViewsLimit};
 
-/// For the fleet's encode.
 #[cfg(feature = "fleet")]
 pub(crate) mod fleet_parts {
     pub(crate) use super::context::RunContext;

@@ -55,7 +55,6 @@ enum Failure<E> {
 }
 
 enum Task<T> {
-    /// Takes an item from the source through the first stage.
     Begin,
     Step(usize, T),
 }
@@ -197,7 +196,6 @@ impl<T, E> Schedule<T, E> {
         self.has_no_more = !has_item && self.n_ended == self.n_ended_when_asked;
     }
 
-    /// Queues an item for the next stage, or records the error.
     fn end_step(&mut self, at: usize, done: std::thread::Result<StepOutcome<T, E>>) {
         self.n_running[at] -= 1;
         let (secs, result) = match done {

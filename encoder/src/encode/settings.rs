@@ -96,7 +96,6 @@ impl Regions {
         *self == Self::Masks
     }
 
-    /// Returns whether masks are made. Objects need them.
     pub(crate) fn have_masks(self) -> bool {
         self != Self::Patches
     }
@@ -148,7 +147,6 @@ impl RasterWidth {
     }
 }
 
-/// How embeddings become shards.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellSettings {
     pub limits: CellLimits,
@@ -181,7 +179,6 @@ pub enum Restart {
     Never,
     /// Those of another splat or of other settings.
     IfOther,
-    /// All.
     Always,
 }
 
@@ -208,7 +205,6 @@ pub struct RunSettings {
     pub gpus: Vec<u32>,
 }
 
-/// How many views are used at most.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ViewsLimit {
     All,

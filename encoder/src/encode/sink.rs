@@ -23,7 +23,6 @@ pub(crate) trait PhotoSource: Sync {
     fn fetch(&self, view: &View) -> Result<bool, EncodeError>;
 }
 
-/// Keeps the results of views.
 pub(crate) trait ViewSink: Sync {
     fn n_at_once(&self) -> usize;
 

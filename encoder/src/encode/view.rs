@@ -31,7 +31,6 @@ use crate::segment::{SegmentInput, Segmenter};
 
 const PICTURE_WIDTH_PX: u32 = 480;
 
-/// Shared by the stages of all views.
 #[derive(Clone, Copy)]
 pub(crate) struct ViewTools<'a> {
     pub(crate) engines: &'a Engines<'a>,
@@ -72,7 +71,6 @@ pub(crate) struct Work<'v> {
     secs: f32,
 }
 
-/// The next stage, with its input.
 enum Next {
     Fetch,
     Decode,
@@ -167,7 +165,6 @@ impl ViewTools<'_> {
         stages
     }
 
-    /// Reserves photos under way, with masks and crops.
     pub(crate) fn reserve(&self, memory: &mut MemoryPlan, views: &[View]) {
         let Engines { models, session, .. } = self.engines;
         let preprocess = models.preprocess();
@@ -193,7 +190,6 @@ impl ViewTools<'_> {
 }
 
 impl<'a> ViewStages<'a> {
-    /// Models are opened when the first view needs them.
     pub(crate) fn new(tools: ViewTools<'a>, context: &'a RunContext<'a>) -> Self {
         let (models, session) = (tools.engines.models.clone(), tools.engines.session.clone());
         let preprocess = models.preprocess();
@@ -370,7 +366,6 @@ impl<'a> ViewStages<'a> {
         Partition { raster_view, regions, masks_of_region, outlines }
     }
 
-    /// Embeds masks, or patches that are regions.
     fn embed(&self, view: &View, cropped: Cropped) -> Result<Embedded, EncodeError> {
         let Cropped { crops, windows, patches, partition } = cropped;
         let failed = |source| EncodeError::Embed { view: view.name.clone(), source };
@@ -418,7 +413,6 @@ impl<'a> ViewStages<'a> {
         Ok(result)
     }
 
-    /// Rasterises each Gaussian's contribution to each region.
     fn lift(&self, view: &View, Embedded { vectors, partition }: Embedded) -> Result<Lifted, EncodeError> {
         let Partition { raster_view, regions, masks_of_region, outlines } = partition;
         let ViewTools { engines, scene, split, .. } = self.tools;

@@ -31,7 +31,6 @@ impl Coordinator {
         Self { bucket, queue, run: Mutex::default() }
     }
 
-    /// Uploads the open views' inputs, and begins a run.
     fn begin(
         &self,
         plan: &Plan<'_>,

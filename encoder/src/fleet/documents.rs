@@ -12,7 +12,6 @@ use crate::encode::ViewSettings;
 
 const FORMAT: u32 = 4;
 
-/// This program's version in documents.
 pub(super) fn own_version() -> String {
     format!("{}, fleet format {FORMAT}", env!("CARGO_PKG_VERSION"))
 }

@@ -138,7 +138,6 @@ impl ViewFiles {
         }
     }
 
-    /// Fetches a view's photo and masks to its paths.
     pub(super) fn fetch(&self, view: &View) -> Result<(), FleetError> {
         let Some(planned) = self.planned(view) else { return Ok(()) };
         let mut files = vec![(&planned.photo, self.photo_path(planned))];
@@ -152,7 +151,6 @@ impl ViewFiles {
     }
 }
 
-/// Fetches an input and checks its hash.
 pub(super) fn fetch_input(bucket: &Bucket, hash: Hash32) -> Result<axum::body::Bytes, FleetError> {
     let key = documents::input_key(hash);
     let bytes = bucket.require(&key)?;

@@ -92,7 +92,6 @@ impl Prepared {
         }
     }
 
-    /// Fails if scene and views do not fit the worker's memory.
     pub(super) fn check_memory(&self, memory_bytes: u64, tools: &ViewTools<'_>) -> Result<(), FleetError> {
         let mut memory = MemoryPlan::new(memory_bytes);
         memory.reserve(Phase::Always, "the scene", self.scene.len_bytes());

@@ -251,7 +251,6 @@ impl Queue {
     }
 }
 
-/// Pulls while the worker holds fewer views than it may.
 async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliver: i64) {
     let mut consumer: Option<PullConsumer> = None;
     loop {
@@ -292,7 +291,6 @@ async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliv
     }
 }
 
-/// Reports progress on the held messages.
 async fn send_heartbeats(held: Weak<Held>, interval: Duration) {
     loop {
         tokio::time::sleep(interval).await;

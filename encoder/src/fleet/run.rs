@@ -105,7 +105,6 @@ impl Run {
         Ok(documents::parse::<End>(bucket, &key, &bytes)? == End::Superseded)
     }
 
-    /// Fails if the run is superseded.
     pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
         match self.has_ended(bucket)? {
             true => Err(self.superseded(bucket)),
@@ -113,7 +112,6 @@ impl Run {
         }
     }
 
-    /// Ends the run by publishing it.
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
         // Only the run's own coordinator puts this.
         match bucket.claim(&self.key(END), documents::to_bytes(&End::Published)?)? {

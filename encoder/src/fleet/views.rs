@@ -31,7 +31,6 @@ pub(super) struct ViewWork<'a> {
     pub(super) dispatcher: &'a dyn Dispatcher,
     pub(super) n_threads: usize,
     pub(super) gpus: &'a [u32],
-    /// Views that this worker stored.
     pub(super) n_done: AtomicUsize,
 }
 

@@ -47,7 +47,6 @@ pub(crate) struct WorkerSettings {
     pub(crate) memory_bytes: u64,
     /// Folder for photos in work; temporary.
     pub(crate) folder: PathBuf,
-    /// The mask model, if the coordinator uses one.
     pub(crate) segmenter: Option<PathBuf>,
     /// How long to wait for a run, and for a heartbeat of its coordinator.
     pub(crate) patience: Duration,
@@ -134,7 +133,6 @@ fn work_for(
     result
 }
 
-/// Does views while the run has open ones.
 fn while_open(
     work: &ViewWork<'_>,
     mut coordinator: HeartbeatWatch,

@@ -10,7 +10,6 @@ use super::height::Ground;
 use super::up;
 use crate::memory::{MemoryPlan, Phase};
 
-/// Marks places without a thing.
 pub(crate) const NO_THING: u32 = u32::MAX;
 
 /// Gaussians below this opacity are no surface.
@@ -32,7 +31,6 @@ const SAMPLE: usize = 1 << 22;
 /// Reach of a Gaussian in standard deviations; with 1, things close together merge.
 const REACH: f64 = 0.5;
 const AT_ONCE: usize = 1 << 16;
-/// Bits of a voxel's coordinate.
 const BITS: u32 = 21;
 
 /// Things on a scene's ground; none by default.
@@ -48,7 +46,6 @@ struct Things {
     resolution: f64,
     /// Ascending.
     voxels: Vec<u64>,
-    /// Thing of each voxel.
     of_voxel: Vec<u32>,
     /// By thing: narrower than what the scene consists of.
     is_narrow: Vec<bool>,
@@ -193,7 +190,6 @@ impl Things {
         is_within.then(|| at.to_array().into_iter().fold(0, |key, at| key << BITS | at as u64))
     }
 
-    /// Whether the highest thing above a point is wide.
     fn is_roofed(&self, point: DVec3) -> bool {
         let Some(place) = self.place_of(point) else { return false };
         let top_of_column = place | ((1 << BITS) - 1);

@@ -61,7 +61,6 @@ pub(crate) fn find(scene: &Gaussians) -> Up {
     }
 }
 
-/// Gaussians that belong to surfaces.
 pub(crate) fn solid(scene: &Gaussians) -> impl Iterator<Item = usize> {
     (0..scene.len()).filter(|i| scene.opacities[*i] >= MIN_OPACITY)
 }

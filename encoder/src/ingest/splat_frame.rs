@@ -32,7 +32,6 @@ impl Activated {
     }
 }
 
-/// A file that states the splat's frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FoundFrame {
     pub path: PathBuf,

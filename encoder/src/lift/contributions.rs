@@ -53,7 +53,6 @@ pub struct Run {
     pub cell_id: u32,
     /// Index within the cell / [`GAUSSIANS_PER_SLICE`].
     pub(crate) slice: u32,
-    /// First entry in the file.
     pub start: u64,
     /// CRC-32 of the entries.
     checksum: u64,

@@ -91,7 +91,6 @@ pub(super) fn make_unit(sum: &mut [f32], total_weight: f32) -> f32 {
 }
 
 impl Scratch {
-    /// Numbers regions by their first entry.
     fn number_regions(&mut self, contributions: &PartContributions, gaussians: Range<usize>) {
         let entries =
             contributions.starts[gaussians.start] as usize..contributions.starts[gaussians.end] as usize;
@@ -111,7 +110,6 @@ impl Scratch {
     }
 }
 
-/// Sums of region vectors of consecutive Gaussians.
 struct Chunk<'a> {
     contributions: &'a PartContributions,
     table: &'a RegionTable,

@@ -59,7 +59,6 @@ impl CellField {
         self.input_indices.is_empty()
     }
 
-    /// Regions of a Gaussian's contributions, and their weights.
     pub fn entries(&self, k: usize) -> impl Iterator<Item = (usize, f32)> + '_ {
         let range = self.starts[k] as usize..self.starts[k + 1] as usize;
         self.regions[range.clone()].iter().map(|r| *r as usize).zip(self.weights[range].iter().copied())

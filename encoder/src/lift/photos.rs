@@ -11,7 +11,6 @@ use crate::masks::{BoxPx, Mask};
 const MAGIC: [u8; 8] = *b"SLAGMBOX";
 const VERSION: u32 = 2;
 
-/// The masks of a view's photo.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Photo {
     pub name: String,

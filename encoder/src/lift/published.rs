@@ -15,7 +15,6 @@ pub(crate) fn extra_field(cell_id: u32, part: u32) -> String {
     format!("field/{cell_id}/{part}")
 }
 
-/// `n_gaussians`: of the cell.
 pub fn read_field(
     reader: &StoreReader,
     cell_id: u32,

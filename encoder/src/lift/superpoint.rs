@@ -48,7 +48,6 @@ impl SuperpointSettings {
     }
 }
 
-/// A partition of a scene's Gaussians.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Superpoints {
     /// `[N]`: [`NO_SUPERPOINT`] for Gaussians that cannot be drawn.

@@ -42,7 +42,6 @@ pub struct RegionTable {
 }
 
 impl RegionTable {
-    /// An empty table of vectors of `dim` components.
     pub fn new(dim: usize) -> Self {
         Self {
             dim,

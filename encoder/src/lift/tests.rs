@@ -8,7 +8,6 @@ use super::*;
 use slag_math::dot;
 use slag_math::random::mix64;
 
-/// Contribution files in a folder, and their index.
 pub(super) struct Scene {
     pub(super) index: ContributionIndex,
     pub(super) table: RegionTable,
@@ -178,7 +177,6 @@ proptest! {
     }
 }
 
-/// A cell's parts, read in order, are the cell.
 #[test]
 fn parts_of_a_cell_make_the_cell() {
     let whole = scene_of(5, 10_000, 4);

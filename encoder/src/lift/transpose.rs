@@ -7,14 +7,12 @@ use super::contributions::{ContributionError, GAUSSIANS_PER_SLICE, PackedEntry};
 use super::index::{ContributionIndex, IndexedView, PartContributions, RawGroup};
 use super::table::RegionTable;
 
-/// A slice's entries in one view.
 #[derive(Clone, Copy)]
 struct SliceRun<'a> {
     view: usize,
     entries: &'a [PackedEntry],
 }
 
-/// A slice to transpose, and where its results go.
 struct SliceTask<'a> {
     runs: Vec<SliceRun<'a>>,
     starts: &'a mut [u64],

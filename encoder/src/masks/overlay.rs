@@ -45,7 +45,6 @@ pub fn overlay(photo: &RgbImage, masks: &[Mask], width_px: u32) -> RgbImage {
     picture
 }
 
-/// A strong colour of hue 0 to 1.
 fn hue(hue: f32) -> [f32; 3] {
     [0.0, 2.0, 4.0].map(|shift: f32| {
         let distance = ((hue * 6.0 - shift).rem_euclid(6.0) - 3.0).abs();

@@ -89,7 +89,6 @@ impl Classes {
         Self { of_pixel, sizes, n_inside: vec![0], split: vec![INVALID], pixels, touched }
     }
 
-    /// Splits classes that lie partly in the mask.
     fn refine(&mut self, mask: &Mask, columns: &[u32], rows: &[u32]) {
         self.pixels.clear();
         for_each_pixel(mask, columns, rows, |pixel| {

@@ -54,7 +54,6 @@ impl Rle {
         }
     }
 
-    /// Decodes COCO's compact text.
     pub fn from_text(width_px: u32, height_px: u32, text: &str) -> Result<Self, RleError> {
         let mut counts: Vec<u32> = Vec::new();
         let mut bytes = text.bytes().enumerate();

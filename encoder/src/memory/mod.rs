@@ -66,7 +66,6 @@ pub struct MemoryError {
     pub needed_bytes: u64,
     /// Whether no view was done yet.
     pub is_before_views: bool,
-    /// The step that needs the most.
     phase: Phase,
     /// Reservations held at the same time, largest first.
     pub parts: Vec<Reservation>,

@@ -79,7 +79,6 @@ pub(crate) fn find(
     Ok(SceneObjects { objects, object_of, thumbnails: Vec::new(), calibration, report })
 }
 
-/// Masks of each object, and how well each mask shows it.
 struct Masks {
     of_object: Vec<Vec<u32>>,
     /// `[n_masks]`: blending weight under the mask, pixels.

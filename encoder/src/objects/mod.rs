@@ -28,7 +28,6 @@ pub(crate) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, has_superpoin
     }
 }
 
-/// Reserves what depends on the contributions, after the views.
 pub(crate) fn reserve_contributions(memory: &mut MemoryPlan, n_entries: u64) {
     sightings::reserve(memory, n_entries);
 }

@@ -10,7 +10,6 @@ use slag_math::cholesky::{SmallPivots, cholesky};
 
 use super::object::{MAX_MEDOIDS, NONE, Object, SceneObjects};
 
-/// The mean of the masks' vectors, and the medoids.
 const N_VECTORS: usize = 1 + MAX_MEDOIDS;
 
 /// A shard's centroid basis, and the projection onto it.

@@ -12,7 +12,6 @@ const GAUSSIANS_PER_TASK: usize = 1 << 12;
 /// Contributions per pair of superpoint and region, at least: a superpoint has 15 Gaussians in labelled scenes.
 const ENTRIES_PER_REGION: u64 = 8;
 
-/// What a view shows of a superpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ViewSighting<'a> {
     pub(super) view: u32,
@@ -24,7 +23,6 @@ pub(super) struct ViewSighting<'a> {
     pub(super) masks: &'a [MaskSighting],
 }
 
-/// What a mask shows of a superpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct MaskSighting {
     pub(super) mask: u32,

@@ -225,7 +225,6 @@ fn evidence_saturates() {
     assert_eq!(evidence, Evidence { together: u64::MAX, n: u64::MAX });
 }
 
-/// Shards hold what was found, in any order of the Gaussians.
 #[test]
 fn shards_carry_the_objects_of_their_cell() {
     let world = world();

@@ -20,7 +20,6 @@ const AROUND: f64 = 0.15;
 /// The best one with a short enough file is taken. Noise has 9 kB with the least.
 const JPEG_QUALITIES: [u8; 2] = [75, 30];
 
-/// Objects and their JPEG files.
 type Cuts = Vec<(usize, Vec<u8>)>;
 
 /// Cuts a JPEG thumbnail per object, `[n]`: empty if its photo is unreadable or the run was cancelled. Also returns the

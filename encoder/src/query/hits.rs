@@ -76,7 +76,6 @@ pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result
     Ok(indices.iter().filter_map(hit).collect())
 }
 
-/// A cell's smallest shard with input indices.
 fn indexed_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<StoredShard>, QueryError> {
     for record in Profile::ALL.iter().filter_map(|profile| cell.shards.get(profile)) {
         let shard = reader.read_shard(record)?;

@@ -116,7 +116,6 @@ fn merge_range(
     entries
 }
 
-/// A region's pixels in a row of a tile.
 struct Part {
     /// Index into the tile's regions.
     slot: usize,

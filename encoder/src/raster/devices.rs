@@ -75,7 +75,6 @@ pub enum DeviceError {
     Unfit(#[from] RasterError),
 }
 
-/// Distributes views over several devices.
 pub struct Devices {
     pub gpus: Vec<GpuRasterizer>,
     views_in_flight: usize,

@@ -5,7 +5,6 @@ use slag_raster::{Drawing, InputError, RasterView, ViewCounters};
 
 use crate::masks::RegionMap;
 
-/// GPUs that rasterise a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpuSlots {
     pub(crate) n_gpus: usize,

@@ -41,7 +41,6 @@ impl Recorded {
     }
 }
 
-/// Records an encode's progress for its report, and passes it on.
 pub(crate) struct Recorder<'a> {
     shown: &'a dyn Progress,
     recorded: Mutex<Recorded>,

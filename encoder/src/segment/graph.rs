@@ -218,7 +218,6 @@ impl Segmenter for GraphSegmenter {
     }
 }
 
-/// What one image's components are judged by.
 struct Segmented<'a> {
     raster: &'a Raster,
     boundaries: Option<&'a [f32]>,

@@ -80,7 +80,6 @@ fn masks_of(standing: &Standing, input: &SegmentInput<'_>) -> Vec<Mask> {
     masks.filter(|mask| (MIN_AREA_PX..=max_area_px).contains(&mask.area_px)).collect()
 }
 
-/// Columns and rows common to two boxes.
 fn common(a: &BoxPx, b: &BoxPx) -> [Range<u32>; 2] {
     [a.x0.max(b.x0)..a.x1.min(b.x1), a.y0.max(b.y0)..a.y1.min(b.y1)]
 }

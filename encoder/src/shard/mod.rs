@@ -71,7 +71,6 @@ pub(crate) fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
 }
 
-/// Bytes to build the shards of the largest cell.
 pub(crate) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
     let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max();
     largest.map_or(0, |n_gaussians| working_bytes(n_gaussians, dim))

@@ -166,7 +166,6 @@ impl Catalogue {
         Ok(last.and_then(|(key, _)| Some(u64::from_be_bytes(key.as_ref().try_into().ok()?))))
     }
 
-    /// Records a manifest, unless it is recorded.
     pub(crate) fn record(&self, manifest: &Manifest, manifest_hash: Hash32) -> Result<(), StoreError> {
         let write = || -> Result<(), Fault> {
             let key = manifest.generation.to_be_bytes();

@@ -149,7 +149,6 @@ impl Metadata {
 }
 
 impl MetadataReader {
-    /// `root_folder`: where root's keys may lie.
     pub(crate) fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
         let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
         let mut here: Vec<String> =

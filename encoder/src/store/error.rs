@@ -76,7 +76,6 @@ impl From<io::Error> for StoreError {
 const ROOT_HELP: &str =
     "copy it from a backup of the store, or from v1/metadata/ of what `slag-encoder store export` wrote";
 
-/// Help for an error of the file system.
 pub(crate) fn io_help(error: &io::Error) -> &'static str {
     by_the_system(error).unwrap_or("check permissions and free space")
 }
@@ -104,7 +103,6 @@ fn by_the_system(error: &io::Error) -> Option<&'static str> {
 
 const FULL: &str = "free space on that disk, then run the same command again: what is done is kept";
 
-/// Fault of a manifest on this disk.
 pub(super) fn manifest_fault(cause: &ManifestError) -> String {
     match cause {
         ManifestError::Version { .. } => cause.to_string(),
@@ -141,7 +139,6 @@ pub(super) fn metadata_fault(cause: &TufError) -> String {
     }
 }
 
-/// Help for a damaged or missing file of metadata.
 pub(super) fn metadata_help(path: &Path) -> &'static str {
     let is_root = path.to_str().is_some_and(|path| path.ends_with(".root.json"));
     if is_root { ROOT_HELP } else { "run `slag-encoder store refresh`, which signs it anew" }

@@ -12,7 +12,6 @@ use super::error::StoreError;
 
 pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
 
-/// Counts and hashes what is written to a file.
 pub(super) struct HashingWriter {
     file: BufWriter<File>,
     hasher: blake3::Hasher,

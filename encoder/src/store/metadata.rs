@@ -44,7 +44,6 @@ pub(crate) struct Refreshed {
     pub(crate) expires_unix_secs: u64,
 }
 
-/// Metadata and the bytes of its file.
 type WithBytes<T> = (SignedMetadata<T>, Vec<u8>);
 
 /// What clients find.
@@ -168,7 +167,6 @@ impl MetadataReader {
         Ok(None)
     }
 
-    /// Whether anything was signed here, under any root.
     fn is_begun(&self) -> Result<bool, StoreError> {
         let has = |role: &str| Ok::<_, StoreError>(!self.versions(role)?.is_empty());
         Ok(self.path(TIMESTAMP_FILE).exists() || has(Targets::TYPE)? || has(Snapshot::TYPE)?)
@@ -202,7 +200,6 @@ impl MetadataReader {
         Ok(self.versions(role)?.into_iter().max().unwrap_or(0).saturating_add(1))
     }
 
-    /// Versions of a role's numbered files, unordered.
     fn versions(&self, role: &str) -> Result<Vec<u64>, StoreError> {
         let suffix = format!(".{role}.json");
         let mut versions = Vec::new();

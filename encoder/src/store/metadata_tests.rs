@@ -45,7 +45,6 @@ pub(super) fn publish_in(dir: &Path, generation: u64) -> Result<(), StoreError> 
     Store::create_or_open(dir)?.publish(&manifest_of(generation, &[]), &Extras::new()).map(drop)
 }
 
-/// A robot fetches the published manifest.
 pub(super) fn follow(kept: &mut Kept, dir: &Path, now: u64) -> Result<Trusted, TufError> {
     let trusted = refresh(kept, &mut Folder(dir), now)?;
     let bytes = fs_err::read(dir.join("manifest")).expect("there");

@@ -138,7 +138,6 @@ impl StoreReader {
         &self.current
     }
 
-    /// The generation before it, if any.
     pub(crate) fn previous(&self) -> Option<&Published> {
         self.previous.as_ref()
     }

@@ -22,7 +22,6 @@ use super::files::{self, Access};
 /// Roles whose keys lie with the store.
 pub(super) const ONLINE: [&str; 3] = ["targets", "snapshot", "timestamp"];
 
-/// Default folder of a store's root keys.
 pub(crate) fn root_folder(store: &Path) -> PathBuf {
     store.join("keys").join("root")
 }
@@ -172,13 +171,11 @@ fn read_or_make(path: &Path) -> Result<SigningKey, StoreError> {
 
 const DAMAGED: &str = "it is damaged: expected 64 hex digits";
 
-/// Error for a damaged key that cannot be made anew.
 fn damaged(path: PathBuf) -> StoreError {
     let help = "restore it from a backup, or move it away if root's other keys are enough (`slag-encoder keys status` tells the threshold)";
     StoreError::Key { path, what: DAMAGED, help: help.into() }
 }
 
-/// Content of a key's file.
 enum KeyFile {
     Key(Box<SigningKey>),
     Missing,

@@ -26,7 +26,6 @@ pub(crate) const DAMAGES: [fn(&Path); 4] = [
     },
 ];
 
-/// A manifest of cells without shards.
 pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
     let cell = |(cell_id, bounds): (usize, &Aabb)| CellRecord {
         cell_id: cell_id as u32,

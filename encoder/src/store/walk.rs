@@ -16,7 +16,6 @@ use super::metadata::{TIMESTAMP_FILE, clock_unix_secs, folder, names, read_publi
 pub(super) const N_TRIES: usize = 3;
 pub(super) const PAUSE: Duration = Duration::from_millis(if cfg!(test) { 1 } else { 200 });
 
-/// A file that robots refuse.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Refused {
     pub(super) path: PathBuf,
@@ -54,7 +53,6 @@ pub(super) fn refused(store: &Path) -> Result<Vec<Refused>, StoreError> {
     }
 }
 
-/// What a robot would refuse of some metadata and a manifest.
 pub(super) fn refused_of(
     store: &Path,
     metadata: &MetadataFiles,
@@ -133,7 +131,6 @@ impl Walk<'_> {
         }
     }
 
-    /// Records a refused file.
     fn refuse(&mut self, At { name, cause }: &At) -> Ended {
         let fault = metadata_fault(cause);
         let refused = if name == TARGET {

@@ -26,7 +26,6 @@ pub struct Pruned {
     pub len_bytes: u64,
 }
 
-/// The only writer of a store.
 #[derive(Debug)]
 pub struct Store {
     pub(super) dir: PathBuf,

@@ -46,7 +46,6 @@ impl Things {
         Ok(things)
     }
 
-    /// Adds the objects of the next cell's smallest shard.
     fn add(&mut self, cell: &CellRecord, shard: StoredShard) {
         let Some(objects) = shard.objects() else { return };
         let have_thumbnails = objects.thumbnails.is_some() || cell.shards.len() > 1;

@@ -23,7 +23,6 @@ pub(super) struct Generation {
 
 /// Source of scores; it determines the order of a cell's Gaussians.
 enum Scored {
-    /// The published fields, in full precision.
     Fields(RegionTable, Vec<CellField>),
     /// The smallest shards' centroids.
     Shards,
@@ -102,7 +101,6 @@ impl Generation {
         }
     }
 
-    /// A thing's small picture, a JPEG file.
     pub(super) fn thumbnail(&self, id: u64) -> Result<Option<Vec<u8>>, ViewError> {
         let cell_id = self.things.cell_of(id);
         let cell = self.reader.manifest().cells.iter().find(|cell| Some(cell.cell_id) == cell_id);

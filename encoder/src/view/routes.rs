@@ -93,7 +93,6 @@ async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Pro
     blocking(viewer, work).await.map(Json)
 }
 
-/// Compares the published generation with the one before it.
 async fn changes(State(viewer): AppState) -> Result<Json<Diff>, Problem> {
     blocking(viewer, |viewer| viewer.changes()).await.map(Json)
 }

@@ -55,7 +55,6 @@ impl Splat {
         }
     }
 
-    /// Message of one of the splat's own cells.
     pub(super) fn cell(&self, cell_id: u32, step: Step) -> Result<Vec<u8>, ViewError> {
         let cell = self.split.cells.get(cell_id as usize).ok_or(ViewError::NoCell { cell_id })?;
         Ok(self.message(&cell.gaussians, step))

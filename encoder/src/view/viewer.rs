@@ -114,7 +114,6 @@ impl Viewer {
         Ok(description)
     }
 
-    /// Compares the current generation with the one before it.
     pub(super) fn changes(&self) -> Result<Diff, ViewError> {
         let generation = self.generation()?;
         let reader = &generation.reader;

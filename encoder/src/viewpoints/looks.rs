@@ -46,7 +46,6 @@ pub(super) fn look_at(eye: DVec3, target: DVec3) -> DAffine3 {
     look_along(eye, target - eye)
 }
 
-/// An ideal camera with the planner's field of view.
 pub(super) fn pinhole(width_px: u32, height_px: u32) -> Intrinsics {
     raster::pinhole([width_px, height_px], 0.5 * f64::from(width_px) / HALF_WIDTH)
 }

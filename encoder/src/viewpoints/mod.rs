@@ -155,7 +155,6 @@ fn large_from_above(space: &Space, rasterizer: &dyn Rasterizer) -> Result<bool, 
     Ok(large(1.0)? > large(-1.0)?)
 }
 
-/// How often a Gaussian is seen, and from which sides.
 #[derive(Clone, Copy, Default)]
 struct Seen {
     n_views: u8,

@@ -131,7 +131,6 @@ impl Space {
         occupied
     }
 
-    /// Index of the voxel at a point; `None` outside of the grid.
     fn voxel(&self, at: DVec3) -> Option<usize> {
         let [x, y, z] = ((at + self.half) / VOXEL + MARGIN).to_array().map(f64::floor);
         let [nx, ny, nz] = self.n;

@@ -24,7 +24,6 @@ const N_WARM_UP: usize = 5;
 /// Weight of a scene's embedding in a query that resembles a text: text and image vectors of one thing have
 /// cosines around this (CLIP).
 const LIKENESS: f64 = 0.3;
-/// Gaussians that a dump decodes at a time.
 const CHUNK: usize = 4096;
 
 #[derive(Debug, Args)]

@@ -151,7 +151,6 @@ fn encode(
     settings.run.strict = true;
     // So that the robot's page shows colours, too.
     settings.cells.shards.compact_appearance = true;
-    // Small cells, so that the demo has several.
     settings.cells.limits = CellLimits { max_gaussians: 16_384, ..settings.cells.limits };
     let engines = Engines::new(models, &options.session, &CpuRasterizer);
     encode::encode(&settings, &engines, progress, cancel).context("encode")

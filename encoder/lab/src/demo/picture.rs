@@ -43,7 +43,6 @@ fn luma([r, g, b]: [f32; 3]) -> f32 {
 }
 
 pub(super) struct Panel<'a> {
-    /// The question, written across the top.
     pub(super) question: &'a str,
     pub(super) answer: &'a EdgeAnswer,
     /// Cosine of each Gaussian with the question; NaN where it has no embedding.

@@ -27,7 +27,6 @@ const FORMS: [Form; 7] = [
         text: |o| Some(format!("{} {}", o.colours.first()?, o.category)),
         is_true: |a, b| same_noun(a, b) && a.colours.first() == b.colours.first(),
     },
-    // A synonym.
     Form {
         text: |o| o.words.iter().find(|word| **word != o.category).map(|word| format!("the {word}")),
         is_true: same_noun,

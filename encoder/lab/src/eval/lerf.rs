@@ -34,7 +34,6 @@ const MIN_COVERAGE: f32 = 0.7;
 /// Largest relative difference between the aspect ratios of a label and its view.
 const MAX_ASPECT_ERROR: f64 = 0.01;
 
-/// Threshold of the paper's figures.
 const PAPERS_THRESHOLD: f32 = 0.28;
 
 #[derive(Debug, Args)]

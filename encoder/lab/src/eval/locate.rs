@@ -227,14 +227,12 @@ fn on_board(scene: &Gaussians) -> Gaussians {
     on_board
 }
 
-/// A photo as the robot has it.
 struct Query {
     grey: Grey,
     intrinsics: Intrinsics,
     camera_from_world: glam::DAffine3,
 }
 
-/// Reads a query's photo, or draws it, and changes it.
 fn query(view: &View, change: Change, drawn: Option<&dyn LoadedScene>) -> Result<Query> {
     let loaded = ingest::load_image(view).with_context(|| view.name.clone())?;
     let mut intrinsics = loaded.view.intrinsics;

@@ -59,7 +59,6 @@ impl MaskSource {
     }
 }
 
-/// Models and devices for encodes, opened once.
 pub(crate) struct Runner {
     models: ModelDir,
     session: SessionOptions,
@@ -117,7 +116,6 @@ impl Runner {
     }
 }
 
-/// Reads the labels of the scene that a store was encoded from.
 pub(crate) fn truth_of(reader: &StoreReader, dir: &Path) -> Result<Truth> {
     let manifest = reader.manifest();
     Truth::read(dir, (manifest.n_gaussians + manifest.n_rejected) as usize)

@@ -310,7 +310,6 @@ impl Area {
             && bounds.max.z <= if self.kind == SceneKind::Room { self.height_m } else { f64::INFINITY }
     }
 
-    /// Parts of a shell noun, such as floor or walls.
     fn shell(&self, name: &str, object: &Object) -> Vec<Part> {
         let (middle, size) = (self.corner + self.size / 2.0, self.size);
         let slab = |centre: DVec3, size: DVec3| Part {
@@ -384,7 +383,6 @@ pub fn photo_intrinsics() -> Intrinsics {
     pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD)
 }
 
-/// An ideal pinhole camera with square pixels.
 pub fn pinhole([width_px, height_px]: [u32; 2], field_of_view_rad: f64) -> Intrinsics {
     raster::pinhole([width_px, height_px], f64::from(width_px) / 2.0 / (field_of_view_rad / 2.0).tan())
 }

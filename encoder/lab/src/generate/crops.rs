@@ -222,7 +222,6 @@ fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) 
     segments.into_iter().filter_map(|mask| Some((thing_of(&mask)?, mask))).collect()
 }
 
-/// Cuts off one side of a mask, as a segmenter may.
 fn cut_mask(mask: &Mask, random: &mut Xorshift) -> Mask {
     let (width, height) = (mask.box_px.width_px(), mask.box_px.height_px());
     let angle = random.between(0.0, std::f64::consts::TAU);

@@ -60,7 +60,6 @@ struct Parser<'a> {
 }
 
 impl Parser<'_> {
-    /// Takes the next character if it is one of the symbols.
     fn take<T: Copy>(&mut self, symbols: &[(char, T)]) -> Option<T> {
         let first = self.rest.chars().next()?;
         let (_, meaning) = symbols.iter().find(|(symbol, _)| *symbol == first)?;

@@ -350,7 +350,6 @@ fn found(text: &str) -> Result<(SceneKind, Place), String> {
 }
 
 impl PartRule {
-    /// Makes the parts of the loops from index `depth` on.
     fn make(
         &self,
         depth: usize,

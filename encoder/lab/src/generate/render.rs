@@ -32,7 +32,6 @@ impl Light {
     }
 }
 
-/// Solids of one thing, in the world frame.
 #[derive(Clone, Debug)]
 pub struct Thing {
     pieces: Vec<Piece>,

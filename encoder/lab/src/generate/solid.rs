@@ -19,7 +19,6 @@ pub enum Shape {
     Ellipsoid(DVec3),
 }
 
-/// A painted shape with a pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Part {
     pub shape: Shape,

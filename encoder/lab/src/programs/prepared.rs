@@ -32,7 +32,6 @@ pub(crate) fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
 }
 
 impl Service {
-    /// Returns the JSON of a resource, whatever its status.
     pub(crate) fn get(&self, path: &str) -> Result<Value> {
         let body = agent().get(format!("{}{path}", self.url)).call()?.body_mut().read_to_string()?;
         serde_json::from_str(&body).with_context(|| path.to_owned())
@@ -43,7 +42,6 @@ impl Service {
         self.send(path, "application/json", body.to_string().as_bytes())
     }
 
-    /// Like [`Self::post`], with a PNG.
     pub(crate) fn post_image(&self, path: &str, png: &[u8]) -> Result<Value> {
         self.send(path, "image/png", png)
     }
@@ -61,7 +59,6 @@ fn agent() -> ureq::Agent {
     config.timeout_global(Some(TIMEOUT)).build().into()
 }
 
-/// Copies a whole store to an empty cache as a robot does.
 pub(crate) fn fetch_all(store: &Path, cache: &Path, profile: &str) -> Result<()> {
     remove(cache)?;
     fetch(store, cache, &["--at", "0,0,0", "--radius", "1e6", "--profile", profile]).map(|_| ())
@@ -101,7 +98,6 @@ impl Prepared<'_> {
         Ok(names)
     }
 
-    /// Generates, encodes and fetches a scene, skipping what is done.
     fn make(&self, kind: SceneKind, seed: u64, dir: &Path) -> Result<()> {
         let [scene, store, cache] = ["scene", "store", "cache"].map(|name| dir.join(name));
         let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));

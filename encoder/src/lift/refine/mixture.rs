@@ -91,7 +91,6 @@ fn summed_by_key(mut entries: Vec<(u32, f32)>) -> Vec<(u32, f32)> {
     entries.chunk_by(|a, b| a.0 == b.0).map(sum).collect()
 }
 
-/// A mixture's region, and the length of its point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct MixtureRegion {
     pub(super) region: u32,
@@ -234,7 +233,6 @@ pub(super) fn points_of_regions(
     regions.into_par_iter().map(point).collect()
 }
 
-/// Weighted sum of some entries' regions.
 pub(super) fn sum_of(
     contributions: &PartContributions,
     entries: Range<usize>,

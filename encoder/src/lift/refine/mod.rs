@@ -120,7 +120,6 @@ impl PendingRefinement {
         Ok(pending)
     }
 
-    /// Regions of all views, with weighed masks.
     pub fn table(&self) -> &RegionTable {
         &self.table
     }
@@ -150,7 +149,6 @@ impl PendingRefinement {
 }
 
 impl Refinement {
-    /// Superpoints by scale with their weights.
     fn superpoints(
         &self,
         scene: &SceneContributions<'_>,
@@ -183,7 +181,6 @@ impl Refinement {
         Ok(fine.into_iter().chain(larger).collect())
     }
 
-    /// Appends superpoints' and objects' mixtures to the table.
     fn make_mixtures(
         &mut self,
         scene: &SceneContributions<'_>,

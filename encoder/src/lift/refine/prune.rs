@@ -9,7 +9,6 @@ use crate::lift::index::PartContributions;
 /// Least number of Gaussians per task.
 const CHUNK: usize = 4096;
 
-/// A Gaussian's entries in one view, with their total weight.
 struct ViewEntries {
     entries: Range<usize>,
     weight: f32,

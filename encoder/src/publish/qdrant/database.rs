@@ -141,7 +141,6 @@ fn is_unreachable(error: &QdrantError) -> bool {
     matches!(error, QdrantError::ResponseError { status } if status.message().starts_with("Failed to connect"))
 }
 
-/// Whether the same request may succeed later.
 fn may_pass(error: &QdrantError) -> bool {
     match error {
         QdrantError::ResourceExhaustedError { .. } | QdrantError::Io(_) => true,
@@ -158,7 +157,6 @@ fn may_pass(error: &QdrantError) -> bool {
     }
 }
 
-/// A collection for a scene, or a cell of it.
 pub(super) struct Collection<'a> {
     pub(super) database: &'a Database<'a>,
     pub(super) name: String,

@@ -73,7 +73,6 @@ pub struct PushOptions {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct PushProgress {
-    /// Points of this generation in the database.
     pub(crate) n_points: u64,
     /// Points of this generation at the end.
     pub(crate) n_points_expected: u64,

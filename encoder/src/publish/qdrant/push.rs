@@ -41,7 +41,6 @@ struct Record {
     n_without_evidence: u64,
 }
 
-/// A database's collections, as recorded in the store.
 struct Records<'a> {
     tree: sled::Tree,
     url: &'a str,
@@ -75,7 +74,6 @@ impl Records<'_> {
 }
 
 impl Layout {
-    /// Collections of a scene, with their cells.
     fn divide<'a>(self, name: &str, manifest: &'a Manifest) -> Vec<(String, &'a [CellRecord])> {
         let cells = manifest.cells.as_slice();
         match self {
@@ -106,7 +104,6 @@ struct Push<'a> {
     report: PushReport,
 }
 
-/// A collection, and the cells it is to hold.
 struct Target<'a> {
     collection: Collection<'a>,
     cells: &'a [CellRecord],
@@ -142,7 +139,6 @@ impl<'a> Push<'a> {
         Collection { database: self.database, name, manifest: self.reader.manifest() }
     }
 
-    /// Prepares a collection and sends its missing points.
     async fn push_target(
         &mut self,
         target: &Target<'a>,

@@ -24,7 +24,6 @@ use super::problem;
 use super::state::{AppState, Snapshot};
 use crate::store::metadata::{TIMESTAMP_FILE, read_published};
 
-/// Piece size for reading and sending objects.
 const PIECE_BYTES: usize = 64 << 10;
 const JSON: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/json")];
 const BINARY: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];

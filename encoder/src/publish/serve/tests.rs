@@ -232,7 +232,6 @@ async fn cells_near_a_point() {
     let fixture = fixture();
     let origin = Geographic { latitude_deg: 46.842657, longitude_deg: -91.994008, height_m: 158.5 };
     let reference = GeoReference { origin };
-    // A spiral of boxes.
     let boxes: Vec<Aabb> = (0..60)
         .map(|i| {
             let (angle, i) = (f64::from(i) * 0.7, f64::from(i));
@@ -422,7 +421,6 @@ async fn downloads_are_counted_until_they_end() {
     assert_eq!(get_with(&router, &path, &[]).await.status, StatusCode::OK);
 }
 
-/// A running service's address, stop signal and end.
 struct Running {
     address: SocketAddr,
     stop: tokio::sync::oneshot::Sender<()>,

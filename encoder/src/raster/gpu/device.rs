@@ -49,7 +49,6 @@ pub fn adapters() -> Vec<Adapter> {
     adapters
 }
 
-/// An opened device with compiled shaders.
 pub struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
@@ -108,7 +107,6 @@ impl Adapter {
 }
 
 impl Device {
-    /// First error since the device was opened.
     pub(super) fn check(&self) -> Result<(), RasterError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),

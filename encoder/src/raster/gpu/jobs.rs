@@ -23,7 +23,6 @@ pub enum Scan {
 
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) enum SortKey {
-    /// Depth of a visible Gaussian.
     Depth,
     Tile,
     /// Visible Gaussian of an entry, then its region.

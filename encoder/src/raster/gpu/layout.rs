@@ -60,7 +60,6 @@ fn high_and_low(value: DVec3) -> ([f32; 3], [f32; 3]) {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct Chunk {
-    /// In the scene.
     pub(crate) first_gaussian: u32,
     pub n_gaussians: u32,
 }
@@ -100,7 +99,6 @@ pub(crate) struct SortPass {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct RegionSum {
-    /// Index in the scene.
     pub gaussian: u32,
     pub region: u32,
     /// Lower word.

@@ -158,12 +158,10 @@ impl<'s> GpuScene<'s> {
         Some(buffer)
     }
 
-    /// Most elements of this size in one binding.
     fn max_elements(&self, bytes: u64) -> u32 {
         (self.max_binding_bytes / bytes).min(u64::from(MAX_CAPACITY)) as u32
     }
 
-    /// Largest capacities that bindings allow.
     fn max_capacities(&self) -> Capacities {
         let (screen_bytes, _) = screen_layout(self.device.report.precision);
         Capacities {

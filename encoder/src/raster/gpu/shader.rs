@@ -36,7 +36,6 @@ pub(crate) enum Counter {
     FirstVisible,
     /// Gaussians with a projection out of range.
     Unrepresentable,
-    /// (Tile, Gaussian) pairs.
     Pairs,
     /// Per tile, Gaussian and region.
     Entries,
@@ -56,7 +55,6 @@ impl Counter {
     ];
 }
 
-/// All counters after a band.
 pub(crate) type Counts = [u32; Counter::ALL.len()];
 
 /// Without the common part.

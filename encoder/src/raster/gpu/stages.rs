@@ -171,7 +171,6 @@ impl Stages {
         dispatch(pass, kernel, group, [1, 1]);
     }
 
-    /// Blends all tiles and sums their weights over regions.
     pub(crate) fn blend(
         &mut self,
         device: &Device,

@@ -12,10 +12,8 @@ use super::shader::{Counter, Counts};
 use super::stages::{SceneChunk, Stages, bind, dispatch, number, whole};
 use crate::raster::rasterizer::RasterError;
 
-/// Of a drawn pixel.
 pub(crate) const PIXEL_BYTES: u64 = 20;
 
-/// Resources of one view in flight.
 pub struct Workspace {
     pub(crate) capacities: Capacities,
     n_tiles: u32,
@@ -261,7 +259,6 @@ impl Workspace {
 pub(crate) struct Band<'a> {
     pub device: &'a Device,
     pub chunks: &'a [SceneChunk],
-    /// Uploads the Gaussians of a chunk that is not on the device.
     pub(crate) upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
     pub view: &'a ViewBlock,
 }
@@ -297,7 +294,6 @@ mod tests {
         Some((device, workspace))
     }
 
-    /// Submits the recorded commands and reads the start of a buffer.
     fn read_back(
         device: &Device,
         mut recorded: wgpu::CommandEncoder,

@@ -138,7 +138,6 @@ pub(super) fn entry<'a>(
         .or_else(|| one(&|entry| entry.rsplit('/').next().is_some_and(|entry| entry.starts_with(&exported))))
 }
 
-/// Decodes masks and undistorts them like the photo.
 pub(super) fn masks_of_rles(
     path: &Path,
     rles: &[(usize, Rle)],

@@ -84,7 +84,6 @@ impl Filters<'_> {
             .any(|((found, crop), image)| is_near(found, crop) && !is_near(found, image))
     }
 
-    /// Splits candidates into lists that are filtered separately.
     pub(super) fn lists(&self, candidates: Vec<Candidate>) -> Vec<Vec<Candidate>> {
         let lists = self.settings.levels.lists();
         let mut found = vec![Vec::new(); lists.len()];

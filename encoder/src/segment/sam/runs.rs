@@ -92,7 +92,6 @@ impl RunMask {
     }
 }
 
-/// Pixels of an image outside the runs.
 fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
     let mut gaps = Vec::new();
     let mut runs = runs.iter().peekable();

@@ -14,7 +14,6 @@ use slag_models::sam::Letterbox;
 
 use super::runs::{Run, RunMask};
 
-/// Logits and weights of each pixel along an axis.
 struct Axis {
     /// First of three consecutive logits.
     first: Vec<usize>,
@@ -211,7 +210,6 @@ struct Outline {
 }
 
 impl Outline {
-    /// Adds pixels that are above all thresholds.
     #[inline(always)]
     fn fill(&mut self, y: u32, pixels: Range<usize>) {
         self.n_high += pixels.len() as u64;

@@ -43,7 +43,6 @@ pub(crate) struct TradeoffArgs {
     models: ModelArgs,
 }
 
-/// Measures the points that have no file yet and summarises all.
 pub(crate) fn run(args: &TradeoffArgs, progress: &dyn Progress) -> Result<TradeoffReport> {
     let grid = Grid::find(&args.grid)?;
     // Opened first: a model that cannot be opened fails before hours of work.

@@ -168,7 +168,6 @@ enum Verdict {
     /// The robot has no object that is the thing.
     NoObject,
     None(String),
-    /// A pose, and the truth about it.
     Pose {
         clearance_m: f64,
         is_reached: bool,

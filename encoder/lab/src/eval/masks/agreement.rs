@@ -12,7 +12,6 @@ use super::segments::{Ious, MIN_PX, areas};
 /// A point is hidden where its depth differs from the splat's by more than this, relatively.
 const MAX_DEPTH_ERROR: f64 = 0.03;
 
-/// A segmented photo, and the depth of the splat there.
 pub(super) struct Seen {
     pub(super) view: RasterView,
     /// Camera z of each pixel; 0 where there is no splat.

@@ -98,7 +98,6 @@ fn judge(dir: &Path, report: &mut RelationsReport) -> Result<()> {
     Ok(())
 }
 
-/// Middle of a scene, where the robot stands.
 fn middle(things: &[Thing]) -> DVec3 {
     let all = things.iter().fold(Aabb::EMPTY, |all, thing| Aabb {
         min: all.min.min(thing.aabb_min),
@@ -148,7 +147,6 @@ fn questions(things: &[Thing], robot: DVec3) -> Vec<Question> {
     all
 }
 
-/// Asks a question one way; returns the answers, best first.
 fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result<Vec<Value>> {
     let near = [robot.x, robot.y, 0.0];
     // Distance must not affect the plain phrase, so it is asked without a position.

@@ -143,7 +143,6 @@ impl Fixture {
         self.push_until(options, std::future::pending()).await.map(|(report, _)| report)
     }
 
-    /// Pushes until the server has acknowledged `n` batches.
     async fn push_cut_off(
         &self,
         server: &Server,
