@@ -1,5 +1,5 @@
-//! A page of results in one file: headings, tables and pictures inline, no scripts, nothing from elsewhere, so that it
-//! opens from a disk, an e-mail or a web server.
+//! A page of results in one file: headings, tables and pictures inline, no scripts, nothing from elsewhere. It
+//! opens from a disk, an e-mail or a web server alike.
 
 use std::fmt::Write as _;
 

@@ -1,4 +1,5 @@
-//! The map by which robots localise: features of the photos, with the splat's depth at their pixels.
+//! The map with which a robot finds its own place: features of the photos, with the depth that the splat has at
+//! their pixels.
 
 use glam::{DAffine3, DVec2};
 use slag_common::{Intrinsics, View};

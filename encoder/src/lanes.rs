@@ -1,6 +1,8 @@
-//! A pool of things for one piece of work each, such as opened models: each GPU has a few, its lanes, and work goes to
-//! the GPU with the most free ones. While one lane computes, another copies. A GPU's load is the time in which any of
-//! its lanes is in use.
+//! Things that are lent to one piece of work each, such as the opened models of GPUs: each GPU has a few, its lanes,
+//! and work goes to the GPU with the most free ones.
+//!
+//! While one lane of a GPU computes, another copies. The load of a GPU is the time in which any of its lanes is at
+//! work.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};

@@ -1,4 +1,4 @@
-//! Shared by all benchmarks: repetition, percentiles, and the machine's name.
+//! What all benchmarks share: repetition, percentiles, and the machine that they name.
 
 use std::time::Instant;
 

@@ -1,4 +1,4 @@
-//! Prints tables as Markdown, padded so that a terminal shows columns.
+//! The one printer of tables: Markdown, padded so that a terminal shows columns.
 
 use std::fmt;
 

@@ -1,4 +1,4 @@
-//! Choices of an encode, from presets, flags and measured fronts.
+//! The choices of an encode that a preset makes, flags override and a measured front knows.
 
 use clap::Args;
 

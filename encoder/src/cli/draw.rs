@@ -1,4 +1,4 @@
-//! `plan` and `draw`: images of a splat, of planned or given views.
+//! `plan` and `draw`: images of a splat, of planned views and of given ones.
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! Working memory of an encode: the flag's value, or half of the free memory.
+//! The working memory of an encode: the flag's value, or half of the free memory.
 
 use std::fs;
 

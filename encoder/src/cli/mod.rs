@@ -1,4 +1,4 @@
-//! The command line, one file per command: flags in, exit code out. Data goes to stdout, everything else to stderr.
+//! The command line, a file a command: flags in, exit code out. Data goes to stdout, everything else to stderr.
 
 mod check;
 mod choices;

@@ -1,4 +1,4 @@
-//! The summary of an encode for people.
+//! The summary of an encode, as lines for people.
 
 use slag_common::ByteSize;
 

@@ -1,4 +1,4 @@
-//! `view`: a page that draws and queries a store or splat.
+//! `view`: a page that draws a store or a splat, and asks it.
 
 use std::io::{self, Write};
 use std::path::PathBuf;

@@ -1,4 +1,4 @@
-//! Coordinates of a cell's embeddings: few, and such that equal distances are equal errors of scores.
+//! The coordinates of a cell's embeddings: few, and such that equal distances are equal errors of scores.
 
 use half::f16;
 

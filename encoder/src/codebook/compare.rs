@@ -1,4 +1,4 @@
-//! Decoded embeddings, their distances from the given ones, and the errors of their scores.
+//! What readers decode, its distances from the embeddings, and the errors of its scores.
 
 use half::f16;
 use rayon::prelude::*;

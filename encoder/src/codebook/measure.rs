@@ -1,4 +1,4 @@
-//! Errors of decoded scores, measured over a bank of texts.
+//! The errors of decoded scores, measured over a bank of texts.
 
 use rayon::prelude::*;
 use slag_common::shard::ScoreErrors;

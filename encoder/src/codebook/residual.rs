@@ -1,4 +1,5 @@
-//! The residual code: in each subspace of components, an embedding minus its centroid becomes one of 16 codewords.
+//! The residual code: a residual, an embedding minus its centroid, becomes one of 16 codewords in each subspace of
+//! components.
 //!
 //! Components are the eigenvectors of the residuals, so subspaces can be coded one by one (optimised product
 //! quantisation: Ge, He, Ke and Sun 2013). Codes have four bits, which a byte shuffle can look up.

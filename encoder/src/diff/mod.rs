@@ -1,6 +1,7 @@
-//! Changes between two generations: things that appeared, went or moved, and the bytes that robots have to fetch.
+//! What changed between two generations: things that appeared, went or moved, and the bytes that robots have to
+//! fetch.
 //!
-//! [`changes`] matches the things of two generations.
+//! [`changes`] says which things of two generations are the same.
 
 use std::collections::{BTreeMap, BTreeSet};
 

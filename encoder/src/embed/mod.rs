@@ -134,7 +134,6 @@ pub(crate) fn embed_crops(
 /// `batch`: crops per call, the encoder's preference if `None`. Batches depend on the masks alone, so that models whose
 /// vectors vary with the batch (8-bit ones with scales found at run time) agree on every machine. Memory:
 /// [`batch_bytes`].
-/// give the same ones on every machine. Memory: see [`batch_bytes`].
 pub fn embed_masks(
     image: &RgbImage,
     masks: &[Mask],

@@ -1,4 +1,4 @@
-//! A photo's vectors in and around a mask, mixed into the mask's own.
+//! What a photo shows in and around a mask, as a share of the mask's vector.
 
 use crate::masks::patches::Windows;
 use crate::masks::{Mask, patches};

@@ -1,4 +1,4 @@
-//! Third step: the contributions of all views become objects, fields and shards of every cell.
+//! The third step: the contributions of all views become objects, fields and shards of every cell.
 //!
 //! Contributions are read cell by cell. As many cells as the memory plan holds are lifted, coded and cut into shards
 //! at once. A cell's bytes do not depend on the others'.

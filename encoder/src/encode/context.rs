@@ -1,4 +1,4 @@
-//! Progress, cancellation, times and threads of a run.
+//! What every step of a run needs: progress, cancellation, times and threads.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,4 +1,4 @@
-//! Order of the views: first those that together show most of the scene, chosen before any mask is paid for.
+//! Which views to take first: those that together show the most of the scene, known before any mask is paid for.
 //!
 //! A raster of low resolution gives the blending weight `a(k, v) = Σ_p alpha T` of each Gaussian `k` over a view `v`
 //! without its margin, where the photo's edge cuts things off. It is the visible solid angle: it falls with the square

@@ -1,4 +1,4 @@
-//! Who does the views of an encode: this machine, or a fleet of workers.
+//! The interface of what does the views of an encode: this machine, or a fleet of workers.
 
 use std::collections::BTreeMap;
 

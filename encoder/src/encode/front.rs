@@ -1,4 +1,4 @@
-//! A measured front of settings, and the best setting for a target of seconds or bytes.
+//! The measured front of settings, and the choice of one for a target of seconds or bytes.
 //!
 //! `slag-lab bench tradeoff` writes it. Seconds of the views grow with their number, all others with the number of
 //! Gaussians. Photos of another size, other models or another machine need a front of their own.

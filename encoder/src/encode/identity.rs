@@ -1,4 +1,4 @@
-//! When two views' contributions are the same, so that an encode may reuse those of an earlier one.
+//! What makes two views' contributions the same, so that an encode may go on from those of an earlier one.
 
 use rayon::prelude::*;
 use serde::Serialize;

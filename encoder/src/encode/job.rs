@@ -1,4 +1,4 @@
-//! State of an unfinished encode: the finished views, and their files of contributions.
+//! The state of an unfinished encode: which views are done, and their files of contributions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;

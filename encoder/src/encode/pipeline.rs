@@ -1,4 +1,4 @@
-//! Overlapping stages for views: while a device has one view, the cores prepare the next.
+//! Views on their way through stages that overlap: while a device has one view, the cores prepare the next.
 //!
 //! Each stage has as many slots as views may be in it at once, and a queue as long. A free thread takes the most
 //! advanced view, so that views leave before others enter and few are in memory. Stages on the processor share its

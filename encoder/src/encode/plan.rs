@@ -1,4 +1,4 @@
-//! First step: everything that is read, checked and decided before the first view.
+//! The first step: everything that is read, checked and decided before the first view.
 
 use std::path::Path;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! Presets: named bundles of choices.
+//! Presets: bundles of choices with a name.
 
 use clap::ValueEnum;
 

@@ -1,4 +1,4 @@
-//! Last step: the signed manifest becomes the store's current generation.
+//! The last step: the manifest is signed and becomes the store's current generation.
 
 use std::collections::BTreeMap;
 use std::io;

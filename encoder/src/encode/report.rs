@@ -1,4 +1,4 @@
-//! Summary of an encode.
+//! What an encode did: the summary that the program prints.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! Photos in and contributions out, for encodes on several machines.
+//! What comes in and goes out where an encode is spread over machines: photos and contributions.
 
 use serde::{Deserialize, Serialize};
 use slag_common::View;

@@ -1,5 +1,6 @@
 //! The stages of one view: (fetch,) decode, (depth,) segment, crop, embed, raster, write.
-//! Each stage is a method on the result of the one before.
+//!
+//! Each stage is a method that takes what the one before returns.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};

@@ -1,4 +1,4 @@
-//! Second step: every view becomes a file of contributions.
+//! The second step: every view becomes a file of contributions.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;

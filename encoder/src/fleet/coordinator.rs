@@ -1,4 +1,5 @@
-//! The coordinator: uploads the inputs of an encode, downloads the workers' views, and makes the cells here.
+//! The coordinator: uploads the inputs of an encode, and brings the views that workers do to this machine, which
+//! makes the cells.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};

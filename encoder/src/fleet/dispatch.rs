@@ -1,5 +1,5 @@
-//! Which views a worker takes. Without a queue that is its share, every n-th view; once done, and if the others take
-//! long, it also does the rest of theirs, so that a lost machine does not hold up the run.
+//! Which views a worker takes. Without a queue that is its share, every n-th view; when it is done, and the others
+//! take long, the worker does what is left of theirs: a machine that went away must not hold up the rest.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -1,5 +1,7 @@
-//! The coordinator's heartbeat, so that workers do not wait for ever if it dies. Workers compare a beat with the one
-//! before, by their own clocks, because clocks of machines may differ.
+//! The coordinator's heartbeat: without it, workers would wait for ever for one that died for good.
+//!
+//! Workers compare what they read with what they read before, by their own clocks: those of the machines may
+//! differ.
 
 use std::sync::Arc;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};

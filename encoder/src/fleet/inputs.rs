@@ -1,4 +1,4 @@
-//! Uploads photos, masks and scene to the bucket, and downloads them to workers.
+//! Photos, masks and the scene on their way to the bucket, and from there to a worker.
 
 use std::collections::BTreeSet;
 use std::hash::{BuildHasher, Hasher, RandomState};

@@ -1,5 +1,6 @@
-//! The views of an encode on many machines: a bucket keeps all results, workers do views, a coordinator plans, waits,
-//! makes the cells and publishes. A queue only hands out work: a view is done if the bucket has it.
+//! The views of an encode on many machines: a bucket keeps everything that is made, workers do views, a
+//! coordinator plans, waits, makes the cells and publishes. A queue only hands out work: a view that the bucket
+//! has is done.
 //!
 //! | key in the bucket | content |
 //! |---|---|

@@ -1,4 +1,5 @@
-//! Binary objects in a bucket: the scene (the columns that an encode reads, in the poses' world), and views' results.
+//! The binary objects in a bucket: the scene, with the columns that an encode reads, in the world of the poses,
+//! and what a view leaves.
 
 use std::ops::Range;
 

@@ -1,4 +1,4 @@
-//! A run on a worker: scene and settings, fetched and checked.
+//! A run on a worker: the scene and settings, brought from the bucket and checked.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

@@ -1,9 +1,8 @@
-//! A run's queue on NATS JetStream: one stream per run with work-queue retention, and one durable pull consumer shared
-//! by all workers. It only hands out work: the coordinator refills it from what the bucket lacks.
+//! A run's queue on NATS JetStream: a stream with work-queue retention for each run, and one durable pull consumer
+//! that all workers share. It only hands out work: the coordinator fills it again from what the bucket lacks.
 //!
 //! A worker holds few messages at a time, reports progress on each every third of the ack wait, and acknowledges a
 //! message once its result is in the bucket.
-//! which the server would hand it to another, and acknowledges a message once its result is in the bucket.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt::Display;

@@ -1,5 +1,6 @@
-//! The runs in a bucket, numbered consecutively; the highest counts. A run ends once: its coordinator publishes, or the
-//! next run's coordinator supersedes it. Both put the same key on condition that it is absent, so one put decides.
+//! The runs in a bucket. They have consecutive numbers, and the highest one counts. A run ends once: by its
+//! coordinator's word that it publishes, or by that of the next run's coordinator. Both put the same object on
+//! condition that it is not there, so one put decides whether a run is published.
 
 use super::documents::{self, End, PlannedBy, RunPlan};
 use super::error::FleetError;

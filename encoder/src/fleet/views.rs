@@ -1,4 +1,4 @@
-//! Views on a worker: the pipeline, with the bucket at both ends.
+//! Views on a worker: through the pipeline, with the bucket at both ends.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 

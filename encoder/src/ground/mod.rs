@@ -1,4 +1,4 @@
-//! The ground, and what stands on it: from above, a car and its park may share a colour, but not a height.
+//! The ground, and what stands on it: in photos from above a car and its park have one colour, but not one height.
 //!
 //! Separating things from terrain by height follows laser scanning (Zhang et al., "A Progressive Morphological
 //! Filter", IEEE TGRS 41(4), 2003).

@@ -1,4 +1,4 @@
-//! Things that stand on the ground: connected voxels above it.
+//! What stands on the ground: voxels above it that touch each other.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;

@@ -1,4 +1,4 @@
-//! The frame of the splat relative to the poses, and the file that states it.
+//! The frame of the splat against that of the poses: which file says so.
 
 use std::fmt;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! Undistortion: each pixel of the ideal pinhole image is looked up in the photo.
+//! Undistortion: each pixel of the ideal pinhole image looks up its position in the photo.
 
 use image::RgbImage;
 use slag_common::Intrinsics;

@@ -1,8 +1,9 @@
-//! A view's mask vectors, regions and sparse contributions in a file of the job's folder, so that a killed encode does
+//! A view's mask vectors, regions and sparse contributions, in a file of the job's folder: a killed encode does
 //! not compute them again.
 //!
-//! A container holds all but the contributions. These follow, ordered by (cell, slice of its Gaussians): those of
-//! consecutive cells are one range of the file, so a pass over all cells reads each byte once.
+//! The file starts with a container that holds all but the contributions. These follow it, ordered by (cell, slice
+//! of its Gaussians): the contributions of consecutive cells are one range of the file, so a pass over all cells
+//! reads each byte once.
 
 use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;

@@ -1,4 +1,4 @@
-//! A cell's factorised field (sparse contributions over the scene's region vectors) and its scores.
+//! The factorised field of a cell, sparse contributions over the scene's region vectors, and its scores.
 
 use std::io::{self, Write};
 

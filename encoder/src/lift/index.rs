@@ -1,4 +1,4 @@
-//! Contribution files of all views, in the order of names, and the parts that their entries form.
+//! The contribution files of all views, in the order of the views' names, and the parts that their entries form.
 //!
 //! Each view's file is ordered by cell and slice, so that any range of cells is one range of each file.
 

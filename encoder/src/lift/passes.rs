@@ -1,5 +1,5 @@
-//! Passes over all parts' contributions, for the lift, its refinements and the objects. If the budget holds all parts,
-//! the first pass keeps them and later ones read no file.
+//! A pass over the contributions of all parts. The lift, its refinements and the objects need several: where the
+//! budget holds all parts, the first pass keeps them and later passes read no file.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,4 +1,5 @@
-//! Outlines of a view's masks, kept beside its contributions: how much the photo's edge cuts off, and the object's box.
+//! The outlines of a view's masks in its photo, kept beside its contributions: how much the photo's edge cuts off,
+//! and the box that shows the object.
 
 use std::path::Path;
 

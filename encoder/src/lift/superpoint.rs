@@ -1,5 +1,6 @@
-//! Superpoints: small surface pieces of one appearance, by graph-based segmentation (Felzenszwalb and Huttenlocher,
-//! "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004) of the Gaussians' nearest-neighbour graph.
+//! Superpoints: small pieces of surface of one appearance, by graph-based segmentation (Felzenszwalb and
+//! Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004) of the Gaussians' nearest-neighbour
+//! graph.
 //!
 //! An edge's length is the difference of its ends in colour, in the direction of their thinnest axes and, if known, in
 //! their embeddings; distance only decides who is a neighbour. What stands on the ground has no edge to the ground nor

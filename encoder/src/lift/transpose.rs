@@ -1,4 +1,5 @@
-//! Transposes groups of parts from view-major to Gaussian-major contributions.
+//! Brings the contributions of all views together by Gaussian: each group of parts is transposed from the views'
+//! order to the Gaussians'.
 
 use rayon::prelude::*;
 use slag_common::container::ContainerError;

@@ -1,4 +1,4 @@
-//! One bit per pixel.
+//! Yes or no for each of many pixels, a bit each.
 
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Bits {

@@ -1,4 +1,4 @@
-//! Masks drawn over their photo.
+//! Masks drawn over their photo, for people to look at.
 
 use image::{Rgb, RgbImage, imageops};
 

@@ -1,4 +1,4 @@
-//! Patches of an image model as masks: cells of a square grid stretched over the photo.
+//! The patches of an image model as masks: cells of a square grid that is stretched over the photo.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! Partition of an image into regions: pixels in the same masks.
+//! The partition of an image into regions: pixels that lie in the same masks.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;

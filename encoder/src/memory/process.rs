@@ -1,4 +1,4 @@
-//! The process's actual memory, as Linux counts it.
+//! The memory that this process really has, as Linux counts it.
 
 /// Peak memory of the process so far; `None` on other systems than Linux.
 pub fn peak_bytes() -> Option<u64> {

@@ -1,6 +1,8 @@
-//! Stage 5: superpoints that most views' masks show together become objects. Needs no model and no training: the
-//! contributions tell which Gaussians each mask shows. They are needed once, part by part; the result takes four bytes
-//! a Gaussian.
+//! Stage 5: superpoints that the masks of most views show together become objects.
+//!
+//! No model and no training are needed: the contributions tell which Gaussians each mask shows.
+//!
+//! The contributions are needed once, part by part; the result takes four bytes a Gaussian.
 
 mod choice;
 mod find;

@@ -1,4 +1,4 @@
-//! Pairs of superpoints near each other: only these can be of one object.
+//! Superpoints that lie near each other: only these can be of one object.
 
 use rayon::prelude::*;
 use slag_common::Gaussians;

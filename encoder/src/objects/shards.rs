@@ -1,4 +1,4 @@
-//! A cell's objects, as its shards store them.
+//! The objects of a cell, as its shards store them.
 
 use half::f16;
 use slag_common::objects::{

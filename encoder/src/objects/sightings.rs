@@ -1,4 +1,4 @@
-//! What each view shows of each superpoint: how many Gaussians, under which masks.
+//! What each view shows of each superpoint: how many of its Gaussians, and under which masks.
 
 use rayon::prelude::*;
 

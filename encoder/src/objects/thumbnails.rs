@@ -1,4 +1,4 @@
-//! Small pictures of objects, each cut from the photo that shows it best.
+//! Small pictures of objects, each cut from the photo that shows the object best.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};

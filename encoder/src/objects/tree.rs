@@ -1,6 +1,8 @@
-//! Superpoints are joined pair by pair, most affinity first: each join is a candidate for an object, from a side of a
-//! cup to the whole table. The affinity of two sets is summed over all their pairs near each other (average linkage,
-//! Sokal and Michener 1958).
+//! Superpoints are joined pair by pair, those with most affinity first: each join is a candidate for an object,
+//! from a side of a cup to the whole table.
+//!
+//! The affinity of two sets is that of all their pairs that lie near each other, added up (average linkage, Sokal
+//! and Michener 1958).
 
 use std::cmp::{Ordering, Reverse};
 use std::collections::{BTreeMap, BinaryHeap};

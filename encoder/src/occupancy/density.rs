@@ -1,4 +1,4 @@
-//! Occupied voxels: the opacity of all Gaussians at each voxel, by Beer and Lambert's law.
+//! Which voxels hold a surface: the opacity of all Gaussians at each voxel, by Beer and Lambert's law.
 //!
 //! `opacity = 1 - exp(-sum over Gaussians of alpha exp(-d^2 / 2))`, where d is the distance of the voxel's centre from
 //! the mean in standard deviations of the Gaussian, widened by [`VOXEL_VARIANCE`] of the voxel's squared edge; d above

@@ -1,4 +1,4 @@
-//! Lattice of voxels and blocks, common to a scene's shards.
+//! The lattice of voxels and blocks, common to all shards of a scene.
 
 use glam::DVec3;
 use slag_common::occupancy::BLOCK_EDGE;

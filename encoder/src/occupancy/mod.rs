@@ -1,4 +1,4 @@
-//! Free, occupied and unknown places, for robots that move. Defined in `docs/numerics.md`.
+//! Which places are free, occupied or unknown, for robots that move. The definition is in `docs/numerics.md`.
 
 mod density;
 mod lattice;

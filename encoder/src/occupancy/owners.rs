@@ -1,5 +1,6 @@
-//! The cell that stores each block: the one with its means nearest. Cells are boxes around means with gaps between
-//! them, and free places lie in the gaps, too.
+//! The cell that stores each block: the one with its means nearest.
+//!
+//! Cells are boxes around means with gaps between them, and free places lie in the gaps too.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! Voxels that views look through: those nearer than the surface at their pixel.
+//! Which voxels views have looked through: those nearer than the surface at their pixel.
 
 use glam::DVec3;
 use rayon::prelude::*;

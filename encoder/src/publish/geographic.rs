@@ -1,4 +1,5 @@
-//! A scene on the earth: footprints of its cells (GeoJSON, RFC 7946), and geographic positions in the world frame.
+//! A scene on the earth: footprints of its cells in longitude and latitude (GeoJSON, RFC 7946), and
+//! geographic positions in the world frame.
 
 use geo::{ConvexHull, Coord, GeodesicArea, LineString, MultiPoint, MultiPolygon, Point, Polygon};
 use geojson::{Feature, FeatureCollection, Geometry, GeometryValue, JsonObject, feature::Id};

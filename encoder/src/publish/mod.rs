@@ -1,4 +1,4 @@
-//! Last stage: serves a scene to robots over HTTP, and pushes it as points to Qdrant.
+//! Last stage: serves a scene to robots over HTTP, and pushes it as points to a Qdrant database.
 
 pub(crate) mod geographic;
 #[cfg(feature = "qdrant")]

@@ -1,4 +1,5 @@
-//! Gaussians that a query found: their index in the input splat file, their position, and a splat of them.
+//! The Gaussians that a query found: which they are in the input splat file, where they lie, and themselves as a
+//! splat.
 
 use std::collections::HashMap;
 

@@ -1,4 +1,4 @@
-//! GPU adapters and options of their use; also in builds without the GPU backend.
+//! Descriptions of GPU adapters, and options of their use; also in builds without the GPU backend.
 
 use serde::Serialize;
 

@@ -1,4 +1,4 @@
-//! Devices for rasterisation: GPUs that share the views, or the CPU.
+//! The devices for rasterisation: GPUs that share the views, or the CPU.
 
 use std::collections::BTreeSet;
 use std::fmt;

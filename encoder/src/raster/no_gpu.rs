@@ -1,4 +1,4 @@
-//! Replaces the GPU backend in builds without the feature `gpu`: no adapter is found.
+//! Stands in for the GPU backend in builds without the feature `gpu`: no adapter is found.
 
 use std::convert::Infallible;
 

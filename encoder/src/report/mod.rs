@@ -1,5 +1,5 @@
-//! Report of an encode: one page with its views, masks, objects, cells, errors by profile, and what was left out and
-//! why.
+//! The report of an encode: one page with its views, masks, objects, cells, errors by profile, and what was left
+//! out and why.
 
 mod recorder;
 

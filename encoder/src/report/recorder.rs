@@ -1,4 +1,5 @@
-//! What a report tells beside the summary: views with their masks, some of them drawn, cells, and objects.
+//! What a report tells beside the summary: the views and their masks, some of them drawn, the cells, and the
+//! objects.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -1,4 +1,4 @@
-//! Masks of things on the ground, added to another segmenter's.
+//! Masks of what stands on the ground, beside those of another segmenter.
 
 use std::ops::Range;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! The catalogue of a store, in sled: its published generations.
+//! The catalogue of a store, in sled: what was published.
 //!
 //! | tree | key | value, JSON |
 //! |---|---|---|

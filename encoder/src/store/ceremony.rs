@@ -1,4 +1,4 @@
-//! Changes of the keys in a store's root.
+//! Changes of the keys that a store's root names.
 //!
 //! The next root takes effect once enough keys of the present root and of its own have signed it. If root's keys are
 //! kept elsewhere, it waits as a draft, `keys/N.root.draft.json`, which is carried there, signed, carried back and

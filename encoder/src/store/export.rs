@@ -1,4 +1,4 @@
-//! A store as static files, laid out as robots request them, for any web server.
+//! A store as static files, laid out as robots ask for them, for any web server.
 //!
 //! | path | content |
 //! |---|---|

@@ -1,4 +1,4 @@
-//! Durable files (written beside, synced, renamed, the folder synced), and those of manifests.
+//! Files that survive a power cut: written beside, synced, renamed, the folder synced; and those of manifests.
 
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};

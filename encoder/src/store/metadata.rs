@@ -1,4 +1,4 @@
-//! The store as a repository of The Update Framework, with its manifest as the target `manifest`.
+//! The store as a repository of The Update Framework: its manifest is the target `manifest`.
 //!
 //! | file | what |
 //! |---|---|

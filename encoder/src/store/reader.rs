@@ -1,4 +1,4 @@
-//! Reads a store without a lock: needs only the manifest, the public key and the objects.
+//! The lock-free side of a store: needs the manifest, the public key and the objects alone.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;

@@ -1,4 +1,4 @@
-//! Signing keys of the metadata roles, and their folders.
+//! The signing keys of the metadata roles, and the folders in which they lie.
 //!
 //! | file | what |
 //! |---|---|

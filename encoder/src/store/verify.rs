@@ -1,4 +1,4 @@
-//! Reads every byte that a store publishes, and follows its metadata as a robot does.
+//! Reads every byte of what a store publishes, and follows its metadata as a robot does.
 
 use std::collections::BTreeMap;
 use std::io;

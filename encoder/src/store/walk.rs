@@ -1,4 +1,4 @@
-//! Follows a store's metadata as a robot does, from the first root to the manifest, and lists what a robot would
+//! Walks the metadata of a store as a robot does, from the first root to the manifest, and says what a robot would
 //! refuse.
 
 use std::collections::BTreeMap;

@@ -1,4 +1,4 @@
-//! Damaged metadata is reported, and signed anew if that is safe. The oracle is the client of `slag-common`.
+//! Damaged metadata: it is told, and signed anew where that is safe. The oracle is the client of `slag-common`.
 
 use std::path::{Path, PathBuf};
 

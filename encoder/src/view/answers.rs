@@ -1,4 +1,5 @@
-//! Answers of `GET /v1/query` for the page: matching things, best first. A part of the robot's reply.
+//! Answers of `GET /v1/query` as the page reads them: the things that match, best first. A part of the robot's
+//! reply.
 
 use std::collections::BTreeSet;
 

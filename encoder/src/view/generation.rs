@@ -1,4 +1,4 @@
-//! A store's generation, opened for the page.
+//! A generation of a store, opened for the page.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;

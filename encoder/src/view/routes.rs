@@ -1,4 +1,4 @@
-//! The page's routes, within the limits of the robots' service.
+//! The routes of the page, with the limits of the service for robots around them.
 
 use std::iter;
 use std::sync::Arc;

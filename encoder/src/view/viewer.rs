@@ -1,4 +1,4 @@
-//! Answers the page.
+//! Answers the page from what is shown.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;

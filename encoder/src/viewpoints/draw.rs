@@ -1,4 +1,4 @@
-//! Images of a splat, and a poses file that marks them as drawings.
+//! Images of a splat, and the poses file that says that they are drawings.
 
 use std::f32::consts::SQRT_2;
 use std::io::{self, BufReader, Cursor};

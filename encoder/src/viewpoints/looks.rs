@@ -1,4 +1,4 @@
-//! A candidate's small drawing: can it be trusted, and which Gaussians does it show?
+//! A small drawing of a candidate: can it be trusted, and which Gaussians does it show?
 
 use glam::{DAffine3, DMat3, DVec3};
 use slag_common::Intrinsics;

@@ -1,4 +1,4 @@
-//! Plans, and when a view can be trusted.
+//! What a plan consists of, and when a view can be trusted.
 
 use std::fmt;
 

@@ -1,4 +1,4 @@
-//! The scene in the planner's axes: turned, centred, scaled, with its occupied voxels.
+//! The scene as the planner sees it: turned, centred, scaled, with its occupied voxels.
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use slag_common::Gaussians;

@@ -1,4 +1,4 @@
-//! Names of the objects of labelled scenes: how often they are right, and how well their confidence is calibrated.
+//! What the objects of labelled scenes are called, and how far the confidence of a name can be believed.
 //!
 //! An object is the thing that has most of its Gaussians, at least half of them; one without such a thing has no right
 //! name. A name is right if it, or a part of it between slashes, is the label, a synonym of it, or the last words of

@@ -1,5 +1,5 @@
-//! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes; 19, 15 and 10 classes;
-//! argmax over the classes' words; means over the classes in a scene.
+//! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes, 19, 15 and 10
+//! classes, argmax over the classes' words, means over the classes that a scene has.
 //!
 //! The nearest Gaussian answers for a vertex (OpenGaussian fixes Gaussians to the mesh's vertices). Gaussians with
 //! an opacity below `MIN_OPACITY` do not count, as in its `scripts/eval_scannet.py`.

@@ -1,4 +1,5 @@
-//! Large scenes: copies of a photographed scene on a square grid, with its photos, masks and poses.
+//! Large scenes: a photographed scene many times over, on a square grid, with its photos, masks and poses moved
+//! along.
 
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};

@@ -1,5 +1,5 @@
-//! Gaussians share evidence within superpoints and objects: each superpoint becomes one more region, a mixture of its
-//! Gaussians' masks, and its Gaussians get an entry of that region.
+//! Gaussians share evidence within superpoints and objects: each superpoint becomes one more region, a mixture of
+//! the masks of its Gaussians, and its Gaussians get an entry of that region.
 
 use std::ops::Range;
 

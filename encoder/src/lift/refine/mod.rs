@@ -14,7 +14,6 @@
 //! [`PendingRefinement::begin`] takes the views' table and weighs its masks; objects are found from the pending
 //! refinement; [`PendingRefinement::finish`] returns the table with the mixtures. Decisions are made in principal
 //! coordinates of the mask vectors (`points`) and in one order: the result depends neither on threads nor on memory.
-//! depends neither on threads nor on the memory budget.
 
 mod mixture;
 mod prune;

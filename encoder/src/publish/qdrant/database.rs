@@ -1,4 +1,4 @@
-//! Requests to the database, repeated after temporary errors.
+//! Requests to the database, repeated while their errors may pass.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};

@@ -1,4 +1,4 @@
-//! Pushes a scene's embeddings into Qdrant: one point per Gaussian.
+//! Pushes a scene's embeddings into Qdrant: one point a Gaussian.
 //!
 //! A collection holds one scene, or one cell of it ([`Layout`]). A point's id is the Gaussian's index in the input
 //! splat file. Its payload has `x`, `y`, `z` (world frame), `cell_id`, `scene`, `generation` and, if the scene is

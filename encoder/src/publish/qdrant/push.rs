@@ -1,4 +1,4 @@
-//! The push: by collection, cell and batch, recorded after each.
+//! The push: collection by collection, cell by cell, batch by batch, recorded after each.
 
 use qdrant_client::qdrant::{CollectionInfo, Filter};
 use serde::{Deserialize, Serialize};

@@ -1,5 +1,7 @@
-//! The HTTP service that robots fetch from. `GET /` lists the resources. It needs no lock on the store; a `stat` per
-//! request notices a new manifest.
+//! The HTTP service that robots fetch from.
+//!
+//! `GET /` lists the resources. The service needs no lock on the store; a `stat` for each request notices a
+//! new manifest.
 
 mod cells;
 mod objects;

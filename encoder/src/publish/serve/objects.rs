@@ -1,4 +1,4 @@
-//! A store's files: manifest, objects with byte ranges, and metadata for clients of The Update Framework.
+//! The files of a store: manifest, objects with byte ranges, and metadata for clients of The Update Framework.
 
 use std::io;
 use std::marker::PhantomData;

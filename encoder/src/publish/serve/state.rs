@@ -1,4 +1,4 @@
-//! The served generation, and its replacement.
+//! The generation that is served, and its replacement.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! Device buffers of one view in flight.
+//! The device buffers of one view in flight.
 
 use wgpu::BufferUsages as Usage;
 

@@ -1,4 +1,4 @@
-//! Parameters of all scans and sorts.
+//! The parameters of all scans and sorts.
 
 use slag_raster::constants::{FAR_Z, NEAR_Z};
 

@@ -1,4 +1,4 @@
-//! Data that host and shaders exchange; a test compares these structures with the shaders'.
+//! Data that host and shaders exchange. A test compares these structures with those of the shaders.
 
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;

@@ -1,4 +1,4 @@
-//! Shaders: their source with a prelude of constants and precision, and their pipelines.
+//! The shaders: their source with a prelude of constants and precision, and their pipelines.
 
 use std::borrow::Cow;
 use std::fmt::Write;

@@ -1,4 +1,4 @@
-//! Run-length masks in JSON files: SAM's lists and COCO data sets.
+//! Run-length masks of JSON files: SAM's lists and COCO data sets.
 
 use std::collections::BTreeMap;
 use std::io::Read;

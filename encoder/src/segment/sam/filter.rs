@@ -1,4 +1,4 @@
-//! Filters of Segment Anything's automatic mask generation, in order.
+//! The filters of Segment Anything's automatic mask generation, in their order.
 
 use rayon::prelude::*;
 use slag_models::sam::{Decoded, MASKS_PER_PROMPT};

@@ -1,10 +1,10 @@
-//! Masks from Segment Anything and Segment Anything 2: automatic mask generation as in the first's paper (Kirillov et
-//! al. 2023, appendix B) and its reference implementation; prompts without an object, as the second reports, give no
-//! mask.
+//! Masks from Segment Anything and Segment Anything 2: automatic mask generation as defined by the first's paper
+//! (Kirillov et al. 2023, appendix B) and its reference implementation; prompts without an object, as the second
+//! tells, give none.
 //!
-//! Each point of a grid is a prompt with three masks: whole, part and subpart. The image encoder runs once per image
-//! and crop, the decoder once per batch of points. While it decodes a batch, the previous batch's masks are enlarged
-//! and filtered in parallel.
+//! Each point of a grid is one prompt, which gives three masks: whole, part and subpart. The image encoder runs
+//! once per image and crop, the decoder once per batch of points. While it decodes a batch, the masks of the
+//! previous batch are enlarged and filtered in parallel.
 
 mod filter;
 mod points;

@@ -1,4 +1,4 @@
-//! Prompts of automatic mask generation: grids of points, and crops of the image.
+//! The prompts of automatic mask generation: grids of points, and crops of the image.
 
 use crate::masks::BoxPx;
 

@@ -1,4 +1,4 @@
-//! Settings of automatic mask generation.
+//! The settings of automatic mask generation.
 
 /// Which of the three masks of a prompt are used.
 #[derive(

@@ -1,4 +1,5 @@
-//! Compares the filters with an independent recomputation on synthetic logits: float64, dense arrays, no shared code.
+//! Compares the filters with an independent recomputation on synthetic logits: float64, dense arrays, no shared
+//! code.
 
 mod langsplat;
 mod levels;

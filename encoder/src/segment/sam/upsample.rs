@@ -1,4 +1,4 @@
-//! Upsamples the decoder's coarse logits to the pixels of an image.
+//! Upsampling of the decoder's coarse logits to the pixels of an image.
 //!
 //! SAM enlarges the logits to its input square, crops the padding and scales the rest to the image; both steps are
 //! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step with

@@ -1,4 +1,4 @@
-//! The whole road: an unseen photo is located, a word names a thing, and a place to stand is given in the frame of the
+//! The whole road: a photo that no map has seen, where it was taken, a word, a place to stand in the frame of the
 //! robot's odometry. Judged at the place where that leads.
 
 use std::collections::BTreeSet;

@@ -1,5 +1,5 @@
-//! Relations between things on generated scenes. Each question is put to the robot's program as relations, as the plain
-//! phrase and by the noun alone; the layout judges the answers.
+//! Relations between things, judged on generated scenes: each question is asked of the robot's program as
+//! relations, as the plain phrase, and by the noun alone, and the answers are compared with the layout.
 
 mod truth;
 

@@ -1,4 +1,5 @@
-//! True relations in a generated scene, from the boxes of its layout. The rules share no code with the robot's.
+//! Which relations truly hold in a generated scene: by the boxes of its layout, with rules of their own, which
+//! share no code with the robot's.
 
 use glam::{DVec2, DVec3};
 use serde::Serialize;

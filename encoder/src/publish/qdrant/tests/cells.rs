@@ -1,4 +1,4 @@
-//! One collection per cell, and snapshots.
+//! One collection a cell, and snapshots.
 
 use super::server::{Held, Server, Stored};
 use super::*;

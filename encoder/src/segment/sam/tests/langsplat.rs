@@ -1,6 +1,7 @@
-//! LangSplat's own filter, run on made masks and recorded. `langsplat_mask_nms.json` has 24 sets of rectangles and
-//! ellipses with scores, and what LangSplat's `masks_update` kept of each with the thresholds of its `sam_encoder`.
-//! None of its code is here.
+//! LangSplat's own filter, run on made masks and recorded.
+//!
+//! `langsplat_mask_nms.json` has 24 sets of rectangles and ellipses with scores, and what LangSplat's
+//! `masks_update` kept of each with the thresholds of its `sam_encoder`. None of its code is here.
 
 use serde::Deserialize;
 
