@@ -20,7 +20,7 @@ const LANES_PER_GPU: usize = 3;
 
 /// Views that may wait per lane: with a usual number of masks they fill two batches.
 const VIEWS_PER_LANE: usize = 12;
-/// Crops in the queue per lane.
+/// Crops reserved per lane: of that many views, or of fewer with many masks.
 const CROPS_PER_LANE: u64 = 512;
 
 pub(crate) type OpenEncoder = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Send + Sync;

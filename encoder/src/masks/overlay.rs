@@ -15,7 +15,7 @@ pub fn overlay(photo: &RgbImage, masks: &[Mask], width_px: u32) -> RgbImage {
     let scale = f64::from(photo.width()) / f64::from(width);
     let height = ((f64::from(photo.height()) / scale).round() as u32).max(1);
     let mut picture = imageops::thumbnail(photo, width, height);
-    // Pixel of the photo under the middle of the picture's.
+    // Pixel of the photo under the middle of a pixel of the picture.
     let in_photo = |at: u32, n: u32| ((f64::from(at) + 0.5) * scale).min(f64::from(n) - 1.0) as u32;
     for (number, mask) in masks.iter().enumerate() {
         let colour = hue((number as f32 * HUE_STEP).fract());

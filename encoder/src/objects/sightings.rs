@@ -9,7 +9,8 @@ use crate::memory::{MemoryPlan, Phase};
 /// Least weight of a seen Gaussian relative to its best view: remnants behind others say nothing.
 const MIN_WEIGHT_SHARE: f32 = 0.1;
 const GAUSSIANS_PER_TASK: usize = 1 << 12;
-/// Contributions per pair of superpoint and region, at least: a superpoint has 15 Gaussians in labelled scenes.
+/// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, 15 in labelled
+/// scenes.
 const ENTRIES_PER_REGION: u64 = 8;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
